@@ -1,0 +1,69 @@
+"""Flight: the numpy arrays of one recording. Every reader returns one, every tool takes one."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .anchors import Anchors
+
+
+@dataclass(frozen=True)
+class Imu:
+    """Inertial samples in the body frame (x forward, y left, z up: REP-103).
+
+    t : (n,) s; gyro : (n, 3) rad/s; accel : (n, 3) m/s^2, specific force (+9.81 on z at rest).
+    """
+
+    t: np.ndarray
+    gyro: np.ndarray
+    accel: np.ndarray
+
+    def __len__(self):
+        return len(self.t)
+
+
+@dataclass(frozen=True)
+class Tdoas:
+    """Raw measurements. t : (n,) s; a, b : (n,) anchor ids; d : (n,) metres, d_ab = |p - b| - |p - a|."""
+
+    t: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    d: np.ndarray
+
+    def __len__(self):
+        return len(self.t)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth. t : (n,) s; p : (n, 3) m, world; q : (n, 4) x y z w, body to world, NaN where not recorded."""
+
+    t: np.ndarray
+    p: np.ndarray
+    q: np.ndarray
+
+    def __len__(self):
+        return len(self.t)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One recording. All stamps are of one clock, in s; every stream keeps its own; within a stream stamps never fall.
+
+    name : short and unique, e.g. "0425-traj1"
+    anchors : Anchors
+    tdoa : Tdoas
+    imu : Imu or None
+    truth : Truth or None
+    extra : other streams of the log by name, each a dict of column name to (n,) array with a "t" among them, file units
+    meta : where it came from: source file, format, protocol ("tdoa2", "tdoa3"), ...
+    """
+
+    name: str
+    anchors: Anchors
+    tdoa: Tdoas
+    imu: Imu | None = None
+    truth: Truth | None = None
+    extra: dict = field(default_factory=dict)
+    meta: dict = field(default_factory=dict)
