@@ -1,0 +1,1 @@
+"""The workbench: read, convert, simulate, replay, record, evaluate, and the demo that runs it all."""
