@@ -1,0 +1,87 @@
+"""From raw TDOAs to corrected ones: the core of bias_node and of the offline engine."""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+
+from .effects import EffectSet, Samples
+
+# status of one correction; the values of TdoaCorrected.STATUS_*
+PASSED, EFFECTS, NETWORK, FADED = range(4)
+
+
+@dataclass(frozen=True)
+class Correction:
+    """bias, std : (n,) m; corrected = d - bias, (n,) m; status : (n,) one of PASSED, EFFECTS, NETWORK, FADED."""
+
+    bias: np.ndarray
+    std: np.ndarray
+    corrected: np.ndarray
+    status: np.ndarray
+
+
+class Corrector:
+    """Predicts the systematic error of each TDOA at the pose the tag had a little earlier, and removes it.
+
+    The pose used for a measurement stamped t is the newest one stamped no later than t - lag. It depends on stamps alone,
+    so that a recording gives the same result at any speed, and leaves the filter `lag` seconds to report that pose.
+    """
+
+    def __init__(self, anchors, effects=None, network=None, lag=0.05, history=4096):
+        """anchors : Anchors; effects : EffectSet or None; network : Network or None; lag : s; history : poses kept."""
+        self.anchors = anchors
+        self.effects = effects or EffectSet()
+        self.network = network
+        self.lag = lag
+        parts = [self.effects.name] if len(self.effects) else []
+        self.model = "+".join(parts + ([network.name] if network else [])) or "none"
+        self._history = history
+        self._t, self._p, self._q = [], [], []
+
+    @property
+    def idle(self):
+        """True if there is nothing to correct with."""
+        return not len(self.effects) and self.network is None
+
+    def add_pose(self, t, p, q):
+        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world. Stamps must rise; others are ignored."""
+        if self._t and t <= self._t[-1]:
+            return
+        self._t.append(t)
+        self._p.append(p)
+        self._q.append(q)
+        if len(self._t) > 2 * self._history:
+            for kept in (self._t, self._p, self._q):
+                del kept[: self._history]
+
+    def ready(self, t):
+        """True if no pose that is still to come can change the correction of a measurement stamped t."""
+        return self.idle or (bool(self._t) and self._t[-1] > t - self.lag)
+
+    def correct(self, t, a, b, d):
+        """Correct a batch.
+
+        t : (n,) s; a, b : (n,) anchor rows (of `anchors`); d : (n,) raw d_ab, m. Returns a Correction. Where no pose is
+        known yet, only effects that need none contribute.
+        """
+        n = len(t)
+        zeros = np.zeros(n)
+        if self.idle or n == 0:
+            return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
+        p, q = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
+        for i in range(n):
+            k = bisect_right(self._t, t[i] - self.lag) - 1
+            if k >= 0:
+                p[i], q[i] = self._p[k], self._q[k]
+        samples = Samples(t, a, b, p, q, self.anchors)
+        bias = self.effects.bias(samples)
+        std = zeros
+        status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
+        if self.network is not None:
+            learned, std = self.network.predict(samples)
+            known = np.isfinite(learned)
+            bias = bias + np.where(known, learned, 0.0)
+            std = np.where(known & np.isfinite(std), std, 0.0)
+            status[known] = NETWORK
+        return Correction(bias, std, d - bias, status)

@@ -1,0 +1,45 @@
+"""The tag's antenna is not at the origin of the body frame."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import InputError
+from ..geometry import tdoa, tdoa_jacobian
+from .base import Effect
+
+
+class TagLeverArm(Effect):
+    """The antenna sits at p + R(q) l, with the arm l = (x, y, z) in the body frame."""
+
+    name = "tag_lever_arm"
+    unit = "m"
+    bound = 2.0
+    confounded_with = ("truth_frame", "anchor_position")
+    reference = "any text on strapdown navigation: lever arm compensation"
+
+    @classmethod
+    def check_key(cls, key):
+        if key not in ("x", "y", "z"):
+            raise InputError(f"effects: tag_lever_arm: parameter {key!r} is not one of x, y, z.")
+
+    def _arm(self):
+        return np.array([self.values.get(key, 0.0) for key in "xyz"])
+
+    def bias(self, samples):
+        a, b = samples.anchors.positions[samples.a], samples.anchors.positions[samples.b]
+        return tdoa(samples.p + _rotate(samples.q, self._arm()), a, b) - tdoa(samples.p, a, b)
+
+    def regressors(self, samples, keys):
+        a, b = samples.anchors.positions[samples.a], samples.anchors.positions[samples.b]
+        jacobian = tdoa_jacobian(samples.p + _rotate(samples.q, self._arm()), a, b)
+        axes = np.eye(3)[["xyz".index(key) for key in keys]]
+        return np.stack([np.sum(jacobian * _rotate(samples.q, axis), axis=1) for axis in axes], axis=1)
+
+
+def _rotate(q, v):
+    """R(q) v for (n, 4) quaternions x y z w, NaN where q is NaN; (n, 3)."""
+    known = np.isfinite(q).all(axis=1)
+    out = np.full((len(q), 3), np.nan)
+    if known.any():
+        out[known] = Rotation.from_quat(q[known]).apply(v)
+    return out

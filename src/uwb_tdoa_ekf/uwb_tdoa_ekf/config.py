@@ -1,0 +1,83 @@
+"""Every number that tunes the filter, with its unit and why it is what it is."""
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+from uwb_tdoa_bias.errors import InputError
+
+ROBUST = ("innovation", "gate", "m_estimation")
+LOSSES = ("geman_mcclure", "huber", "cauchy")
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """Tuning of the filter. The node's parameters have the same names."""
+
+    tdoa_std: float = 0.25  # m, spread of a TDOA about its prediction, systematic part that was not corrected included
+    tdoa_correlation: float = 6.0  # n successive TDOAs tell as much as n / this independent ones; 1 for white noise
+    robust: str = "innovation"  # weight from the whitened innovation; "gate": 0 or 1; "m_estimation": Zhao et al. IV-A
+    loss: str = "geman_mcclure"  # or "huber", "cauchy": for "innovation" and "m_estimation"
+    measurement_scale: float = 2.5  # standard deviations at which the loss bends
+    state_scale: float = 2.5  # the same for the prior's share in "m_estimation"
+    iterations: int = 2  # of "m_estimation"
+    gate: float = 3.0  # standard deviations, for "gate"
+
+    use_imu: bool = True  # False: constant velocity, for tags without an IMU
+    motion_noise: float = 1.5  # m/s^2/sqrt(Hz), random acceleration of the tag while no IMU says better
+    imu_timeout: float = 0.1  # s without an IMU sample after which motion_noise takes over
+    accel_noise: float = 0.1  # m/s^2/sqrt(Hz), motors running
+    gyro_noise: float = 0.005  # rad/s/sqrt(Hz)
+    accel_bias_walk: float = 0.01  # m/s^3/sqrt(Hz)
+    gyro_bias_walk: float = 1e-4  # rad/s^2/sqrt(Hz)
+    vibration_trust: float = 1.5  # m/s^2, acceleration that is plausible for the vehicle; stronger vibration is not believed
+
+    initial_yaw: float = 0.0  # rad
+    initial_yaw_std: float = 0.5  # rad
+    initial_accel_bias_std: float = 0.1  # m/s^2
+    initial_gyro_bias_std: float = 0.01  # rad/s
+    start_window: float = 0.5  # s of TDOAs from which the start position is found
+    start_patience: float = 1.0  # s after which a start from contradicting TDOAs is better than none
+
+    odometry_rate: float = 200.0  # Hz
+
+    def __post_init__(self):
+        for name, allowed in (("robust", ROBUST), ("loss", LOSSES)):
+            if getattr(self, name) not in allowed:
+                raise InputError(f"{name}: {getattr(self, name)!r} is not one of {', '.join(allowed)}.")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.type in ("float", "int") and field.name != "initial_yaw" and not 0 < value < 1e9:
+                raise InputError(f"{field.name}: {value!r} must be a number above 0.")
+
+    def tuning(self):
+        """The numbers the compiled core reads."""
+        values = {name: getattr(self, name) for name in Tuning._fields if name not in ("robust", "loss")}
+        return Tuning(robust=ROBUST.index(self.robust), loss=LOSSES.index(self.loss), **values)
+
+
+class Tuning(NamedTuple):
+    """FilterConfig as the compiled core takes it: names replaced by their place in ROBUST and LOSSES."""
+
+    tdoa_std: float
+    tdoa_correlation: float
+    robust: int
+    loss: int
+    measurement_scale: float
+    state_scale: float
+    iterations: int
+    gate: float
+    use_imu: bool
+    motion_noise: float
+    imu_timeout: float
+    accel_noise: float
+    gyro_noise: float
+    accel_bias_walk: float
+    gyro_bias_walk: float
+    vibration_trust: float
+    initial_yaw: float
+    initial_yaw_std: float
+    initial_accel_bias_std: float
+    initial_gyro_bias_std: float
+    start_window: float
+    start_patience: float
+    odometry_rate: float

@@ -1,0 +1,31 @@
+"""Which TDOAs cannot be measurements at all."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+MARGIN = 1.0  # m by which |d_ab| may exceed the distance between a and b: its largest believable error
+
+
+@njit(cache=True)
+def usable(a, b, d, bias_std, positions):
+    """False for an unknown anchor (row -1), a pair of one anchor, a value that is not finite or longer than the baseline.
+
+    a, b : anchor rows; d, bias_std : m; positions : (N, 3) m.
+    """
+    if a < 0 or b < 0 or a == b or not (math.isfinite(d) and math.isfinite(bias_std)):
+        return False
+    baseline = 0.0
+    for k in range(3):
+        baseline += (positions[a, k] - positions[b, k]) ** 2
+    return abs(d) <= math.sqrt(baseline) + MARGIN
+
+
+@njit(cache=True)
+def usable_all(a, b, d, bias_std, positions):
+    """`usable` for (n,) arrays: (n,) bool."""
+    out = np.empty(len(d), np.bool_)
+    for i in range(len(d)):
+        out[i] = usable(a[i], b[i], d[i], bias_std[i], positions)
+    return out
