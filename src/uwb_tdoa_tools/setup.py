@@ -1,0 +1,46 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "uwb_tdoa_tools"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Reads, converts, simulates, replays, records and evaluates flights of UWB TDOA measurements",
+    maintainer="uwb_tdoa maintainers",
+    maintainer_email="maintainers@uwb-tdoa.invalid",
+    license="Apache-2.0",
+    packages=find_packages(exclude=["test"]),
+    python_requires=">=3.10",
+    install_requires=[
+        "setuptools",
+        "matplotlib>=3.6",
+        "numba>=0.57",
+        "numpy>=1.26",
+        "PyYAML>=6.0",
+        "rosbags>=0.10",
+        "scipy>=1.11",
+        "tqdm>=4.64",
+        "uwb_tdoa_bias",
+        "uwb_tdoa_ekf",
+    ],
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/config", glob("config/*.yaml")),
+        (f"share/{NAME}/launch", glob("launch/*.py")),
+        (f"share/{NAME}/models", glob("models/*.onnx")),
+    ],
+    zip_safe=False,  # numba keeps its cache beside the modules
+    entry_points={
+        "console_scripts": [
+            "convert = uwb_tdoa_tools.convert:main",
+            "demo = uwb_tdoa_tools.demo:main",
+            "evaluate = uwb_tdoa_tools.evaluate:main",
+            "record = uwb_tdoa_tools.record:main",
+            "replay = uwb_tdoa_tools.replay:main",
+            "simulate = uwb_tdoa_tools.simulate:main",
+        ]
+    },
+)
