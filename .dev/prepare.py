@@ -1,0 +1,216 @@
+"""Bring the workspace up to date: environment, message package, Python packages. What is up to date is not touched.
+
+Called by ./dev with a Python 3.10 - 3.12 of the system; uses nothing but its standard library. Each step is remembered
+by a hash of what it depends on, in .venv/steps.json, so that doing nothing takes milliseconds. Two calls at once wait
+for each other.
+"""
+
+import fcntl
+import hashlib
+import importlib.util
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+VENV, BUILD, INSTALL, LOG = (ROOT / name for name in (".venv", "build", "install", "log"))
+PYTHON = VENV / "bin" / "python"
+STEPS = VENV / "steps.json"
+MESSAGES = ["uwb_tdoa_msgs"]
+PACKAGES = ["uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools"]
+VERSION = f"{sys.version_info.major}.{sys.version_info.minor}"
+BASE_PYTHON = os.path.realpath(sys.executable)  # never the one of a virtual environment
+OWN_ROS = os.environ.get("ROS_DISTRO") == "jazzy"  # the user has sourced one; else ROS comes from wheels
+# What a ROS installation may lack: the name to import, and the one in requirements.txt.
+MODULES = {name: name for name in "hypothesis matplotlib numba onnx onnxruntime rosbags scipy skl2onnx tqdm".split()}
+MODULES |= {"sklearn": "scikit-learn", "yaml": "PyYAML"}
+# Jazzy is built for numpy 1.26, and a pytest plugin of its launch_testing breaks newer pytests.
+LIMITS = ["numpy<2", "pytest<8"]
+
+
+class Failure(Exception):
+    """The set-up cannot go on. The message is one sentence that says what is missing and what to do."""
+
+
+def main():
+    LOG.mkdir(exist_ok=True)
+    with open(LOG / "dev.lock", "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            say("waiting for another ./dev to finish its set-up")
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        prepare()
+
+
+def prepare():
+    done = read_steps()
+    inputs = [ROOT / "requirements.txt", ROOT / ".dev" / "constraints.txt", ROOT / ".dev" / "wheels.py"]
+    environment = digest(inputs, str(ROOT), BASE_PYTHON, VERSION, str(OWN_ROS))
+    if done.get("environment") != environment:
+        check_machine()
+        make_environment()
+        done = {"environment": environment}
+        write_steps(done)
+    elif not (INSTALL / "setup.bash").exists():
+        done = {"environment": environment}
+    build(done)
+
+
+def check_machine():
+    """Say what is missing before anything is downloaded."""
+    if not OWN_ROS and (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        raise Failure(
+            f"ROS 2 from the Python package index needs Linux on x86_64, this is {sys.platform} on "
+            f"{platform.machine()}; source a ROS 2 Jazzy installation."
+        )
+    if OWN_ROS and subprocess.run([BASE_PYTHON, "-c", "import rclpy"], stderr=subprocess.DEVNULL).returncode != 0:
+        raise Failure(
+            f"ROS_DISTRO is jazzy, but {BASE_PYTHON} cannot import rclpy; source /opt/ros/jazzy/setup.bash in this "
+            "shell, or unset ROS_DISTRO to use the wheels."
+        )
+    if importlib.util.find_spec("ensurepip") is None or importlib.util.find_spec("venv") is None:
+        raise Failure(f"Python {VERSION} has no venv module; install it, e.g. sudo apt install python{VERSION}-venv")
+    if not any(map(shutil.which, [os.environ.get("CXX") or "c++", "g++", "clang++"])):
+        raise Failure("no C++ compiler found, which the message package needs; install one, e.g. sudo apt install g++")
+    if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
+        raise Failure(
+            f"Python.h of Python {VERSION} is missing, which the message package needs; "
+            f"install it, e.g. sudo apt install python{VERSION}-dev"
+        )
+
+
+def make_environment():
+    for folder in (VENV, BUILD, INSTALL):
+        shutil.rmtree(folder, ignore_errors=True)
+    options = ["--system-site-packages"] if OWN_ROS else []
+    run("make .venv", "venv", [BASE_PYTHON, "-m", "venv", *options, VENV])
+    try:
+        if OWN_ROS:
+            missing = missing_requirements()
+            install(f"install what ROS 2 Jazzy lacks ({len(missing)} packages)", [*missing, *LIMITS])
+        else:
+            install("install ROS 2 Jazzy and the Python packages", ["-r", ROOT / "requirements.txt"])
+    except Failure as failure:
+        output = (LOG / "dev_pip.log").read_text(errors="replace")
+        if re.search(r"NewConnectionError|NameResolution|ConnectTimeout|ReadTimeout|ProxyError|SSLError", output):
+            raise Failure(
+                "pip cannot reach the package index; check the network, or name a mirror: PIP_INDEX_URL=..."
+            ) from failure
+        raise
+    if not OWN_ROS:
+        run("repair the ROS wheels", "wheels", [PYTHON, ROOT / ".dev" / "wheels.py"])
+
+
+def install(title, arguments):
+    run(title, "pip", [PYTHON, "-m", "pip", "install", "--disable-pip-version-check", *arguments])
+
+
+def missing_requirements():
+    """The pins of those MODULES that the new environment cannot import."""
+    code = f"import importlib.util as u; print(*(n for m, n in {MODULES}.items() if u.find_spec(m) is None))"
+    names = subprocess.check_output([PYTHON, "-c", code], text=True).split()
+    pins = (ROOT / "requirements.txt").read_text().splitlines()
+    return [pin for pin in pins if pin.split("==")[0] in names]
+
+
+def build(done):
+    own_tf2 = [] if OWN_ROS else ["tf2_msgs"]  # the wheels lack it
+    sources = {
+        "messages": digest([ROOT / "colcon.meta", ROOT / ".dev" / "tf2_msgs", ROOT / "src" / "uwb_tdoa_msgs"]),
+        "packages": digest([ROOT / "src" / name for name in PACKAGES]),
+    }
+    selected = []
+    if done.get("messages") != sources["messages"]:
+        selected += own_tf2 + MESSAGES
+    if done.get("packages") != sources["packages"]:
+        selected += PACKAGES
+    if not selected:
+        return
+    if OWN_ROS:
+        paths, options, variables = ["src"], [], {}
+    else:
+        paths, options = ["src", ".dev/tf2_msgs"], ["-G", "Ninja"]
+        variables = {"AMENT_PREFIX_PATH": str(VENV), "CMAKE_PREFIX_PATH": str(VENV)}
+    run(
+        f"build {', '.join(selected)}",
+        "build",
+        [PYTHON, "-m", "colcon", "build", "--merge-install", "--base-paths", *paths, "--packages-select", *selected]
+        + ["--cmake-args", *options, f"-DPython3_EXECUTABLE={PYTHON}"],
+        PATH=f"{VENV / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        **variables,
+    )
+    # A cache of numba knows its own file only, not the compiled functions it calls in others.
+    for cache in INSTALL.rglob("*.nb[ic]"):
+        cache.unlink()
+    write_steps({**done, **sources})
+
+
+def digest(paths, *words):
+    """Hash of the words and of every file under the paths: names and contents."""
+    total = hashlib.sha256("\0".join(words).encode())
+    for path in paths:
+        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+        for file in files:
+            if not {"test", "__pycache__"} & set(file.relative_to(path).parts):
+                total.update(f"\0{file.relative_to(ROOT)}\0".encode())
+                total.update(file.read_bytes())
+    return total.hexdigest()
+
+
+def read_steps():
+    try:
+        return json.loads(STEPS.read_text())
+    except (OSError, ValueError):
+        return {}
+
+
+def write_steps(steps):
+    STEPS.write_text(json.dumps(steps, indent=2) + "\n")
+
+
+def run(title, log_name, command, **variables):
+    """Run one step with its output in log/dev_<log_name>.log; on failure show the end of it and raise Failure."""
+    log = LOG / f"dev_{log_name}.log"
+    environment = {**os.environ, **variables}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # what is installed is compiled once, here
+    started = time.monotonic()
+    live = sys.stderr.isatty()
+    if not live:
+        say(f"{title} ...")
+    with open(log, "wb") as output:
+        step = subprocess.Popen(
+            list(map(str, command)), cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output
+        )
+        while True:
+            try:
+                code = step.wait(timeout=1.0)
+                break
+            except subprocess.TimeoutExpired:
+                if live:
+                    say(f"{title} ... {time.monotonic() - started:.0f} s", end="\r")
+    if code != 0:
+        tail = "".join(f"  | {line}\n" for line in log.read_text(errors="replace").splitlines()[-15:])
+        print(tail, end="", file=sys.stderr)
+        raise Failure(f"the step '{title}' failed; all of its output is in {log.relative_to(ROOT)}.")
+    say(f"{title} ... {time.monotonic() - started:.0f} s")
+
+
+def say(line, end="\n"):
+    print(f"[dev] {line}", end=end, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except Failure as failure:
+        sys.exit(f"dev: error: {failure}")
+    except KeyboardInterrupt:
+        sys.exit(130)
