@@ -1,7 +1,10 @@
 """Every number that tunes the filter, with its unit and why it is what it is."""
 
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import NamedTuple
+
+import yaml
 
 from uwb_tdoa_bias.errors import InputError
 
@@ -48,6 +51,19 @@ class FilterConfig:
             value = getattr(self, field.name)
             if field.type in ("float", "int") and field.name != "initial_yaw" and not 0 < value < 1e9:
                 raise InputError(f"{field.name}: {value!r} must be a number above 0.")
+
+    @classmethod
+    def from_yaml(cls, path):
+        """Read the ros__parameters of a node's parameter file; those that do not tune the filter are passed over."""
+        try:
+            content = yaml.safe_load(Path(path).read_text())
+            (node,) = content.values()
+            parameters = node["ros__parameters"]
+            return cls(**{field.name: parameters[field.name] for field in fields(cls) if field.name in parameters})
+        except (OSError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{path}: expected one node's 'ros__parameters' mapping, as in ekf_node.yaml.") from error
 
     def tuning(self):
         """The numbers the compiled core reads."""

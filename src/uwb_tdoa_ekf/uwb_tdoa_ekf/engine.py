@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 from .robust import predicted, gain_terms, update_gate, update_innovation, update_m_estimation
-from .startup import INLIER, level, locate, share_of_inliers
+from .startup import INLIER, believable, level, locate, share_of_inliers
 from .state import GRAVITY, coast, predict
 
 # verdict on one TDOA; the values of TdoaResidual.VERDICT_*
@@ -143,9 +143,9 @@ def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual):
             _start(m, c, positions, t, first, kept, waited > c.start_patience)
         return
     _advance(m, c, t)
-    variance = c.tdoa_std**2 + bias_std**2
     innovation = d - predicted(m.x, positions[a], positions[b], m.g)
     spread = gain_terms(m.P, m.g, m.K)
+    variance = c.tdoa_std**2 + bias_std**2
     if c.robust == 0:
         w = update_innovation(
             m.x, m.P, m.K, innovation, spread, variance, c.tdoa_correlation, c.loss, c.measurement_scale
@@ -159,7 +159,7 @@ def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual):
         )  # fmt: skip
     residual[0], residual[1], residual[2] = innovation, spread + variance, w
     residual[3] = USED if w > 0.0 else REJECTED
-    agrees = 1.0 if innovation * innovation < 9.0 * (spread + variance) else 0.0
+    agrees = 1.0 if abs(innovation) < INLIER else 0.0
     m.clock[AGREEMENT] += min(1.0, (t - m.clock[LAST_TDOA]) / AGREEMENT_TIME) * (agrees - m.clock[AGREEMENT])
     m.clock[LAST_TDOA] = t
     if m.clock[AGREEMENT] < 0.5 and kept - first >= MINIMUM and t >= m.clock[NEXT_TRY]:
@@ -194,7 +194,8 @@ def _start(m, c, positions, t, first, kept, anyhow):
     """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
     wt, wa, wb, wd = _window(m, first, kept)
     found, cov = np.empty(6), np.empty((6, 6))
-    if locate(wt, wa, wb, wd, positions, c.tdoa_std, found, cov) < AGREE and not anyhow:
+    share = locate(wt, wa, wb, wd, positions, c.tdoa_std, found, cov)
+    if not anyhow and (share < AGREE or not believable(positions, found)):
         return
     force = m.F[0, :3]  # scratch
     for k in range(3):
@@ -222,7 +223,7 @@ def _recover(m, c, positions, first, kept):
     wt, wa, wb, wd = _window(m, first, kept)
     found, cov = np.empty(6), np.empty((6, 6))
     share = locate(wt, wa, wb, wd, positions, c.tdoa_std, found, cov)
-    if share < AGREE_ANYHOW or share < 0.2 + share_of_inliers(wt, wa, wb, wd, positions, m.x[:6]):
+    if not believable(positions, found) or share < AGREE_ANYHOW or share < 0.2 + share_of_inliers(wt, wa, wb, wd, positions, m.x[:6]):
         return
     m.x[:6] = found
     m.P[:6, :] = 0.0

@@ -9,6 +9,8 @@ STARTS = 9  # the middle of the anchors and the corners of the half-size box aro
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
 SPEED = 1.0  # m/s, standard deviation of the velocity before anything is known
+OUTSIDE = 1.0  # m beyond the anchors' extent that a tag may be without further evidence
+LEAP = 2.0  # m, longest step
 INLIER = 0.75  # m, a residual below this does not contradict a position
 
 
@@ -20,50 +22,64 @@ def locate(t, a, b, d, positions, std, x, cov):
     velocity at t[-1] to x (6,) and their covariance to cov (6, 6). Returns the share of TDOAs that agree with it, 0 to 1.
 
     Graduated Geman-McClure: Gauss-Newton from several starts while the loss narrows; the start with the least final loss
-    wins. The covariance counts one independent error per anchor heard, not per TDOA, because errors persist over the
-    window, and grows with the disagreement that is left.
+    wins. A tag is near its anchors and slow until proven otherwise: without that prior, the late arrivals on a floor are
+    explained best by a tag ten metres up. The covariance counts one independent error per anchor heard, not per TDOA,
+    because errors persist over the window, and grows with the disagreement that is left.
     """
-    n, count = len(t), len(positions)
-    low, high = positions[0].copy(), positions[0].copy()
-    for i in range(count):
-        for k in range(3):
-            low[k] = min(low[k], positions[i, k])
-            high[k] = max(high[k], positions[i, k])
+    n = len(t)
+    middle, prior = np.zeros(6), np.full(6, SPEED)
+    for k in range(3):
+        middle[k], prior[k] = reach(positions, k)
+    heard = np.zeros(len(positions))
+    for i in range(n):
+        heard[a[i]] = heard[b[i]] = 1.0
+    alike = max(1.0, n / max(1.0, np.sum(heard) - 1.0))  # TDOAs that share one error
     best_loss = np.inf
     trial = np.zeros(6)
-    information = np.zeros((6, 6))
-    gradient = np.zeros(6)
-    residuals = np.zeros(n)
+    information, gradient, residuals = np.zeros((6, 6)), np.zeros(6), np.zeros(n)
     for start in range(STARTS):
+        trial[:] = middle
         for k in range(3):
-            side = 0.0 if start == 0 else (1.0 if ((start - 1) >> k) & 1 else -1.0)
-            trial[k] = 0.5 * (low[k] + high[k]) + 0.25 * side * (high[k] - low[k] + 1.0)
-            trial[3 + k] = 0.0
+            if start > 0:
+                trial[k] += 0.5 * prior[k] * (1.0 if ((start - 1) >> k) & 1 else -1.0)
         for sweep in range(SWEEPS):
             scale = max(COARSE * 0.7**sweep, FINE)
             _normal_equations(t, a, b, d, positions, trial, scale, information, gradient, residuals)
-            for k in range(6):  # how far one step may go, and how fast a tag may be
-                information[k, k] += 1e-3 if k < 3 else 10.0 / SPEED**2
-                gradient[k] -= 0.0 if k < 3 else 10.0 / SPEED**2 * trial[k]
+            belief = alike * max(std, 0.5 * scale) ** 2
+            for k in range(6):
+                information[k, k] += belief / prior[k] ** 2
+                gradient[k] += belief / prior[k] ** 2 * (middle[k] - trial[k])
             step = np.linalg.solve(information, gradient)
             length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-            shrink = min(1.0, 2.0 / max(length, 1e-9))
-            for k in range(6):
-                trial[k] += shrink * step[k]
+            trial += min(1.0, LEAP / max(length, 1e-9)) * step
         loss = _normal_equations(t, a, b, d, positions, trial, FINE, information, gradient, residuals)
+        loss += alike / n * np.sum(((trial - middle) / prior) ** 2) * (std / FINE) ** 2
         if loss < best_loss:
             best_loss = loss
             x[:] = trial
     _normal_equations(t, a, b, d, positions, x, 1e6, information, gradient, residuals)
-    heard = np.zeros(count)
-    for i in range(n):
-        heard[a[i]] = heard[b[i]] = 1.0
-    spread = max(std, 1.5 * np.median(np.abs(residuals)))
-    factor = max(1.0, n / max(1.0, np.sum(heard) - 1.0)) * spread * spread
+    variance = alike * max(std, 1.5 * np.median(np.abs(residuals))) ** 2
     for k in range(6):
-        information[k, k] += factor * (1e-4 if k < 3 else 1.0 / SPEED**2)
-    cov[:, :] = np.linalg.inv(information) * factor
+        information[k, k] += variance / prior[k] ** 2
+    cov[:, :] = np.linalg.inv(information) * variance
     return np.mean(np.abs(residuals) < INLIER)
+
+
+@njit(cache=True)
+def reach(positions, k):
+    """Middle of the anchors along axis k, and how far from it a tag is believed without further evidence, m."""
+    low, high = np.min(positions[:, k]), np.max(positions[:, k])
+    return 0.5 * (low + high), max(0.5 * (high - low) + OUTSIDE, 3.0 * OUTSIDE)
+
+
+@njit(cache=True)
+def believable(positions, x):
+    """True if position x (3,) is within reach of the anchors."""
+    for k in range(3):
+        middle, far = reach(positions, k)
+        if abs(x[k] - middle) > far:
+            return False
+    return True
 
 
 @njit(cache=True)

@@ -1,0 +1,102 @@
+"""How good is the estimate? Errors against ground truth, of the filter run here or of a recorded odometry."""
+
+import json
+from pathlib import Path
+
+from tqdm import tqdm
+
+from uwb_tdoa_bias.corrector import Corrector
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.network import Network
+from uwb_tdoa_ekf.config import FilterConfig
+from uwb_tdoa_ekf.offline import run_offline
+
+from . import cli, inputs
+from .bag import read_odometry
+from .metrics import Score, pooled
+from .plots import plot_error
+from .readers import read_flight
+from .tum import write_tum
+
+COLUMNS = {
+    "rmse_x": "x", "rmse_y": "y", "rmse_z": "z", "rmse_3d": "3D", "median_3d": "median", "max_3d": "max",
+    "frac_gt_1m": ">1 m", "nees_mean": "NEES", "nis_mean": "NIS", "start_delay": "delay",
+}  # fmt: skip
+
+
+def evaluate(flight, config=None, effects=None, network=None):
+    """Run the filter over a Flight with ground truth. Returns (Score, Run). Raises InputError if there is no truth."""
+    if flight.truth is None:
+        raise InputError(f"{flight.name}: it holds no ground truth to compare with.")
+    result = run_offline(flight, config, Corrector(flight.anchors, effects, network))
+    return Score(flight.name, result.odometry, flight.truth, result.residuals), result
+
+
+def main(argv=None):
+    """The executable."""
+    parser = cli.parser(
+        "evaluate",
+        "Errors of the estimate against ground truth over the airborne part (truth z > 0.3 m), in metres.\n"
+        "Runs bias correction and filter here, as the nodes would, or takes a recorded odometry.",
+        "evaluate flight.bag",
+        "evaluate 0425-traj2 --survey anchor_0425.txt --plot error.png",
+        "evaluate flights/ --survey surveys/ --no-bias --json errors.json",
+        "evaluate flight.bag --odometry recorded.bag --tum out/",
+    )
+    parser.add_argument("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
+    parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    parser.add_argument("--effects", metavar="FILE", help="effects.yaml: systematic effects to correct for")
+    parser.add_argument("--model", metavar="FILE", help="ONNX bias network to correct with")
+    parser.add_argument("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
+    parser.add_argument("--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)")
+    parser.add_argument("--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT")
+    parser.add_argument("--namespace", default="", help="of the topics in the bags, e.g. tag1")
+    parser.add_argument("--json", metavar="FILE", help="write all figures: runs, pooled")
+    parser.add_argument("--plot", metavar="FILE", help="picture of the errors over time (one FLIGHT)")
+    parser.add_argument("--tum", metavar="DIR", help="write estimates and truths as TUM trajectories, e.g. for evo")
+    return cli.run(_evaluate, parser, argv)
+
+
+def _evaluate(args):
+    config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
+    effects = EffectSet.from_yaml(args.effects) if args.effects and not args.no_bias else None
+    network = Network(args.model) if args.model and not args.no_bias else None
+    found = inputs.find_flights(args.flights, args.survey)
+    for option in ("odometry", "plot"):
+        if getattr(args, option) and len(found) != 1:
+            raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
+    scores = []
+    print(_line("flight", COLUMNS.values()))
+    for path, survey in tqdm(found, unit="flight", disable=None, leave=False):
+        flight = read_flight(path, survey, args.namespace)
+        if args.odometry:
+            odometry = read_odometry(args.odometry, args.namespace)
+            score = Score(flight.name, odometry, flight.truth)
+        else:
+            score, result = evaluate(flight, config, effects, network)
+            odometry = result.odometry
+        scores.append(score)
+        tqdm.write(_row(score.row()))
+        if args.plot:
+            plot_error(score, odometry, flight.truth, args.plot)
+        if args.tum:
+            write_tum(Path(args.tum) / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
+            write_tum(Path(args.tum) / f"{flight.name}_truth.tum", flight.truth.t, flight.truth.p, flight.truth.q)
+    together = pooled(scores)
+    if len(scores) > 1:
+        print(_row(together))
+        print(f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
+              f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
+    if args.json:
+        report = {"runs": [score.row() for score in scores], "pooled": together}
+        Path(args.json).write_text(json.dumps(report, indent=1))
+    return 0
+
+
+def _row(row):
+    return _line(row["flight"], (f"{row[key]:.3f}" for key in COLUMNS)) + ("  DIVERGED" if row["diverged"] else "")
+
+
+def _line(first, cells):
+    return f"{first:20s}" + "".join(f"{cell:>9s}" for cell in cells)

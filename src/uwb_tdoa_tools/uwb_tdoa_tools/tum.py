@@ -1,0 +1,12 @@
+"""TUM trajectory files: `stamp x y z qx qy qz qw` a line, as evo and others read them."""
+
+from pathlib import Path
+
+import numpy as np
+
+
+def write_tum(path, t, p, q):
+    """Write t (n,) s, p (n, 3) m, q (n, 4) x y z w; an unknown attitude becomes the identity."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    q = np.where(np.isfinite(q), q, [0.0, 0.0, 0.0, 1.0])
+    np.savetxt(path, np.column_stack([t, p, q]), fmt=["%.9f"] + ["%.6f"] * 7)
