@@ -1,0 +1,103 @@
+"""The antenna of a UWB module: gain and group delay over direction.
+
+Antenna frame: z along the null axis of the doughnut (the long side of an upright module), x out of its front face.
+Azimuth runs from +x through +y, elevation from the xy plane towards +z.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from uwb_tdoa_bias.errors import InputError
+
+# Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These are not measured
+# numbers: they are drawn in the shape of the plots in the DWM1000 data sheet (an uneven doughnut: 3 dB of ripple around
+# the upright module, two nulls of unequal depth along its axis, the deeper one where the board is in the way), at the
+# level that Decawave's support quotes for the upright module (-2 to -5 dB).
+DWM1000_AZIMUTH = (-2.0, -2.2, -3.0, -4.0, -3.6, -2.8, -3.0, -4.2, -5.0, -4.4, -3.2, -2.3)  # from +x through +y
+DWM1000_ELEVATION_1 = (-2.0, -2.5, -5.0, -11.0, -6.5, -3.5, -3.0, -4.5, -9.0, -20.0, -8.0, -3.0)  # from +x through +z
+DWM1000_ELEVATION_2 = (-4.0, -3.5, -5.5, -11.0, -7.0, -5.0, -4.4, -5.5, -10.0, -20.0, -9.0, -5.0)  # from +y through +z
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """A 3-D radiation pattern built from three cuts, and the group delay that goes with it.
+
+    Attributes
+    ----------
+    azimuth : gains around the xy plane from +x through +y, equally spaced over 360 degrees, dBi
+    elevation_1 : gains around the xz plane from +x through +z, dBi
+    elevation_2 : gains around the yz plane from +y through +z, dBi
+    gain_offset : added to all gains, dB (default 0)
+    delay_span : group delay of a direction in which nothing is radiated directly, metres (default 0.15: 10 - 15 cm is
+        what is reported for modules, 20 cm and more for poor antennas)
+
+    Where two cuts cross they must agree (to 0.01 dB), or the pattern would jump.
+    """
+
+    azimuth: tuple = DWM1000_AZIMUTH
+    elevation_1: tuple = DWM1000_ELEVATION_1
+    elevation_2: tuple = DWM1000_ELEVATION_2
+    gain_offset: float = 0.0
+    delay_span: float = 0.15
+
+    def __post_init__(self):
+        cuts = []
+        for name in ("azimuth", "elevation_1", "elevation_2"):
+            gains = np.asarray(getattr(self, name), dtype=float)
+            if gains.ndim != 1 or len(gains) < 4 or len(gains) % 4 or not np.isfinite(gains).all():
+                raise InputError(f"antenna: {name} needs a multiple of 4 finite gains in dBi around the full circle.")
+            angle = np.linspace(0.0, 2.0 * np.pi, len(gains) + 1)
+            cuts.append(CubicSpline(angle, np.append(gains, gains[0]), bc_type="periodic"))
+        azimuth, first, second = cuts
+        right = 0.5 * np.pi
+        crossings = {
+            "+x": (azimuth(0), first(0)),
+            "-x": (azimuth(2 * right), first(2 * right)),
+            "+y": (azimuth(right), second(0)),
+            "-y": (azimuth(3 * right), second(2 * right)),
+            "+z": (first(right), second(right)),
+            "-z": (first(3 * right), second(3 * right)),
+        }
+        for axis, (one, other) in crossings.items():
+            if abs(one - other) > 0.01:
+                raise InputError(f"antenna: two cuts cross at {axis} with {one:.2f} and {other:.2f} dBi; make it one.")
+        fine = np.linspace(0.0, 2.0 * np.pi, 721)
+        object.__setattr__(self, "_cuts", tuple(cuts))
+        object.__setattr__(self, "_peak", float(max(cut(fine).max() for cut in cuts)))
+
+    @property
+    def peak_gain(self):
+        """Largest gain on the three cuts, dBi."""
+        return self._peak + self.gain_offset
+
+    def gain(self, direction):
+        """Gain towards `direction`, (..., 3) in the antenna frame, any length: (...) dBi.
+
+        Source: eq. 14 of Grasso et al. (Sensors 2022, 22, 9136). Of each elevation cut the side of the direction's own
+        quadrant is used. The azimuth cut is met exactly; the elevation cuts where cos(elevation)^40 has died out, and
+        where they cross the others.
+        """
+        direction = np.asarray(direction, dtype=float)
+        x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
+        horizontal = np.hypot(x, y)
+        theta, phi = np.arctan2(y, x), np.arctan2(z, horizontal)
+        azimuth, first, second = self._cuts
+        gain_theta = azimuth(np.mod(theta, 2.0 * np.pi))
+        gain_phi_1 = first(np.mod(np.where(x >= 0.0, phi, np.pi - phi), 2.0 * np.pi))
+        gain_phi_2 = second(np.mod(np.where(y >= 0.0, phi, np.pi - phi), 2.0 * np.pi))
+        near_plane = np.cos(phi) ** 40
+        along_x = np.cos(theta) ** 2
+        elevation = along_x * gain_phi_1 + (1.0 - along_x) * gain_phi_2
+        return (1.0 - near_plane) * elevation + near_plane * gain_theta + self.gain_offset
+
+    def group_delay(self, direction):
+        """How late the antenna is in `direction`, (..., 3) in its frame: (...) metres, 0 ... delay_span.
+
+        Own model: of the field that arrives, the share g = 10^((gain - peak gain) / 20) came straight from the antenna
+        and the rest, 1 - g, came over the board by a path that is `delay_span` longer; the centroid of the two is late
+        by delay_span (1 - g). So the best direction is not delayed, and a null is late by nearly all of delay_span.
+        """
+        amplitude = 10.0 ** ((self.gain(direction) - self.peak_gain) / 20.0)
+        return self.delay_span * np.maximum(1.0 - amplitude, 0.0)

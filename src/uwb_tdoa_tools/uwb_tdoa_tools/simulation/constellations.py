@@ -1,0 +1,136 @@
+"""Named anchor constellations for simulated flights, and seeded random ones."""
+
+import re
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.errors import InputError
+
+LOW = 0.18  # m, height of an anchor on its stand on the floor
+
+
+def facing(positions, target, level=True, inverted=None):
+    """Anchors whose front (antenna x) faces a point.
+
+    positions (N, 3) and target (3,), metres. level: turn about the vertical only, so that the antenna axis (z) stays
+    upright; otherwise tilt as well. inverted: (N,) bool, stands that hang upside down (z down), default none.
+    """
+    positions = np.asarray(positions, dtype=float)
+    inverted = np.zeros(len(positions), bool) if inverted is None else np.asarray(inverted, bool)
+    front = np.asarray(target, dtype=float) - positions
+    if level:
+        front[:, 2] = 0.0
+    length = np.linalg.norm(front, axis=1, keepdims=True)
+    front = np.where(length > 1e-9, front / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
+    left = np.cross([0.0, 0.0, 1.0], front)
+    left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
+    left[np.abs(front[:, 2]) > 1.0 - 1e-9] = [0.0, 1.0, 0.0]  # straight up or down: left is ours to choose
+    left[inverted] *= -1.0
+    axes = np.stack([front, left, np.cross(front, left)], axis=2)
+    return Anchors(np.arange(len(positions)), positions, Rotation.from_matrix(axes).as_quat())
+
+
+def corners(x=7.0, y=8.0, z=3.0, level=True):
+    """A low and a high anchor in each corner of x by y by z metres, in the order of the Toronto surveys: neighbours in
+    the TDOA2 ring lie far apart, 4 stand on the floor and 4 hang upside down under the ceiling."""
+    a, b = 0.5 * x, 0.5 * y
+    positions = [
+        (-a, -b, LOW), (-a, b, z), (a, b, LOW), (a, -b, z), (-a, -b, z), (a, -b, LOW), (a, b, z), (-a, b, LOW)
+    ]  # fmt: skip
+    return facing(positions, (0.0, 0.0, 0.5 * z), level, np.array(positions)[:, 2] > 0.5 * z)
+
+
+def wall_middles():
+    """Four low ones at the middles of the walls, four high ones in the corners, 7 x 8 x 3 m."""
+    positions = [
+        (-3.5, 0, LOW), (3.5, 4, 3), (0, -4, LOW), (-3.5, 4, 3), (3.5, 0, LOW), (-3.5, -4, 3), (0, 4, LOW), (3.5, -4, 3)
+    ]  # fmt: skip
+    return facing(positions, (0.0, 0.0, 1.5), inverted=np.array(positions)[:, 2] > 1.5)
+
+
+def staircase():
+    """Eight around the walls of 7 x 8 x 3 m, each higher than the one before, all upright."""
+    x = [-3.5, 0.0, 3.5, 3.5, 3.5, 0.0, -3.5, -3.5]
+    y = [-4.0, -4.0, -4.0, 0.0, 4.0, 4.0, 4.0, 0.0]
+    return facing(np.column_stack([x, y, np.linspace(LOW, 3.0, 8)[[0, 4, 1, 5, 2, 6, 3, 7]]]), (0.0, 0.0, 1.5))
+
+
+def pillars():
+    """Three heights on each of four pillars that stand inside 7 x 8 x 3 m: 12 anchors."""
+    feet = [(-2.8, -2.6), (2.5, -3.2), (2.9, 2.7), (-2.4, 3.3)]
+    positions = [(x, y, z) for z in (0.3, 1.6, 2.9) for x, y in feet]
+    return facing(positions, (0.0, 0.0, 1.5), inverted=np.array(positions)[:, 2] > 2.0)
+
+
+def six():
+    """Six anchors, three low and three high, on two opposite triangles in 6 x 6 x 2.8 m."""
+    angle = np.deg2rad([90, 270, 210, 30, 330, 150])
+    z = np.array([LOW, 2.8, LOW, 2.8, LOW, 2.8])
+    return facing(np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), z]), (0.0, 0.0, 1.4), inverted=z > 1)
+
+
+def hall():
+    """Sixteen along the walls of a hall of 14 x 20 x 5 m, low and high in turn."""
+    rim = [(-7, -10), (-7, -5), (-7, 0), (-7, 5), (-7, 10), (-3.5, 10), (0, 10), (3.5, 10)]
+    rim += [(-x, -y) for x, y in rim]
+    z = np.where(np.arange(16) % 2, 5.0, 0.3)
+    return facing(np.column_stack([rim, z]), (0.0, 0.0, 2.5), inverted=z > 1)
+
+
+def planar():
+    """Four at the corners of 4 x 4 m, 0.2 m high, facing the centre: Grasso et al. (Sensors 2022), section 2.1."""
+    return facing([(-2, -2, 0.2), (2, -2, 0.2), (2, 2, 0.2), (-2, 2, 0.2)], (0.0, 0.0, 0.2))
+
+
+def pair():
+    """Two anchors 4.5 m apart at 1.25 m, facing each other, with the default hovering place half-way between them: the
+    bench of Zhao et al. (RA-L 2021), figure 4."""
+    return facing([(-2.25, 0, 1.25), (2.25, 0, 1.25)], (0.0, 0.0, 1.25))
+
+
+def random(seed, count=8):
+    """Seeded: `count` anchors (4 to 64) on the walls of a seeded room of 5 - 9 x 5 - 9 x 2.5 - 3.5 m, low ones and high
+    ones in turn, at least 0.5 m apart, facing the centre to within some 20 degrees."""
+    if not 4 <= count <= 64:
+        raise InputError(f"constellation: random-{seed}-{count} asks for {count} anchors; choose 4 to 64.")
+    rng = np.random.default_rng([seed, count])
+    size = np.array([*rng.uniform(5.0, 9.0, 2), rng.uniform(2.5, 3.5)])
+    positions = np.empty((0, 3))
+    while len(positions) < count:
+        place = rng.uniform(-0.5, 0.5, 3) * size
+        wall = rng.integers(2)
+        place[wall] = np.copysign(0.5 * size[wall], place[wall])
+        low = len(positions) % 2 == 0
+        place[2] = rng.uniform(LOW, 0.4 * size[2]) if low else rng.uniform(0.6, 1.0) * size[2]
+        if len(positions) == 0 or np.linalg.norm(positions - place, axis=1).min() > 0.5:
+            positions = np.vstack([positions, place])
+    straight = facing(positions, (0.0, 0.0, 0.5 * size[2]), inverted=np.arange(count) % 2 == 1)
+    wobble = Rotation.from_rotvec(np.deg2rad(12.0) * rng.standard_normal((count, 3)))
+    return Anchors(straight.ids, positions, (wobble * Rotation.from_quat(straight.orientations)).as_quat())
+
+
+CONSTELLATIONS = {
+    "corners": corners,
+    "tilted": lambda: corners(level=False),
+    "low_ceiling": lambda: corners(6.0, 7.0, 2.4),
+    "small_room": lambda: corners(5.0, 4.5, 2.6),
+    "wall_middles": wall_middles,
+    "staircase": staircase,
+    "pillars": pillars,
+    "six": six,
+    "hall": hall,
+    "planar": planar,
+    "pair": pair,
+}
+
+
+def constellation(name):
+    """Anchors of a named constellation, or of `random-SEED` or `random-SEED-COUNT`; raises InputError."""
+    if name in CONSTELLATIONS:
+        return CONSTELLATIONS[name]()
+    if match := re.fullmatch(r"random-(\d{1,9})(?:-(\d{1,5}))?", str(name)):
+        return random(int(match[1]), int(match[2] or 8))
+    choices = ", ".join(CONSTELLATIONS)
+    raise InputError(f"constellation: {name!r} is not known; choose {choices} or random-SEED[-COUNT].")

@@ -1,0 +1,88 @@
+"""The radio link between a tag and an anchor: received power, and by how much a signal seems to arrive late.
+
+Pure functions that broadcast: give one anchor per sample as (n, 3) beside (n, 3), or all anchors for all samples as
+(m, 3) beside (n, 1, 3).
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .antenna import Antenna
+
+SPEED_OF_LIGHT = 299792458.0  # m/s
+
+# Range error of the DW1000 over received power, 500 MHz channels, 64 MHz PRF: Decawave APS011, table 2.
+APS011_POWER_DBM = np.arange(-61.0, -97.0, -2.0)
+APS011_BIAS_MM = np.array([-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86.0])
+
+# An assumption: the tag's module lies flat on the vehicle, front (antenna x) up, null axis (antenna z) along body x.
+FLAT_MOUNT = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+
+
+@dataclass(frozen=True)
+class RadioLink:
+    """What a link is made of besides the poses.
+
+    Attributes
+    ----------
+    anchor_antenna, tag_antenna : Antenna (default DWM1000-like)
+    tag_mount : quaternion x y z w, tag antenna to body (default: lying flat, null axis along body x)
+    tx_power_dbm : power into the transmitting antenna, dBm (default -8.3: the legal mean of -41.3 dBm/MHz over
+        500 MHz, and 6 dB that the chip's smart power adds to frames this short)
+    frequency : centre of the channel, Hz (default channel 2)
+    """
+
+    anchor_antenna: Antenna = field(default_factory=Antenna)
+    tag_antenna: Antenna = field(default_factory=Antenna)
+    tag_mount: tuple = FLAT_MOUNT
+    tx_power_dbm: float = -8.3
+    frequency: float = 3.9936e9
+
+
+def received_power_dbm(p_tag, q_tag, p_anchor, q_anchor, link=RadioLink()):
+    """Power that arrives at the tag, dBm, with the shape the arguments broadcast to.
+
+    p_tag (..., 3) tag antenna and p_anchor (..., 3) anchor antenna, world, metres; q_tag (..., 4) body to world;
+    q_anchor (..., 4) anchor antenna to world; quaternions x y z w.
+    Source: Friis, eq. 11 of Grasso et al. (Sensors 2022, 22, 9136), in dB, with the losses inside the gains.
+    Polarisation is not modelled, and nearer than 1 cm the distance counts as 1 cm.
+    """
+    seen_from_tag, seen_from_anchor = _directions(p_tag, q_tag, p_anchor, q_anchor, link)
+    distance = np.maximum(np.linalg.norm(seen_from_tag, axis=-1), 0.01)
+    path_loss = 20.0 * np.log10(4.0 * np.pi * link.frequency * distance / SPEED_OF_LIGHT)
+    gains = link.anchor_antenna.gain(seen_from_anchor) + link.tag_antenna.gain(seen_from_tag)
+    return link.tx_power_dbm + gains - path_loss
+
+
+def power_bias(power_dbm):
+    """Range error of the DW1000 at a received power in dBm: metres, linear in the table of APS011, constant beyond."""
+    return 1e-3 * np.interp(power_dbm, APS011_POWER_DBM[::-1], APS011_BIAS_MM[::-1])
+
+
+def arrival_bias(p_tag, q_tag, p_anchor, q_anchor, link=RadioLink()):
+    """By how much the signal of an anchor seems to come from farther away: metres; arguments as `received_power_dbm`.
+
+    The sum of the chip's error over received power (APS011) and of the group delays of both antennas.
+    """
+    seen_from_tag, seen_from_anchor = _directions(p_tag, q_tag, p_anchor, q_anchor, link)
+    delay = link.anchor_antenna.group_delay(seen_from_anchor) + link.tag_antenna.group_delay(seen_from_tag)
+    return power_bias(received_power_dbm(p_tag, q_tag, p_anchor, q_anchor, link)) + delay
+
+
+def _directions(p_tag, q_tag, p_anchor, q_anchor, link):
+    """The anchor seen in the frame of the tag's antenna, and the tag seen in the frame of the anchor's antenna."""
+    to_anchor = np.asarray(p_anchor, dtype=float) - np.asarray(p_tag, dtype=float)
+    in_body = into_frame(q_tag, to_anchor)
+    return into_frame(link.tag_mount, in_body), into_frame(q_anchor, -to_anchor)
+
+
+def into_frame(q, v):
+    """R(q)^T v: world vectors (..., 3) in the frame whose orientation is q (..., 4), x y z w, frame to world."""
+    q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
+    x, y, z, w = -q[..., 0], -q[..., 1], -q[..., 2], q[..., 3]
+    vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
+    tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
+    return np.stack(
+        [vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx], axis=-1
+    )

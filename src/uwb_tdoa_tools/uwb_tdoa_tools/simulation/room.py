@@ -1,0 +1,39 @@
+"""The room a flight takes place in: what the anchors span, and the part of it that is comfortable to fly in."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+CLEARANCE = 0.8  # m from the walls
+FLOOR_CLEARANCE = 0.6  # m from floor and ceiling
+REST_HEIGHT = 0.03  # m, height of the body frame when the vehicle stands on the floor
+
+
+@dataclass(frozen=True)
+class Room:
+    """A box. lower, upper : (3,) corners in the world frame, metres; the floor is at lower[2]."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+
+    @property
+    def centre(self):
+        """(3,) metres."""
+        return 0.5 * (self.lower + self.upper)
+
+    @property
+    def flyable(self):
+        """The box that paths are sized to by default, (lower, upper), each (3,) metres: the room less a clearance."""
+        margin = np.minimum([CLEARANCE, CLEARANCE, FLOOR_CLEARANCE], 0.25 * (self.upper - self.lower))
+        return self.lower + margin, self.upper - margin
+
+
+def room_of(anchors):
+    """The room that Anchors stand in: the box around them, at least 4 x 4 x 2.5 m, floor at 0 or the lowest anchor."""
+    lowest, highest = anchors.positions.min(axis=0), anchors.positions.max(axis=0)
+    middle, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 2.0)
+    floor = min(0.0, lowest[2])
+    return Room(
+        np.array([middle[0] - half[0], middle[1] - half[1], floor]),
+        np.array([middle[0] + half[0], middle[1] + half[1], max(highest[2], floor + 2.5)]),
+    )
