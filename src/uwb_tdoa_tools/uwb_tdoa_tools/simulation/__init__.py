@@ -1,0 +1,56 @@
+"""Simulated flights: a room with anchors, a path through it, an inertial sensor, and the TDOAs of a UWB tag.
+
+    from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+    flight = simulate(SimulationConfig(trajectory="circle", protocol="tdoa3", seed=3))
+"""
+
+import numpy as np
+
+from uwb_tdoa_bias.flight import Flight, Truth
+
+from . import imu, ranging
+from .config import SimulationConfig
+from .imu import NO_IMU_ERRORS, ImuErrors
+from .trajectories import Trajectory
+
+__all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
+
+
+def simulate(config):
+    """Fly `config`, a SimulationConfig, and return the Flight. Raises InputError where it does not fit together.
+
+    truth : exact poses.
+    extra : "tdoa_truth" (t, bias, multipath, noise, outlier, m: what each TDOA holds besides geometry) and
+        "state_truth" (at the stamps of the truth: velocity vx, vy, vz in the world, m/s, and the biases of the inertial
+        sensor, gyro_bias_x ... rad/s, accel_bias_x ... m/s^2).
+    meta : source, format, protocol, config, and under "parameters" the constants that the errors were made with.
+    """
+    filled, room = config.complete()
+    trajectory = Trajectory(filled, room, filled.random("trajectory"))
+    t_imu = np.arange(1, int(filled.duration * filled.imu_rate) + 1) / filled.imu_rate
+    samples, gyro_bias, accel_bias = imu.measure(t_imu, trajectory, filled.imu_errors, filled.random)
+    t_truth = np.arange(1, int(filled.duration * filled.truth_rate) + 1) / filled.truth_rate
+    motion = trajectory.motion(t_truth)
+    tdoa, tdoa_truth, parameters = ranging.measure(filled, room, trajectory)
+
+    newest = np.maximum(np.searchsorted(t_imu, t_truth + 1e-9) - 1, 0)
+    state = {"t": t_truth}
+    for name, values in (("v", motion.v), ("gyro_bias_", gyro_bias[newest]), ("accel_bias_", accel_bias[newest])):
+        state.update({name + axis: values[:, k] for k, axis in enumerate("xyz")})
+    parameters["take_off"], parameters["landing"] = trajectory.take_off, trajectory.landing
+    room_name = config.constellation if config.anchors is None else "anchors"
+    return Flight(
+        name=f"sim-{config.trajectory}-{config.protocol}-{room_name}-{config.seed}",
+        anchors=filled.anchors,
+        tdoa=tdoa,
+        imu=samples,
+        truth=Truth(t_truth, motion.p, motion.q),
+        extra={"tdoa_truth": tdoa_truth, "state_truth": state},
+        meta={
+            "source": "simulation",
+            "format": "simulation",
+            "protocol": config.protocol,
+            "config": filled.as_dict(),
+            "parameters": parameters,
+        },
+    )

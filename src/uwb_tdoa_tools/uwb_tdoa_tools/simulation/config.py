@@ -1,0 +1,160 @@
+"""What a simulated flight is: one frozen dataclass."""
+
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.errors import InputError
+
+from .constellations import constellation
+from .imu import ImuErrors
+from .room import room_of
+from .schedule import PROTOCOLS
+from .trajectories import TRAJECTORIES
+
+YAW_PROFILES = ("fixed", "along_track", "rotating")
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """One simulated flight. The same config gives the same flight, bit for bit; every part draws from its own stream,
+    so that switching one error off leaves the others as they were. Raises InputError for what cannot be simulated.
+
+    The room and the path
+    ---------------------
+    seed : of all random streams, 0 or more (default 0)
+    constellation : name of an anchor constellation, or random-SEED[-COUNT] (default "corners": 8 in 7 x 8 x 3 m)
+    anchors : Anchors to use instead of a named constellation (default None)
+    trajectory : "circle", "rising_circle", "sines", "square", "hover" or "spin" (default "sines")
+    duration : of the recording, s (default 60)
+    speed : along the path at cruise, m/s; root mean square for sines (default 1)
+    place : (x, y) of the middle of the path, m (default None: the middle of the room)
+    height : of the path, m; not used by sines (default None: half the height that is flyable)
+    radius : of the circle, or half the side of the square, m (default None: 70 % of what fits)
+    yaw : "fixed", "along_track" or "rotating"; spin always rotates (default "fixed")
+    yaw_angle : yaw at the start, or added to the track, rad (default 0)
+    yaw_rate : while rotating, rad/s (default 0.5)
+    floor_time : at rest on the floor before take-off and after landing, s (default 3)
+    start_in_air : start and end on the path, in the air (default False: take off and land)
+
+    The inertial sensor and the truth
+    ---------------------------------
+    imu_rate : samples per second, Hz (default 1000)
+    imu_errors : ImuErrors; NO_IMU_ERRORS for a perfect sensor (default: a small quadrotor's MEMS sensor)
+    truth_rate : ground-truth poses per second, Hz (default 250)
+
+    The TDOA measurements
+    ---------------------
+    protocol : "tdoa2" (ring, about 475 per second) or "tdoa3" (any pair, about 240 per second) (default "tdoa2")
+    noise_std : standard deviation of the white noise of one TDOA, m; 0 for none (default 0.06)
+    anchor_noise_std : standard deviation of the arrival noise of each anchor, m, in the order of the anchors; a TDOA
+        then has the root of the summed squares of its two (default None: noise_std / sqrt(2) for every anchor)
+    shared_noise : two TDOAs made from the same reception share its noise, as in Grasso et al. (Sensors 2022, 22, 9136),
+        eqs. 4 - 5 (default False: independent noise)
+    bias : received-power and antenna errors, which depend on the poses, and the anchors' own delays (default True)
+    anchor_delay_std : spread of the constant delays of the anchors that calibration left, m (default 0.05)
+    tag_unit : which specimen of the tag flies: 0 is nominal, others have seeded small differences in gain (0.7 dB) and
+        mounting (2 degrees) (default 0)
+    tag_lever_arm : tag antenna in the body frame, m (default (0, 0, 0))
+    multipath : late arrivals near the floor (default True)
+    outlier_probability : share of TDOAs that are outliers, 0 for none (default 0.01)
+    """
+
+    seed: int = 0
+    constellation: str = "corners"
+    anchors: Anchors | None = None
+    trajectory: str = "sines"
+    duration: float = 60.0
+    speed: float = 1.0
+    place: tuple | None = None
+    height: float | None = None
+    radius: float | None = None
+    yaw: str = "fixed"
+    yaw_angle: float = 0.0
+    yaw_rate: float = 0.5
+    floor_time: float = 3.0
+    start_in_air: bool = False
+    imu_rate: float = 1000.0
+    imu_errors: ImuErrors = field(default_factory=ImuErrors)
+    truth_rate: float = 250.0
+    protocol: str = "tdoa2"
+    noise_std: float = 0.06
+    anchor_noise_std: tuple | None = None
+    shared_noise: bool = False
+    bias: bool = True
+    anchor_delay_std: float = 0.05
+    tag_unit: int = 0
+    tag_lever_arm: tuple = (0.0, 0.0, 0.0)
+    multipath: bool = True
+    outlier_probability: float = 0.01
+
+    def __post_init__(self):
+        for name, choices in (("trajectory", TRAJECTORIES), ("yaw", YAW_PROFILES), ("protocol", PROTOCOLS)):
+            if getattr(self, name) not in choices:
+                raise InputError(f"{name}: {getattr(self, name)!r} is not known; choose {', '.join(choices)}.")
+        for name in ("seed", "tag_unit"):
+            value = getattr(self, name)
+            if not (isinstance(value, (int, np.integer)) and 0 <= value < 2**32):
+                raise InputError(f"{name}: {value!r} is not a whole number from 0 to 4294967295.")
+        for name, lowest, highest in (
+            ("duration", 1.0, 3600.0),
+            ("speed", 0.01, 20.0),
+            ("radius", 0.05, 1000.0),
+            ("height", -1000.0, 1000.0),
+            ("yaw_angle", -1000.0, 1000.0),
+            ("yaw_rate", -10.0, 10.0),
+            ("floor_time", 0.0, 3600.0),
+            ("imu_rate", 50.0, 10000.0),
+            ("truth_rate", 1.0, 10000.0),
+            ("noise_std", 0.0, 100.0),
+            ("anchor_delay_std", 0.0, 100.0),
+            ("outlier_probability", 0.0, 1.0),
+        ):
+            value = getattr(self, name)
+            if value is not None and not lowest <= value <= highest:
+                raise InputError(f"{name}: {value!r} is outside {lowest:g} ... {highest:g}.")
+        for name, length in (("place", 2), ("tag_lever_arm", 3)):
+            value = getattr(self, name)
+            if value is not None and not (np.shape(value) == (length,) and np.isfinite(value).all()):
+                raise InputError(f"{name}: {value!r} is not {length} finite numbers of metres.")
+
+    def complete(self):
+        """(config, Room): this config with anchors, place, height, radius and anchor_noise_std filled in."""
+        anchors = self.anchors if self.anchors is not None else constellation(self.constellation)
+        if not 2 <= len(anchors) <= 64:
+            raise InputError(f"anchors: {len(anchors)} were given; the simulation takes 2 to 64.")
+        if self.bias and not np.isfinite(anchors.orientations).all():
+            lost = anchors.ids[~np.isfinite(anchors.orientations).all(axis=1)][0]
+            raise InputError(
+                f"anchors: anchor {lost} has no orientation, on which its bias depends; add it or switch bias off."
+            )
+        std = self.anchor_noise_std
+        std = np.full(len(anchors), self.noise_std / np.sqrt(2.0)) if std is None else np.asarray(std, dtype=float)
+        if std.shape != (len(anchors),) or not (np.isfinite(std).all() and (std >= 0.0).all()):
+            raise InputError(
+                f"anchor_noise_std: {self.anchor_noise_std!r} is not {len(anchors)} numbers of at least 0, in metres."
+            )
+        room = room_of(anchors)
+        low, high = room.flyable
+        place = tuple(float(v) for v in (room.centre[:2] if self.place is None else self.place))
+        reach = min(np.min(high[:2] - place), np.min(np.asarray(place) - low[:2]))
+        filled = replace(
+            self,
+            anchors=anchors,
+            place=place,
+            height=float(0.5 * (low[2] + high[2])) if self.height is None else self.height,
+            radius=float(max(0.7 * reach, 0.05)) if self.radius is None else self.radius,
+            anchor_noise_std=tuple(std.tolist()),
+        )
+        return filled, room
+
+    def random(self, part):
+        """The numpy Generator of the named part of the simulation."""
+        return np.random.default_rng([self.seed, *part.encode()])
+
+    def as_dict(self):
+        """Plain numbers, strings and lists, for Flight.meta and JSON; the anchors by their ids."""
+        content = asdict(replace(self, anchors=None))
+        content["anchors"] = None if self.anchors is None else self.anchors.ids.tolist()
+        return content

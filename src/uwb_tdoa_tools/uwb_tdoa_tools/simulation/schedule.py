@@ -1,0 +1,66 @@
+"""Who is heard when: the TDOA2 and TDOA3 schedules of the Loco Positioning System."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+SLOT = 2.0e-3  # s, TDOA2: one packet per slot
+SLOT_JITTER = 1.0e-4  # s, standard deviation of a stamp around its slot
+PACKET_LOSS = 0.025  # TDOA2: share of packets not received; each costs the two pairs that it belongs to
+TDOA3_DEAD_TIME = 0.5e-3  # s, the shortest time between two measurements
+TDOA3_MEAN_WAIT = 3.6e-3  # s, mean of the exponential wait on top of it: about 240 measurements per second
+
+PROTOCOLS = ("tdoa2", "tdoa3")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """One row per measurement, of the ordered pair (a, b) at the arrival of b's packet.
+
+    t : (n,) s, rising
+    a, b : (n,) rows of the anchors
+    heard_a, heard_b : (n,) number of the reception that each arrival time was taken from; two measurements that share a
+        reception share its noise
+    sender : (m,) row of the anchor of each reception
+    """
+
+    t: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    heard_a: np.ndarray
+    heard_b: np.ndarray
+    sender: np.ndarray
+
+
+def make_schedule(protocol, n_anchors, duration, rng):
+    """The Schedule of `protocol` ("tdoa2" or "tdoa3") over 0 ... duration, s, for n_anchors (at least 2) anchors."""
+    return (_tdoa2 if protocol == "tdoa2" else _tdoa3)(n_anchors, duration, rng)
+
+
+def _tdoa2(n_anchors, duration, rng):
+    """A ring: anchors send in turn, and every packet is compared with the one of the slot before."""
+    n = max(int(duration / SLOT), 2)
+    sender = np.arange(n) % n_anchors
+    jitter = np.clip(SLOT_JITTER * rng.standard_normal(n), -0.4 * SLOT, 0.4 * SLOT)
+    t = (np.arange(n) + 0.5) * SLOT + jitter
+    received = rng.random(n) >= PACKET_LOSS
+    k = 1 + np.flatnonzero(received[1:] & received[:-1])
+    return Schedule(t[k], sender[k - 1], sender[k], k - 1, k, sender)
+
+
+def _tdoa3(n_anchors, duration, rng):
+    """Any order: a packet of a random anchor is compared with the newest packet of a random other one."""
+    n = int(1.3 * duration / (TDOA3_DEAD_TIME + TDOA3_MEAN_WAIT)) + 50
+    t = np.cumsum(TDOA3_DEAD_TIME + rng.exponential(TDOA3_MEAN_WAIT, n))
+    b = rng.integers(0, n_anchors, n)
+    a = (b + rng.integers(1, n_anchors, n)) % n_anchors
+    n = np.searchsorted(t, duration)
+    t, a, b = t[:n], a[:n], b[:n]
+    sender = np.concatenate([np.arange(n_anchors), b])  # everyone was heard once before the first measurement
+    heard_b = n_anchors + np.arange(n)
+    heard_a = np.empty(n, dtype=np.int64)
+    for anchor in range(n_anchors):
+        heard = np.flatnonzero(sender == anchor)
+        rows = np.flatnonzero(a == anchor)
+        heard_a[rows] = heard[np.searchsorted(heard, heard_b[rows]) - 1]
+    return Schedule(t, a, b, heard_a, heard_b, sender)

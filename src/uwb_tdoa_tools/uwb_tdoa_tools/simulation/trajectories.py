@@ -1,0 +1,232 @@
+"""Where the vehicle flies: trajectory families, and the smooth motion made of them.
+
+A family gives positions over "path time" s, which runs with the clock at cruise. A Trajectory adds take-off, speeding
+up, slowing down and landing, and fits one spline through it all, whose derivatives are then exact.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.errors import InputError
+
+from .room import REST_HEIGHT
+
+GRAVITY = 9.81  # m/s^2
+DRAG = 0.2  # 1/s, rotor drag per mass: without it the lateral accelerometers would never feel anything
+KNOT = 0.05  # s, spacing of the spline's knots
+SPEED_UP = 2.0  # s, from rest to cruise and back
+CORNER_TIME = 1.2  # s, to turn a corner of the square
+HEADING_TIME = 3.0  # s, over which a heading along the track is smoothed
+MAX_ACCELERATION = 8.0  # m/s^2, what a small quadrotor still flies
+SPIN_UP = 0.5  # s, the motors turn before take-off and after landing
+
+_STEP = Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])  # 0 to 1 with four derivatives zero at both ends
+_RAMP = _STEP.integ()
+
+
+def circle(s, config, room, rng):
+    """A level circle around the place, radius and speed as configured."""
+    angle = config.speed * s / config.radius
+    return np.column_stack(
+        [
+            config.place[0] + config.radius * np.cos(angle),
+            config.place[1] + config.radius * np.sin(angle),
+            np.full(len(s), config.height),
+        ]
+    )
+
+
+def rising_circle(s, config, room, rng):
+    """The circle with a height that rises and falls in a sine, up to 0.6 m, 0.7 times per turn."""
+    p = circle(s, config, room, rng)
+    low, high = room.flyable
+    swing = np.clip(min(high[2] - config.height, config.height - low[2]), 0.0, 0.6)
+    p[:, 2] += swing * np.sin(0.7 * config.speed * s / config.radius)
+    return p
+
+
+def sines(s, config, room, rng):
+    """Products of two sines per axis, of seeded amplitude, period and phase, through the flyable room.
+
+    Source: the training trajectories of Zhao et al. (RA-L 2021), section V-B. `speed` is the root mean square here.
+    """
+    low, high = room.flyable
+    reach = 0.5 * (high - low) * rng.uniform(0.75, 1.0, 3)
+    rate = 2.0 * np.pi / rng.uniform([[8.0], [13.0]], [[13.0], [24.0]], (2, 3))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (2, 3))
+
+    def position(u):
+        return 0.5 * (low + high) + reach * np.prod(np.sin(rate * u[:, None, None] + phase), axis=1)
+
+    u = np.linspace(0.0, 240.0, 4801)
+    pace = np.gradient(position(u), u, axis=0)
+    return position(s * config.speed / np.sqrt(np.mean(np.sum(pace**2, axis=1))))
+
+
+def square(s, config, room, rng):
+    """A level square around the place, its edges `radius` away from it, at constant speed, with rounded corners."""
+    edge = 2.0 * config.radius
+    laps = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]]) * edge
+    dt = 0.01
+    s_fine = np.arange(-CORNER_TIME, s[-1] + CORNER_TIME + dt, dt)
+    along = np.mod(config.speed * s_fine + 0.5 * edge, 4.0 * edge)
+    sharp = np.column_stack([np.interp(along, edge * np.arange(5), laps[:, k]) for k in range(2)])
+    rounded = CubicSpline(s_fine, _smoothed(sharp, int(CORNER_TIME / dt) | 1))(s)
+    return np.column_stack([rounded + config.place, np.full(len(s), config.height)])
+
+
+def hover(s, config, room, rng):
+    """Stay at the place."""
+    return np.tile([*config.place, config.height], (len(s), 1))
+
+
+TRAJECTORIES = {
+    "circle": circle,
+    "rising_circle": rising_circle,
+    "sines": sines,
+    "square": square,
+    "hover": hover,
+    "spin": hover,  # with the yaw rotating
+}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Exact motion at n instants, body frame x forward, y left, z up in a z-up world.
+
+    p, v, a : (n, 3) m, m/s, m/s^2, world; q : (n, 4) x y z w, body to world; body_rates : (n, 3) rad/s, body;
+    specific_force : (n, 3) m/s^2, body.
+    """
+
+    p: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    q: np.ndarray
+    body_rates: np.ndarray
+    specific_force: np.ndarray
+
+
+class Trajectory:
+    """One flight over 0 ... config.duration: position and yaw as splines, attitude and rates from them.
+
+    Parameters: config, a SimulationConfig with place, height and radius filled in; room, a Room; rng, a numpy Generator
+    for what the family draws. Raises InputError where the flight does not fit the room, the time or the vehicle.
+    take_off, landing : s, when it leaves the floor and is back on it; None when it starts and ends in the air.
+    """
+
+    def __init__(self, config, room, rng):
+        self.take_off = self.landing = None
+        start, end, clamp = 0.0, config.duration, None
+        if not config.start_in_air:
+            rise = max(3.0, 1.5 * config.height)
+            shortest = 2.0 * (config.floor_time + rise + SPEED_UP)
+            if config.duration < shortest:
+                raise InputError(
+                    f"duration: {config.duration:g} s is too short to take off and land; give {shortest:g} s or more, "
+                    "a shorter floor_time, or start in the air."
+                )
+            start, end = config.floor_time, config.duration - config.floor_time
+            self.take_off, self.landing = start, end
+            clamp = ([(k, np.zeros(3)) for k in (1, 2, 3)],) * 2  # at rest, smoothly, at both ends
+        air = end - start
+        tau = np.linspace(0.0, air, max(int(np.ceil(air / KNOT)), 8) + 1)
+        s = tau if config.start_in_air else _path_time(tau, rise, air)
+        p = TRAJECTORIES[config.trajectory](s, config, room, rng)
+        outside = (p < room.lower).any(axis=0) | (p > room.upper).any(axis=0)
+        if outside.any():
+            axis = int(np.argmax(outside))
+            reach = f"{p[:, axis].min():.2f} ... {p[:, axis].max():.2f} m"
+            walls = f"{room.lower[axis]:.2f} ... {room.upper[axis]:.2f} m"
+            raise InputError(
+                f"trajectory: {config.trajectory} reaches {reach} in {'xyz'[axis]}, outside the room's {walls}; "
+                "change place, height or radius."
+            )
+        if not config.start_in_air:
+            lift = _STEP(np.clip(tau / rise, 0.0, 1.0)) * _STEP(np.clip((air - tau) / rise, 0.0, 1.0))
+            ground = room.lower[2] + REST_HEIGHT
+            p[:, 2] = ground + lift * (p[:, 2] - ground)
+        yaw = _yaw(s, p, config)
+        self._start, self._end, self._clamped = start, end, clamp is not None
+        self._p = make_interp_spline(start + tau, p, k=7, bc_type=clamp)
+        scalar = ([(k, 0.0) for k in (1, 2, 3)],) * 2 if clamp else None
+        self._yaw = make_interp_spline(start + tau, yaw, k=7, bc_type=scalar)
+        hardest = np.linalg.norm(self._p.derivative(2)(start + tau), axis=1).max()
+        if hardest > MAX_ACCELERATION:
+            raise InputError(
+                f"speed: {config.speed:g} m/s asks for an acceleration of {hardest:.1f} m/s^2 on this path, "
+                f"more than {MAX_ACCELERATION:g}; fly slower or wider."
+            )
+
+    def motion(self, t):
+        """The Motion at the stamps t, (n,) s; before take-off and after landing it rests exactly.
+
+        The thrust, along body z, carries weight, acceleration and rotor drag (differential flatness of a quadrotor,
+        after Mellinger and Kumar, ICRA 2011); the body rates are the analytic derivative of that attitude.
+        """
+        t = np.asarray(t, dtype=float)
+        inside = np.clip(t, self._start, self._end)
+        moving = ((t > self._start) & (t < self._end))[:, None] if self._clamped else 1.0
+        p = self._p(inside)
+        v, a, jerk = (self._p.derivative(k)(inside) * moving for k in (1, 2, 3))
+        yaw, yaw_rate = self._yaw(inside), self._yaw.derivative()(inside) * np.squeeze(moving)
+
+        gravity = np.array([0.0, 0.0, GRAVITY])
+        thrust = a + gravity + DRAG * v
+        thrust_rate = jerk + DRAG * a
+        size = np.linalg.norm(thrust, axis=1, keepdims=True)
+        z = thrust / size
+        z_rate = (thrust_rate - z * np.sum(z * thrust_rate, axis=1, keepdims=True)) / size
+        heading = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
+        heading_rate = yaw_rate[:, None] * np.column_stack([-np.sin(yaw), np.cos(yaw), np.zeros(len(t))])
+        y = np.cross(z, heading)
+        y_size = np.linalg.norm(y, axis=1, keepdims=True)
+        y /= y_size
+        x = np.cross(y, z)
+        y_rate = (np.cross(z_rate, heading) + np.cross(z, heading_rate)) / y_size  # up to a part along y itself
+        body_rates = np.column_stack([np.sum(u * w, axis=1) for u, w in ((-y, z_rate), (x, z_rate), (-x, y_rate))])
+        axes = np.stack([x, y, z], axis=2)
+        q = Rotation.from_matrix(axes).as_quat()
+        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[:, None]  # no sign flips
+        return Motion(p, v, a, q, body_rates, np.einsum("nij,ni->nj", axes, a + gravity))
+
+    def motors(self, t):
+        """Whether the motors turn at the stamps t: (n,) bool."""
+        t = np.asarray(t)
+        return (t >= self._start - SPIN_UP) & (t <= self._end + SPIN_UP) if self._clamped else np.ones(len(t), bool)
+
+
+def _path_time(tau, rise, air):
+    """Path time after tau seconds in the air: still during rise and descent, with the clock in between, smoothly."""
+
+    def since(x):  # integral of the smooth step, in units of SPEED_UP
+        return _RAMP(np.clip(x, 0.0, 1.0)) + np.maximum(x - 1.0, 0.0)
+
+    return SPEED_UP * (since((tau - rise) / SPEED_UP) - since((tau - (air - rise - SPEED_UP)) / SPEED_UP))
+
+
+def _yaw(s, p, config):
+    """Yaw at every knot, rad: "fixed", "along_track" or "rotating", from config.yaw_angle on."""
+    if config.trajectory == "spin" or config.yaw == "rotating":
+        return config.yaw_angle + config.yaw_rate * s
+    if config.yaw == "fixed" or np.ptp(s) == 0.0:
+        return np.full(len(s), config.yaw_angle)
+    step = np.diff(p[:, :2], axis=0)
+    going = np.hypot(*step.T) > 1e-6
+    if not going.any():
+        return np.full(len(s), config.yaw_angle)
+    track = np.unwrap(np.arctan2(step[going, 1], step[going, 0]))
+    middle = 0.5 * (np.arange(len(step)) + np.arange(1, len(step) + 1))
+    course = np.interp(np.arange(len(s)), middle[going], track)
+    return config.yaw_angle + _smoothed(course[:, None], int(HEADING_TIME / KNOT) | 1)[:, 0]
+
+
+def _smoothed(values, width):
+    """Columns of (n, k) values averaged with a raised-cosine window of `width` samples; the ends go on as constants."""
+    window = np.hanning(width + 2)[1:-1]
+    window /= window.sum()
+    padded = np.pad(values, ((width, width), (0, 0)), mode="edge")
+    return np.column_stack([np.convolve(column, window, mode="same") for column in padded.T])[width:-width]
