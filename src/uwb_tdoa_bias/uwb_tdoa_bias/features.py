@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from .compiled import compiled
 from .geometry import rotate
 
 # Azimuth (about z, from x) and elevation (above the x-y plane) of the tag seen from the antenna frame of each anchor (A),
@@ -27,7 +27,7 @@ def features(samples):
     return out
 
 
-@njit(cache=True)
+@compiled
 def _fill(p, q, a, b, positions, orientations, out):
     delta = np.empty(3)
     inverse = np.empty(4)
@@ -50,6 +50,6 @@ def _fill(p, q, a, b, positions, orientations, out):
             out[i, 10 + side] = math.atan2(seen[2], math.hypot(seen[0], seen[1]))
 
 
-@njit(cache=True)
+@compiled
 def _conjugate(q, out):
     out[0], out[1], out[2], out[3] = -q[0], -q[1], -q[2], q[3]

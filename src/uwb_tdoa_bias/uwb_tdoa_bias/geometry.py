@@ -1,7 +1,8 @@
 """What a TDOA is when nothing is wrong with it."""
 
 import numpy as np
-from numba import njit
+
+from .compiled import compiled
 
 
 def tdoa(p, a, b):
@@ -23,7 +24,7 @@ def _unit(v):
     return v / np.where(norm > 1e-9, norm, np.inf)
 
 
-@njit(cache=True)
+@compiled
 def rotate(q, v, out):
     """out = R(q) v for a unit quaternion q = x y z w (body to world); all (k,) arrays."""
     x, y, z, w = q[0], q[1], q[2], q[3]

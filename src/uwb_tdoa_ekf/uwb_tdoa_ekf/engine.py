@@ -4,7 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from uwb_tdoa_bias.compiled import compiled
 
 from .robust import predicted, gain_terms, update_gate, update_innovation, update_m_estimation
 from .startup import INLIER, believable, level, locate, share_of_inliers
@@ -57,7 +58,7 @@ def new_memory():
     return Memory(x, np.eye(15), clock, imu, np.zeros((4, 2 * WINDOW)), *(np.zeros(shape) for shape in shapes))
 
 
-@njit(cache=True)
+@compiled
 def run(m, c, positions, imu_t, gyro, force, tdoa_t, a, b, d, bias_std, odometry, covariance, residuals):
     """Feed events in stamp order.
 
@@ -85,7 +86,7 @@ def run(m, c, positions, imu_t, gyro, force, tdoa_t, a, b, d, bias_std, odometry
     return rows
 
 
-@njit(cache=True)
+@compiled
 def _on_imu(m, c, t, gyro, force):
     last_gyro, last_force, slow, power, mean = m.imu[0], m.imu[1], m.imu[2], m.imu[3], m.imu[4]
     dt = t - m.clock[LAST_IMU]
@@ -107,7 +108,7 @@ def _on_imu(m, c, t, gyro, force):
         last_gyro[k], last_force[k] = gyro[k], force[k]
 
 
-@njit(cache=True)
+@compiled
 def _advance(m, c, t):
     """Predict to stamp t with the inertial sample at hand, or without one if it is too old."""
     trust, psd = m.S[0], m.S[1]  # scratch
@@ -129,7 +130,7 @@ def _advance(m, c, t):
         m.clock[NOW] = t if t - m.clock[NOW] <= MAX_STEP else m.clock[NOW] + dt
 
 
-@njit(cache=True)
+@compiled
 def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual):
     first, kept = _remember(m, c, t, a, b, d)
     if not m.clock[RUNNING]:
@@ -167,7 +168,7 @@ def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual):
         _recover(m, c, positions, first, kept)
 
 
-@njit(cache=True)
+@compiled
 def _remember(m, c, t, a, b, d):
     """Append to the window; returns the places of the first TDOA within start_window and of the end."""
     kept = int(m.clock[KEPT])
@@ -183,13 +184,13 @@ def _remember(m, c, t, a, b, d):
     return first, kept
 
 
-@njit(cache=True)
+@compiled
 def _window(m, first, kept):
     w = m.window[:, first:kept]
     return w[0], w[1].astype(np.int64), w[2].astype(np.int64), w[3]
 
 
-@njit(cache=True)
+@compiled
 def _start(m, c, positions, t, first, kept, anyhow):
     """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
     wt, wa, wb, wd = _window(m, first, kept)
@@ -217,7 +218,7 @@ def _start(m, c, positions, t, first, kept, anyhow):
     m.clock[RUNNING] = 1.0
 
 
-@njit(cache=True)
+@compiled
 def _recover(m, c, positions, first, kept):
     """If the window agrees on a position that the filter does not believe, go there; attitude and biases stay."""
     wt, wa, wb, wd = _window(m, first, kept)

@@ -7,7 +7,7 @@ because their errors are alike: the update uses variance * dilution, the weight 
 
 import math
 
-from numba import njit
+from uwb_tdoa_bias.compiled import compiled
 
 from .state import inject
 
@@ -15,7 +15,7 @@ GEMAN_MCCLURE, HUBER, CAUCHY = 0, 1, 2  # as in config.LOSSES
 NEGLIGIBLE = 0.01  # weight below which a measurement is not used
 
 
-@njit(cache=True)
+@compiled
 def weight(loss, e, scale):
     """IRLS weight w(e) = rho'(e) / e, 1 at e = 0. e: normalised residual; scale: where the loss bends, same unit."""
     u = (e / scale) ** 2
@@ -26,7 +26,7 @@ def weight(loss, e, scale):
     return 1.0 / (1.0 + u)
 
 
-@njit(cache=True)
+@compiled
 def predicted(x, a, b, g):
     """Predicted d_ab (m) for antenna positions a, b (3,); writes its derivative by the position to g (3,)."""
     ax, ay, az = x[0] - a[0], x[1] - a[1], x[2] - a[2]
@@ -37,7 +37,7 @@ def predicted(x, a, b, g):
     return rb - ra
 
 
-@njit(cache=True)
+@compiled
 def gain_terms(P, g, K):
     """K <- P g (15,); returns g' P g, m^2."""
     for j in range(15):
@@ -45,7 +45,7 @@ def gain_terms(P, g, K):
     return g[0] * K[0] + g[1] * K[1] + g[2] * K[2]
 
 
-@njit(cache=True)
+@compiled
 def update_innovation(x, P, K, innovation, spread, variance, dilution, loss, scale):
     """Weight from the whitened innovation, then one Kalman update with the variance divided by it. Returns the weight.
 
@@ -59,7 +59,7 @@ def update_innovation(x, P, K, innovation, spread, variance, dilution, loss, sca
     return w
 
 
-@njit(cache=True)
+@compiled
 def update_gate(x, P, K, innovation, spread, variance, dilution, gate):
     """Kalman update if the innovation is within `gate` standard deviations. Returns 1 or 0."""
     if innovation * innovation > gate * gate * (spread + variance):
@@ -68,7 +68,7 @@ def update_gate(x, P, K, innovation, spread, variance, dilution, gate):
     return 1.0
 
 
-@njit(cache=True)
+@compiled
 def _kalman(x, P, K, innovation, total):
     inject(x, K, innovation / total)
     for i in range(15):
@@ -78,7 +78,7 @@ def _kalman(x, P, K, innovation, total):
             P[j, i] = P[i, j]
 
 
-@njit(cache=True)
+@compiled
 def update_m_estimation(x, P, S, K, g, innovation, variance, dilution, loss, state_scale, scale, iterations):
     """M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13. Returns the measurement's weight.
 

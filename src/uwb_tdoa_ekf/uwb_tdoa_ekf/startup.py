@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from uwb_tdoa_bias.compiled import compiled
 
 STARTS = 9  # the middle of the anchors and the corners of the half-size box around it
 SWEEPS = 14  # Gauss-Newton steps per start
@@ -14,7 +15,7 @@ LEAP = 2.0  # m, longest step
 INLIER = 0.75  # m, a residual below this does not contradict a position
 
 
-@njit(cache=True)
+@compiled
 def locate(t, a, b, d, positions, std, x, cov):
     """Robust multilateration over a window, with constant velocity.
 
@@ -65,14 +66,14 @@ def locate(t, a, b, d, positions, std, x, cov):
     return np.mean(np.abs(residuals) < INLIER)
 
 
-@njit(cache=True)
+@compiled
 def reach(positions, k):
     """Middle of the anchors along axis k, and how far from it a tag is believed without further evidence, m."""
     low, high = np.min(positions[:, k]), np.max(positions[:, k])
     return 0.5 * (low + high), max(0.5 * (high - low) + OUTSIDE, 3.0 * OUTSIDE)
 
 
-@njit(cache=True)
+@compiled
 def believable(positions, x):
     """True if position x (3,) is within reach of the anchors."""
     for k in range(3):
@@ -82,7 +83,7 @@ def believable(positions, x):
     return True
 
 
-@njit(cache=True)
+@compiled
 def share_of_inliers(t, a, b, d, positions, x):
     """Share of the window's TDOAs that agree with position and velocity x (6,) at its end, 0 to 1."""
     residuals = np.empty(len(t))
@@ -90,7 +91,7 @@ def share_of_inliers(t, a, b, d, positions, x):
     return np.mean(np.abs(residuals) < INLIER)
 
 
-@njit(cache=True)
+@compiled
 def _normal_equations(t, a, b, d, positions, x, scale, information, gradient, residuals):
     """Weighted normal equations of the window at x (6,); returns the mean Geman-McClure loss, 0 to 1."""
     information[:, :] = 0.0
@@ -122,7 +123,7 @@ def _normal_equations(t, a, b, d, positions, x, scale, information, gradient, re
     return loss / n
 
 
-@njit(cache=True)
+@compiled
 def level(force, yaw, x):
     """Write to x the attitude in which `force` (3,), the mean specific force, points up, and which has the given yaw."""
     roll = math.atan2(force[1], force[2])

@@ -8,12 +8,12 @@ Motion model: eq. 14 of Zhao et al. (RA-L 2021).
 
 import math
 
-from numba import njit
+from uwb_tdoa_bias.compiled import compiled
 
 GRAVITY = 9.81  # m/s^2, along -z of the world
 
 
-@njit(cache=True)
+@compiled
 def rotation(x, R):
     """R (3, 3): body to world, from the quaternion in x."""
     qx, qy, qz, qw = x[6], x[7], x[8], x[9]
@@ -28,7 +28,7 @@ def rotation(x, R):
     R[2, 2] = 1 - 2 * (qx * qx + qy * qy)
 
 
-@njit(cache=True)
+@compiled
 def turn(x, r0, r1, r2):
     """q <- q * Exp(r) for a rotation vector r (rad) in the body frame."""
     angle = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
@@ -43,7 +43,7 @@ def turn(x, r0, r1, r2):
     x[6], x[7], x[8], x[9] = qx * n, qy * n, qz * n, qw * n
 
 
-@njit(cache=True)
+@compiled
 def inject(x, K, gain):
     """Add the error K * gain, (15,), to the nominal state."""
     for j in range(6):
@@ -53,7 +53,7 @@ def inject(x, K, gain):
         x[j + 1] += K[j] * gain
 
 
-@njit(cache=True)
+@compiled
 def predict(x, P, F, R, dt, gyro, force, trust, accel_psd, gyro_psd, accel_walk_psd, gyro_walk_psd):
     """Advance state and covariance by dt seconds.
 
@@ -111,7 +111,7 @@ def predict(x, P, F, R, dt, gyro, force, trust, accel_psd, gyro_psd, accel_walk_
             P[i, j] = P[j, i]
 
 
-@njit(cache=True)
+@compiled
 def coast(x, P, dt, accel_psd, turn_psd):
     """Advance by dt seconds with no inertial sample: constant velocity with random acceleration, attitude held.
 

@@ -3,12 +3,13 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from uwb_tdoa_bias.compiled import compiled
 
 MARGIN = 1.0  # m by which |d_ab| may exceed the distance between a and b: its largest believable error
 
 
-@njit(cache=True)
+@compiled
 def usable(a, b, d, bias_std, positions):
     """False for an unknown anchor (row -1), a pair of one anchor, a value that is not finite or longer than the baseline.
 
@@ -22,7 +23,7 @@ def usable(a, b, d, bias_std, positions):
     return abs(d) <= math.sqrt(baseline) + MARGIN
 
 
-@njit(cache=True)
+@compiled
 def usable_all(a, b, d, bias_std, positions):
     """`usable` for (n,) arrays: (n,) bool."""
     out = np.empty(len(d), np.bool_)
