@@ -1,5 +1,6 @@
 """How good is the estimate? Errors against ground truth, of the filter run here or of a recorded odometry."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -53,6 +54,10 @@ def main(argv=None):
     parser.add_argument("--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT")
     parser.add_argument("--namespace", default="", help="of the topics in the bags, e.g. tag1")
     parser.add_argument("--json", metavar="FILE", help="write all figures: runs, pooled")
+    parser.add_argument("--markdown", metavar="FILE", help="write the table as Markdown")
+    parser.add_argument(
+        "--beside", metavar="CSV", help="add the 3D RMSE that others reach to that table: columns flight, peer, mode, rmse_3d, diverged"
+    )
     parser.add_argument("--plot", metavar="FILE", help="picture of the errors over time (one FLIGHT)")
     parser.add_argument("--tum", metavar="DIR", help="write estimates and truths as TUM trajectories, e.g. for evo")
     return cli.run(_evaluate, parser, argv)
@@ -69,7 +74,7 @@ def _evaluate(args):
     scores = []
     print(_line("flight", COLUMNS.values()))
     for path, survey in tqdm(found, unit="flight", disable=None, leave=False):
-        flight = read_flight(path, survey, args.namespace)
+        flight = read_flight(path, survey)
         if args.odometry:
             odometry = read_odometry(args.odometry, args.namespace)
             score = Score(flight.name, odometry, flight.truth)
@@ -91,7 +96,33 @@ def _evaluate(args):
     if args.json:
         report = {"runs": [score.row() for score in scores], "pooled": together}
         Path(args.json).write_text(json.dumps(report, indent=1))
+    if args.markdown:
+        rows = [score.row() for score in scores] + [together] * (len(scores) > 1)
+        Path(args.markdown).write_text(_markdown(rows, _others(args.beside) if args.beside else {}))
     return 0
+
+
+def _others(path):
+    """{peer and mode: {flight: 3D RMSE as text, or "diverged"}} of a CSV file. Raises InputError."""
+    others = {}
+    with open(path, newline="") as file:
+        for line in csv.DictReader(file):
+            try:
+                cell = "diverged" if line["diverged"] == "True" else f"{float(line['rmse_3d']):.3f}"
+                others.setdefault(f"{line['peer']} {line['mode']}", {})[line["flight"]] = cell
+            except (KeyError, TypeError, ValueError) as error:
+                raise InputError(f"{path}: needs columns flight, peer, mode, rmse_3d, diverged ({error!r}).") from error
+    return others
+
+
+def _markdown(rows, others):
+    """The table of all runs, in metres, with one column per other estimator."""
+    table = [["flight", *COLUMNS.values(), *others]]
+    table.append(["---"] + ["---:"] * (len(table[0]) - 1))
+    for row in rows:
+        cells = [f"{row[key]:.3f}" for key in COLUMNS] + [peer.get(row["flight"], "") for peer in others.values()]
+        table.append([row["flight"], *cells])
+    return "".join("| " + " | ".join(cells) + " |\n" for cells in table)
 
 
 def _row(row):
