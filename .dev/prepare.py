@@ -88,8 +88,9 @@ def check_machine():
 
 
 def make_environment():
-    for folder in (VENV, BUILD, INSTALL):
-        shutil.rmtree(folder, ignore_errors=True)
+    old = [folder for folder in (VENV, BUILD, INSTALL) if folder.exists()]
+    if old:
+        run("remove what was made for another environment", "remove", ["rm", "-rf", *old])
     options = ["--system-site-packages"] if OWN_ROS else []
     run("make .venv", "venv", [BASE_PYTHON, "-m", "venv", *options, VENV])
     try:
@@ -97,16 +98,16 @@ def make_environment():
             missing = missing_requirements()
             install(f"install what ROS 2 Jazzy lacks ({len(missing)} packages)", [*missing, *LIMITS])
         else:
-            install("install ROS 2 Jazzy and the Python packages", ["-r", ROOT / "requirements.txt"])
+            install("install ROS 2 Jazzy and the Python packages", ["--no-compile", "-r", ROOT / "requirements.txt"])
     except Failure as failure:
         output = (LOG / "dev_pip.log").read_text(errors="replace")
-        if re.search(r"NewConnectionError|NameResolution|ConnectTimeout|ReadTimeout|ProxyError|SSLError", output):
+        if re.search(r"NewConnectionError|NameResolution|Timeout|ProxyError|from versions: none", output):
             raise Failure(
-                "pip cannot reach the package index; check the network, or name a mirror: PIP_INDEX_URL=..."
+                "pip reaches no package index that has these; check the network, or name a mirror: PIP_INDEX_URL=..."
             ) from failure
         raise
     if not OWN_ROS:
-        run("repair the ROS wheels", "wheels", [PYTHON, ROOT / ".dev" / "wheels.py"])
+        run("repair and compile them", "wheels", [PYTHON, ROOT / ".dev" / "wheels.py"])
 
 
 def install(title, arguments):
@@ -147,9 +148,6 @@ def build(done):
         PATH=f"{VENV / 'bin'}{os.pathsep}{os.environ['PATH']}",
         **variables,
     )
-    # A cache of numba knows its own file only, not the compiled functions it calls in others.
-    for cache in INSTALL.rglob("*.nb[ic]"):
-        cache.unlink()
     write_steps({**done, **sources})
 
 
