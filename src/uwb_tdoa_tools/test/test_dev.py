@@ -1,0 +1,124 @@
+"""What ./dev says without doing anything, and what it says is missing. Nothing here installs or builds."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+PROGRAMS = ("bash", "cat", "dirname", "readlink")
+BASE_PYTHON = os.path.realpath(sys.executable)
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    """A fresh copy of the scripts, as after `git clone`."""
+    shutil.copy(ROOT / "dev", tmp_path)
+    shutil.copy(ROOT / "requirements.txt", tmp_path)
+    shutil.copytree(ROOT / ".dev", tmp_path / ".dev")
+    return tmp_path
+
+
+@pytest.fixture
+def machine(tmp_path):
+    """A PATH with the barest of machines on it. Call it with name=target to put programs there."""
+    path = tmp_path / "bin"
+    path.mkdir()
+
+    def install(**programs):
+        for name, target in {**{name: shutil.which(name) for name in PROGRAMS}, **programs}.items():
+            (path / name).symlink_to(target)
+        return {"PATH": str(path)}
+
+    return install
+
+
+def dev(folder, *arguments, **environment):
+    plain = {"PATH": os.environ["PATH"], "HOME": os.environ.get("HOME", "/"), **environment}
+    done = subprocess.run([folder / "dev", *arguments], env=plain, capture_output=True, text=True, timeout=60)
+    return done.returncode, done.stdout, done.stderr
+
+
+def script(path, *lines):
+    path.write_text("\n".join(("#!/usr/bin/env bash", *lines, "")))
+    path.chmod(0o755)
+    return path
+
+
+@pytest.mark.parametrize("arguments", [(), ("help",), ("--help",)])
+def test_usage_names_every_command(arguments):
+    code, out, err = dev(ROOT, *arguments)
+    assert (code, err) == (0, "")
+    for word in ("demo", "test", "build", "run PKG EXE", "shell", "examples:"):
+        assert word in out
+
+
+def test_unknown_command(workspace):
+    assert dev(workspace, "fly") == (2, "", "dev: error: unknown command 'fly'; './dev help' lists them.\n")
+
+
+def test_run_needs_package_and_executable(workspace):
+    code, _, err = dev(workspace, "run", "uwb_tdoa_tools")
+    assert code == 2
+    assert err.startswith("dev: error: run needs a package and an executable")
+
+
+def test_named_python_of_a_wrong_version(workspace):
+    old = script(workspace / "python3.9", "exit 1")
+    code, out, err = dev(workspace, "build", PYTHON=str(old))
+    assert (code, out) == (1, "")
+    assert err == f"dev: error: PYTHON={old} is no Python 3.10, 3.11 or 3.12; name one of these, or unset PYTHON.\n"
+
+
+def test_no_python_of_a_right_version(workspace, machine):
+    code, _, err = dev(workspace, "test", **machine())
+    assert code == 1
+    assert err.startswith("dev: error: no Python 3.10, 3.11 or 3.12 found; install one, ")
+    assert len(err.splitlines()) == 1
+
+
+def test_no_compiler(workspace, machine):
+    code, _, err = dev(workspace, "demo", **machine(python3=BASE_PYTHON))
+    assert (code, err) == (
+        1,
+        "dev: error: no C++ compiler found, which the message package needs; install one, e.g. sudo apt install g++\n",
+    )
+    assert not (workspace / ".venv").exists()
+
+
+def test_no_venv_module(workspace, machine):
+    (workspace / "sitecustomize.py").write_text("import sys; sys.modules['ensurepip'] = None\n")
+    code, _, err = dev(workspace, "demo", **machine(python3=BASE_PYTHON), PYTHONPATH=str(workspace))
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    assert (code, err) == (
+        1,
+        f"dev: error: Python {version} has no venv module; install it, e.g. sudo apt install python{version}-venv\n",
+    )
+
+
+def test_another_ros_distribution(workspace):
+    assert dev(workspace, "build", ROS_DISTRO="humble") == (
+        1,
+        "",
+        "dev: error: ROS humble is sourced, but this needs ROS 2 jazzy; source it, or none.\n",
+    )
+
+
+def test_a_jazzy_without_rclpy(workspace):
+    code, _, err = dev(workspace, "build", ROS_DISTRO="jazzy", PYTHON=BASE_PYTHON)
+    assert code == 1
+    assert err.startswith("dev: error: ROS_DISTRO is jazzy, but ") and "cannot import rclpy" in err
+
+
+def test_a_step_that_fails_shows_the_end_of_its_log(workspace, machine):
+    compiler = script(workspace / "c++", "exit 1")
+    environment = machine(python3=BASE_PYTHON, **{"c++": compiler})
+    (workspace / "requirements.txt").write_text("no package is named like this\n")
+    code, _, err = dev(workspace, "build", **environment)
+    assert code == 1
+    assert "  | ERROR: Invalid requirement" in err
+    assert err.splitlines()[-1].endswith("all of its output is in log/dev_pip.log.")
+    assert not (workspace / ".venv" / "steps.json").exists()
