@@ -1,0 +1,24 @@
+"""Random attitudes, and random TDOAs with the poses they were taken at."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.effects import Samples
+
+
+def random_rotation(rng):
+    """Any attitude, each as likely."""
+    return Rotation.from_quat(rng.standard_normal(4))
+
+
+def random_samples(seed, n=20, n_anchors=5):
+    """Samples of n TDOAs between anchors in a cube of 10 m, all attitudes known."""
+    rng = np.random.default_rng(seed)
+    anchors = Anchors(
+        rng.permutation(100)[:n_anchors], rng.uniform(-5, 5, (n_anchors, 3)), rng.standard_normal((n_anchors, 4))
+    )
+    a = rng.integers(0, n_anchors, n)
+    b = (a + rng.integers(1, n_anchors, n)) % n_anchors
+    q = Rotation.from_quat(rng.standard_normal((n, 4))).as_quat() if n else np.empty((0, 4))
+    return Samples(np.arange(n) / 100.0, a, b, rng.uniform(-5, 5, (n, 3)), q, anchors)

@@ -1,0 +1,142 @@
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.corrector import EFFECTS, NETWORK, PASSED, Corrector
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+
+ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
+DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))
+ARM = EffectSet((TagLeverArm({"z": 0.3}),))
+
+
+class Height:
+    """Stands in for a network: the bias is the height of the tag, unknown where there is no pose or z is above 2 m."""
+
+    name = "height"
+
+    def __init__(self, std=0.05):
+        self.std = std
+
+    def predict(self, samples):
+        z = samples.p[:, 2]
+        return np.where(z > 2.0, np.nan, z), np.full(len(samples), self.std)
+
+
+def correct(corrector, t):
+    t = np.atleast_1d(np.asarray(t, dtype=float))
+    rows = np.arange(len(t))
+    return corrector.correct(t, rows % 4, (rows + 1) % 4, np.ones(len(t)))
+
+
+def climbing(corrector, stamps):
+    """Tell the corrector poses whose height is their stamp."""
+    for t in stamps:
+        corrector.add_pose(t, np.array([1.0, 1.0, t]), np.array([0.0, 0.0, 0.0, 1.0]))
+    return corrector
+
+
+def test_with_nothing_to_correct_with_measurements_pass():
+    corrector = climbing(Corrector(ANCHORS), [0.0, 1.0])
+    assert corrector.idle and corrector.model == "none" and corrector.ready(1e9)
+    found = correct(corrector, [0.5, 2.0])
+    assert found.bias.tolist() == [0, 0] and found.std.tolist() == [0, 0] and found.corrected.tolist() == [1, 1]
+    assert found.status.tolist() == [PASSED, PASSED]
+
+
+def test_model_names_effects_and_network():
+    assert Corrector(ANCHORS, DELAYS).model == "anchor_delay"
+    assert Corrector(ANCHORS, None, Height()).model == "height"
+    assert Corrector(ANCHORS, DELAYS, Height()).model == "anchor_delay+height"
+
+
+def test_effects_without_poses_need_none():
+    found = correct(Corrector(ANCHORS, DELAYS), [0.0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(found.bias, [-0.1, -0.2, 0.2, 0.1])
+    np.testing.assert_allclose(found.corrected, 1.0 - found.bias)
+    assert (found.status == EFFECTS).all()
+
+
+def test_effects_see_the_pose():
+    corrector = Corrector(ANCHORS, ARM, lag=0.05)
+    q = Rotation.from_euler("x", 90, degrees=True).as_quat()  # body z points to world -y
+    corrector.add_pose(0.0, np.array([1.0, 2.0, 1.0]), q)
+    antenna = np.array([1.0, 1.7, 1.0])
+    found = correct(corrector, 0.1)
+
+    def d(p):
+        return np.linalg.norm(p - ANCHORS.positions[1]) - np.linalg.norm(p - ANCHORS.positions[0])
+
+    assert found.bias[0] == pytest.approx(d(antenna) - d(np.array([1.0, 2.0, 1.0])), abs=1e-12)
+
+
+@given(
+    st.lists(st.integers(0, 100), max_size=30),
+    st.lists(st.integers(0, 120), min_size=1, max_size=10),
+    st.integers(0, 20),
+)
+def test_uses_the_newest_pose_not_younger_than_the_lag(poses, asked, lag):
+    # eighths of a second are exact: "no later than" is tested at equality too
+    corrector = climbing(Corrector(ANCHORS, None, Height(), lag=lag / 8), np.array(poses) / 8)
+    told = [t for k, t in enumerate(poses) if t > max(poses[:k], default=-1)]  # stamps must rise, others are ignored
+    found = correct(corrector, np.array(asked) / 8)
+    for t, bias, status in zip(asked, found.bias, found.status):
+        known = [pose for pose in told if pose <= t - lag]
+        height = max(known) / 8 if known else 3.0
+        assert bias == (height if height <= 2.0 else 0.0)
+        assert status == (NETWORK if height <= 2.0 else PASSED)
+
+
+@given(st.lists(st.integers(0, 60), max_size=20), st.integers(0, 60), st.lists(st.integers(0, 90), max_size=20))
+def test_once_ready_no_later_pose_changes_a_correction(before, asked, after):
+    corrector = climbing(Corrector(ANCHORS, None, Height(), lag=0.5), np.array(before) / 40)
+    if not corrector.ready(asked / 40):
+        return
+    first = correct(corrector, asked / 40).bias[0]
+    climbing(corrector, np.array(after) / 40)
+    assert correct(corrector, asked / 40).bias[0] == first
+
+
+def test_not_ready_before_a_pose_passed_the_lag():
+    corrector = Corrector(ANCHORS, ARM, lag=0.25)
+    assert not corrector.ready(0.0)
+    climbing(corrector, [1.0])
+    assert corrector.ready(1.125) and not corrector.ready(1.5)
+
+
+def test_a_batch_is_the_same_as_one_by_one():
+    corrector = climbing(Corrector(ANCHORS, ARM, Height()), np.arange(0.0, 3.0, 0.01))
+    t = np.random.default_rng(0).uniform(-0.1, 3.1, 200)
+    a = np.arange(200) % 4
+    together = corrector.correct(t, a, (a + 1) % 4, t)
+    for i in range(200):
+        alone = corrector.correct(t[i : i + 1], a[i : i + 1], (a[i : i + 1] + 1) % 4, t[i : i + 1])
+        for name in ("bias", "std", "corrected", "status"):
+            assert getattr(alone, name)[0] == getattr(together, name)[i], name
+
+
+def test_where_the_network_cannot_tell_effects_remain():
+    corrector = climbing(Corrector(ANCHORS, DELAYS, Height(), lag=0.0), [1.0, 2.5])
+    found = correct(corrector, [0.0, 1.0, 2.5])  # no pose yet; a pose it knows; one it does not
+    np.testing.assert_allclose(found.bias, [-0.1, -0.2 + 1.0, 0.2])
+    assert found.status.tolist() == [EFFECTS, NETWORK, EFFECTS]
+    assert found.std.tolist() == [0.0, 0.05, 0.0]
+
+
+def test_a_network_without_a_finite_deviation_predicts_none():
+    corrector = climbing(Corrector(ANCHORS, None, Height(std=np.nan), lag=0.0), [1.0])
+    assert correct(corrector, 1.0).std.tolist() == [0.0]
+
+
+def test_forgets_old_poses_and_keeps_the_last_ones():
+    corrector = climbing(Corrector(ANCHORS, None, Height(), lag=0.0, history=10), np.arange(1000) / 1000)
+    found = correct(corrector, np.array([0.001, 0.990, 0.995, 0.999]))
+    np.testing.assert_allclose(found.bias, [0.0, 0.990, 0.995, 0.999], atol=1e-12)
+    assert len(corrector._t) == len(corrector._p) == len(corrector._q) <= 20
+
+
+def test_empty_batch():
+    found = correct(climbing(Corrector(ANCHORS, DELAYS, Height()), [0.0]), [])
+    assert len(found.bias) == len(found.std) == len(found.corrected) == len(found.status) == 0

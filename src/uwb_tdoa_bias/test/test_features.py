@@ -1,0 +1,112 @@
+from hypothesis import given, strategies as st
+import numpy as np
+from random_samples import random_rotation, random_samples
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.effects import Samples
+from uwb_tdoa_bias.features import FEATURES, features
+
+ANGLES = [k for k, name in enumerate(FEATURES) if name.startswith(("azimuth", "elevation"))]
+seeds = st.integers(0, 2**32 - 1)
+
+
+def expected(samples):
+    """Every feature by its name, each straight from its definition."""
+    anchors, out = samples.anchors, {}
+    for side, rows in (("a", samples.a), ("b", samples.b)):
+        to_anchor = anchors.positions[rows] - samples.p
+        for k, axis in enumerate("xyz"):
+            out[f"d{axis}_{side}"] = to_anchor[:, k]
+        seen_by_tag = Rotation.from_quat(samples.q).inv().apply(to_anchor)
+        seen_by_anchor = Rotation.from_quat(anchors.orientations[rows]).inv().apply(-to_anchor)
+        for viewer, direction in (("T", seen_by_tag), ("A", seen_by_anchor)):
+            x, y, z = direction.T / np.linalg.norm(direction, axis=1)
+            out[f"azimuth_{viewer}_{side}"] = np.arctan2(y, x)
+            out[f"elevation_{viewer}_{side}"] = np.arcsin(z)
+    return np.stack([out[name] for name in FEATURES], axis=1)
+
+
+def test_fourteen_names_in_the_order_of_the_paper():
+    assert FEATURES == (
+        "dx_a", "dy_a", "dz_a", "dx_b", "dy_b", "dz_b",
+        "azimuth_A_a", "azimuth_A_b", "azimuth_T_a", "azimuth_T_b",
+        "elevation_A_a", "elevation_A_b", "elevation_T_a", "elevation_T_b",
+    )  # fmt: skip
+
+
+@given(seeds)
+def test_definitions(seed):
+    samples = random_samples(seed)
+    np.testing.assert_allclose(features(samples), expected(samples), atol=1e-6)  # arcsin is steep near the pole
+
+
+def test_a_case_worked_by_hand():
+    quarter = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # 90 degrees about z: body x is world y
+    anchors = Anchors([0, 1], [[3.0, 0.0, 4.0], [0.0, -2.0, 0.0]], [[0, 0, 0, 1], quarter])
+    samples = Samples(np.zeros(1), np.array([0]), np.array([1]), np.zeros((1, 3)), np.array([quarter]), anchors)
+    found = dict(zip(FEATURES, features(samples)[0]))
+    up = np.arctan2(4.0, 3.0)
+    hand = {
+        "dx_a": 3.0, "dy_a": 0.0, "dz_a": 4.0, "dx_b": 0.0, "dy_b": -2.0, "dz_b": 0.0,
+        "azimuth_A_a": np.pi, "elevation_A_a": -up,  # the tag is at (-3, 0, -4) from anchor a, whose axes are the world's
+        "azimuth_A_b": 0.0, "elevation_A_b": 0.0,  # at (0, 2, 0) from anchor b, whose x axis is world y
+        "azimuth_T_a": -np.pi / 2, "elevation_T_a": up,  # world x is to the right of the tag
+        "azimuth_T_b": np.pi, "elevation_T_b": 0.0,
+    }  # fmt: skip
+    for name in FEATURES:
+        apart = found[name] - hand[name]
+        if name.startswith("azimuth"):
+            apart = (apart + np.pi) % (2.0 * np.pi) - np.pi
+        assert abs(apart) < 1e-12, name
+
+
+@given(seeds)
+def test_a_rigid_motion_of_everything_turns_positions_and_keeps_angles(seed):
+    rng = np.random.default_rng(seed)
+    samples = random_samples(seed)
+    turn, shift = random_rotation(rng), rng.uniform(-10, 10, 3)
+    old = samples.anchors
+    moved = Samples(
+        samples.t, samples.a, samples.b, turn.apply(samples.p) + shift,
+        (turn * Rotation.from_quat(samples.q)).as_quat(),
+        Anchors(old.ids, turn.apply(np.array(old.positions)) + shift, (turn * Rotation.from_quat(old.orientations)).as_quat()),
+    )  # fmt: skip
+    before, after = features(samples), features(moved)
+    for first in (0, 3):
+        np.testing.assert_allclose(after[:, first : first + 3], turn.apply(before[:, first : first + 3]), atol=1e-9)
+    apart = (after[:, ANGLES] - before[:, ANGLES] + np.pi) % (2.0 * np.pi) - np.pi
+    # an azimuth means nothing along the z axis: weigh it by the distance from there
+    elevations = before[:, [10, 11, 12, 13]]
+    apart[:, :4] *= np.cos(elevations)
+    np.testing.assert_allclose(apart, 0.0, atol=1e-6)
+
+
+@given(seeds)
+def test_swapping_the_pair_swaps_the_sides(seed):
+    samples = random_samples(seed)
+    swapped = Samples(samples.t, samples.b, samples.a, samples.p, samples.q, samples.anchors)
+    other = {"a": "b", "b": "a"}
+    order = [FEATURES.index(name[:-1] + other[name[-1]]) for name in FEATURES]
+    np.testing.assert_array_equal(features(swapped), features(samples)[:, order])
+
+
+def test_unknown_attitudes_make_only_their_own_angles_nan():
+    samples = random_samples(3, n=4, n_anchors=2)
+    orientations = samples.anchors.orientations.copy()
+    orientations[0] = np.nan
+    q = samples.q.copy()
+    q[:2] = np.nan
+    anchors = Anchors(samples.anchors.ids, samples.anchors.positions, orientations)
+    unknown = Samples(samples.t, np.array([0, 1, 0, 1]), np.array([1, 0, 1, 0]), samples.p, q, anchors)
+    found = features(unknown)
+    for i in range(4):
+        for k, name in enumerate(FEATURES):
+            row = unknown.a[i] if name.endswith("_a") else unknown.b[i]
+            needs_tag, needs_anchor = "_T_" in name, "_A_" in name
+            lost = (needs_tag and i < 2) or (needs_anchor and row == 0)
+            assert np.isnan(found[i, k]) == lost, (i, name)
+
+
+def test_no_samples():
+    assert features(random_samples(0, n=0)).shape == (0, 14)
