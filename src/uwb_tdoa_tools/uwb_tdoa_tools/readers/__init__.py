@@ -1,0 +1,59 @@
+"""Readers: each turns one kind of recording into a Flight. `read_flight` finds out which kind it is."""
+
+import zlib
+from pathlib import Path
+
+from uwb_tdoa_bias.errors import InputError
+
+from .streams import read_bytes
+from .survey import read_survey
+from .usd_log import MAGIC, read_usd_log
+from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
+
+__all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
+
+
+def read_flight(path, survey=None):
+    """Flight of a recording of any known kind, told apart by content, not by name.
+
+    path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (its directory or its .mcap or .db3 file).
+    survey : path of a survey file (see `read_survey`) or Anchors. Logs and CSV files need it; a bag brings its own
+        anchors, and a survey given with it replaces them.
+    Raises InputError.
+    """
+    from ..bag import read_bag  # here, because bags need the rosbags library and the others do not
+    from ..bag_files import is_bag
+
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: does not exist; give a micro-SD log, a UTIL CSV file or a bag.")
+    if is_bag(path):
+        return read_bag(path, anchors=_anchors(survey))
+    if path.is_dir():
+        raise InputError(f"{path}: is a directory without metadata.yaml; give a bag directory or a file.")
+    reader = _reader(path)
+    if survey is None:
+        raise InputError(f"{path}: does not say where the anchors are; give a survey file (--survey FILE).")
+    return reader(path, _anchors(survey))
+
+
+def _anchors(survey):
+    return read_survey(survey) if isinstance(survey, (str, Path)) else survey
+
+
+def _reader(path):
+    head = read_bytes(path)[: 1 << 16]
+    if head[0] == MAGIC:
+        return read_usd_log
+    if head.startswith(GZIP_MAGIC):
+        try:
+            head = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, 1 << 16)
+        except zlib.error as error:
+            raise InputError(f"{path}: the gzip data is damaged ({error}); copy the file again.") from error
+    first = head.split(b"\n", 1)[0]
+    if is_util_csv(first.decode("utf-8", "replace")):
+        return read_util_csv
+    raise InputError(
+        f"{path}: is of no known kind (it starts with {head[:16]!r}); a micro-SD log starts with byte 0xBC, a UTIL CSV "
+        "file with a header line with t_tdoa, and a bag is a directory with metadata.yaml."
+    )

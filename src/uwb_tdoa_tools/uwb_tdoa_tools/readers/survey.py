@@ -1,0 +1,123 @@
+"""Anchor surveys: total-station text files, CSV files of positions, and our own YAML."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.errors import InputError
+
+# The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z) and arm 3 forward (x),
+# away from the antenna's back. Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this
+# makes a right-handed frame of the three. (With +y the fit is as good, three points being flat, but every stand tilts by
+# some 60 degrees; with -y the stands on the floor have z up to within 1 degree and the antenna sits at one place of all
+# stands: 11 mm forward, 26 mm to -y, 49 mm up.)
+ARM_TIPS = np.array([[0.0, 0.0, 0.110], [0.0, -0.121, 0.0], [0.080, 0.0, 0.0]])
+MAX_TIP_RESIDUAL = 0.010  # metres RMS; measured: 0.5 ... 2.2 mm
+
+_ANTENNA = re.compile(r"anchorAnt_?(\d+)$")
+_TIP = re.compile(r"anchor_?(\d+)_([123])$")
+
+
+def read_survey(path):
+    """Anchors of a survey file of any of three kinds, told apart by content.
+
+    - total station: lines `name,x,y,z` in metres; `anchorAntN` is the antenna of anchor N, `anchorN_1/_2/_3` the arm tips
+      of its stand (up, left, forward), from which the orientation follows; other names are ignored;
+    - `id,x,y,z` with that header line: positions only;
+    - YAML, see `Anchors.from_yaml`.
+
+    Orientation: antenna stand to world; x forward, z up the stand, y completes a right-handed frame. NaN without tips.
+    Positions stay in the frame of the survey. Raises InputError with the line.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a survey file.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv or .yaml).") from error
+    if re.search(r"^[{\s]*[\"']?anchors[\"']?\s*:", text, flags=re.MULTILINE):
+        return Anchors.from_yaml(path)
+    lines = [
+        (number, [cell.strip() for cell in line.split(",")])
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip()
+    ]
+    if not lines:
+        raise InputError(f"{path}: is empty; give a survey file (.txt, .csv or .yaml).")
+    if lines[0][1] == ["id", "x", "y", "z"]:
+        return _positions(path, lines[1:])
+    return _total_station(path, lines)
+
+
+def orientation_from_tips(tips):
+    """Rotation that best turns `ARM_TIPS` into the surveyed tips, and the RMS distance that remains.
+
+    tips : (3, 3) world positions of tips 1, 2, 3, metres. Returns (quaternion x y z w stand to world, metres).
+    Source: Kabsch, Acta Cryst. A 32, 1976 (as implemented by scipy).
+    """
+    surveyed, nominal = tips - tips.mean(axis=0), ARM_TIPS - ARM_TIPS.mean(axis=0)
+    rotation, _ = Rotation.align_vectors(surveyed, nominal)
+    return rotation.as_quat(), float(np.sqrt(((rotation.apply(nominal) - surveyed) ** 2).sum(axis=1).mean()))
+
+
+def _positions(path, lines):
+    ids, positions = [], []
+    for number, cells in lines:
+        if not cells[0].isdigit():
+            raise InputError(f"{path}: line {number}: id is {cells[0]!r}; it must be a whole number.")
+        ids.append(int(cells[0]))
+        positions.append(_point(path, number, cells))
+    if not ids:
+        raise InputError(f"{path}: holds no anchor; add lines 'id,x,y,z' in metres.")
+    return Anchors.from_positions(positions, ids)
+
+
+def _total_station(path, lines):
+    antennas, tips = {}, {}
+    for number, cells in lines:
+        antenna, tip = _ANTENNA.match(cells[0]), _TIP.match(cells[0])
+        points, key = (antennas, int(antenna[1])) if antenna else (tips, (int(tip[1]), int(tip[2]))) if tip else (None, None)
+        point = _point(path, number, cells)
+        if points is None:
+            continue
+        if key in points:
+            raise InputError(f"{path}: line {number}: {cells[0]} is there twice; keep one.")
+        points[key] = point
+    if not antennas:
+        raise InputError(
+            f"{path}: is no survey that can be read: expected lines 'anchorAnt0,x,y,z' of a total station, a header line "
+            "'id,x,y,z', or YAML with 'anchors:'."
+        )
+    for anchor, _ in tips:
+        if anchor not in antennas:
+            raise InputError(f"{path}: anchor {anchor} has arm tips but no line 'anchorAnt{anchor},x,y,z'; add it.")
+    ids = sorted(antennas)
+    return Anchors(ids, [antennas[i] for i in ids], [_orientation(path, i, tips) for i in ids])
+
+
+def _orientation(path, anchor, tips):
+    found = [tips[anchor, k] for k in (1, 2, 3) if (anchor, k) in tips]
+    if not found:
+        return np.full(4, np.nan)
+    if len(found) < 3:
+        raise InputError(f"{path}: anchor {anchor} has {len(found)} of 3 arm tips; survey all three or delete them.")
+    quaternion, residual = orientation_from_tips(np.array(found))
+    if residual > MAX_TIP_RESIDUAL:
+        raise InputError(
+            f"{path}: the arm tips of anchor {anchor} miss the stand's shape by {1e3 * residual:.0f} mm (at most "
+            f"{1e3 * MAX_TIP_RESIDUAL:.0f} mm expected); check lines anchor{anchor}_1, _2 and _3."
+        )
+    return quaternion
+
+
+def _point(path, number, cells):
+    try:
+        point = [float(cell) for cell in cells[1:]]
+    except ValueError:
+        point = []
+    if len(point) != 3 or not np.isfinite(point).all():
+        raise InputError(f"{path}: line {number}: {','.join(cells)[:60]!r} is not 'name,x,y,z' with finite metres.")
+    return point

@@ -1,0 +1,151 @@
+"""CSV files of the UTIL dataset (Zhao et al., IJRR 2024), the full schema of 27 columns or a subset, plain or gzip."""
+
+import csv
+import gzip
+import io
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from uwb_tdoa_bias.errors import InputError
+
+from .streams import make_flight, read_bytes
+
+GZIP_MAGIC = b"\x1f\x8b"
+# Each sensor has its own time column and its own length: the sensors are only set side by side, a row is not one instant.
+# Units: the authors' converter writes the columns as the micro-SD log has them, so acc is in g and gyro in deg/s
+# (utiasDSL/util-uwb-dataset, scripts/flight-dataset/sdcard_scripts/log_to_csv.py); stamps are in s from the start.
+_STREAMS = {  # our stream: {column of the file: column of the stream}, the time column first
+    "tdoa": {"t_tdoa": "t", "idA": "a", "idB": "b", "tdoa_meas": "d"},
+    "acc": {"t_acc": "t", "acc_x": "x", "acc_y": "y", "acc_z": "z"},
+    "gyro": {"t_gyro": "t", "gyro_x": "x", "gyro_y": "y", "gyro_z": "z"},
+    "tof": {"t_tof": "t", "tof": "tof"},
+    "flow": {"t_flow": "t", "deltaX": "deltaX", "deltaY": "deltaY"},
+    "baro": {"t_baro": "t", "baro": "baro"},
+    "pose": {"t_pose": "t", "pose_x": "x", "pose_y": "y", "pose_z": "z"},
+}
+_QUATERNION = {"pose_qx": "qx", "pose_qy": "qy", "pose_qz": "qz", "pose_qw": "qw"}
+TDOA_COLUMNS = tuple(_STREAMS["tdoa"])
+
+
+def read_util_csv(path, anchors):
+    """Flight of a CSV file in the UTIL schema; it must hold at least t_tdoa, idA, idB and tdoa_meas.
+
+    Acceleration g to m/s^2, rates deg/s to rad/s. Ground truth without quaternion columns has NaN for q. tof, flow and
+    baro are in `Flight.extra` as they are; `meta["ignored_columns"]` names columns that the schema does not know.
+    Raises InputError with the line for a file that is empty, foreign or cut and for a cell that is not a finite number.
+    A plain file that was cut exactly between two lines cannot be told from a shorter one; a gzip file can.
+    """
+    text = _text(path)
+    rows = list(csv.reader(io.StringIO(text)))
+    header = [name.strip() for name in rows.pop(0)]
+    _check_header(path, header)
+    if not text.endswith("\n"):
+        raise InputError(
+            f"{path}: line {len(rows) + 1} has no line end: the file is cut; copy it again, or end it with a new line if "
+            "it is whole."
+        )
+    for line, row in enumerate(rows, start=2):
+        if len(row) != len(header):
+            raise InputError(f"{path}: line {line} has {len(row)} cells, the header has {len(header)}; copy the file again.")
+    cells = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
+
+    streams = {}
+    for stream, rename in _STREAMS.items():
+        if stream == "pose" and any(name in cells for name in _QUATERNION):
+            rename = rename | _QUATERNION
+        if not any(name in cells for name in rename):
+            continue
+        missing = [name for name in rename if name not in cells]
+        if missing:
+            raise InputError(f"{path}: the header has columns of {stream} but not {missing[0]}; all or none must be there.")
+        streams[stream] = {rename[name]: values for name, values in _numbers(path, rename, cells).items()}
+    tdoa = streams["tdoa"]
+    tdoa["a"], tdoa["b"] = _ids(path, "idA", tdoa["a"]), _ids(path, "idB", tdoa["b"])
+    if "pose" in streams and "qx" not in streams["pose"]:
+        streams["pose"].update({name: np.full(len(streams["pose"]["t"]), np.nan) for name in _QUATERNION.values()})
+
+    meta = {"source": str(path), "format": "UTIL CSV"}
+    known = {name for rename in _STREAMS.values() for name in rename} | set(_QUATERNION)
+    if ignored := [name for name in header if name not in known]:
+        meta["ignored_columns"] = ignored
+    name = Path(path).name.removesuffix(".gz").removesuffix(".csv")
+    return make_flight(name, anchors, streams, meta)
+
+
+def is_util_csv(line):
+    """Whether a first line of text is a header that `read_util_csv` can use or would explain."""
+    return "t_tdoa" in line or "tdoa_meas" in line
+
+
+def _text(path):
+    content = read_bytes(path)
+    if content.startswith(GZIP_MAGIC):
+        try:
+            content = gzip.decompress(content)
+        except (EOFError, OSError, zlib.error) as error:
+            raise InputError(f"{path}: the gzip data is cut or damaged ({error}); copy the file again.") from error
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: byte {error.start} is not text; a UTIL CSV file (plain or gzip) was expected.") from error
+    if "\0" in text:
+        raise InputError(f"{path}: byte {text.index(chr(0))} is 0, not text; a UTIL CSV file was expected: copy it again.")
+    if not text.strip():
+        raise InputError(f"{path}: holds no text; a UTIL CSV file with a header line was expected.")
+    return text
+
+
+def _check_header(path, header):
+    missing = [name for name in TDOA_COLUMNS if name not in header]
+    if missing:
+        raise InputError(
+            f"{path}: line 1: column {missing[0]} is missing from the header ({','.join(header)[:80]}); a UTIL CSV file "
+            f"has at least {','.join(TDOA_COLUMNS)}."
+        )
+    if len(set(header)) < len(header):
+        twice = next(name for name in header if header.count(name) > 1)
+        raise InputError(f"{path}: line 1: column {twice!r} is there twice; every column must be there once.")
+
+
+def _numbers(path, names, cells):
+    """{name: (n,) float array} of the columns of one sensor: the rows before the first empty cell."""
+    columns = {name: [cell.strip() for cell in cells[name]] for name in names}
+    length = min((column.index("") if "" in column else len(column)) for column in columns.values())
+    values = {}
+    for name, column in columns.items():
+        after = next((row for row in range(length, len(column)) if column[row]), None)
+        if after is not None:
+            raise InputError(
+                f"{path}: line {after + 2}: {name} is {column[after]!r} although {', '.join(names)} ended with an empty cell "
+                f"at line {length + 2}; the columns of one sensor must be filled from the top, without holes."
+            )
+        try:
+            values[name] = np.array(column[:length], dtype=float)
+        except ValueError:
+            row = next(row for row in range(length) if not _is_number(column[row]))
+            raise InputError(f"{path}: line {row + 2}: {name} is {column[row]!r}; it must be a number.") from None
+        bad = np.flatnonzero(~np.isfinite(values[name]))
+        if len(bad):
+            raise InputError(
+                f"{path}: line {bad[0] + 2}: {name} is {column[bad[0]]!r}; it must be finite: leave the cells after the end "
+                "of a sensor empty, and delete broken measurements."
+            )
+    return values
+
+
+def _is_number(cell):
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _ids(path, name, values):
+    """Whole anchor ids 0 ... 65535 (the authors' converter writes them as 4 or 4.0)."""
+    bad = np.flatnonzero((values != np.round(values)) | (values < 0) | (values > 65535))
+    if len(bad):
+        raise InputError(f"{path}: line {bad[0] + 2}: {name} is {values[bad[0]]}; it must be a whole number 0 ... 65535.")
+    return values.astype(np.int64)
