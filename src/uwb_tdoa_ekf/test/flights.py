@@ -1,0 +1,94 @@
+"""Small simulated flights whose every error is known, for the tests of the filter."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.geometry import tdoa
+
+GRAVITY = 9.81
+
+
+def corners(size=(7.0, 8.0, 3.0), first_id=10):
+    """Anchors at the corners of a box with one corner at the origin; their ids are not their rows."""
+    box = np.stack(np.meshgrid(*([0.0, 1.0],) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    return Anchors.from_positions(box * size, ids=first_id + np.arange(8)[::-1])
+
+
+class Wave:
+    """A smooth path: every coordinate and every Euler angle is a sine of time, so that all derivatives are exact."""
+
+    def __init__(self, rng, middle, reach=1.5, tilt=0.15, yaw=0.5):
+        self.middle = np.asarray(middle, dtype=float)
+        self.size = reach * rng.uniform(0.5, 1.0, 3) * [1.0, 1.0, 0.5]
+        self.pace = rng.uniform(0.4, 0.9, 3)
+        self.phase = rng.uniform(0.0, 2.0 * np.pi, 3)
+        self.angle_size = np.array([yaw, tilt, tilt])
+        self.angle_pace = rng.uniform(0.5, 1.2, 3)
+        self.angle_phase = rng.uniform(0.0, 2.0 * np.pi, 3)
+
+    def motion(self, t):
+        """p, v (n, 3) m, m/s, world; Rotation body to world; specific force and body rates (n, 3)."""
+        t = np.asarray(t)[:, None]
+        p = self.middle + self.size * np.sin(self.pace * t + self.phase)
+        v = self.size * self.pace * np.cos(self.pace * t + self.phase)
+        a = -self.size * self.pace**2 * np.sin(self.pace * t + self.phase)
+        yaw, pitch, roll = (self.angle_size * np.sin(self.angle_pace * t + self.angle_phase)).T
+        dyaw, dpitch, droll = (self.angle_size * self.angle_pace * np.cos(self.angle_pace * t + self.angle_phase)).T
+        attitude = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
+        rates = np.stack(
+            [
+                droll - dyaw * np.sin(pitch),
+                dpitch * np.cos(roll) + dyaw * np.sin(roll) * np.cos(pitch),
+                -dpitch * np.sin(roll) + dyaw * np.cos(roll) * np.cos(pitch),
+            ],
+            axis=1,
+        )
+        return p, v, attitude, attitude.inv().apply(a + [0.0, 0.0, GRAVITY]), rates
+
+
+def fly(
+    seed=0, duration=10.0, imu_rate=200.0, tdoa_rate=200.0, tdoa_std=0.1, accel_noise=0.0, gyro_noise=0.0,
+    accel_bias=0.0, gyro_bias=0.0, accel_bias_walk=0.0, gyro_bias_walk=0.0, anchors=None, outliers=0.0, hover=False, begin=0.0,
+):  # fmt: skip
+    """A Flight with random pairs of anchors, and the exact pose every 5 ms. The errors are those of the filter's model:
+    tdoa_std, m, white; accel_noise, m/s^2/sqrt(Hz), and gyro_noise, rad/s/sqrt(Hz), white; accel_bias, m/s^2, and
+    gyro_bias, rad/s, standard deviations of the first bias; their random walks per sqrt(s); outliers: share of TDOAs
+    that are metres off."""
+    rng = np.random.default_rng(seed)
+    anchors = corners() if anchors is None else anchors
+    middle = anchors.positions.mean(axis=0)
+    wave = Wave(rng, middle, 0.0, 0.0, 0.0) if hover else Wave(rng, middle)
+    imu_t = np.arange(int(duration * imu_rate)) / imu_rate
+    _, _, _, force, rates = wave.motion(imu_t)
+    force = force + _inertial_error(rng, len(imu_t), imu_rate, accel_noise, accel_bias, accel_bias_walk)
+    rates = rates + _inertial_error(rng, len(imu_t), imu_rate, gyro_noise, gyro_bias, gyro_bias_walk)
+    # off the grid of the IMU, so that no two stamps of different streams agree
+    tdoa_t = (np.arange(int(duration * tdoa_rate)) + rng.uniform(0.1, 0.9, int(duration * tdoa_rate))) / tdoa_rate
+    n = len(tdoa_t)
+    a = rng.integers(0, len(anchors), n)
+    b = (a + rng.integers(1, len(anchors), n)) % len(anchors)
+    p = wave.motion(tdoa_t)[0]
+    d = tdoa(p, anchors.positions[a], anchors.positions[b]) + tdoa_std * rng.standard_normal(n)
+    d += np.where(rng.random(n) < outliers, rng.choice([-1.0, 1.0], n) * rng.uniform(1.0, 5.0, n), 0.0)
+    truth_t = np.arange(0.0, duration, 0.005)
+    p, _, attitude, _, _ = wave.motion(truth_t)
+    return Flight(
+        name=f"wave-{seed}",
+        anchors=anchors,
+        tdoa=Tdoas(tdoa_t + begin, anchors.ids[a], anchors.ids[b], d),
+        imu=Imu(imu_t + begin, rates, force),
+        truth=Truth(truth_t + begin, p, attitude.as_quat()),
+        meta={"wave": wave},
+    )
+
+
+def _inertial_error(rng, n, rate, noise, bias, walk):
+    steps = walk / np.sqrt(rate) * rng.standard_normal((n, 3))
+    return bias * rng.standard_normal(3) + np.cumsum(steps, axis=0) + noise * np.sqrt(rate) * rng.standard_normal((n, 3))
+
+
+def position_at(flight, t):
+    """True positions (n, 3) m at stamps t."""
+    return np.stack([np.interp(t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)

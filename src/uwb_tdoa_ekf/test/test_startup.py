@@ -1,0 +1,180 @@
+from covariances import assert_covariance
+from flights import GRAVITY, corners
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.geometry import tdoa
+from uwb_tdoa_ekf.startup import INLIER, OUTSIDE, believable, level, locate, reach, share_of_inliers
+
+SIZE = np.array([7.0, 8.0, 3.0])
+STD = 0.25  # m, what locate is told of one TDOA
+
+
+def constellation(n, rng):
+    """(n, 3) positions in the room: four corners that form a tetrahedron, the eight corners, then anywhere."""
+    corner = np.array(corners().positions)
+    chosen = [0, 3, 5, 6] + [1, 2, 4, 7]
+    return np.concatenate([corner[chosen], rng.uniform(0.0, 1.0, (max(n - 8, 0), 3)) * SIZE])[:n]
+
+
+def window(rng, positions, p, v, n=100, std=0.0, outliers=0.0, anchor_std=0.0, length=0.5):
+    """n TDOAs of random pairs over `length` s, at whose end the tag is at p with velocity v."""
+    t = np.sort(rng.uniform(0.0, length, n))
+    a = rng.integers(0, len(positions), n)
+    b = (a + rng.integers(1, len(positions), n)) % len(positions)
+    late = anchor_std * rng.standard_normal(len(positions))
+    d = tdoa(p + (t - t[-1])[:, None] * v, positions[a], positions[b]) + late[b] - late[a] + std * rng.standard_normal(n)
+    wrong = rng.random(n) < outliers
+    return t, a, b, d + np.where(wrong, rng.choice([-1.0, 1.0], n) * rng.uniform(1.0, 5.0, n), 0.0)
+
+
+def located(tdoas, positions, std=STD):
+    x, covariance = np.empty(6), np.empty((6, 6))
+    share = locate(*tdoas, positions, std, x, covariance)
+    return x, covariance, share
+
+
+def errors(n, count, speed=0.0, seed=0, **kind):
+    """Position errors (count,) m, and shares of agreeing TDOAs, for tags anywhere inside."""
+    rng = np.random.default_rng([seed, n])
+    off, shares = [], []
+    for _ in range(count):
+        positions, v = constellation(n, rng), rng.standard_normal(3)
+        p = rng.uniform(0.15, 0.85, 3) * SIZE
+        x, covariance, share = located(window(rng, positions, p, speed * v / np.linalg.norm(v), **kind), positions)
+        assert_covariance(covariance)
+        off.append(np.linalg.norm(x[:3] - p))
+        shares.append(share)
+    return np.array(off), np.array(shares)
+
+
+@pytest.mark.parametrize("n", [4, 5, 6, 8, 16, 64])
+def test_finds_a_tag_at_rest_exactly_but_for_its_prior(n):
+    off, shares = errors(n, 60)
+    assert off.max() < 0.1 and (shares == 1.0).all()
+
+
+@pytest.mark.parametrize("n", [4, 6, 8, 64])
+def test_finds_a_moving_tag(n):
+    off, shares = errors(n, 60, speed=1.0)
+    # the prior of 1 m/s per axis holds the velocity back: half the window's path is the most that this can cost
+    assert off.max() < 0.25 + 0.05 and (shares == 1.0).all()
+
+
+@pytest.mark.parametrize("n", [4, 6, 8, 64])
+def test_finds_a_tag_in_noise(n):
+    off, shares = errors(n, 60, speed=0.5, std=0.1)
+    assert np.median(off) < 0.12 and off.max() < 0.3 and (shares == 1.0).all()
+
+
+@pytest.mark.parametrize("n", [4, 6, 8, 64])
+def test_a_third_of_outliers_of_metres_does_not_mislead(n):
+    off, shares = errors(n, 60, std=0.1, outliers=0.3)
+    assert np.median(off) < 0.1 and off.max() < 0.3
+    assert abs(shares.mean() - 0.7) < 0.03  # and it knows how many agree
+
+
+def test_anchors_in_one_plane_tell_the_distance_from_it_but_not_the_side():
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        positions = constellation(64, rng)
+        positions[:, 2] = 3.0
+        p = rng.uniform(0.15, 0.85, 3) * SIZE
+        x, _, _ = located(window(rng, positions, p, np.zeros(3)), positions)
+        np.testing.assert_allclose([x[0], x[1], abs(x[2] - 3.0)], [p[0], p[1], abs(p[2] - 3.0)], atol=0.1)
+
+
+def test_few_anchors_in_one_plane_say_how_little_they_tell():
+    rng, seen = np.random.default_rng(2), []
+    for _ in range(100):
+        around = 2.0 * np.pi * (np.arange(8) + rng.uniform(0.0, 0.7, 8)) / 8
+        positions = np.stack([3.5 + 3.5 * np.cos(around), 4.0 + 4.0 * np.sin(around), np.full(8, 3.0)], axis=1)
+        p = np.array([3.5, 4.0, 0.0]) + rng.uniform(-1.5, 1.5, 3) * [1, 1, 0] + [0, 0, rng.uniform(0.5, 3.0)]
+        x, covariance, _ = located(window(rng, positions, p, np.zeros(3), std=0.1), positions)
+        side = np.copysign(1.0, x[2] - 3.0)
+        e = x[:3] - [p[0], p[1], 3.0 + side * abs(p[2] - 3.0)]
+        seen.append(e @ np.linalg.solve(covariance[:3, :3], e))
+    assert np.mean(seen) < 3.0
+
+
+@pytest.mark.parametrize("n", [8, 16])
+def test_covariance_is_honest_when_errors_persist_over_the_window(n):
+    """Errors of the anchors, of the size that locate is told, last for the whole window, as measured ones do."""
+    rng, seen = np.random.default_rng(n), []
+    for _ in range(400):
+        positions, p, v = constellation(n, rng), rng.uniform(0.15, 0.85, 3) * SIZE, rng.standard_normal(3)
+        tdoas = window(rng, positions, p, v, std=0.03, anchor_std=STD / np.sqrt(2.0))
+        x, covariance, _ = located(tdoas, positions)
+        e = x - np.concatenate([p, v])
+        seen.append([e @ np.linalg.solve(covariance, e), e[:3] @ np.linalg.solve(covariance[:3, :3], e[:3])])
+    whole, position = np.mean(seen, axis=0)
+    print(f"{n} anchors: mean NEES {whole:.2f} of 6, position {position:.2f} of 3")
+    assert 6.0 / 3.0 < whole < 6.5 and 3.0 / 3.0 < position < 3.5
+
+
+def test_two_anchors_do_not_break_it():
+    positions = np.array([[0.0, 0.0, 0.0], [7.0, 0.0, 0.0]])
+    rng = np.random.default_rng(0)
+    x, covariance, _ = located(window(rng, positions, np.array([2.0, 1.0, 1.0]), np.zeros(3), n=12), positions)
+    assert np.isfinite(x).all()
+    assert_covariance(covariance)
+    assert covariance[1, 1] > 1.0  # it knows that it does not know
+
+
+def test_all_at_one_instant():
+    rng, positions = np.random.default_rng(3), np.array(corners().positions)
+    t, a, b, d = window(rng, positions, np.array([2.0, 3.0, 1.0]), np.zeros(3))
+    x, covariance, _ = located((np.zeros(len(t)), a, b, d), positions)
+    np.testing.assert_allclose(x, [2, 3, 1, 0, 0, 0], atol=0.05)
+    np.testing.assert_allclose(np.diag(covariance)[3:], 1.0, rtol=0.01)  # nothing was learned of the velocity
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_nonsense_gives_a_finite_position_and_a_covariance(seed):
+    rng = np.random.default_rng(seed)
+    positions = constellation(int(rng.integers(4, 20)), rng)
+    t, a, b, _ = window(rng, positions, np.zeros(3), np.zeros(3), n=int(rng.integers(12, 60)))
+    x, covariance, share = located((t, a, b, rng.uniform(-12.0, 12.0, len(t))), positions)
+    assert np.isfinite(x).all() and 0.0 <= share <= 1.0
+    assert_covariance(covariance)
+
+
+def test_share_of_inliers_at_the_truth_is_one_less_the_outliers():
+    rng, positions = np.random.default_rng(4), np.array(corners().positions)
+    p, v = np.array([2.0, 3.0, 1.0]), np.array([1.0, -0.5, 0.2])
+    t, a, b, d = window(rng, positions, p, v)
+    d[:25] += INLIER + 0.01
+    d[25:50] -= INLIER - 0.01
+    assert share_of_inliers(t, a, b, d, positions, np.concatenate([p, v])) == 0.75
+
+
+def test_believable_is_within_reach_of_the_anchors():
+    positions = np.array(corners().positions)
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    for k, half in enumerate((3.5 + OUTSIDE, 4.0 + OUTSIDE, 3.0 * OUTSIDE)):
+        middle, far = reach(positions, k)
+        assert (middle, far) == (0.5 * (low[k] + high[k]), half)
+        x = 0.5 * (low + high)
+        x[k] += half - 0.01
+        assert believable(positions, x)
+        x[k] += 0.02
+        assert not believable(positions, x)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_level_makes_the_force_point_up_and_keeps_the_yaw(seed):
+    rng = np.random.default_rng(seed)
+    yaw, pitch, roll = rng.uniform([-np.pi, -1.5, -np.pi], [np.pi, 1.5, np.pi])
+    true = Rotation.from_euler("ZYX", [yaw, pitch, roll])
+    x = np.zeros(16)
+    level(true.inv().apply([0.0, 0.0, GRAVITY]), yaw, x)
+    assert (true.inv() * Rotation.from_quat(x[6:10])).magnitude() < 1e-7
+    assert abs(np.linalg.norm(x[6:10]) - 1.0) < 1e-12
+
+
+def test_level_without_any_force_is_upright():
+    x = np.zeros(16)
+    level(np.zeros(3), 0.0, x)
+    assert x[6:10].tolist() == [0, 0, 0, 1]

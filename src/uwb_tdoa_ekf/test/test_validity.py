@@ -1,0 +1,40 @@
+import numpy as np
+import pytest
+
+from uwb_tdoa_ekf.validity import MARGIN, usable, usable_all
+
+POSITIONS = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])
+CASES = [
+    (0, 1, 0.0, 0.0, True),
+    (0, 1, 5.0, 0.0, True),  # right behind anchor 0
+    (0, 1, 5.0 + MARGIN, 0.0, True),
+    (0, 1, -5.0 - MARGIN, 0.0, True),
+    (0, 1, 5.001 + MARGIN, 0.0, False),  # no place hears that
+    (1, 0, -5.001 - MARGIN, 0.0, False),
+    (0, 2, 5.0, 0.0, False),
+    (0, 0, 0.0, 0.0, False),
+    (-1, 1, 0.0, 0.0, False),
+    (1, -1, 0.0, 0.0, False),
+    (-1, -1, 0.0, 0.0, False),
+    (0, 1, np.nan, 0.0, False),
+    (0, 1, np.inf, 0.0, False),
+    (0, 1, -np.inf, 0.0, False),
+    (0, 1, 0.0, np.nan, False),
+    (0, 1, 0.0, np.inf, False),
+    (0, 1, 0.0, 0.3, True),
+]
+
+
+@pytest.mark.parametrize("a, b, d, bias_std, expected", CASES)
+def test_one(a, b, d, bias_std, expected):
+    assert usable(a, b, d, bias_std, POSITIONS) == expected
+
+
+def test_all_is_one_for_each():
+    a, b, d, bias_std, expected = (np.array(column) for column in zip(*CASES))
+    assert usable_all(a, b, d, bias_std, POSITIONS).tolist() == expected.tolist()
+
+
+def test_none():
+    none = np.empty(0)
+    assert usable_all(none.astype(int), none.astype(int), none, none, POSITIONS).tolist() == []
