@@ -24,8 +24,10 @@ from uwb_tdoa_bias.errors import InputError
 from uwb_tdoa_bias.flight import Flight
 
 from . import bag_messages
-from .bag_files import deserialize, messages, new_bag, open_bag
+from .bag_files import check_output, check_type, deserialize, is_bag, messages, new_bag, open_bag
 from .message_types import typestore
+
+__all__ = ["Odometry", "check_output", "is_bag", "read_bag", "read_fields", "read_odometry", "write_bag"]
 
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
 
@@ -170,11 +172,12 @@ def read_fields(path, topic, namespace=""):
         found = _find(path, _connections(reader), namespace, topic)
         if not found:
             raise InputError(f"{path}: has no topic {_absolute(namespace, topic)}; record it.")
-        recorded = [deserialize(path, reader, c, data) for c, _, data in messages(path, reader, found)]
+        recorded = [deserialize(path, c, data) for c, _, data in messages(path, reader, found)]
     stamps = np.array([bag_messages.stamp_of(message.header) for message in recorded], dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
     columns = {"t": stamps[order] / 1e9}
-    for name in vars(recorded[0]) if recorded else ():
+    _, fields = typestore().fielddefs[found[0].msgtype]
+    for name, _ in fields if recorded else ():
         values = [getattr(message, name) for message in recorded]
         if isinstance(values[0], (bool, int, float, str)):
             columns[name] = np.array(values)[order]
@@ -206,18 +209,13 @@ def _find(path, connections, namespace, topic, msgtype=None):
         return []
     if msgtype is not None and connection.msgtype != msgtype:
         raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {msgtype} is needed there.")
-    ours = typestore()
-    if msgtype in ours.fielddefs and connection.digest not in ("", ours.hash_rihs01(msgtype)):
-        raise InputError(
-            f"{path}: {connection.topic} was recorded with another version of {msgtype}; use the version of this software "
-            "that recorded it."
-        )
+    check_type(path, connection)
     return [connection]
 
 
 def _table(path, reader, connections, row):
     """Stamps (n,) s, the other columns (n, k) of row(message) in order of stamps, and how often the stamps fell."""
-    rows = [row(deserialize(path, reader, c, data)) for c, _, data in messages(path, reader, connections)]
+    rows = [row(deserialize(path, c, data)) for c, _, data in messages(path, reader, connections)]
     if not rows:
         return np.empty(0), np.empty((0, 0)), 0
     stamps = np.array([values[0] for values in rows], dtype=np.int64)
@@ -233,7 +231,7 @@ def _read_anchors(path, reader, connections, namespace):
     found = _find(path, connections, namespace, "uwb/anchors", "uwb_tdoa_msgs/msg/AnchorArray")
     last = None
     for connection, _, data in messages(path, reader, found):
-        last = deserialize(path, reader, connection, data)
+        last = deserialize(path, connection, data)
     if last is None:
         raise InputError(f"{path}: has no message on {_absolute(namespace, 'uwb/anchors')}; give a survey file (--survey FILE).")
     return bag_messages.anchors_of(last)

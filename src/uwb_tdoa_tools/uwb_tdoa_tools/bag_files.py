@@ -5,12 +5,13 @@ import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwb_tdoa_bias.errors import InputError
 
-from .message_types import typestore
+from .message_types import add_type, typestore
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _FILE_MAGIC = (b"\x89MCAP0\r\n", b"SQLite format 3\0")
@@ -63,14 +64,14 @@ def is_bag(path):
 
 @contextmanager
 def open_bag(path):
-    """An open AnyReader of a bag directory or data file; raises InputError with what is wrong with it."""
+    """An open rosbags Reader of a bag directory or data file; raises InputError with what is wrong with it."""
     path = Path(path)
     if not is_bag(path):
         raise InputError(f"{path}: is not a bag; give the directory with metadata.yaml or its .mcap or .db3 file.")
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise InputError(f"{path}: has no metadata.yaml: the recording was not closed; run `ros2 bag reindex` on it.")
-    reader = AnyReader([path], default_typestore=typestore())
     try:
+        reader = Reader(path)
         reader.open()
     except Exception as error:  # rosbags raises whatever its parsers run into
         raise _damaged(path, error) from error
@@ -93,12 +94,28 @@ def messages(path, reader, connections):
         yield message
 
 
-def deserialize(path, reader, connection, data):
+def deserialize(path, connection, data):
     """The message of (connection, bytes); raises InputError if the bytes are none."""
     try:
-        return reader.deserialize(data, connection.msgtype)
+        return typestore().deserialize_cdr(data, connection.msgtype)
     except Exception as error:  # as in open_bag
         raise _damaged(path, error) from error
+
+
+def check_type(path, connection):
+    """Raise InputError unless we know the type of a topic, in the version in which it was recorded."""
+    store = typestore()
+    add_type(store, connection.msgtype)
+    recorded = connection.digest
+    if not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG:  # a data file without metadata.yaml
+        of_bag = get_typestore(Stores.EMPTY)
+        of_bag.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+        recorded = of_bag.hash_rihs01(connection.msgtype)
+    if recorded and recorded != store.hash_rihs01(connection.msgtype):
+        raise InputError(
+            f"{path}: {connection.topic} was recorded with another version of {connection.msgtype}; use the version of "
+            "this software that recorded it."
+        )
 
 
 def _damaged(path, error):

@@ -13,22 +13,22 @@ from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
 __all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
 
 
-def read_flight(path, survey=None):
+def read_flight(path, survey=None, namespace=""):
     """Flight of a recording of any known kind, told apart by content, not by name.
 
     path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (its directory or its .mcap or .db3 file).
     survey : path of a survey file (see `read_survey`) or Anchors. Logs and CSV files need it; a bag brings its own
         anchors, and a survey given with it replaces them.
+    namespace : of the tag's topics in a bag, see `read_bag`.
     Raises InputError.
     """
-    from ..bag import read_bag  # here, because bags need the rosbags library and the others do not
-    from ..bag_files import is_bag
+    from ..bag import is_bag, read_bag  # here, because bags need the rosbags library and the others do not
 
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: does not exist; give a micro-SD log, a UTIL CSV file or a bag.")
     if is_bag(path):
-        return read_bag(path, anchors=_anchors(survey))
+        return read_bag(path, namespace, _anchors(survey))
     if path.is_dir():
         raise InputError(f"{path}: is a directory without metadata.yaml; give a bag directory or a file.")
     reader = _reader(path)

@@ -1,0 +1,290 @@
+import dataclasses
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from recordings import ANCHORS, differences, small_flight
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.rosbag2 import Reader, Writer
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_tools.bag import read_bag, read_fields, read_odometry, write_bag
+from uwb_tdoa_tools.bag_messages import tdoa_messages
+from uwb_tdoa_tools.message_types import typestore
+
+BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+
+
+def content(path):
+    """All messages of a bag, by topic."""
+    with AnyReader([path]) as reader:
+        found = {}
+        for connection, stamp, data in reader.messages():
+            found.setdefault(connection.topic, []).append((stamp, reader.deserialize(data, connection.msgtype)))
+        return found
+
+
+@BOTH
+def test_round_trip(tmp_path, storage):
+    flight = small_flight(0.2)
+    counts = write_bag(flight, tmp_path / "flight", storage)
+    assert counts == {
+        "/imu/data": 200, "/uwb/tdoa": 100, "/ground_truth/pose": 50, "/uwb/anchors": 1, "/tf_static": 1,
+    }  # fmt: skip
+    back = read_bag(tmp_path / "flight")
+    assert differences(flight, back) == []
+    assert back.name == "small" and back.meta["protocol"] == "tdoa3" and "reordered" not in back.meta
+    (file,) = (tmp_path / "flight").glob("flight.*")  # the data file alone will do
+    assert differences(flight, read_bag(file)) == []
+
+
+@st.composite
+def flights(draw):
+    def stamps(smallest):
+        ticks = draw(st.lists(st.integers(0, 10**12), min_size=smallest, max_size=5))
+        return np.sort(np.array(ticks, dtype=np.int64)) / 1e6
+
+    def values(*shape, finite=False):
+        return draw(arrays(float, shape, elements=st.floats(allow_nan=not finite, allow_infinity=not finite)))
+
+    ids = draw(st.lists(st.integers(0, 65535), min_size=1, max_size=4, unique=True))
+    unit = st.sampled_from([[0.0, 0.0, 0.0, 1.0], [0.6, 0.0, -0.8, 0.0], [np.nan] * 4])
+    n = len(ids)
+    anchors = Anchors(ids, np.clip(values(n, 3, finite=True), -1e300, 1e300), draw(st.lists(unit, min_size=n, max_size=n)))
+    t = stamps(1)
+    tdoas = Tdoas(t, draw(arrays(np.int64, len(t), elements=st.sampled_from(ids))), np.full(len(t), 65535), values(len(t)))
+    t = stamps(1)
+    imu = draw(st.sampled_from([None, Imu(t, values(len(t), 3), values(len(t), 3))]))
+    t = stamps(1)
+    q = np.array(draw(st.lists(unit, min_size=len(t), max_size=len(t))))
+    truth = draw(st.sampled_from([None, Truth(t, values(len(t), 3), q)]))
+    return Flight(draw(st.text(max_size=5)), anchors, tdoas, imu, truth)
+
+
+@settings(deadline=None, max_examples=15)
+@given(flight=flights(), storage=st.sampled_from(["mcap", "sqlite3"]))
+def test_any_flight_comes_back_exactly(flight, storage):
+    with tempfile.TemporaryDirectory() as folder:
+        write_bag(flight, Path(folder) / "flight", storage)
+        back = read_bag(Path(folder) / "flight")
+    assert differences(flight, back) == []
+    assert back.name == flight.name
+
+
+def test_what_the_messages_say(tmp_path):
+    flight = small_flight(0.05)
+    write_bag(flight, tmp_path / "flight")
+    messages = content(tmp_path / "flight")
+    stamp, imu = messages["/imu/data"][3]
+    assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (10, 3_000_000) and stamp == 10_003_000_000
+    assert imu.header.frame_id == "base_link"
+    assert imu.orientation_covariance.tolist() == [-1] + [0] * 8
+    assert not imu.angular_velocity_covariance.any() and not imu.linear_acceleration_covariance.any()
+    ((stamp, array),) = messages["/uwb/anchors"]
+    assert stamp == 10_000_000_000 and array.header.frame_id == "map"
+    unknown = array.anchors[2].pose.orientation
+    assert (unknown.x, unknown.y, unknown.z, unknown.w) == (0, 0, 0, 0)
+    ((_, tf),) = messages["/tf_static"]
+    assert [transform.child_frame_id for transform in tf.transforms] == ["anchor_0", "anchor_1", "anchor_5"]
+    assert {transform.header.frame_id for transform in tf.transforms} == {"map"}
+    assert tf.transforms[2].transform.rotation.w == 1 and tf.transforms[1].transform.translation.z == 3.0
+    pose = messages["/ground_truth/pose"][0][1]
+    assert pose.header.frame_id == "map" and pose.pose.orientation.w == 0
+
+
+def test_stamps_never_fall_and_latched_topics_come_first(tmp_path):
+    write_bag(small_flight(0.2), tmp_path / "flight")
+    with Reader(tmp_path / "flight") as reader:
+        order = [(stamp, connection.topic) for connection, stamp, _ in reader.messages()]
+    stamps = [stamp for stamp, _ in order]
+    assert stamps == sorted(stamps)
+    assert {topic for _, topic in order[:2]} == {"/uwb/anchors", "/tf_static"}
+
+
+@BOTH
+def test_qos_and_type_hashes_are_recorded(tmp_path, storage):
+    write_bag(small_flight(0.05), tmp_path / "flight", storage)
+    store = typestore()
+    with Reader(tmp_path / "flight") as reader:
+        for connection in reader.connections:
+            (qos,) = connection.ext.offered_qos_profiles
+            latched = connection.topic in ("/uwb/anchors", "/tf_static")
+            assert qos.durability == (QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE)
+            assert qos.reliability == QosReliability.RELIABLE
+            assert connection.digest == store.hash_rihs01(connection.msgtype)
+            assert connection.digest.startswith("RIHS01_") and len(connection.digest) == 71
+
+
+def test_existing_output(tmp_path):
+    out = tmp_path / "flight"
+    write_bag(small_flight(0.05), out)
+    with pytest.raises(InputError, match="exists already"):
+        write_bag(small_flight(0.05), out)
+    write_bag(small_flight(0.1), out, "sqlite3", force=True)
+    assert len(read_bag(out).imu) == 100
+    assert [path.name for path in tmp_path.iterdir()] == ["flight"]
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "thesis.txt").write_text("all of it")
+    with pytest.raises(InputError, match="is not a bag, so --force does not replace it"):
+        write_bag(small_flight(0.05), precious, force=True)
+    assert (precious / "thesis.txt").exists()
+
+
+def test_failure_half_way_leaves_nothing(tmp_path):
+    flight = small_flight(0.1)
+    t = flight.truth.t.copy()
+    t[-1] = np.nan  # found when the last stream is serialized
+    with pytest.raises(InputError, match="truth: stamp 24 is nan"):
+        write_bag(dataclasses.replace(flight, truth=Truth(t, flight.truth.p, flight.truth.q)), tmp_path / "flight")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("stamp", [-1e-3, 2.0**31, np.inf])
+def test_stamps_that_ros_cannot_hold(tmp_path, stamp):
+    tdoas = Tdoas(np.array([stamp]), np.array([0]), np.array([1]), np.array([0.5]))
+    with pytest.raises(InputError, match="tdoa: stamp 0 is"):
+        write_bag(Flight("bad", ANCHORS, tdoas), tmp_path / "flight")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_storage_and_empty_flight(tmp_path):
+    with pytest.raises(InputError, match="'zip' is not known; choose one of mcap, sqlite3"):
+        write_bag(small_flight(0.05), tmp_path / "flight", "zip")
+    none = np.empty(0)
+    with pytest.raises(InputError, match="holds no message"):
+        write_bag(Flight("empty", ANCHORS, Tdoas(none, none, none, none)), tmp_path / "flight")
+
+
+def write_topics(path, *topics):
+    """A bag of (topic, msgtype, [(stamp ns, message)])."""
+    store = typestore()
+    with Writer(path, version=9) as writer:
+        for topic, msgtype, messages in topics:
+            connection = writer.add_connection(topic, msgtype, typestore=store)
+            for stamp, message in messages:
+                writer.write(connection, stamp, store.serialize_cdr(message, msgtype))
+
+
+def test_namespace_other_topics_and_order_of_stamps(tmp_path):
+    store = typestore()
+    tdoa = small_flight(0.05).tdoa
+    late = list(tdoa_messages(tdoa, store))
+    late[3], late[4] = (late[3][0], late[4][1]), (late[4][0], late[3][1])  # two arrive the wrong way round
+    text = store.types["std_msgs/msg/String"]("hello")
+    write_topics(
+        tmp_path / "bag",
+        ("/tag1/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", late),
+        ("/chatter", "std_msgs/msg/String", [(5, text)]),
+    )
+    with pytest.raises(InputError, match="no message on /uwb/tdoa; give the namespace it was recorded in: /tag1"):
+        read_bag(tmp_path / "bag", anchors=ANCHORS)
+    with pytest.raises(InputError, match="no message on /tag1/uwb/anchors; give a survey"):
+        read_bag(tmp_path / "bag", namespace="/tag1")
+    back = read_bag(tmp_path / "bag", namespace="tag1", anchors=ANCHORS)
+    np.testing.assert_array_equal(back.tdoa.t, tdoa.t)
+    np.testing.assert_array_equal(back.tdoa.d, tdoa.d)
+    assert back.meta["reordered"] == {"uwb/tdoa": 1}
+    assert back.imu is None and back.truth is None and back.name == "bag"
+
+
+def test_wrong_type_on_a_topic(tmp_path):
+    text = typestore().types["std_msgs/msg/String"]("hello")
+    write_topics(tmp_path / "bag", ("/uwb/tdoa", "std_msgs/msg/String", [(5, text)]))
+    with pytest.raises(InputError, match="/uwb/tdoa is std_msgs/msg/String; uwb_tdoa_msgs/msg/Tdoa is needed"):
+        read_bag(tmp_path / "bag", anchors=ANCHORS)
+
+
+def test_other_version_of_a_type(tmp_path):
+    with Writer(tmp_path / "bag", version=9) as writer:
+        definition, rihs01 = "uint16 anchor_a", "RIHS01_" + 64 * "0"
+        connection = writer.add_connection("/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", msgdef=definition, rihs01=rihs01)
+        writer.write(connection, 5, b"\0\1\0\0\1\0")
+    for path in (tmp_path / "bag", tmp_path / "bag" / "bag.db3"):
+        with pytest.raises(InputError, match="another version of uwb_tdoa_msgs/msg/Tdoa"):
+            read_bag(path, anchors=ANCHORS)
+
+
+def odometry_message(stamp, p, q, twist, pose_covariance, twist_covariance):
+    types = typestore().types
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), "map")
+    point, vector = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Vector3"]
+    pose = types["geometry_msgs/msg/Pose"](point(*p), types["geometry_msgs/msg/Quaternion"](*q))
+    speed = types["geometry_msgs/msg/Twist"](vector(*twist), vector(0.0, 0.0, 0.0))
+    return stamp, types["nav_msgs/msg/Odometry"](
+        header,
+        "base_link",
+        types["geometry_msgs/msg/PoseWithCovariance"](pose, pose_covariance),
+        types["geometry_msgs/msg/TwistWithCovariance"](speed, twist_covariance),
+    )
+
+
+def test_odometry(tmp_path):
+    covariance = np.arange(36.0)
+    half = np.sqrt(0.5)
+    messages = [
+        odometry_message(2_000_000_001, (4.0, 5.0, 6.0), (0, 0, 0, 1), (1.0, 0.0, 0.0), covariance, -covariance),
+        odometry_message(1_000_000_000, (1.0, 2.0, 3.0), (0, 0, half, half), (1.0, 0.0, 0.0), 2 * covariance, covariance),
+    ]
+    write_topics(tmp_path / "bag", ("/odometry", "nav_msgs/msg/Odometry", messages))
+    odometry = read_odometry(tmp_path / "bag")
+    assert len(odometry) == 2
+    np.testing.assert_array_equal(odometry.t, [1.0, 2.000000001])
+    np.testing.assert_array_equal(odometry.p, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(odometry.v, [[0, 1, 0], [1, 0, 0]], atol=1e-12)  # turned from body to world
+    np.testing.assert_allclose(odometry.q[0], [0, 0, half, half])
+    np.testing.assert_array_equal(odometry.pose_covariance[0], 2 * covariance.reshape(6, 6))
+    np.testing.assert_array_equal(odometry.twist_covariance[1], -covariance.reshape(6, 6))
+    with pytest.raises(InputError, match="no message on /tag1/odometry"):
+        read_odometry(tmp_path / "bag", namespace="tag1")
+
+
+def test_fields_of_any_topic(tmp_path):
+    store = typestore()
+    Residual = store.types["uwb_tdoa_msgs/msg/TdoaResidual"]
+    header = next(iter(tdoa_messages(small_flight(0.01).tdoa, store)))[1].header
+    messages = [(7, Residual(header, 1, 2, 0.25, np.nan, 0.5, 3)), (8, Residual(header, 2, 1, -0.25, 1.0, 1.0, 0))]
+    write_topics(tmp_path / "bag", ("/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual", messages))
+    fields = read_fields(tmp_path / "bag", "uwb/residual")
+    assert set(fields) == {"t", "anchor_a", "anchor_b", "innovation", "innovation_variance", "weight", "verdict"}
+    np.testing.assert_array_equal(fields["verdict"], [3, 0])
+    np.testing.assert_array_equal(fields["innovation"], [0.25, -0.25])
+    with pytest.raises(InputError, match="no topic /uwb/tdoa_corrected; record it"):
+        read_fields(tmp_path / "bag", "uwb/tdoa_corrected")
+
+
+@BOTH
+@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.95, 0.999])
+def test_cut_data_file(tmp_path, storage, kept):
+    write_bag(small_flight(), tmp_path / "flight", storage)
+    (file,) = (tmp_path / "flight").glob("flight.*")
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(kept * len(whole))])
+    with pytest.raises(InputError, match="cut or damaged"):
+        read_bag(tmp_path / "flight")
+
+
+@pytest.mark.parametrize("metadata", ["", "rosbag2_bagfile_information: 3", "{", "a: b"])
+def test_damaged_metadata(tmp_path, metadata):
+    write_bag(small_flight(0.05), tmp_path / "flight")
+    (tmp_path / "flight" / "metadata.yaml").write_text(metadata)
+    with pytest.raises(InputError, match="cut or damaged"):
+        read_bag(tmp_path / "flight")
+
+
+def test_not_a_bag(tmp_path):
+    write_bag(small_flight(0.05), tmp_path / "flight")
+    (tmp_path / "flight" / "metadata.yaml").unlink()
+    with pytest.raises(InputError, match="was not closed"):
+        read_bag(tmp_path / "flight")
+    shutil.rmtree(tmp_path / "flight")
+    for path in (tmp_path, tmp_path / "flight"):
+        with pytest.raises(InputError, match="is not a bag"):
+            read_bag(path)

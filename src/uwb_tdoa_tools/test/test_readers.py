@@ -1,0 +1,66 @@
+import gzip
+
+import numpy as np
+import pytest
+from recordings import ANCHORS, SURVEY, csv_text, log_bytes, small_flight
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_tools.bag import write_bag
+from uwb_tdoa_tools.readers import read_flight
+
+
+@pytest.fixture
+def survey(tmp_path):
+    file = tmp_path / "survey.csv"
+    file.write_text(SURVEY)
+    return file
+
+
+@pytest.mark.parametrize(
+    "content, kind",
+    [
+        (log_bytes(), "uSD log version 2"),
+        (csv_text().encode(), "UTIL CSV"),
+        (gzip.compress(csv_text().encode()), "UTIL CSV"),
+    ],
+)
+def test_kind_is_found_by_content(tmp_path, survey, content, kind):
+    file = tmp_path / "flight.txt"  # a name that says nothing
+    file.write_bytes(content)
+    for given in (survey, str(survey), ANCHORS):
+        flight = read_flight(file, given)
+        assert flight.meta["format"] == kind
+        np.testing.assert_array_equal(flight.anchors.positions, ANCHORS.positions)
+    with pytest.raises(InputError, match="does not say where the anchors are; give a survey file"):
+        read_flight(file)
+
+
+def test_bag_brings_its_anchors_unless_others_are_given(tmp_path, survey):
+    write_bag(small_flight(0.05), tmp_path / "flight.bag")
+    assert np.isfinite(read_flight(tmp_path / "flight.bag").anchors.orientations[1]).all()
+    (file,) = (tmp_path / "flight.bag").glob("*.mcap")
+    assert np.isfinite(read_flight(file).anchors.orientations[1]).all()
+    assert np.isnan(read_flight(tmp_path / "flight.bag", survey).anchors.orientations).all()
+
+
+@pytest.mark.parametrize(
+    "content, sentence",
+    [
+        (b"", "is empty"),
+        (b"\x00\x01binary", "of no known kind"),
+        (b"time,value\n1,2\n", "of no known kind"),
+        (b"\x1f\x8bnothing that unpacks", "gzip data is damaged"),
+        (gzip.compress(b"time,value\n"), "of no known kind"),
+    ],
+)
+def test_foreign_files(tmp_path, survey, content, sentence):
+    file = tmp_path / "file"
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=sentence):
+        read_flight(file, survey)
+
+
+def test_missing_and_directory(tmp_path, survey):
+    with pytest.raises(InputError, match="does not exist"):
+        read_flight(tmp_path / "nothing", survey)
+    with pytest.raises(InputError, match="is a directory without metadata.yaml"):
+        read_flight(tmp_path, survey)

@@ -1,0 +1,119 @@
+import gzip
+
+import numpy as np
+import pytest
+from recordings import ANCHORS, FULL_HEADER, FULL_ROWS, csv_text
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_tools.readers import read_util_csv
+
+SUBSET = "t_tdoa,idA,idB,tdoa_meas,t_pose,pose_x,pose_y,pose_z"
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(content, name="const9-trial1-tdoa2.csv"):
+        file = tmp_path / name
+        file.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return read_util_csv(file, ANCHORS)
+
+    return read
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_full_schema(read, packed):
+    text = csv_text().encode()
+    flight = read(gzip.compress(text), "const9-trial1-tdoa2.csv.gz") if packed else read(text)
+    assert flight.name == "const9-trial1-tdoa2"
+    np.testing.assert_array_equal(flight.tdoa.t, [0.010, 0.012, 0.014])
+    np.testing.assert_array_equal(flight.tdoa.a, [0, 1, 5])
+    np.testing.assert_array_equal(flight.tdoa.b, [1, 5, 0])
+    np.testing.assert_array_equal(flight.tdoa.d, [0.25, -0.5, 0.75])
+    np.testing.assert_array_equal(flight.imu.t, [0.001, 0.002, 0.003, 0.004])
+    np.testing.assert_allclose(flight.imu.gyro[:3], np.pi * np.diag([1, 0.5, 0.25]))
+    np.testing.assert_allclose(flight.imu.accel[2:], 9.81 * np.array([[0, 0, 2], [1, 0, 1]]))
+    np.testing.assert_array_equal(flight.truth.t, [0.005, 0.009])
+    np.testing.assert_array_equal(flight.truth.q[1], [0, 0, 0.6, 0.8])
+    assert {name: len(columns["t"]) for name, columns in flight.extra.items()} == {"tof": 1, "flow": 2, "baro": 1}
+    np.testing.assert_array_equal(flight.extra["flow"]["deltaY"], [-2, 4])
+
+
+def test_subset_without_imu_and_attitude(read):
+    flight = read(csv_text(SUBSET, ["0.1,0,1,0.5,0.2,1,2,3", "0.2,1,5,0.25,,,,"]))
+    assert flight.imu is None
+    assert len(flight.tdoa) == 2 and len(flight.truth) == 1
+    assert np.isnan(flight.truth.q).all()
+
+
+def test_windows_lines_byte_order_mark_and_foreign_columns(read):
+    text = csv_text("t_tdoa,idA,idB,tdoa_meas,note", ["0.1,0,1,0.5,good"]).replace("\n", "\r\n")
+    flight = read(b"\xef\xbb\xbf" + text.encode())
+    assert len(flight.tdoa) == 1
+    assert flight.meta["ignored_columns"] == ["note"]
+
+
+def test_stamps_that_fall_are_sorted_and_counted(read):
+    flight = read(csv_text("t_tdoa,idA,idB,tdoa_meas", ["0.2,0,1,2", "0.1,0,1,1", "0.3,0,1,3"]))
+    np.testing.assert_array_equal(flight.tdoa.d, [1, 2, 3])
+    assert flight.meta["reordered"] == {"tdoa": 1}
+
+
+
+
+TDOA = "t_tdoa,idA,idB,tdoa_meas"
+
+
+@pytest.mark.parametrize(
+    "text, sentence",
+    [
+        ("", "empty"),
+        ("\n\n", "no text"),
+        ("a,b\n1,2\n", "column t_tdoa is missing"),
+        (csv_text("t_tdoa,idA,idB", ["1,0,1"]), "column tdoa_meas is missing"),
+        (csv_text(TDOA + ",t_acc,acc_x,acc_y", ["1,0,1,1,1,0,0"]), "columns of acc but not acc_z"),
+        (csv_text(TDOA + ",idA", ["1,0,1,1,0"]), "'idA' is there twice"),
+        (csv_text(TDOA, []), "no TDOA"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,1"]), "line 3 has 3 cells, the header has 4"),
+        (csv_text(TDOA, ["1,0,1,1"])[:-1], "line 2 has no line end"),
+        (csv_text(TDOA, ["1,0,1,one"]), "line 2: tdoa_meas is 'one'"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,1,nan"]), "line 3: tdoa_meas is 'nan'"),
+        (csv_text(TDOA, ["inf,0,1,1"]), "line 2: t_tdoa is 'inf'"),
+        (csv_text(TDOA, ["1,0.5,1,1"]), "line 2: idA is 0.5"),
+        (csv_text(TDOA, ["1,0,-1,1"]), "line 2: idB is -1"),
+        (csv_text(TDOA, ["1,0,1,1", ",,,", "3,0,1,1"]), "line 4: t_tdoa is '3' although"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,,1"]), "line 3: t_tdoa is '2' although"),
+    ],
+)
+def test_refused_with_the_line(read, text, sentence):
+    with pytest.raises(InputError, match=sentence):
+        read(text)
+
+
+@pytest.mark.parametrize("cut", [1, 5, 11, 30, 60, -1, -5, -9, -20])
+def test_cut_gzip_is_refused(read, cut):
+    with pytest.raises(InputError):
+        read(gzip.compress(csv_text().encode())[:cut])
+
+
+def test_changed_byte_in_gzip_is_refused(read):
+    packed = bytearray(gzip.compress(csv_text().encode()))
+    packed[len(packed) // 2] ^= 1
+    with pytest.raises(InputError, match="cut or damaged"):
+        read(bytes(packed))
+
+
+def test_plain_file_cut_within_a_line_is_refused(read):
+    whole = csv_text()
+    for cut in range(1, len(whole)):
+        text = whole[:cut]
+        if text.endswith("\n") and text.count("\n") > 1:  # cannot be told from a shorter recording
+            assert len(read(text).tdoa) == min(text.count("\n") - 1, 3)
+        else:
+            with pytest.raises(InputError):
+                read(text)
+
+
+def test_not_text(read):
+    with pytest.raises(InputError, match="byte 0 is not text"):
+        read(b"\xff\xfe" + FULL_ROWS[0].encode())
+    with pytest.raises(InputError, match="is 0, not text"):
+        read((FULL_HEADER + "\n\0\n").encode())
