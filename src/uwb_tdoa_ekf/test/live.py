@@ -1,0 +1,48 @@
+"""Feed a flight to an Estimator message by message."""
+
+from dataclasses import fields
+
+import numpy as np
+
+IMU, TDOA = 0, 1
+
+
+def messages(flight):
+    """All (stamp, stream, place in the stream) of a flight in stamp order, inertial samples first."""
+    streams = ((IMU, flight.imu.t if flight.imu is not None else ()), (TDOA, flight.tdoa.t))
+    return sorted((t, stream, i) for stream, stamps in streams for i, t in enumerate(stamps))
+
+
+def arriving(flight, rng, imu_delay=0.0, tdoa_delay=0.0, imu_jitter=0.0, tdoa_jitter=0.0):
+    """The messages in the order in which they come in after such delays: constant, and uniform from 0 to jitter, s."""
+    delay, jitter = (imu_delay, tdoa_delay), (imu_jitter, tdoa_jitter)
+    return sorted(messages(flight), key=lambda m: m[0] + delay[m[1]] + jitter[m[1]] * rng.random())
+
+
+def feed(estimator, flight, order=None, advance=None):
+    """Everything (Odometry, Residuals) that the estimator gives for the messages in this order (default: by stamp).
+    advance(): whether to advance after a message (default: always)."""
+    parts = []
+    for t, stream, i in messages(flight) if order is None else order:
+        if stream == IMU:
+            estimator.add_imu(t, flight.imu.gyro[i], flight.imu.accel[i])
+        else:
+            estimator.add_tdoa(t, int(flight.tdoa.a[i]), int(flight.tdoa.b[i]), flight.tdoa.d[i])
+        if advance is None or advance():
+            parts.append(estimator.advance())
+    parts.append(estimator.finish())
+    return tuple(joined([part[k] for part in parts]) for k in range(2))
+
+
+def joined(parts):
+    """One Odometry or Residuals out of many."""
+    kind = type(parts[0])
+    return kind(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind)))
+
+
+def assert_same(left, right, tolerance=0.0):
+    """Two Odometry, or two Residuals, agree in everything."""
+    for field in fields(left):
+        a, b = getattr(left, field.name), getattr(right, field.name)
+        assert len(a) == len(b), field.name
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance, err_msg=field.name)

@@ -1,0 +1,295 @@
+from dataclasses import replace
+from pathlib import Path
+import re
+import time
+
+from covariances import assert_covariance
+from flights import corners, fly, position_at
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.flight import Imu, Tdoas
+from uwb_tdoa_bias.geometry import tdoa
+from uwb_tdoa_ekf import engine
+from uwb_tdoa_ekf.config import ROBUST, FilterConfig
+from uwb_tdoa_ekf.engine import RECOVERIES, REJECTED, RUNNING, STARTUP, USED, Memory, new_memory, run
+
+MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaResidual.msg"
+
+
+def drive(flight, config=None, memory=None, cuts=()):
+    """Rows, covariances and residuals of the engine, fed in the pieces between the stamps `cuts`."""
+    memory = new_memory() if memory is None else memory
+    tuning, anchors, imu, d = (config or FilterConfig()).tuning(), flight.anchors, flight.imu, flight.tdoa
+    a, b = anchors.index(d.a), anchors.index(d.b)
+    parts = []
+    edges = [-np.inf, *sorted(cuts), np.inf]
+    for low, high in zip(edges, edges[1:]):
+        i, k = np.flatnonzero((imu.t > low) & (imu.t <= high)), np.flatnonzero((d.t > low) & (d.t <= high))
+        rows, covariance = np.empty((len(i) + len(k), 17)), np.empty((len(i) + len(k), 9, 9))
+        residuals = np.empty((len(k), 4))
+        count = run(
+            memory, tuning, anchors.positions, imu.t[i], imu.gyro[i], imu.accel[i],
+            d.t[k], a[k], b[k], d.d[k], np.zeros(len(k)), rows, covariance, residuals,
+        )  # fmt: skip
+        parts.append((rows[:count], covariance[:count], residuals))
+    return tuple(np.concatenate(column) for column in zip(*parts))
+
+
+def without_imu(flight, low=-np.inf, high=np.inf):
+    """The flight with no inertial samples between two stamps."""
+    kept = (flight.imu.t < low) | (flight.imu.t >= high)
+    return replace(flight, imu=Imu(flight.imu.t[kept], flight.imu.gyro[kept], flight.imu.accel[kept]))
+
+
+def errors(flight, rows):
+    return np.linalg.norm(rows[:, 1:4] - position_at(flight, rows[:, 0]), axis=1)
+
+
+def assert_sound(memory, rows, covariance):
+    assert np.isfinite(rows).all()
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 7:11], axis=1), 1.0, atol=1e-9)
+    assert (np.diff(rows[:, 0]) >= 0.0).all()
+    if len(rows):
+        assert_covariance(covariance)
+    assert np.isfinite(memory.x).all()
+    assert_covariance(memory.P)
+
+
+@pytest.mark.skipif(not MESSAGE.is_file(), reason="the message definitions are not beside this package")
+def test_verdicts_are_those_of_the_message():
+    declared = dict(re.findall(r"VERDICT_(\w+)=(\d)", MESSAGE.read_text()))
+    assert declared == {name: str(getattr(engine, name)) for name in ("USED", "REJECTED", "LATE", "INVALID", "STARTUP")}
+
+
+@settings(max_examples=20)
+@given(st.lists(st.floats(0.0, 3.0), max_size=8))
+def test_feeding_in_pieces_changes_nothing(cuts):
+    flight = fly(1, 3.0)
+    for left, right in zip(drive(flight), drive(flight, cuts=cuts)):
+        np.testing.assert_array_equal(left, right)
+
+
+def test_a_copy_of_the_memory_is_a_copy_of_the_filter():
+    flight, memory = fly(2, 4.0), new_memory()
+    early = replace(flight, imu=cut(flight.imu, 0.0, 2.0), tdoa=cut(flight.tdoa, 0.0, 2.0))
+    late = replace(flight, imu=cut(flight.imu, 2.0, 4.0), tdoa=cut(flight.tdoa, 2.0, 4.0))
+    drive(early, memory=memory)
+    twin = Memory(*(array.copy() for array in memory))
+    first = drive(late, memory=memory)
+    for left, right in zip(first, drive(late, memory=twin)):
+        np.testing.assert_array_equal(left, right)
+
+
+def cut(stream, low, high):
+    kept = (stream.t >= low) & (stream.t < high)
+    return type(stream)(*(getattr(stream, name)[kept] for name in stream.__dataclass_fields__))
+
+
+def test_starts_by_itself_within_its_window_and_knows_where_it_is():
+    for seed in range(5):
+        flight = fly(seed, 2.0, outliers=0.1)
+        rows, covariance, residuals = drive(flight)
+        assert 0.4 < rows[0, 0] < 0.6
+        assert errors(flight, rows)[0] < 0.3
+        startup = residuals[:, 3] == STARTUP
+        np.testing.assert_array_equal(startup, flight.tdoa.t <= flight.tdoa.t[startup][-1])
+        assert np.isnan(residuals[startup, :2]).all() and (residuals[startup, 2] == 0.0).all()
+        assert np.isfinite(residuals[~startup]).all()
+        assert np.isin(residuals[~startup, 3], (USED, REJECTED)).all()
+
+
+def test_starts_level_with_the_yaw_it_was_told():
+    flight = fly(3, 2.0, hover=True)
+    turned = Rotation.from_euler("ZYX", [0.7, 0.2, -0.3])
+    flight = replace(flight, imu=replace(flight.imu, accel=turned.inv().apply(flight.imu.accel)))
+    rows, covariance, _ = drive(flight, FilterConfig(initial_yaw=0.7))
+    assert (Rotation.from_quat(rows[0, 7:11]).inv() * turned).magnitude() < 0.02
+    assert covariance[0, 8, 8] == pytest.approx(0.25, rel=0.05)
+
+
+def test_contradicting_tdoas_start_only_after_the_patience():
+    flight = fly(4, 3.0, outliers=0.6)
+    rows, _, _ = drive(flight, FilterConfig(start_patience=1.5))
+    assert 1.5 < rows[0, 0] < 1.75
+
+
+def test_one_tdoa_long_before_the_others_does_not_use_up_the_patience():
+    flight = fly(4, 3.0, outliers=0.6, begin=30.0)
+    early = np.concatenate([[1.0], flight.tdoa.t])
+    first = [np.concatenate([column[:1], column]) for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)]
+    rows, _, _ = drive(replace(flight, tdoa=Tdoas(early, *first)))
+    assert rows[0, 0] > 30.4  # a window of start_window, not a dozen TDOAs
+
+
+def test_tracks_a_flight_with_outliers():
+    for robust in ROBUST:
+        flight = fly(5, 15.0, outliers=0.1, accel_noise=0.02, gyro_noise=0.002)
+        rows, _, residuals = drive(flight, FilterConfig(robust=robust))
+        assert np.sqrt(np.mean(errors(flight, rows[rows[:, 0] > 3.0]) ** 2)) < 0.15, robust
+        big = np.abs(residuals[:, 0]) > 1.5
+        assert big.sum() > 50 and residuals[big, 2].max() < 0.6
+
+
+def test_odometry_comes_at_the_first_event_of_each_period():
+    flight = fly(6, 3.0, imu_rate=1000.0)
+    rows, _, residuals = drive(flight, FilterConfig(odometry_rate=50.0))
+    start = flight.tdoa.t[residuals[:, 3] == STARTUP][-1]
+    stamps = np.sort(np.concatenate([flight.imu.t, flight.tdoa.t]))
+    stamps = stamps[stamps >= start]
+    _, first = np.unique(np.floor(stamps * 50.0 + 1e-6), return_index=True)
+    np.testing.assert_array_equal(rows[:, 0], stamps[first])
+
+
+def test_residuals_are_innovation_and_its_variance():
+    """Against the rows: at 1 MHz every event gives one, so that the row before a TDOA holds the state it met."""
+    flight = fly(7, 2.0, imu_rate=1000.0)
+    rows, covariance, residuals = drive(flight, FilterConfig(odometry_rate=1e6, tdoa_std=0.2))
+    tested = 0
+    for k in np.flatnonzero(residuals[:, 3] == USED)[50:150]:
+        before = np.searchsorted(rows[:, 0], flight.tdoa.t[k]) - 1
+        dt = flight.tdoa.t[k] - rows[before, 0]
+        p = rows[before, 1:4] + dt * rows[before, 4:7]
+        a, b = (flight.anchors.positions[flight.anchors.index(i[k])] for i in (flight.tdoa.a, flight.tdoa.b))
+        assert residuals[k, 0] == pytest.approx(flight.tdoa.d[k] - tdoa(p, a, b), abs=1e-4)
+        g = (p - b) / np.linalg.norm(p - b) - (p - a) / np.linalg.norm(p - a)
+        assert residuals[k, 1] == pytest.approx(0.2**2 + g @ covariance[before, :3, :3] @ g, rel=0.05)
+        tested += 1
+    assert tested == 100
+
+
+@pytest.mark.parametrize("config", [FilterConfig(), FilterConfig(use_imu=False)])
+def test_without_an_imu_it_follows_a_slow_tag(config):
+    flight = without_imu(fly(8, 15.0))
+    rows, covariance, _ = drive(flight, config)
+    assert errors(flight, rows[rows[:, 0] > 3.0]).max() < 0.5
+    assert_covariance(covariance)
+
+
+def test_bridges_seconds_without_imu_or_tdoas():
+    flight = fly(9, 20.0)
+    for gap in (without_imu(flight, 8.0, 11.0), replace(flight, tdoa=cut(flight.tdoa, 0.0, 8.0))):
+        memory = new_memory()
+        rows, covariance, _ = drive(gap, memory=memory)
+        assert_sound(memory, rows, covariance)
+    rows, _, _ = drive(without_imu(flight, 8.0, 11.0))
+    assert errors(flight, rows[rows[:, 0] > 3.0]).max() < 0.6
+    silent = replace(flight, tdoa=Tdoas(*np.concatenate([_columns(flight, 0, 8), _columns(flight, 10, 20)], axis=1)))
+    rows, covariance, _ = drive(silent)
+    blind = (rows[:, 0] > 8.0) & (rows[:, 0] < 10.0)
+    std = np.sqrt(np.einsum("nii->ni", covariance[blind, :3, :3]))
+    assert (np.diff(std.sum(axis=1)) > 0.0).all()  # it says that it knows less and less
+    assert (np.abs(rows[blind, 1:4] - position_at(flight, rows[blind, 0])) < 4.0 * std).all()
+    assert errors(flight, rows[rows[:, 0] > 11.0]).max() < 0.4
+
+
+def _columns(flight, low, high):
+    part = cut(flight.tdoa, low, high)
+    return np.stack([part.t, part.a, part.b, part.d])
+
+
+@pytest.mark.parametrize("robust", ROBUST)
+def test_finds_a_tag_again_that_was_carried_away(robust):
+    near, far = fly(10, 12.0, hover=True), fly(10, 12.0, hover=True)
+    there = np.array([1.0, 6.5, 0.8])
+    p = np.where(far.tdoa.t[:, None] < 5.0, near.truth.p[0], there)
+    positions = far.anchors.positions
+    d = tdoa(p, positions[far.anchors.index(far.tdoa.a)], positions[far.anchors.index(far.tdoa.b)])
+    d += 0.1 * np.random.default_rng(0).standard_normal(len(d))
+    memory = new_memory()
+    rows, covariance, _ = drive(replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), memory)
+    assert memory.clock[RECOVERIES] <= 2
+    assert np.linalg.norm(rows[rows[:, 0] > 7.0, 1:4] - there, axis=1).max() < 0.3
+    assert_sound(memory, rows, covariance)
+
+
+def test_a_good_flight_needs_no_recovery():
+    for seed in range(3):
+        memory = new_memory()
+        drive(fly(seed, 10.0, outliers=0.1), memory=memory)
+        assert memory.clock[RECOVERIES] == 0
+
+
+def nasty(seed, imu_size):
+    """Streams that no sensor would send: huge and jumping IMU values, stamps that repeat, gaps of seconds, TDOAs of any
+    value that is not refused, a tag on an antenna."""
+    rng = np.random.default_rng(seed)
+    flight = fly(seed, 2.0, imu_rate=float(rng.choice([20.0, 100.0, 1000.0])))
+
+    def stretch(t):
+        gaps = rng.choice([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 20.0], len(t)) * np.diff(t, prepend=0.0)
+        return np.sort(np.cumsum(gaps) + np.where(rng.random(len(t)) < 0.002, rng.uniform(0.0, 3.0, len(t)), 0.0).cumsum())
+
+    wild = rng.random(len(flight.imu)) < rng.choice([0.0, 0.01, 0.5])
+    gyro, accel = flight.imu.gyro.copy(), flight.imu.accel.copy()
+    gyro[wild] = imu_size * rng.standard_normal((wild.sum(), 3))
+    accel[wild] = 10.0 * imu_size * rng.standard_normal((wild.sum(), 3))
+    a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
+    baseline = np.linalg.norm(flight.anchors.positions[a] - flight.anchors.positions[b], axis=1)
+    d = flight.tdoa.d.copy()
+    wild = rng.random(len(d)) < rng.choice([0.0, 0.1, 1.0])
+    d[wild] = (rng.uniform(-1.0, 1.0, len(d)) * (baseline + 1.0))[wild]
+    if rng.random() < 0.2:  # on the first anchor
+        d = tdoa(flight.anchors.positions[0], flight.anchors.positions[a], flight.anchors.positions[b])
+    return replace(
+        flight,
+        imu=Imu(stretch(flight.imu.t), gyro, accel),
+        tdoa=replace(flight.tdoa, t=stretch(flight.tdoa.t), d=d),
+    )
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(ROBUST), st.booleans())
+def test_nothing_but_finite_states_and_covariances_comes_out(seed, robust, use_imu):
+    memory = new_memory()
+    rows, covariance, _ = drive(nasty(seed, 40.0), FilterConfig(robust=robust, use_imu=use_imu), memory)
+    assert_sound(memory, rows, covariance)
+
+
+@pytest.mark.parametrize("size", [1e3, 1e6, 1e30, 1e100, 1e200])
+@pytest.mark.parametrize("stream", ["gyro", "accel"])
+def test_one_absurd_inertial_sample_does_not_poison_the_filter(stream, size):
+    flight, memory = fly(11, 3.0), new_memory()
+    getattr(flight.imu, stream)[400] = [size, -size, 0.5 * size]
+    rows, covariance, _ = drive(flight, memory=memory)
+    assert_sound(memory, rows, covariance)
+
+
+def test_stamps_that_repeat_are_used_and_move_nothing():
+    flight = fly(12, 3.0)
+    doubled = np.repeat(np.arange(len(flight.imu)), 2)
+    twice = replace(flight, imu=Imu(flight.imu.t[doubled], flight.imu.gyro[doubled], flight.imu.accel[doubled]))
+    rows, _, _ = drive(flight)
+    again, _, _ = drive(twice)
+    # the sample repeated is averaged with itself, not with the one before: a difference of half a sample's change
+    np.testing.assert_allclose(again[:, 1:4], rows[:, 1:4], atol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robust", ROBUST)
+def test_stays_sound_over_an_hour_of_updates(robust):
+    memory, config = new_memory(), FilterConfig(robust=robust, odometry_rate=1.0)
+    flight = fly(13, 60.0, imu_rate=100.0, tdoa_rate=50.0)
+    for lap in range(60):
+        later = replace(
+            flight,
+            imu=replace(flight.imu, t=flight.imu.t + 60.0 * lap),
+            tdoa=replace(flight.tdoa, t=flight.tdoa.t + 60.0 * lap),
+        )
+        rows, covariance, _ = drive(later, config, memory)
+        assert_sound(memory, rows, covariance)
+    assert memory.clock[RUNNING]
+
+
+@pytest.mark.slow
+def test_a_clock_that_leaps_forward_does_not_stall_the_filter():
+    """From a start at zero to the wall clock would be 1.7e9 s; this is a thousandth of it."""
+    flight, memory = fly(14, 2.0), new_memory()
+    drive(flight, memory=memory)
+    leap = replace(flight, imu=replace(flight.imu, t=flight.imu.t + 1.7e6), tdoa=replace(flight.tdoa, t=flight.tdoa.t + 1.7e6))
+    begin = time.perf_counter()
+    rows, covariance, _ = drive(leap, memory=memory)
+    assert time.perf_counter() - begin < 0.5
+    assert_sound(memory, rows, covariance)

@@ -1,0 +1,312 @@
+from dataclasses import fields, replace
+
+from flights import corners, fly, position_at
+from hypothesis import given, settings, strategies as st
+from live import IMU, TDOA, arriving, assert_same, feed, joined, messages
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.flight import Tdoas
+from uwb_tdoa_ekf.config import FilterConfig
+from uwb_tdoa_ekf.engine import INVALID, LATE, STARTUP, USED
+from uwb_tdoa_ekf.estimator import TIME_JUMP, VERDICTS, Estimator
+from uwb_tdoa_ekf.offline import run_offline
+
+seeds = st.integers(0, 2**32 - 1)
+REST = (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)
+FIRST, SECOND, THIRD = corners().ids[:3].tolist()
+
+
+def assert_same_as_offline(flight, config=None, **feeding):
+    estimator = Estimator(flight.anchors, config)
+    odometry, residuals = feed(estimator, flight, **feeding)
+    expected = run_offline(flight, config)
+    assert_same(odometry, expected.odometry)
+    assert_same(by_stamp(residuals), by_stamp(expected.residuals))  # what is refused is told at once
+    assert {name: estimator.counts[name] for name in VERDICTS.values()} == expected.counts
+
+
+def by_stamp(residuals):
+    order = np.argsort(residuals.t, kind="stable")
+    return replace(residuals, **{field.name: getattr(residuals, field.name)[order] for field in fields(residuals)})
+
+
+def received(estimator):
+    """(IMU, TDOA) messages that the accounts and the buffers tell of."""
+    counts, (imu, tdoa) = estimator.counts, estimator.waiting
+    return sum(counts[name] for name in ("imu_used", "imu_late", "imu_invalid")) + imu, sum(
+        counts[name] for name in VERDICTS.values()
+    ) + tdoa
+
+
+def test_in_order_it_is_the_offline_engine():
+    assert_same_as_offline(fly(1, 4.0, outliers=0.05))
+
+
+@settings(max_examples=25)
+@given(seeds, st.floats(0.0, 0.2), st.sampled_from([0, 1]), st.floats(0.0, 0.0049))
+def test_neither_skew_of_the_streams_nor_disorder_within_reorder_changes_anything(seed, delay, behind, jitter):
+    flight, rng = fly(2, 2.0), np.random.default_rng(seed)
+    delays = {"imu_delay": delay} if behind == IMU else {"tdoa_delay": delay}
+    order = arriving(flight, rng, tdoa_jitter=jitter, **delays)
+    assert_same_as_offline(flight, order=order, advance=lambda: rng.random() < 0.3)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05])
+def test_inertial_samples_may_come_out_of_order_too(delay):
+    flight = fly(2, 2.0, imu_rate=1000.0)
+    order = arriving(flight, np.random.default_rng(0), imu_jitter=0.0049, imu_delay=delay)
+    assert_same_as_offline(flight, order=order)
+
+
+def test_the_order_in_which_siblings_of_one_stamp_come_changes_nothing():
+    flight = fly(3, 2.0)
+    flight = replace(flight, tdoa=replace(flight.tdoa, t=np.floor(flight.tdoa.t * 50.0) / 50.0 + 0.0013))
+    backwards = sorted(messages(flight), key=lambda m: (m[0], m[1], -m[2]))
+    one, _ = feed(Estimator(flight.anchors), flight)
+    other, _ = feed(Estimator(flight.anchors), flight, order=backwards)
+    assert_same(one, other, 1e-12)
+
+
+def test_without_use_of_the_imu_inertial_messages_change_nothing():
+    assert_same_as_offline(fly(4, 3.0), FilterConfig(use_imu=False))
+
+
+def test_without_use_of_the_imu_nothing_waits_for_it():
+    estimator = Estimator(corners(), FilterConfig(use_imu=False))
+    estimator.add_tdoa(1.0, FIRST, SECOND, 0.0)
+    estimator.add_tdoa(1.006, FIRST, SECOND, 0.0)
+    _, residuals = estimator.advance()
+    assert residuals.t.tolist() == [1.0]
+
+
+def test_tdoas_wait_for_the_imu_to_pass_them():
+    estimator = Estimator(corners())
+    estimator.add_imu(0.9, *REST)
+    for t in (1.0, 1.01, 1.1):
+        estimator.add_tdoa(t, FIRST, SECOND, 0.0)
+    assert len(estimator.advance()[1].t) == 0
+    estimator.add_imu(1.005, *REST)
+    assert estimator.advance()[1].t.tolist() == [1.0]
+    assert estimator.waiting == (0, 2)
+
+
+def test_a_silent_stream_is_waited_for_no_longer_than_the_lag():
+    estimator = Estimator(corners(), lag=0.25)
+    for k in range(40):
+        estimator.add_tdoa(0.01 * k, FIRST, SECOND, 0.0)
+    _, residuals = estimator.advance()
+    assert residuals.t[-1] == pytest.approx(0.39 - 0.25)
+    assert estimator.waiting == (0, 25)
+    estimator = Estimator(corners(), lag=0.25)
+    for k in range(40):
+        estimator.add_imu(0.01 * k, *REST)
+    estimator.advance()
+    assert estimator.counts["imu_used"] == 15
+
+
+def test_what_is_older_than_what_was_used_is_late_and_harmless():
+    flight = fly(5, 3.0)
+    order = messages(flight)
+    moved = [k for k, m in enumerate(order) if m[1] == TDOA and m[0] > 1.5][::20]
+    kept = [m for k, m in enumerate(order) if k not in moved]
+    straggling = sorted(kept + [order[k] for k in moved], key=lambda m: m[0] + (0.1 if m in {order[k] for k in moved} else 0.0))
+    estimator = Estimator(flight.anchors)
+    odometry, residuals = feed(estimator, flight, order=straggling)
+    assert estimator.counts["late"] == len(moved) == np.sum(residuals.verdict == LATE)
+    assert sorted(residuals.t[residuals.verdict == LATE]) == [order[k][0] for k in moved]
+    expected, _ = feed(Estimator(flight.anchors), flight, order=kept)
+    assert_same(odometry, expected)
+    late = residuals.verdict == LATE
+    assert np.isnan(residuals.innovation[late]).all() and (residuals.weight[late] == 0.0).all()
+
+
+def test_late_inertial_samples_are_counted():
+    estimator = Estimator(corners())
+    estimator.add_imu(1.0, *REST)
+    estimator.add_tdoa(1.1, FIRST, SECOND, 0.0)
+    estimator.add_imu(1.2, *REST)
+    estimator.finish()
+    estimator.add_imu(0.99, *REST)
+    assert estimator.counts["imu_late"] == 1 and received(estimator) == (3, 1)
+
+
+@pytest.mark.parametrize(
+    "t, a, b, d, bias_std",
+    [
+        (1.0, FIRST, SECOND, np.nan, 0.0),
+        (1.0, FIRST, SECOND, np.inf, 0.0),
+        (1.0, FIRST, SECOND, 0.0, np.nan),
+        (np.nan, FIRST, SECOND, 0.0, 0.0),
+        (np.inf, FIRST, SECOND, 0.0, 0.0),
+        (1.0, 999, SECOND, 0.0, 0.0),
+        (1.0, FIRST, 999, 0.0, 0.0),
+        (1.0, FIRST, FIRST, 0.0, 0.0),
+        (1.0, FIRST, SECOND, 12.0, 0.0),
+    ],
+)
+def test_what_cannot_be_a_measurement_is_invalid(t, a, b, d, bias_std):
+    estimator = Estimator(corners())
+    estimator.add_tdoa(t, a, b, d, bias_std)
+    _, residuals = estimator.advance()
+    assert residuals.verdict.tolist() == [INVALID]
+    assert (residuals.a[0], residuals.b[0]) == (a, b) and residuals.weight[0] == 0.0
+    assert estimator.counts["invalid"] == 1 and received(estimator) == (0, 1)
+
+
+def test_an_inertial_sample_that_is_not_finite_is_as_if_it_had_never_come():
+    flight, rng = fly(6, 3.0), np.random.default_rng(0)
+    bad = rng.choice(len(flight.imu), 30, replace=False)
+    estimator = Estimator(flight.anchors)
+    broken = replace(flight, imu=replace(flight.imu, gyro=flight.imu.gyro.copy(), accel=flight.imu.accel.copy()))
+    broken.imu.gyro[bad[:15], 1] = np.nan
+    broken.imu.accel[bad[15:], 2] = [np.inf, -np.inf, np.nan] * 5
+    odometry, _ = feed(estimator, broken)
+    assert estimator.counts["imu_invalid"] == 30
+    kept = [m for m in messages(flight) if m[1] == TDOA or m[2] not in bad]
+    expected, _ = feed(Estimator(flight.anchors), flight, order=kept)
+    assert_same(odometry, expected)
+    estimator.add_imu(np.nan, *REST)
+    assert estimator.counts["imu_invalid"] == 31
+
+
+@settings(max_examples=40)
+@given(seeds, st.booleans())
+def test_every_message_is_accounted_for_once(seed, use_imu):
+    """Any disorder, any nonsense, at any moment: accounts plus buffers are what was received."""
+    rng = np.random.default_rng(seed)
+    estimator = Estimator(corners(), FilterConfig(use_imu=use_imu))
+    sent, clock, parts = [0, 0], 0.0, []
+    for _ in range(300):
+        clock += rng.choice([0.0, 0.001, 0.01, 0.5, -3.0 * (rng.random() < 0.05)])
+        t = clock - rng.choice([0.0, 0.0, 0.004, 0.3])
+        if rng.random() < 0.5:
+            t, wrong = (np.nan if rng.random() < 0.05 else t), rng.random() < 0.05
+            estimator.add_imu(t, (np.nan if wrong else 0.1, 0.0, 0.0), REST[1])
+            sent[IMU] += 1
+        else:
+            a, b = rng.choice([*estimator.anchors.ids, 99], 2).tolist()
+            estimator.add_tdoa(t, a, b, rng.choice([0.0, 1.0, 30.0, np.nan]))
+            sent[TDOA] += 1
+        if rng.random() < 0.4:
+            parts.append(estimator.advance())
+        told = sum(len(residuals.t) for _, residuals in parts)
+        assert told == sum(estimator.counts[name] for name in VERDICTS.values())
+    parts.append(estimator.finish())
+    assert estimator.waiting == (0, 0) and received(estimator) == tuple(sent)
+    residuals = joined([part[1] for part in parts])
+    for value, name in VERDICTS.items():
+        assert np.sum(residuals.verdict == value) == estimator.counts[name]
+    assert np.isfinite(joined([part[0] for part in parts]).p).all()
+
+
+def test_a_clock_that_falls_back_starts_anew_and_keeps_the_accounts():
+    first, again = fly(7, 3.0, begin=1000.0), fly(7, 3.0)
+    estimator = Estimator(first.anchors)
+    for t, stream, i in messages(first):  # not finished: some are still waiting when the clock falls back
+        if stream == IMU:
+            estimator.add_imu(t, first.imu.gyro[i], first.imu.accel[i])
+        else:
+            estimator.add_tdoa(t, int(first.tdoa.a[i]), int(first.tdoa.b[i]), first.tdoa.d[i])
+    estimator.advance()
+    waiting = estimator.waiting
+    assert estimator.running and min(waiting) > 0
+    odometry, residuals = feed(estimator, again)
+    assert estimator.counts["restarts"] >= 1
+    dropped = residuals.t > 900.0
+    assert (residuals.verdict[dropped] == LATE).all() and np.sum(dropped) == waiting[TDOA]
+    assert received(estimator) == (2 * len(first.imu), 2 * len(first.tdoa))
+    assert_same(odometry, run_offline(again).odometry)
+
+
+def test_falling_back_by_less_is_late_not_a_restart():
+    flight = fly(8, 2.0)
+    estimator = Estimator(flight.anchors)
+    feed(estimator, flight)
+    estimator.add_tdoa(flight.tdoa.t[-1] - 0.9 * TIME_JUMP, FIRST, SECOND, 0.0)
+    estimator.add_imu(flight.imu.t[-1] - 0.9 * TIME_JUMP, *REST)
+    _, residuals = estimator.advance()
+    assert residuals.verdict.tolist() == [LATE]
+    assert estimator.running and estimator.counts["restarts"] == 0 and estimator.counts["imu_late"] == 1
+
+
+def test_finish_leaves_nothing_behind():
+    flight = fly(9, 2.0)
+    estimator = Estimator(flight.anchors)
+    feed(estimator, flight, advance=lambda: False)
+    assert estimator.waiting == (0, 0)
+    odometry, residuals = estimator.finish()
+    assert len(odometry) == len(residuals.t) == 0
+
+
+def test_nothing_in_nothing_out():
+    estimator = Estimator(corners())
+    for odometry, residuals in (estimator.advance(), estimator.finish()):
+        assert len(odometry) == len(residuals.t) == 0
+        assert odometry.p.shape == (0, 3) and odometry.covariance.shape == (0, 9, 9)
+    assert not estimator.running and estimator.recoveries == 0 and set(estimator.counts.values()) == {0}
+
+
+def test_residuals_carry_ids_not_rows():
+    flight = fly(10, 1.5)
+    _, residuals = feed(Estimator(flight.anchors), flight)
+    np.testing.assert_array_equal(residuals.a, flight.tdoa.a)
+    np.testing.assert_array_equal(residuals.b, flight.tdoa.b)
+    np.testing.assert_array_equal(residuals.t, flight.tdoa.t)
+    assert set(np.unique(residuals.verdict)) == {USED, STARTUP}
+
+
+def test_the_order_of_the_anchors_changes_nothing():
+    flight = fly(11, 2.0)
+    mixed = np.random.default_rng(0).permutation(len(flight.anchors))
+    anchors = Anchors.from_positions(flight.anchors.positions[mixed], flight.anchors.ids[mixed])
+    one, _ = feed(Estimator(flight.anchors), flight)
+    other, _ = feed(Estimator(anchors), flight)
+    assert_same(one, other, 1e-9)
+
+
+def test_a_doubtful_correction_counts_less():
+    flight = fly(12, 3.0)
+    spreads = []
+    for bias_std in (0.0, 1.0):
+        estimator = Estimator(flight.anchors)
+        for t, stream, i in messages(flight):
+            if stream == IMU:
+                estimator.add_imu(t, flight.imu.gyro[i], flight.imu.accel[i])
+            else:
+                a, b, d = int(flight.tdoa.a[i]), int(flight.tdoa.b[i]), flight.tdoa.d[i]
+                estimator.add_tdoa(t, a, b, d, bias_std)
+        odometry, residuals = estimator.finish()
+        used = residuals.verdict == USED
+        assert residuals.variance[used].min() > 0.25**2 + bias_std**2
+        spreads.append(np.trace(odometry.covariance[-1, :3, :3]))
+    assert spreads[1] > 1.5 * spreads[0]
+
+
+def test_five_anchors_and_an_imu_of_100_hz_are_enough():
+    anchors = corners()
+    five = Anchors.from_positions(anchors.positions[[0, 3, 5, 6, 1]], anchors.ids[[0, 3, 5, 6, 1]])
+    flight = fly(13, 8.0, imu_rate=100.0, tdoa_rate=60.0, anchors=five)
+    odometry, _ = feed(Estimator(five), flight)
+    late = odometry.t > 3.0
+    assert np.linalg.norm(odometry.p[late] - position_at(flight, odometry.t[late]), axis=1).max() < 0.4
+
+
+def test_streams_of_columns_that_are_no_floats_are_taken_as_numbers():
+    """A driver may hand over what numpy or a message gives it: np.float32, np.uint16, tuples, arrays."""
+    flight = fly(14, 1.5)
+    flight = replace(flight, tdoa=Tdoas(*(column for column in (flight.tdoa.t, *_ids(flight), flight.tdoa.d))))
+    estimator, parts = Estimator(flight.anchors), []
+    for t, stream, i in messages(flight):
+        if stream == IMU:
+            estimator.add_imu(np.float64(t), tuple(flight.imu.gyro[i]), flight.imu.accel[i].tolist())
+        else:
+            estimator.add_tdoa(np.float64(t), flight.tdoa.a[i], flight.tdoa.b[i], flight.tdoa.d[i])
+        parts.append(estimator.advance())
+    parts.append(estimator.finish())
+    assert_same(joined([part[0] for part in parts]), run_offline(flight).odometry)
+
+
+def _ids(flight):
+    return flight.tdoa.a.astype(np.uint16), flight.tdoa.b.astype(np.uint16)

@@ -1,0 +1,226 @@
+from dataclasses import replace
+
+from flights import corners, fly, position_at
+from live import IMU, assert_same, joined, messages
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from uwb_tdoa_bias.corrector import Corrector
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.flight import Flight, Imu, Tdoas
+from uwb_tdoa_ekf.config import FilterConfig
+from uwb_tdoa_ekf.engine import INVALID, STARTUP, USED
+from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.offline import run_offline
+
+IDS = corners().ids.tolist()
+EFFECTS = EffectSet((AnchorDelay({IDS[0]: 0.3, IDS[4]: -0.2}), TagLeverArm({"x": 0.05, "z": 0.2})))
+
+
+def live(flight, corrector, config=None):
+    """Estimator and corrector as the two nodes use them, message by message in the order of the stamps: what a
+    measurement is corrected with is what the filter has told by then."""
+    estimator, parts, corrected = Estimator(flight.anchors, config, reorder=0.0), [], []
+
+    def advance():
+        odometry, residuals = estimator.advance()
+        for t, p, q in zip(odometry.t, odometry.p, odometry.q):
+            corrector.add_pose(t, p, q)
+        parts.append((odometry, residuals))
+
+    for t, stream, i in messages(flight):
+        if stream == IMU:
+            estimator.add_imu(t, flight.imu.gyro[i], flight.imu.accel[i])
+        else:
+            a, b = int(flight.tdoa.a[i]), int(flight.tdoa.b[i])
+            rows = flight.anchors.index([a]), flight.anchors.index([b])
+            correction = corrector.correct(np.array([t]), *rows, flight.tdoa.d[i : i + 1])
+            corrected.append((correction.bias[0], correction.std[0]))
+            estimator.add_tdoa(t, a, b, correction.corrected[0], correction.std[0])
+        advance()
+    odometry, residuals = estimator.finish()
+    parts.append((odometry, residuals))
+    return joined([part[0] for part in parts]), joined([part[1] for part in parts]), np.array(corrected)
+
+
+class Doubt:
+    """Stands in for a network that knows a bias and how sure it is of it, both depending on the pose."""
+
+    name = "doubt"
+
+    def predict(self, samples):
+        return 0.1 * np.sin(samples.p[:, 0]), 0.05 + 0.02 * np.abs(samples.q[:, 2])
+
+
+@pytest.mark.parametrize("lag", [0.01, 0.05, 0.2])
+@pytest.mark.parametrize("network", [None, Doubt()])
+def test_corrections_are_those_of_live_feeding(lag, network):
+    flight = fly(1, 4.0, outliers=0.02)
+    baseline = run_offline(flight, None, Corrector(flight.anchors, EFFECTS, network, lag))
+    odometry, residuals, corrected = live(flight, Corrector(flight.anchors, EFFECTS, network, lag))
+    assert_same(odometry, baseline.odometry, 1e-9)
+    valid = baseline.residuals.verdict != INVALID
+    np.testing.assert_allclose(corrected[valid], np.stack([baseline.bias, baseline.bias_std], axis=1)[valid], atol=1e-9)
+    assert np.abs(baseline.bias).max() > 0.3 and (baseline.residuals.verdict == USED).sum() > 500
+
+
+def test_stamps_on_a_grid_as_coarse_as_the_lag_are_corrected_alike():
+    """Poses exactly `lag` old, and the boundaries of batches, on the stamps of measurements."""
+    flight = fly(2, 4.0, imu_rate=100.0, tdoa_rate=100.0)
+    flight = replace(flight, tdoa=replace(flight.tdoa, t=np.arange(len(flight.tdoa)) / 100.0))
+    baseline = run_offline(flight, None, Corrector(flight.anchors, EFFECTS, Doubt(), 0.05))
+    odometry, _, corrected = live(flight, Corrector(flight.anchors, EFFECTS, Doubt(), 0.05))
+    np.testing.assert_allclose(corrected[:, 0], baseline.bias, atol=1e-9)
+    assert_same(odometry, baseline.odometry, 1e-9)
+
+
+def test_what_is_corrected_is_what_was_wrong():
+    flight = fly(3, 8.0, tdoa_std=0.05)
+    a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
+    delay = np.where(flight.anchors.ids == IDS[0], 0.5, 0.0)
+    wrong = replace(flight, tdoa=replace(flight.tdoa, d=flight.tdoa.d + delay[b] - delay[a]))
+    right = run_offline(wrong, None, Corrector(flight.anchors, EffectSet((AnchorDelay({IDS[0]: 0.5}),))))
+    np.testing.assert_allclose(right.bias, delay[b] - delay[a], atol=1e-12)
+    expected = run_offline(flight)
+    np.testing.assert_allclose(right.odometry.p, expected.odometry.p, atol=1e-9)
+
+
+def test_no_effects_and_no_corrector_are_the_same():
+    flight = fly(4, 2.0)
+    one, other = run_offline(flight), run_offline(flight, FilterConfig(), Corrector(flight.anchors))
+    assert_same(one.odometry, other.odometry)
+    assert not one.bias.any() and not one.bias_std.any()
+
+
+@pytest.mark.parametrize("effects", [None, EFFECTS])
+def test_every_tdoa_gets_one_verdict_in_the_order_of_the_flight(effects):
+    flight = fly(5, 3.0, outliers=0.1)
+    a, d, t = flight.tdoa.a.copy(), flight.tdoa.d.copy(), flight.tdoa.t.copy()
+    a[100], a[300], d[301], d[302] = 99, flight.tdoa.b[300], np.nan, 50.0
+    t[303] = np.nan
+    flight = replace(flight, tdoa=Tdoas(t, a, flight.tdoa.b, d))
+    result = run_offline(flight, None, Corrector(flight.anchors, effects))
+    residuals = result.residuals
+    np.testing.assert_array_equal(residuals.t, t)
+    np.testing.assert_array_equal(residuals.a, a)
+    assert (residuals.verdict[[100, 300, 301, 302, 303]] == INVALID).all()
+    refused = residuals.verdict == INVALID
+    beyond = ~(np.abs(d) <= 1.0 + _baseline(flight))
+    np.testing.assert_array_equal(refused, beyond | np.isin(np.arange(len(d)), [100, 300, 303]))
+    assert np.isnan(residuals.innovation[refused]).all() and not residuals.weight[refused].any()
+    assert sum(result.counts.values()) == len(flight.tdoa)
+    assert result.counts["startup"] == np.sum(residuals.verdict == STARTUP) > 0
+
+
+def _baseline(flight):
+    positions, anchors = flight.anchors.positions, flight.anchors
+    return np.linalg.norm(positions[anchors.index(flight.tdoa.a)] - positions[anchors.index(flight.tdoa.b)], axis=1)
+
+
+def test_an_inertial_sample_that_is_not_finite_is_passed_over_as_on_line():
+    flight = fly(6, 3.0)
+    flight.imu.accel[350, 1] = np.nan
+    flight.imu.gyro[400, 0] = np.inf
+    result = run_offline(flight)
+    assert np.isfinite(result.odometry.p).all() and np.isfinite(result.odometry.covariance).all()
+
+
+@pytest.mark.parametrize("effects", [None, EFFECTS])
+@pytest.mark.parametrize("count", [0, 1, 11])
+@pytest.mark.parametrize("imu", [True, False])
+def test_flights_too_short_to_start(effects, count, imu):
+    flight = fly(7, 2.0)
+    tdoa = Tdoas(*(column[:count] for column in (flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)))
+    none = Imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+    for samples in (flight.imu, None, none) if imu else (None,):
+        short = Flight("short", flight.anchors, tdoa, samples)
+        result = run_offline(short, None, Corrector(flight.anchors, effects))
+        assert len(result.odometry) == 0 and result.odometry.covariance.shape == (0, 9, 9)
+        assert result.counts["startup"] == count == len(result.residuals.t) == len(result.bias)
+
+
+def test_no_anchor_of_the_flight_is_known():
+    flight = fly(8, 2.0)
+    lost = replace(flight, tdoa=replace(flight.tdoa, a=flight.tdoa.a + 100, b=flight.tdoa.b + 100))
+    for effects in (None, EFFECTS):
+        result = run_offline(lost, None, Corrector(flight.anchors, effects))
+        assert result.counts["invalid"] == len(flight.tdoa) and len(result.odometry) == 0
+
+
+def test_leaves_the_flight_as_it_was_and_gives_the_same_twice():
+    flight = fly(9, 2.0)
+    before = flight.tdoa.d.copy(), flight.imu.accel.copy()
+    one = run_offline(flight, None, Corrector(flight.anchors, EFFECTS))
+    two = run_offline(flight, None, Corrector(flight.anchors, EFFECTS))
+    assert_same(one.odometry, two.odometry)
+    np.testing.assert_array_equal(flight.tdoa.d, before[0])
+    np.testing.assert_array_equal(flight.imu.accel, before[1])
+
+
+@pytest.mark.slow  # compiles the engine anew
+def test_arrays_of_any_layout_are_taken():
+    """What a reader hands over may be columns of one table, or read-only."""
+    flight = fly(10, 2.0)
+    table = np.column_stack([flight.imu.t, flight.imu.gyro, flight.imu.accel])
+    table.setflags(write=False)
+    other = replace(flight, imu=Imu(table[:, 0], table[:, 1:4], table[:, 4:7]))
+    assert_same(run_offline(other).odometry, run_offline(flight).odometry)
+
+
+def consistency(robust, loss="geman_mcclure", seeds=range(40), duration=20.0, tdoa_std=0.1, **config):
+    """NEES and NIS of flights whose every error is of the filter's own model, with the filter told their true sizes.
+
+    Returns (nees (flights, times) at 20 Hz after 3 s, nis (flights,) mean over the flight after 3 s, count of the latter).
+    """
+    sizes = dict(accel_noise=0.05, gyro_noise=0.003, accel_bias_walk=0.01, gyro_bias_walk=1e-4)
+    settings = FilterConfig(
+        robust=robust, loss=loss, tdoa_std=tdoa_std, tdoa_correlation=1.0, gate=1e6,
+        initial_accel_bias_std=0.1, initial_gyro_bias_std=0.01, **sizes, **config,
+    )  # fmt: skip
+    times, nees, nis = np.arange(3.0, duration - 0.1, 0.05), [], []
+    for seed in seeds:
+        flight = fly(seed, duration, tdoa_std=tdoa_std, accel_bias=0.1, gyro_bias=0.01, **sizes)
+        result = run_offline(flight, settings)
+        at = np.searchsorted(result.odometry.t, times)
+        error = result.odometry.p[at] - position_at(flight, result.odometry.t[at])
+        covariance = result.odometry.covariance[at, :3, :3]
+        nees.append(np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0]))
+        residuals = result.residuals
+        counted = (residuals.verdict <= 1) & (residuals.t > 3.0)
+        nis.append(np.mean(residuals.innovation[counted] ** 2 / residuals.variance[counted]))
+    return np.array(nees), np.array(nis), int(counted.sum())
+
+
+def shares_inside(nees, nis, count, what):
+    """Shares of times and of flights inside the two-sided 95 % chi-square bounds of their averages: Bar-Shalom et al.,
+    Estimation with Applications to Tracking and Navigation, sec. 5.4.2: the NEES over flights, the NIS over time."""
+    flights = len(nees)
+    low, high = chi2.ppf([0.025, 0.975], 3 * flights) / flights
+    mean = nees.mean(axis=0)
+    times = np.mean((mean > low) & (mean < high))
+    nis_low, nis_high = chi2.ppf([0.025, 0.975], count) / count
+    inside = np.mean((nis > nis_low) & (nis < nis_high))
+    print(
+        f"{what}: NEES {nees.mean():.2f} of 3, {times:.0%} of the times in {low:.2f} ... {high:.2f} ({flights} flights); "
+        f"NIS {nis.mean():.3f}, {inside:.0%} of the flights in {nis_low:.3f} ... {nis_high:.3f}"
+    )
+    return times, inside
+
+
+@pytest.mark.slow
+def test_a_plain_update_is_consistent():
+    """Average position NEES of 40 flights inside its 95 % bounds at 90 % of the times, NIS inside for 85 % of the flights
+    (34 of 40; 38 are expected, fewer than 34 happen once in 300 times to an honest filter)."""
+    times, flights = shares_inside(*consistency("gate"), "no gate")
+    assert times >= 0.9 and flights >= 0.85
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robust, loss", [("innovation", "geman_mcclure"), ("innovation", "huber"), ("m_estimation", "huber")])
+def test_robust_updates_are_cautious_but_not_overconfident(robust, loss):
+    """Weights throw information away that Gaussian noise does not ask them to: the covariance may only be too large."""
+    nees, nis, count = consistency(robust, loss)
+    shares_inside(nees, nis, count, f"{robust}, {loss}")
+    high = chi2.ppf(0.975, 3 * len(nees)) / len(nees)
+    assert np.mean(nees.mean(axis=0) < high) >= 0.9 and nees.mean() > 1.0
