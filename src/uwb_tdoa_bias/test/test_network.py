@@ -1,0 +1,121 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from uwb_tdoa_bias import known_answer
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.effects import Samples
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.network import Network
+
+SHIPPED = Path(__file__).resolve().parents[1] / "models" / "known_answer.onnx"
+ANCHORS = Anchors.from_positions([[5, 0, 1], [-3, 2, 3], [0, -400, 2]])
+
+
+def samples(p, q, a, b):
+    n = len(p)
+    return Samples(np.zeros(n), np.array(a), np.array(b), np.array(p, float), np.array(q, float), ANCHORS)
+
+
+def batch(n=50):
+    random = np.random.default_rng(3)
+    q = random.normal(size=(n, 4))
+    a = random.integers(0, 2, n)
+    return samples(random.uniform(-2, 2, (n, 3)), q / np.linalg.norm(q, axis=1, keepdims=True), a, 1 - a)
+
+
+def expected(s):
+    """By hand: rotate the vector to anchor b into the body frame with x y z w written out as a matrix."""
+    out = []
+    for p, (x, y, z, w), a, b in zip(s.p, s.q, s.a, s.b):
+        to_world = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        seen = to_world.T @ (ANCHORS.positions[b] - p)
+        elevation = np.arctan2(seen[2], np.hypot(seen[0], seen[1]))
+        out.append(known_answer.known_answer(elevation, ANCHORS.positions[a][0] - p[0]))
+    return np.array(out)
+
+
+def test_shipped_model_says_the_known_answer():
+    s = batch()
+    bias, std = Network(SHIPPED).predict(s)
+    np.testing.assert_allclose(bias, expected(s), atol=1e-6)  # the model computes in float32
+    assert np.ptp(bias) > 0.1  # an answer that says something
+    np.testing.assert_array_equal(std, 0.0)
+
+
+def test_one_sample_gives_what_a_batch_gives():
+    network, s = Network(SHIPPED), batch()
+    one = samples(s.p[7:8], s.q[7:8], s.a[7:8], s.b[7:8])
+    np.testing.assert_allclose(network.predict(one)[0], network.predict(s)[0][7:8], atol=1e-7)
+
+
+def test_output_is_clipped():
+    far = samples([[-80.0, 0, 0], [80.0, 0, 0]], [[0, 0, 0, 1]] * 2, [0, 0], [1, 1])
+    np.testing.assert_array_equal(Network(SHIPPED).predict(far)[0], [1.0, -1.0])
+
+
+def test_unknown_attitude_gives_nan():
+    s = samples([[0, 0, 1]] * 2, [[np.nan] * 4, [0, 0, 0, 1]], [0, 0], [1, 1])
+    np.testing.assert_array_equal(np.isnan(Network(SHIPPED).predict(s)[0]), [True, False])
+
+
+def test_shipped_model_is_what_the_maker_makes(tmp_path):
+    pytest.importorskip("onnx")
+    path = tmp_path / "made.onnx"
+    path.write_bytes(known_answer.make().SerializeToString())
+    made, shipped, s = Network(path), Network(SHIPPED), batch()
+    np.testing.assert_array_equal(made.predict(s)[0], shipped.predict(s)[0])
+    assert made.name == shipped.name == "known_answer"
+
+
+def changed(tmp_path, **meta):
+    """The model with other metadata; None removes an entry."""
+    pytest.importorskip("onnx")
+    model = known_answer.make()
+    for entry in list(model.metadata_props):
+        if entry.key in meta:
+            if meta[entry.key] is None:
+                model.metadata_props.remove(entry)
+            else:
+                entry.value = meta[entry.key]
+    path = tmp_path / "changed.onnx"
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("meta", "named"),
+    [
+        ({"features": None}, "features"),
+        ({"clip": None}, "clip"),
+        ({"name": None}, "name"),
+        ({"offset": "not json"}, "offset"),
+        ({"clip": '"wide"'}, "clip"),
+        ({"features": json.dumps(["elevation_T_b", "distance"])}, "features (names out of"),
+        ({"features": json.dumps(["dx_a"])}, "1 features"),
+        ({"offset": "[0.0]"}, "1 offsets"),
+        ({"scale": "[1.0, 1.0, 1.0]"}, "3 scales"),
+        ({"scale": "[0.0, 4.0]"}, "no scale may be 0"),
+    ],
+)
+def test_wrong_metadata_are_refused_by_name(tmp_path, meta, named):
+    path = changed(tmp_path, **meta)
+    with pytest.raises(InputError) as error:
+        Network(path)
+    assert named in str(error.value) and str(path) in str(error.value)
+
+
+def test_missing_file_and_no_model(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        Network(tmp_path / "nowhere.onnx")
+    text = tmp_path / "text.onnx"
+    text.write_text("I am no model")
+    with pytest.raises(InputError, match="cannot be loaded as ONNX"):
+        Network(text)
