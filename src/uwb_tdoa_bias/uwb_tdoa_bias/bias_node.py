@@ -1,0 +1,193 @@
+"""bias_node: raw TDOAs in, corrected TDOAs out.
+
+uwb/tdoa (Tdoa), odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray)
+  -> uwb/tdoa_corrected (TdoaCorrected: one for each Tdoa), /diagnostics (diagnostic_msgs/DiagnosticArray).
+Every parameter is documented in config/bias_node.yaml.
+"""
+
+from collections import Counter, deque
+import math
+import sys
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+import numpy as np
+from rclpy.node import Node
+from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
+
+from . import ros
+from .anchors import Anchors
+from .corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
+from .effects import EffectSet
+from .errors import InputError
+from .hold import Hold
+from .network import Network
+
+TIME_JUMP = 1.0  # s; a stream that falls back by more has started anew
+EARLY = 2000  # TDOAs kept while there are no anchors
+STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
+
+
+class BiasNode(Node):
+    """Converts messages for a Corrector and keeps the accounts: received = published + waiting + dropped."""
+
+    NAME = "bias_node"
+
+    def __init__(self):
+        super().__init__(self.NAME)
+        effects_file = ros.parameter(self, "effects_file", "", "effects.yaml to correct with; empty for none")
+        model_file = ros.parameter(self, "model_file", "", "ONNX model to correct with; empty for none")
+        self._lag = ros.parameter(self, "pose_lag", 0.05, "a TDOA is corrected at the newest pose this much older, s")
+        self._limit = ros.parameter(self, "hold", 0.225, "longest wait of a TDOA for its pose, s of stamps")
+        for name, value in (("pose_lag", self._lag), ("hold", self._limit)):
+            if not 0.0 < value < math.inf:
+                raise InputError(f"{name}: {value!r} must be a number of seconds above 0.")
+        self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
+        self._network = Network(model_file) if model_file else None
+        self._model = self._warm_up()
+        self._idle = self._model[NETWORK] == "none"
+        self._corrector = None
+        self._epoch, self._counts, self._rate = ros.Epoch(), Counter(), ros.Rate()
+        self._early, self._hold = deque(), Hold(self._limit)
+        self._newest = self._newest_pose = -math.inf
+        self._reported_unready = 0
+        self._message = TdoaCorrected()  # one for all: what is published is copied
+
+        self._publisher = ros.publish_stream(self, TdoaCorrected, "uwb/tdoa_corrected")
+        self._anchors = ros.AnchorsInput(self, self._on_anchors)
+        self._inputs = {
+            "odometry": ros.subscribe_stream(self, Odometry, "odometry", self._on_odometry),
+            "uwb/tdoa": ros.subscribe_stream(self, Tdoa, "uwb/tdoa", self._on_tdoa),
+        }
+        self._diagnostics = ros.Diagnostics(self, self._report)
+        self.get_logger().info(f"ready; correcting with: {self._model[NETWORK]}")
+
+    def _warm_up(self):
+        """Compile and load whatever the first correction would; returns what to call each status's bias."""
+        corrector = Corrector(Anchors.from_positions(np.eye(3)), self._effects, self._network, self._lag)
+        corrector.add_pose(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        corrector.correct(np.array([1.0]), np.array([0]), np.array([1]), np.array([0.0]))
+        return {PASSED: "none", EFFECTS: self._effects.name, NETWORK: corrector.model, FADED: corrector.model}
+
+    def _start_over(self):
+        """Forget poses and whatever waits for one."""
+        self._counts["dropped"] += len(self._hold)
+        self._hold = Hold(self._limit)
+        self._newest = self._newest_pose = -math.inf
+        self._corrector = Corrector(self._anchors.anchors, self._effects, self._network, self._lag)
+
+    def _on_anchors(self, _):
+        self._start_over()
+        early, self._early = self._early, deque()
+        for message in early:
+            self._take(message)
+
+    def _on_odometry(self, message):
+        self._counts["poses"] += 1
+        if self._corrector is None or self._idle:
+            return
+        if message.header.frame_id != self._corrector.anchors.frame:
+            self.get_logger().warning(
+                f"odometry is in frame '{message.header.frame_id}', the anchors in '{self._corrector.anchors.frame}': "
+                "taken as the same frame",
+                once=True,
+            )
+        t = self._epoch.seconds(message.header.stamp)
+        if t < self._newest_pose - TIME_JUMP:
+            self._start_over()
+        self._newest_pose = max(self._newest_pose, t)
+        position = message.pose.pose.position
+        orientation = ros.orientation_of(message.pose.pose.orientation)
+        self._corrector.add_pose(t, (position.x, position.y, position.z), orientation)
+        self._release()
+
+    def _on_tdoa(self, message):
+        self._counts["received"] += 1
+        if self._idle:
+            self._publish(message, 0.0, 0.0, PASSED)
+        elif self._corrector is None:
+            if len(self._early) == EARLY:
+                self._early.popleft()
+                self._counts["dropped"] += 1
+            self._early.append(message)
+        else:
+            self._take(message)
+
+    def _take(self, message):
+        t = self._epoch.seconds(message.header.stamp)
+        if t < self._newest - TIME_JUMP:
+            self.get_logger().info("time has gone back: starting over")
+            self._start_over()
+        self._newest = max(self._newest, t)
+        self._hold.add(t, message)
+        self._release()
+
+    def _release(self):
+        released = self._hold.take(self._is_ready)
+        if not released:
+            return
+        t = np.array([t for t, _, _ in released])
+        a, b = (
+            self._corrector.anchors.index([getattr(message, name) for _, message, _ in released])
+            for name in ("anchor_a", "anchor_b")
+        )
+        d = np.array([message.distance_difference for _, message, _ in released])
+        valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
+        correction = self._corrector.correct(t[valid], a[valid], b[valid], d[valid])
+        bias, std, status = np.zeros(len(t)), np.zeros(len(t)), np.full(len(t), PASSED)
+        bias[valid], std[valid], status[valid] = correction.bias, correction.std, correction.status
+        self._counts["invalid"] += len(t) - int(valid.sum())
+        for (_, message, ready), *values in zip(released, bias.tolist(), std.tolist(), status.tolist()):
+            self._counts["unready"] += not ready
+            self._publish(message, *values)
+
+    def _is_ready(self, t):
+        return self._newest_pose == -math.inf or self._corrector.ready(t)
+
+    def _publish(self, message, bias, std, status):
+        out = self._message
+        out.header = message.header
+        out.anchor_a, out.anchor_b = message.anchor_a, message.anchor_b
+        out.raw = message.distance_difference
+        out.bias, out.bias_std = bias, std
+        out.corrected = out.raw - bias
+        out.status, out.model = status, self._model[status]
+        self._publisher.publish(out)
+        self._counts["published"] += 1
+        self._counts[STATUS[status]] += 1
+
+    def _report(self):
+        counts = self._counts
+        rate = self._rate.of(counts["received"])
+        unready, self._reported_unready = counts["unready"] - self._reported_unready, counts["unready"]
+        values = {"model": self._model[NETWORK], "received": counts["received"], "published": counts["published"]}
+        values |= {"waiting": len(self._hold) + len(self._early), "dropped": counts["dropped"]}
+        values |= {name: counts[name] for name in STATUS.values()}
+        values |= {"released before their pose": counts["unready"], "invalid": counts["invalid"]}
+        values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
+        values |= {f"publishers of {name}": input.get_publisher_count() for name, input in self._inputs.items()}
+        return *self._health(rate, unready), values
+
+    def _health(self, rate, unready):
+        if self._idle:
+            return DiagnosticStatus.OK, "passing TDOAs on: neither effects_file nor model_file is set"
+        if self._anchors.refused:
+            return DiagnosticStatus.ERROR, self._anchors.refused
+        if self._corrector is None:
+            return DiagnosticStatus.ERROR, "no anchors yet: publish them on uwb/anchors, reliable and transient local"
+        if not rate:
+            return DiagnosticStatus.WARN, "no TDOAs on uwb/tdoa: check that the tag's driver runs in this namespace"
+        if self._newest_pose == -math.inf:
+            return DiagnosticStatus.WARN, "no poses on odometry yet: what needs one is not corrected; start ekf_node"
+        if unready:
+            return DiagnosticStatus.WARN, "odometry is late: TDOAs leave before their pose; check the load of ekf_node"
+        return DiagnosticStatus.OK, f"correcting with {self._model[NETWORK]}"
+
+
+def main(argv=None):
+    """Run the node; returns the exit code."""
+    return ros.run(BiasNode, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
