@@ -1,0 +1,224 @@
+"""ekf_node: inertial samples and corrected TDOAs in, odometry out.
+
+imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray)
+  -> odometry (nav_msgs/Odometry), /tf (tf2_msgs/TFMessage), uwb/residual (TdoaResidual: one for each TdoaCorrected),
+     /diagnostics (diagnostic_msgs/DiagnosticArray).
+Every parameter is documented in config/ekf_node.yaml.
+"""
+
+from collections import Counter, deque
+from dataclasses import fields
+import math
+import sys
+import time
+
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import Imu
+from tf2_msgs.msg import TFMessage
+from uwb_tdoa_bias import ros
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
+
+from .config import FilterConfig
+from .engine import INVALID
+from .estimator import TIME_JUMP, VERDICTS, Estimator
+from .frames import body_velocity, pose_covariance
+from .health import Health
+
+EARLY = 5000  # messages kept while there are no anchors
+UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
+
+
+class EkfNode(Node):
+    """Converts messages for an Estimator and publishes what it says. The filter is all in there."""
+
+    NAME = "ekf_node"
+
+    def __init__(self):
+        super().__init__(self.NAME)
+        tuning = {
+            field.name: ros.parameter(self, field.name, field.default, "tunes the filter; see config/ekf_node.yaml")
+            for field in fields(FilterConfig)
+        }
+        self._config = FilterConfig(**tuning)
+        self._reorder = ros.parameter(self, "reorder", 0.005, "how long a TDOA waits for older ones, s of stamps")
+        self._lag = ros.parameter(self, "lag", 0.25, "how long a silent stream is waited for, s of stamps")
+        self._world = ros.parameter(self, "world_frame", "", "frame of the odometry; empty for that of the anchors")
+        self._body = ros.parameter(self, "body_frame", "base_link", "frame of the tag and the IMU")
+        publish_tf = ros.parameter(self, "publish_tf", True, "publish world -> body on /tf")
+        if not 0.0 <= self._reorder < self._lag < math.inf:
+            raise InputError(f"reorder, lag: {self._reorder!r}, {self._lag!r} must be seconds with 0 <= reorder < lag.")
+        self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute")
+        _warm_up(self._config)
+
+        self._estimator = None
+        self._epoch = ros.Epoch()
+        self._early = deque()
+        self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
+        self._gyros, self._gyro = deque(maxlen=EARLY), None  # (t, x, y, z) not used yet, and the last one used
+        self._health = Health(self._config, self._lag)
+        # One message object each, for all: what is published is copied.
+        self._odometry = Odometry(child_frame_id=self._body)
+        self._transform = TransformStamped(child_frame_id=self._body)
+        self._tf, self._residual = TFMessage(transforms=[self._transform]), TdoaResidual()
+
+        self._odometry_publisher = ros.publish_stream(self, Odometry, "odometry")
+        self._residual_publisher = ros.publish_stream(self, TdoaResidual, "uwb/residual")
+        self._tf_publisher = self.create_publisher(TFMessage, "/tf", ros.TF_QOS) if publish_tf else None
+        self._anchors = ros.AnchorsInput(self, self._on_anchors)
+        self._inputs = {
+            "imu/data": ros.subscribe_stream(self, Imu, "imu/data", self._on_imu),
+            "uwb/tdoa_corrected": ros.subscribe_stream(self, TdoaCorrected, "uwb/tdoa_corrected", self._on_tdoa),
+        }
+        self._diagnostics = ros.Diagnostics(self, self._report)
+        self.get_logger().info("ready")
+
+    def _on_anchors(self, anchors):
+        if self._estimator is not None:
+            self._publish(*self._estimator.finish())
+            self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
+        self._estimator = Estimator(anchors, self._config, self._reorder, self._lag)
+        world = self._world or anchors.frame
+        for message in (self._odometry, self._transform, self._residual):
+            message.header.frame_id = world
+        early, self._early = self._early, deque()
+        for take, message in early:
+            take(message)
+        self._publish(*self._estimator.advance())
+
+    def _on_imu(self, message):
+        self._health.imu += 1
+        self._receive(self._take_imu, message)
+
+    def _on_tdoa(self, message):
+        self._health.tdoa += 1
+        self._receive(self._take_tdoa, message)
+
+    def _receive(self, take, message):
+        if self._estimator is not None:
+            take(message)
+            self._publish(*self._estimator.advance())
+            return
+        self._early.append((take, message))
+        if len(self._early) > EARLY:
+            take, message = self._early.popleft()
+            self._past["imu_invalid" if take == self._take_imu else "invalid"] += 1
+            if take == self._take_tdoa:
+                t = self._epoch.seconds(message.header.stamp)
+                self._publish_residual(t, message.anchor_a, message.anchor_b, math.nan, math.nan, 0.0, INVALID)
+
+    def _take_imu(self, message):
+        t = self._epoch.seconds(message.header.stamp)
+        rate, force = message.angular_velocity, message.linear_acceleration
+        gyro, force = (rate.x, rate.y, rate.z), (force.x, force.y, force.z)
+        if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
+            self.get_logger().warning(
+                "imu/data says with a covariance of -1 that it has no angular velocity or no acceleration: such "
+                "samples are not used; without a whole IMU set use_imu to false",
+                once=True,
+            )
+            gyro = (math.nan,) * 3
+        self._estimator.add_imu(t, gyro, force)
+        if self._gyros and t < self._gyros[-1][0]:
+            if t > self._gyros[-1][0] - TIME_JUMP:
+                return
+            self._gyros.clear()
+        if math.isfinite(sum(gyro)):
+            self._gyros.append((t, *gyro))
+
+    def _take_tdoa(self, message):
+        t = self._epoch.seconds(message.header.stamp)
+        self._estimator.add_tdoa(t, message.anchor_a, message.anchor_b, message.corrected, message.bias_std)
+
+    def _publish(self, odometry, residuals):
+        if len(odometry.t):
+            self._publish_odometry(odometry)
+        if len(residuals.t):
+            columns = (
+                residuals.t, residuals.a, residuals.b, residuals.innovation, residuals.variance, residuals.weight,
+                residuals.verdict,
+            )  # fmt: skip
+            for row in zip(*(column.tolist() for column in columns)):
+                self._publish_residual(*row)
+
+    def _publish_residual(self, t, a, b, innovation, variance, weight, verdict):
+        out = self._residual
+        out.header.stamp = self._epoch.stamp(t)
+        out.anchor_a, out.anchor_b = a, b
+        out.innovation, out.innovation_variance = innovation, variance
+        out.weight, out.verdict = weight, verdict
+        self._residual_publisher.publish(out)
+
+    def _publish_odometry(self, odometry):
+        n = len(odometry)
+        pose = pose_covariance(odometry.q, odometry.covariance).reshape(n, 36)
+        velocity, spread = body_velocity(odometry.q, odometry.v, odometry.covariance)
+        twist = np.zeros((n, 6, 6))
+        twist[:, :3, :3] = spread
+        rates, variances = zip(*map(self._rate_at, odometry.t.tolist(), odometry.gyro_bias.tolist()))
+        twist[:, [3, 4, 5], [3, 4, 5]] = np.array(variances)[:, None]
+        twist = twist.reshape(n, 36)
+        out, tf = self._odometry, self._transform.transform
+        columns = (odometry.t, odometry.p, odometry.q, velocity)
+        for i, (t, p, q, u, rate) in enumerate(zip(*(column.tolist() for column in columns), rates)):
+            out.header.stamp = self._transform.header.stamp = self._epoch.stamp(t)
+            position, orientation, twist_out = out.pose.pose.position, out.pose.pose.orientation, out.twist.twist
+            position.x, position.y, position.z = p
+            orientation.x, orientation.y, orientation.z, orientation.w = q
+            twist_out.linear.x, twist_out.linear.y, twist_out.linear.z = u
+            twist_out.angular.x, twist_out.angular.y, twist_out.angular.z = rate
+            out.pose.covariance, out.twist.covariance = pose[i], twist[i]
+            self._odometry_publisher.publish(out)
+            if self._tf_publisher is not None:
+                tf.translation.x, tf.translation.y, tf.translation.z = p
+                tf.rotation = orientation
+                self._tf_publisher.publish(self._tf)
+        self._health.last_odometry = time.monotonic()
+
+    def _rate_at(self, t, bias):
+        """Angular velocity at stamp t, (3,) rad/s, and its variance: that of its mean over one odometry interval."""
+        while self._gyros and self._gyros[0][0] <= t:
+            self._gyro = self._gyros.popleft()
+        if self._gyro is None or abs(t - self._gyro[0]) > self._config.imu_timeout:
+            return (0.0, 0.0, 0.0), UNKNOWN_RATE
+        rate = tuple(measured - wrong for measured, wrong in zip(self._gyro[1:], bias))
+        return rate, self._config.gyro_noise**2 * self._config.odometry_rate
+
+    def _report(self):
+        counts, estimator = Counter(self._past), self._estimator
+        imu_waiting = sum(take == self._take_imu for take, _ in self._early)
+        tdoa_waiting = len(self._early) - imu_waiting
+        if estimator is not None:
+            counts.update(estimator.counts, recoveries=estimator.recoveries)
+            imu_waiting, tdoa_waiting = estimator.waiting
+        level, text, values = self._health.report(self._anchors.refused, estimator, counts)
+        values |= {"TDOAs received": self._health.tdoa} | {name: counts[name] for name in VERDICTS.values()}
+        values |= {"waiting": tdoa_waiting, "IMU samples received": self._health.imu}
+        values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
+        values |= {"imu_waiting": imu_waiting, "recoveries": counts["recoveries"], "restarts": counts["restarts"]}
+        values |= {f"publishers of {name}": input.get_publisher_count() for name, input in self._inputs.items()}
+        return level, text, values
+
+
+def _warm_up(config):
+    """Compile, or load from numba's cache, what the first messages would."""
+    estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]), config)
+    for step in range(200):
+        estimator.add_imu(0.01 * step, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+        estimator.add_tdoa(0.01 * step, step % 4, (step + 1) % 4, 0.0)
+        odometry, _ = estimator.advance()
+    pose_covariance(odometry.q, odometry.covariance)
+    body_velocity(odometry.q, odometry.v, odometry.covariance)
+
+
+def main(argv=None):
+    """Run the node; returns the exit code."""
+    return ros.run(EkfNode, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
