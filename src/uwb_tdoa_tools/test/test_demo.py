@@ -1,0 +1,37 @@
+import pytest
+
+pytest.importorskip("rclpy")
+from uwb_tdoa_tools import demo  # noqa: E402
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0."),
+        (["--survey", "survey.txt"], "--survey: needs --flight; a simulated flight has its own anchors."),
+        (["--flight", "nowhere.log"], "nowhere.log: does not exist"),
+    ],
+)
+def test_bad_usage_is_one_sentence(arguments, sentence, tmp_path, capsys):
+    assert demo.main([*arguments, "--out", str(tmp_path / "out")]) == 2
+    assert f"demo: error: {sentence}" in capsys.readouterr().err
+
+
+def figures(line):
+    """The numbers in a line of the table of errors."""
+    return [float(word) for word in line.split()[-6:]]
+
+
+@pytest.mark.slow
+def test_a_simulated_flight_through_the_real_nodes(tmp_path, capsys):
+    assert demo.main(["--out", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    raw, corrected, without_ros = (
+        next(figures(line) for line in lines if line.startswith(name))
+        for name in ("raw  ", "corrected  ", "corrected, without ROS")
+    )
+    assert corrected[3] < 0.6 * raw[3]  # 3D RMSE
+    if any(" 0 late, " in line and line.endswith(" 0 lost") for line in lines):
+        assert corrected[:5] == pytest.approx(without_ros[:5], abs=1.01e-3)
+    for name in ("flight.bag", "recorded.bag", "effects.yaml", "error.png"):
+        assert (tmp_path / name).exists()
