@@ -94,6 +94,8 @@ def differences(one, other):
             found.append(part)
         for name in vars(first) if first is not None and second is not None else ():
             a, b = np.asarray(getattr(first, name)), np.asarray(getattr(second, name))
-            if a.shape != b.shape or not (np.array_equal(a, b, equal_nan=True) if a.dtype.kind == "f" else (a == b).all()):
+            if a.shape != b.shape or not (
+                np.array_equal(a, b, equal_nan=True) if a.dtype.kind == "f" else (a == b).all()
+            ):
                 found.append(f"{part}.{name}")
     return found

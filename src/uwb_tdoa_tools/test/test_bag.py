@@ -57,9 +57,13 @@ def flights(draw):
     ids = draw(st.lists(st.integers(0, 65535), min_size=1, max_size=4, unique=True))
     unit = st.sampled_from([[0.0, 0.0, 0.0, 1.0], [0.6, 0.0, -0.8, 0.0], [np.nan] * 4])
     n = len(ids)
-    anchors = Anchors(ids, np.clip(values(n, 3, finite=True), -1e300, 1e300), draw(st.lists(unit, min_size=n, max_size=n)))
+    anchors = Anchors(
+        ids, np.clip(values(n, 3, finite=True), -1e300, 1e300), draw(st.lists(unit, min_size=n, max_size=n))
+    )
     t = stamps(1)
-    tdoas = Tdoas(t, draw(arrays(np.int64, len(t), elements=st.sampled_from(ids))), np.full(len(t), 65535), values(len(t)))
+    tdoas = Tdoas(
+        t, draw(arrays(np.int64, len(t), elements=st.sampled_from(ids))), np.full(len(t), 65535), values(len(t))
+    )
     t = stamps(1)
     imu = draw(st.sampled_from([None, Imu(t, values(len(t), 3), values(len(t), 3))]))
     t = stamps(1)
@@ -231,7 +235,9 @@ def test_odometry(tmp_path):
     half = np.sqrt(0.5)
     messages = [
         odometry_message(2_000_000_001, (4.0, 5.0, 6.0), (0, 0, 0, 1), (1.0, 0.0, 0.0), covariance, -covariance),
-        odometry_message(1_000_000_000, (1.0, 2.0, 3.0), (0, 0, half, half), (1.0, 0.0, 0.0), 2 * covariance, covariance),
+        odometry_message(
+            1_000_000_000, (1.0, 2.0, 3.0), (0, 0, half, half), (1.0, 0.0, 0.0), 2 * covariance, covariance
+        ),
     ]
     write_topics(tmp_path / "bag", ("/odometry", "nav_msgs/msg/Odometry", messages))
     odometry = read_odometry(tmp_path / "bag")

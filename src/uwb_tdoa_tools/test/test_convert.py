@@ -47,7 +47,14 @@ def test_existing_output_is_refused_before_the_work(files, capsys):
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"hello", log_bytes()[:-1], log_bytes()[:40], log_bytes()[:90] + b"\x55" + log_bytes()[91:], csv_text()[:-3].encode()],
+    [
+        b"",
+        b"hello",
+        log_bytes()[:-1],
+        log_bytes()[:40],
+        log_bytes()[:90] + b"\x55" + log_bytes()[91:],
+        csv_text()[:-3].encode(),
+    ],
 )
 def test_bad_input_leaves_no_bag(files, capsys, content):
     (files / "bad").write_bytes(content)

@@ -21,14 +21,19 @@ def test_type_hash_is_the_one_of_the_build(name):
     descriptions = [folder / f"{name}.json" for folder in BUILT if (folder / f"{name}.json").exists()]
     if not descriptions:
         pytest.skip("uwb_tdoa_msgs is not built and sourced")
-    hashes = {entry["type_name"]: entry["hash_string"] for entry in json.loads(descriptions[0].read_text())["type_hashes"]}
+    hashes = {
+        entry["type_name"]: entry["hash_string"] for entry in json.loads(descriptions[0].read_text())["type_hashes"]
+    }
     msgtype = f"uwb_tdoa_msgs/msg/{name}"
     assert typestore().hash_rihs01(msgtype) == hashes[msgtype]
 
 
 def test_installed_types_come_with_what_they_are_made_of(tmp_path, monkeypatch):
     share = tmp_path / "share"
-    for package, name, text in (("one_msgs", "Outer", "two_msgs/Inner[3] many\nstring name"), ("two_msgs", "Inner", "int8 x")):
+    for package, name, text in (
+        ("one_msgs", "Outer", "two_msgs/Inner[3] many\nstring name"),
+        ("two_msgs", "Inner", "int8 x"),
+    ):
         folder = share / package / "msg"
         folder.mkdir(parents=True)
         (folder / f"{name}.msg").write_text(text)

@@ -57,8 +57,6 @@ def test_stamps_that_fall_are_sorted_and_counted(read):
     assert flight.meta["reordered"] == {"tdoa": 1}
 
 
-
-
 TDOA = "t_tdoa,idA,idB,tdoa_meas"
 
 

@@ -5,7 +5,7 @@ Topic (in a bag always absolute)   type                              what
 /uwb/tdoa                          uwb_tdoa_msgs/msg/Tdoa            Flight.tdoa
 /uwb/anchors                       uwb_tdoa_msgs/msg/AnchorArray     Flight.anchors, once, transient local
 /ground_truth/pose                 geometry_msgs/msg/PoseStamped     Flight.truth
-/tf_static                         tf2_msgs/msg/TFMessage            anchors as frames anchor_<id>, once, transient local
+/tf_static                         tf2_msgs/msg/TFMessage            frames anchor_<id>, once, transient local
 
 The time of a message is its header stamp. `Flight.extra` has no message type and stays behind.
 """
@@ -138,7 +138,9 @@ def read_bag(path, namespace="", anchors=None):
 
         tdoa = stream("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of)
         if tdoa is None:
-            raise InputError(f"{path}: has no message on {_absolute(namespace, 'uwb/tdoa')}; {_others(connections, namespace)}.")
+            raise InputError(
+                f"{path}: has no message on {_absolute(namespace, 'uwb/tdoa')}; {_others(connections, namespace)}."
+            )
         if anchors is None:
             anchors = _read_anchors(path, reader, connections, namespace)
         imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
@@ -203,7 +205,7 @@ def _absolute(namespace, topic):
 
 
 def _find(path, connections, namespace, topic, msgtype=None):
-    """The connection of a topic as a list, empty if it is not there; raises InputError if its type is not the right one."""
+    """The connection of a topic as a list, empty if it is not there; raises InputError if its type is another."""
     connection = connections.get(_absolute(namespace, topic))
     if connection is None:
         return []
@@ -233,7 +235,9 @@ def _read_anchors(path, reader, connections, namespace):
     for connection, _, data in messages(path, reader, found):
         last = deserialize(path, connection, data)
     if last is None:
-        raise InputError(f"{path}: has no message on {_absolute(namespace, 'uwb/anchors')}; give a survey file (--survey FILE).")
+        raise InputError(
+            f"{path}: has no message on {_absolute(namespace, 'uwb/anchors')}; give a survey file (--survey FILE)."
+        )
     return bag_messages.anchors_of(last)
 
 

@@ -25,7 +25,7 @@ def new_bag(out, storage="mcap", force=False):
         raise InputError(f"storage: {storage!r} is not known; choose one of {', '.join(STORAGES)}.")
     check_output(out, force)
     out.parent.mkdir(parents=True, exist_ok=True)
-    # A sibling, so that the last step is a rename. The bag's own name inside of it: rosbags names the data file after it.
+    # A sibling, so that the last step is a rename. In it the bag's own name: rosbags names the data file after it.
     scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
     try:
         with Writer(scratch / out.name, version=Writer.VERSION_LATEST, storage_plugin=STORAGES[storage]) as writer:
@@ -39,7 +39,7 @@ def new_bag(out, storage="mcap", force=False):
 
 
 def check_output(out, force=False):
-    """Raise InputError if a new bag cannot be put at `out`: something is there, and not a bag that force may replace."""
+    """Raise InputError if a new bag cannot be put at `out`: something is there that force may not replace."""
     out = Path(out)
     if not out.name:
         raise InputError(f"{out}: is no name for a bag; give the path of a new directory.")
@@ -82,7 +82,7 @@ def open_bag(path):
 
 
 def messages(path, reader, connections):
-    """Yield (connection, stamp ns, bytes) of the given connections in order of the bag; raises InputError if it is damaged."""
+    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order; raises InputError."""
     found = reader.messages(connections=connections) if connections else iter(())
     while True:
         try:

@@ -10,9 +10,10 @@ from .bag import check_output, write_bag
 from .bag_files import STORAGES
 from .readers import read_flight
 
-DESCRIPTION = """Convert a recorded flight to a ROS 2 bag: a Crazyflie micro-SD event log, a UTIL CSV file (plain or gzip), or a bag.
+DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
-The bag has imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_static. It appears only when it is complete.
+IN is a Crazyflie micro-SD event log (versions 1 and 2), a UTIL CSV file (plain or gzip), or a bag. The new bag has
+imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_static. It appears only when it is complete.
 """
 
 
@@ -56,7 +57,9 @@ def convert(args):
     if args.json:
         print(json.dumps(summary, indent=2, default=str))
         return
-    print(f"{flight.name}: {summary['end'] - summary['start']:.1f} s, {flight.meta.get('protocol', 'protocol unknown')}")
+    print(
+        f"{flight.name}: {summary['end'] - summary['start']:.1f} s, {flight.meta.get('protocol', 'protocol unknown')}"
+    )
     for topic, count in counts.items():
         print(f"  {topic}: {count}")
     for name, count in summary["left_out"].items():

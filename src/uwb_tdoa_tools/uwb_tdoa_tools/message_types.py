@@ -39,7 +39,9 @@ def add_type(store, msgtype):
 
 def _definition(msgtype):
     package, _, name = msgtype.split("/")
-    prefixes = [Path(prefix) / "share" for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
+    prefixes = [
+        Path(prefix) / "share" for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix
+    ]
     for share in [*prefixes, _SOURCE_TREE]:
         file = share / package / "msg" / f"{name}.msg"
         if file.is_file():

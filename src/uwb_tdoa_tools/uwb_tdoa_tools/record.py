@@ -3,7 +3,6 @@
 import sys
 import time
 
-from rclpy.utilities import remove_ros_args
 from tqdm import tqdm
 
 from uwb_tdoa_bias.errors import InputError
@@ -11,12 +10,12 @@ from uwb_tdoa_bias.errors import InputError
 from . import cli
 from .bag_files import STORAGES, new_bag
 from .message_types import add_type, typestore
-from .ros_session import message_class, recorded_qos, session, subscription_qos
+from .ros_session import message_class, own_arguments, recorded_qos, session, subscription_qos
 
 DESCRIPTION = """Record ROS topics to a bag, like `ros2 bag record`, until SIGINT (Ctrl-C) or SIGTERM.
 
-Topics are found as they appear; each is subscribed to with the strongest QoS that all its publishers offer. Messages are
-stored as they come, with the time of their arrival. The bag appears when the recording ends.
+Topics are found as they appear; each is subscribed to with the strongest QoS that all its publishers offer. Messages
+are stored as they come, with the time of their arrival. The bag appears when the recording ends.
 """
 DISCOVERY_PERIOD = 0.1  # s between two looks for new topics
 POLL_PERIOD = 0.005  # s between two looks for messages; the subscriptions hold what comes in between
@@ -34,14 +33,35 @@ def main(argv=None):
     parser.add_argument("-a", "--all", action="store_true", help="record all topics, except hidden ones")
     parser.add_argument("-o", "--output", required=True, metavar="BAG", help="the bag to write, a new directory")
     parser.add_argument("-s", "--storage", choices=STORAGES, default="mcap", help="default: mcap")
-    own = remove_ros_args(["record", *arguments])[1:]
-    return cli.run(lambda args: record(args, arguments), parser, own)
+    return cli.run(lambda args: record(args, arguments), parser, own_arguments("record", arguments))
 
 
 def record(args, ros_arguments):
     """Record as the parsed arguments say; returns the exit code. Raises InputError."""
     if bool(args.topics) == args.all:
         raise InputError("topics: name the topics to record, or give --all for all of them, not both.")
+    try:
+        recorder, failure = _record(args, ros_arguments)
+    except NothingRecorded as nothing:
+        _say(f"no message came on {nothing}; there is no bag")
+        return 1
+    for topic, count in sorted(recorder.counts.items()):
+        print(f"{topic}: {count} messages")
+    print(f"{sum(recorder.counts.values())} messages -> {args.output}")
+    if failure is not None:
+        raise failure
+    if missing := sorted(recorder.missing()):
+        _say(f"no message came on {', '.join(missing)}")
+        return 1
+    return 0
+
+
+class NothingRecorded(Exception):
+    """Ends a recording without a bag."""
+
+
+def _record(args, ros_arguments):
+    """The Recorder when it has ended, and the error that ended it, or None."""
     with session("record", ros_arguments) as (node, stop), new_bag(args.output, args.storage) as writer:
         wanted = {node.resolve_topic_name(topic) for topic in args.topics} if args.topics else None
         recorder = Recorder(node, writer, wanted)
@@ -60,15 +80,9 @@ def record(args, ros_arguments):
             failure = error
         else:
             failure = None
-    for topic, count in sorted(recorder.counts.items()):
-        print(f"{topic}: {count} messages")
-    print(f"{sum(recorder.counts.values())} messages -> {args.output}")
-    if failure is not None:
-        raise failure
-    if missing := (wanted or set()) - {topic for topic, count in recorder.counts.items() if count}:
-        _say(f"no message came on {', '.join(sorted(missing))}")
-        return 1
-    return 0
+        if not any(recorder.counts.values()) and failure is None:
+            raise NothingRecorded(", ".join(sorted(wanted)) if wanted else "any topic")
+    return recorder, failure
 
 
 class Recorder:
@@ -104,6 +118,10 @@ class Recorder:
                     self.counts[connection.topic] += 1
                     taken += 1
         return taken
+
+    def missing(self):
+        """Topics that were asked for by name and brought nothing."""
+        return {topic for topic in self._wanted or () if not self.counts.get(topic)}
 
     def _is_wanted(self, topic):
         if self._wanted is not None:

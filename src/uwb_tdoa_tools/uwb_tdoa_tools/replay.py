@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSProfile
-from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from uwb_tdoa_bias.errors import InputError
@@ -19,7 +18,7 @@ from uwb_tdoa_bias.errors import InputError
 from . import cli
 from .bag_files import messages, open_bag
 from .read_ahead import read_ahead
-from .ros_session import message_class, publisher_qos, session
+from .ros_session import message_class, own_arguments, publisher_qos, session
 
 RCLError = rclpy_implementation.RCLError
 DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 bag play`.
@@ -49,7 +48,12 @@ def main(argv=None):
     parser.add_argument("-r", "--rate", type=_positive, default=1.0, help="times as fast as recorded (default 1)")
     parser.add_argument("-l", "--loop", action="store_true", help="start again at the end, until stopped")
     parser.add_argument(
-        "--clock", type=_positive, nargs="?", const=40.0, metavar="HZ", help="publish the bag's time on /clock (default 40 Hz)"
+        "--clock",
+        type=_positive,
+        nargs="?",
+        const=40.0,
+        metavar="HZ",
+        help="publish the bag's time on /clock (default 40 Hz)",
     )
     parser.add_argument(
         "--wait-matched", type=_positive, default=2.0, metavar="SECONDS",
@@ -59,8 +63,7 @@ def main(argv=None):
         "--wait-topics", nargs="+", default=[], metavar="TOPIC",
         help="wait for these topics only, and fail if nobody subscribes to one of them in time",
     )  # fmt: skip
-    own = remove_ros_args(["replay", *arguments])[1:]
-    return cli.run(lambda args: replay(args, arguments), parser, own)
+    return cli.run(lambda args: replay(args, arguments), parser, own_arguments("replay", arguments))
 
 
 @dataclass
@@ -131,7 +134,7 @@ def _publishers(node, bag, reader):
 
 
 def _wait_matched(publishers, limit, topics, stop):
-    """Return when every topic has a subscription, or after `limit` s; raises InputError if named topics have none by then."""
+    """Return when every topic has a subscription, or after `limit` s; InputError if a named one has none then."""
     wanted = [f"/{topic.lstrip('/')}" for topic in topics] or list(publishers)
     if missing := [topic for topic in wanted if topic not in publishers]:
         raise InputError(f"--wait-topics: {missing[0]} is not in the bag; it has {', '.join(publishers)}.")
@@ -144,7 +147,9 @@ def _wait_matched(publishers, limit, topics, stop):
             break
         time.sleep(0.01)
     if missing and topics and not stop:
-        raise InputError(f"nobody subscribes to {missing[0]} within {limit:g} s; start the nodes first, or wait longer.")
+        raise InputError(
+            f"nobody subscribes to {missing[0]} within {limit:g} s; start the nodes first, or wait longer."
+        )
     if missing:
         _say(f"nobody subscribes to {', '.join(missing)}")
     time.sleep(SETTLE)
@@ -205,7 +210,7 @@ def _clock_message(nanoseconds):
 
 
 def _wait_acknowledged(publishers, stop):
-    """Whether every subscription has everything; waits for it at most ACKNOWLEDGE_LIMIT, in slices that see a signal."""
+    """Whether every subscription has everything; waits at most ACKNOWLEDGE_LIMIT, in slices that see a signal."""
     until = time.monotonic() + ACKNOWLEDGE_LIMIT
     for publisher in publishers:
         while not publisher.wait_for_all_acked(Duration(seconds=LONGEST_SLEEP)):

@@ -8,6 +8,7 @@ import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from uwb_tdoa_bias.errors import InputError
@@ -54,6 +55,14 @@ def session(name, arguments):
             signal.signal(number, handler)
 
 
+def own_arguments(name, arguments):
+    """The command line without what is for ROS (--ros-args ...)."""
+    try:
+        return remove_ros_args([name, *arguments])[1:]
+    except rclpy_implementation.UnknownROSArgsError:  # `session` will say it
+        return arguments[: arguments.index("--ros-args")]
+
+
 def message_class(msgtype):
     """Class of a type like "pkg/msg/Name", or None if its package is not installed."""
     package, kind, name = msgtype.split("/")
@@ -64,10 +73,10 @@ def message_class(msgtype):
 
 
 def publisher_qos(recorded, messages):
-    """QoSProfile to replay a topic with. recorded : rosbags Qos of each recorded publisher; messages : how many there are.
+    """QoSProfile to replay a topic with. recorded : rosbags Qos of each recorded publisher; messages : how many.
 
-    Durability as recorded. Always reliable: that serves reliable and best-effort subscriptions alike. A stream keeps all
-    that is not acknowledged, so that a reliable subscription that lags holds the replay up and loses nothing. On a
+    Durability as recorded. Always reliable: that serves reliable and best-effort subscriptions alike. A stream keeps
+    all that is not acknowledged, so that a reliable subscription that lags holds the replay up and loses nothing. On a
     transient-local topic, a late subscription gets as many messages as the recorded publishers kept.
     """
     if any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in recorded):

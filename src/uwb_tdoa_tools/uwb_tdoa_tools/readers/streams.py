@@ -60,8 +60,8 @@ def protocol(tdoas):
     """ "tdoa2" if most measurements are between neighbours a, a + 1 in the ring of the ids that occur, else "tdoa3".
 
     TDoA2 anchors send in turn in fixed slots and the tag takes the difference of two that follow each other, further
-    apart only where it missed one; in TDoA3 any pair occurs (Bitcraze documentation). Measured: at least 93 % neighbours
-    with the one, at most 20 % with the other, of eight anchors.
+    apart only where it missed one; in TDoA3 any pair occurs (Bitcraze documentation). Measured, of eight anchors: at
+    least 93 % neighbours with the one, at most 20 % with the other.
     """
     ids = np.unique(np.concatenate([tdoas.a, tdoas.b]))
     step = (np.searchsorted(ids, tdoas.b) - np.searchsorted(ids, tdoas.a)) % len(ids)
@@ -71,9 +71,9 @@ def protocol(tdoas):
 def _imu(gyro, acc, meta):
     """One stream of both sensors at the gyroscope's stamps.
 
-    The firmware reads both at one instant and logs one after the other, some 20 us apart: sample n goes with sample n as
-    long as all stamps agree to half a period. Where they do not (an event was lost), the accelerometer is interpolated
-    linearly between its own samples, and gyroscope samples outside of its time are left out.
+    The firmware reads both at one instant and logs one after the other, some 20 us apart: sample n goes with sample n
+    as long as all stamps agree to half a period. Where they do not (an event was lost), the accelerometer is
+    interpolated linearly between its own samples, and gyroscope samples outside of its time are left out.
     """
     t, rate, force = gyro["t"], _stack(gyro, "x", "y", "z"), _stack(acc, "x", "y", "z")
     half_period = 0.5 * np.median(np.diff(t)) if len(t) > 1 else 0.0

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.anchors import Anchors
 from uwb_tdoa_bias.errors import InputError
 
-# The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z) and arm 3 forward (x),
-# away from the antenna's back. Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this
-# makes a right-handed frame of the three. (With +y the fit is as good, three points being flat, but every stand tilts by
-# some 60 degrees; with -y the stands on the floor have z up to within 1 degree and the antenna sits at one place of all
-# stands: 11 mm forward, 26 mm to -y, 49 mm up.)
+# The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z), arm 3 forward (x).
+# Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this makes a right-handed frame
+# of the three. (With +y the fit is as good, for three points are flat, but every stand tilts by some 60 degrees. With
+# -y those on the floor have z up to within 1 degree, and in all of them the antenna is 11 mm forward, 26 mm to -y and
+# 49 mm up of where the arms meet.)
 ARM_TIPS = np.array([[0.0, 0.0, 0.110], [0.0, -0.121, 0.0], [0.080, 0.0, 0.0]])
 MAX_TIP_RESIDUAL = 0.010  # metres RMS; measured: 0.5 ... 2.2 mm
 
@@ -24,8 +24,8 @@ _TIP = re.compile(r"anchor_?(\d+)_([123])$")
 def read_survey(path):
     """Anchors of a survey file of any of three kinds, told apart by content.
 
-    - total station: lines `name,x,y,z` in metres; `anchorAntN` is the antenna of anchor N, `anchorN_1/_2/_3` the arm tips
-      of its stand (up, left, forward), from which the orientation follows; other names are ignored;
+    - total station: lines `name,x,y,z` in metres; `anchorAntN` is the antenna of anchor N, `anchorN_1/_2/_3` the arm
+      tips of its stand (up, left, forward), from which the orientation follows; other names are ignored;
     - `id,x,y,z` with that header line: positions only;
     - YAML, see `Anchors.from_yaml`.
 
@@ -37,7 +37,9 @@ def read_survey(path):
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give a survey file.") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv or .yaml).") from error
+        raise InputError(
+            f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv or .yaml)."
+        ) from error
     if re.search(r"^[{\s]*[\"']?anchors[\"']?\s*:", text, flags=re.MULTILINE):
         return Anchors.from_yaml(path)
     lines = [
@@ -79,7 +81,9 @@ def _total_station(path, lines):
     antennas, tips = {}, {}
     for number, cells in lines:
         antenna, tip = _ANTENNA.match(cells[0]), _TIP.match(cells[0])
-        points, key = (antennas, int(antenna[1])) if antenna else (tips, (int(tip[1]), int(tip[2]))) if tip else (None, None)
+        points, key = (
+            (antennas, int(antenna[1])) if antenna else (tips, (int(tip[1]), int(tip[2]))) if tip else (None, None)
+        )
         point = _point(path, number, cells)
         if points is None:
             continue
@@ -88,8 +92,8 @@ def _total_station(path, lines):
         points[key] = point
     if not antennas:
         raise InputError(
-            f"{path}: is no survey that can be read: expected lines 'anchorAnt0,x,y,z' of a total station, a header line "
-            "'id,x,y,z', or YAML with 'anchors:'."
+            f"{path}: is no survey that can be read: expected lines 'anchorAnt0,x,y,z' of a total station, a header "
+            "line 'id,x,y,z', or YAML with 'anchors:'."
         )
     for anchor, _ in tips:
         if anchor not in antennas:

@@ -72,7 +72,8 @@ def _read_header(path, data):
     """Version, {id: (name, [(variable, numpy type), ...])} and where the events start."""
     if data[0] != MAGIC:
         raise InputError(
-            f"{path}: byte 0 is 0x{data[0]:02X}, a micro-SD event log starts with 0xBC; give the file as it is on the card."
+            f"{path}: byte 0 is 0x{data[0]:02X}, a micro-SD event log starts with 0xBC; give the file as it is on "
+            "the card."
         )
     at = 1
 
@@ -93,7 +94,9 @@ def _read_header(path, data):
         end = data.find(0, at)
         content = take((end if end >= 0 else len(data)) + 1 - at, what)[:-1]
         if not content.isascii() or not content:
-            raise InputError(f"{path}: byte {at - len(content) - 1}: expected {what}, found {content!r}; the file is damaged.")
+            raise InputError(
+                f"{path}: byte {at - len(content) - 1}: expected {what}, found {content!r}; the file is damaged."
+            )
         return content.decode("ascii")
 
     version = number("the version")
@@ -114,7 +117,9 @@ def _read_header(path, data):
                 )
             fields.append((field, _NUMPY_OF_STRUCT[code]))
         if event in events or name in (known for known, _ in events.values()):
-            raise InputError(f"{path}: byte {where}: event type {event} {name!r} is defined twice; the file is damaged.")
+            raise InputError(
+                f"{path}: byte {where}: event type {event} {name!r} is defined twice; the file is damaged."
+            )
         events[event] = (name, fields)
     return version, events, at
 
@@ -126,7 +131,8 @@ def _check(path, data, stopped):
     if stored != computed:
         raise InputError(
             f"{path}: the checksum in the last 4 bytes is 0x{stored:08X} but 0x{computed:08X} was expected for the "
-            f"{len(data) - _CRC_SIZE} bytes before it ({first}); the file is cut or damaged: copy it from the card again."
+            f"{len(data) - _CRC_SIZE} bytes before it ({first}); the file is cut or damaged: copy it from the "
+            "card again."
         )
     if stopped >= 0:
         raise InputError(

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.errors import InputError
 from .streams import make_flight, read_bytes
 
 GZIP_MAGIC = b"\x1f\x8b"
-# Each sensor has its own time column and its own length: the sensors are only set side by side, a row is not one instant.
+# Each sensor has its own time column and its own length: they are only set side by side, a row is not one instant.
 # Units: the authors' converter writes the columns as the micro-SD log has them, so acc is in g and gyro in deg/s
 # (utiasDSL/util-uwb-dataset, scripts/flight-dataset/sdcard_scripts/log_to_csv.py); stamps are in s from the start.
 _STREAMS = {  # our stream: {column of the file: column of the stream}, the time column first
@@ -43,12 +43,14 @@ def read_util_csv(path, anchors):
     _check_header(path, header)
     if not text.endswith("\n"):
         raise InputError(
-            f"{path}: line {len(rows) + 1} has no line end: the file is cut; copy it again, or end it with a new line if "
-            "it is whole."
+            f"{path}: line {len(rows) + 1} has no line end: the file is cut; copy it again, or end it with a new line "
+            "if it is whole."
         )
     for line, row in enumerate(rows, start=2):
         if len(row) != len(header):
-            raise InputError(f"{path}: line {line} has {len(row)} cells, the header has {len(header)}; copy the file again.")
+            raise InputError(
+                f"{path}: line {line} has {len(row)} cells, the header has {len(header)}; copy the file again."
+            )
     cells = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
 
     streams = {}
@@ -59,7 +61,9 @@ def read_util_csv(path, anchors):
             continue
         missing = [name for name in rename if name not in cells]
         if missing:
-            raise InputError(f"{path}: the header has columns of {stream} but not {missing[0]}; all or none must be there.")
+            raise InputError(
+                f"{path}: the header has columns of {stream} but not {missing[0]}; all or none must be there."
+            )
         streams[stream] = {rename[name]: values for name, values in _numbers(path, rename, cells).items()}
     tdoa = streams["tdoa"]
     tdoa["a"], tdoa["b"] = _ids(path, "idA", tdoa["a"]), _ids(path, "idB", tdoa["b"])
@@ -89,9 +93,13 @@ def _text(path):
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not text; a UTIL CSV file (plain or gzip) was expected.") from error
+        raise InputError(
+            f"{path}: byte {error.start} is not text; a UTIL CSV file (plain or gzip) was expected."
+        ) from error
     if "\0" in text:
-        raise InputError(f"{path}: byte {text.index(chr(0))} is 0, not text; a UTIL CSV file was expected: copy it again.")
+        raise InputError(
+            f"{path}: byte {text.index(chr(0))} is 0, not text; a UTIL CSV file was expected: copy it again."
+        )
     if not text.strip():
         raise InputError(f"{path}: holds no text; a UTIL CSV file with a header line was expected.")
     return text
@@ -101,8 +109,8 @@ def _check_header(path, header):
     missing = [name for name in TDOA_COLUMNS if name not in header]
     if missing:
         raise InputError(
-            f"{path}: line 1: column {missing[0]} is missing from the header ({','.join(header)[:80]}); a UTIL CSV file "
-            f"has at least {','.join(TDOA_COLUMNS)}."
+            f"{path}: line 1: column {missing[0]} is missing from the header ({','.join(header)[:80]}); a UTIL CSV "
+            f"file has at least {','.join(TDOA_COLUMNS)}."
         )
     if len(set(header)) < len(header):
         twice = next(name for name in header if header.count(name) > 1)
@@ -118,8 +126,8 @@ def _numbers(path, names, cells):
         after = next((row for row in range(length, len(column)) if column[row]), None)
         if after is not None:
             raise InputError(
-                f"{path}: line {after + 2}: {name} is {column[after]!r} although {', '.join(names)} ended with an empty cell "
-                f"at line {length + 2}; the columns of one sensor must be filled from the top, without holes."
+                f"{path}: line {after + 2}: {name} is {column[after]!r} although {', '.join(names)} ended with an "
+                f"empty cell at line {length + 2}; fill the columns of one sensor from the top, without holes."
             )
         try:
             values[name] = np.array(column[:length], dtype=float)
@@ -129,8 +137,8 @@ def _numbers(path, names, cells):
         bad = np.flatnonzero(~np.isfinite(values[name]))
         if len(bad):
             raise InputError(
-                f"{path}: line {bad[0] + 2}: {name} is {column[bad[0]]!r}; it must be finite: leave the cells after the end "
-                "of a sensor empty, and delete broken measurements."
+                f"{path}: line {bad[0] + 2}: {name} is {column[bad[0]]!r}; it must be finite: leave the cells after "
+                "the end of a sensor empty, and delete broken measurements."
             )
     return values
 
@@ -147,5 +155,7 @@ def _ids(path, name, values):
     """Whole anchor ids 0 ... 65535 (the authors' converter writes them as 4 or 4.0)."""
     bad = np.flatnonzero((values != np.round(values)) | (values < 0) | (values > 65535))
     if len(bad):
-        raise InputError(f"{path}: line {bad[0] + 2}: {name} is {values[bad[0]]}; it must be a whole number 0 ... 65535.")
+        raise InputError(
+            f"{path}: line {bad[0] + 2}: {name} is {values[bad[0]]}; it must be a whole number 0 ... 65535."
+        )
     return values.astype(np.int64)

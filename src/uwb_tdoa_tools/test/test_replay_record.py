@@ -1,0 +1,280 @@
+"""Replay and record as real processes that talk over DDS. No step waits for time to pass, only for what must happen."""
+
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from recordings import differences, small_flight
+from uwb_tdoa_tools.bag import read_bag, read_fields, write_bag
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg", reason="uwb_tdoa_msgs is not built and sourced")
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from rosbags.rosbag2 import Reader  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from sensor_msgs.msg import Imu  # noqa: E402
+from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
+from uwb_tdoa_tools import record, replay  # noqa: E402
+
+LIMIT = 60.0  # s: a step that takes longer has failed
+STREAMS = ["imu/data", "uwb/tdoa", "ground_truth/pose"]
+DEEP = QoSProfile(depth=100_000, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class Process:
+    """A tool of ours that runs, and what it says on stderr, line by line."""
+
+    def __init__(self, name, *arguments):
+        command = [sys.executable, "-m", f"uwb_tdoa_tools.{name}", *map(str, arguments)]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.said = []
+        self._lines = queue.Queue()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self):
+        for line in self.process.stderr:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def until(self, text):
+        """Wait for a line on stderr that holds the text."""
+        deadline = time.monotonic() + LIMIT
+        while True:
+            line = self._lines.get(timeout=max(deadline - time.monotonic(), 0.01))
+            assert line is not None, f"ended without saying {text!r}: {self.said}"
+            self.said.append(line)
+            if text in line:
+                return
+
+    def end(self, number=None):
+        """Exit code and stdout, after sending a signal if one is given."""
+        if number is not None:
+            self.process.send_signal(number)
+        code = self.process.wait(timeout=LIMIT)
+        while (line := self._lines.get(timeout=LIMIT)) is not None:
+            self.said.append(line)
+        return code, self.process.stdout.read()
+
+
+@contextmanager
+def processes():
+    """A maker of processes, all of which have ended when the block ends."""
+    started = []
+
+    def start(*arguments):
+        started.append(Process(*arguments))
+        return started[-1]
+
+    try:
+        yield start
+    finally:
+        for process in started:
+            process.process.kill()
+            process.process.wait()
+            process.process.stdout.close()
+
+
+@pytest.fixture
+def start():
+    with processes() as make:
+        yield make
+
+
+@pytest.fixture
+def node():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    yield rclpy.create_node("listener", context=context, enable_rosout=False, start_parameter_services=False)
+    rclpy.shutdown(context=context)
+
+
+def take(subscription, enough):
+    """Messages from a subscription until enough(messages)."""
+    messages = []
+    deadline = time.monotonic() + LIMIT
+    while not enough(messages):
+        assert time.monotonic() < deadline, f"only {len(messages)} messages came"
+        with subscription.handle:
+            message = subscription.handle.take_message(subscription.msg_type, False)
+        if message is None:
+            time.sleep(0.001)
+        else:
+            messages.append(message[0])
+    return messages
+
+
+def subscribe(node, message_type, topic, qos=DEEP):
+    return node.create_subscription(message_type, topic, lambda _: None, qos)
+
+
+@pytest.mark.parametrize(
+    "storage, ending", [("mcap", signal.SIGINT), pytest.param("sqlite3", signal.SIGTERM, marks=pytest.mark.slow)]
+)
+def test_recorded_replay_is_the_bag(tmp_path, start, storage, ending):
+    flight = small_flight(seconds=4.0)
+    write_bag(flight, tmp_path / "flight.bag", storage)
+    again = tmp_path / "again.bag"
+    recording = start("record", "-o", again, "-s", storage, *STREAMS, "uwb/anchors", "/clock")
+    recording.until("waiting for")
+    replaying = start(
+        "replay",
+        tmp_path / "flight.bag",
+        "--rate",
+        4,
+        "--clock",
+        100,
+        "--wait-matched",
+        LIMIT,
+        "--wait-topics",
+        *STREAMS,
+    )
+    code, out = replaying.end()
+    assert code == 0, replaying.said
+    assert "/imu/data: 4000 messages" in out and "/uwb/tdoa: 2000 messages" in out
+    took = float(re.search(r"messages in ([0-9.]+) s", out)[1])
+    assert took > 0.99 * flight.imu.t[-1] / 4 - 10.0 / 4
+    assert not again.exists()  # not before it is complete
+    code, out = recording.end(ending)
+    assert code == 0, recording.said
+    assert "/imu/data: 4000 messages" in out
+    back = read_bag(again)
+    assert differences(flight, back) == []
+    assert {path.name for path in tmp_path.iterdir()} == {"flight.bag", "again.bag"}
+    with Reader(again) as reader:
+        clock = [data for connection, _, data in reader.messages() if connection.topic == "/clock"]
+    seconds = [int.from_bytes(data[4:8], "little") + 1e-9 * int.from_bytes(data[8:12], "little") for data in clock]
+    assert (np.diff(seconds) >= 0).all()
+    assert flight.imu.t[0] <= seconds[0] and seconds[-1] <= flight.imu.t[-1] + 0.001
+    assert len(seconds) > 20
+
+
+def test_anchors_reach_who_comes_late(tmp_path, start, node):
+    write_bag(small_flight(seconds=30.0, rate=100), tmp_path / "flight.bag")
+    imu = subscribe(node, Imu, "imu/data")
+    replaying = start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", "imu/data")
+    take(imu, lambda messages: len(messages) > 10)  # the anchors have long been published
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+    (array,) = take(subscribe(node, AnchorArray, "uwb/anchors", latched), lambda messages: messages)
+    assert [anchor.id for anchor in array.anchors] == [0, 1, 5]
+    code, out = replaying.end(signal.SIGINT)
+    assert code == 128 + signal.SIGINT
+    assert "replay: stopped\n" in replaying.said and "/uwb/anchors: 1 messages" in out
+
+
+@pytest.mark.slow
+def test_slow_reliable_subscription_loses_nothing(tmp_path, start, node):
+    """The subscription sleeps for a second, in which the replay could publish all of it ten times."""
+    count = 12_000  # more than what DDS keeps for a writer
+    write_bag(small_flight(seconds=count / 1000), tmp_path / "flight.bag")
+    keep_all = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+    imu = subscribe(node, Imu, "imu/data", keep_all)
+    replaying = start(
+        "replay", tmp_path / "flight.bag", "--rate", 100, "--wait-matched", LIMIT, "--wait-topics", "imu/data"
+    )
+    replaying.until("playing")
+    time.sleep(1.0)
+    messages = take(imu, lambda messages: len(messages) == count)
+    stamps = [message.header.stamp.sec * 1000 + message.header.stamp.nanosec // 10**6 for message in messages]
+    assert stamps == list(range(10_000, 10_000 + count))
+
+
+def test_best_effort_subscription_is_served(tmp_path, start, node):
+    write_bag(small_flight(seconds=1.0), tmp_path / "flight.bag")
+    tdoa = subscribe(node, Tdoa, "uwb/tdoa", QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT))
+    replaying = start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", "uwb/tdoa")
+    first = take(tdoa, lambda messages: len(messages) >= 10)[0]
+    assert first.header.frame_id == "base_link" and first.anchor_b == 5
+    assert replaying.end()[0] == 0
+
+
+def test_loop_starts_again_until_stopped(tmp_path, start, node):
+    write_bag(small_flight(seconds=0.2), tmp_path / "flight.bag")
+    imu = subscribe(node, Imu, "imu/data")
+    replaying = start("replay", tmp_path / "flight.bag", "--loop", "--wait-matched", LIMIT, "--wait-topics", "imu/data")
+    messages = take(imu, lambda messages: len(messages) == 500)
+    stamps = np.array([message.header.stamp.nanosec for message in messages])
+    np.testing.assert_array_equal(stamps, np.tile(np.arange(200), 3)[:500] * 1_000_000)
+    assert replaying.end(signal.SIGTERM)[0] == 0
+
+
+@pytest.mark.slow
+def test_clock_can_be_followed(tmp_path, start, node):
+    write_bag(small_flight(seconds=1.0, rate=10), tmp_path / "flight.bag")  # ticks come between messages too
+    clock = subscribe(node, Clock, "/clock")
+    start("replay", tmp_path / "flight.bag", "--clock", "--wait-matched", LIMIT, "--wait-topics", "imu/data")
+    subscribe(node, Imu, "imu/data")
+    ticks = take(clock, lambda messages: len(messages) >= 20)
+    stamps = np.array([tick.clock.sec + 1e-9 * tick.clock.nanosec for tick in ticks])
+    assert (np.diff(stamps) >= 0).all() and 10.0 <= stamps[0] and stamps[-1] < 11.0
+    assert len(set(stamps)) > 12  # 10 messages alone would not give as many
+
+
+def test_remapped_into_a_namespace(tmp_path, start, node):
+    write_bag(small_flight(seconds=0.2), tmp_path / "flight.bag")
+    tdoa = subscribe(node, Tdoa, "/tag1/uwb/tdoa")
+    remap = ["--ros-args", "-r", "/uwb/tdoa:=/tag1/uwb/tdoa"]
+    start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", "uwb/tdoa", *remap)
+    assert len(take(tdoa, lambda messages: len(messages) == 100)) == 100
+
+
+def test_nobody_subscribes(tmp_path, start):
+    write_bag(small_flight(seconds=0.1), tmp_path / "flight.bag")
+    waited = start("replay", tmp_path / "flight.bag", "--wait-matched", 0.1, "--wait-topics", "imu/data")
+    assert waited.end()[0] == 2
+    assert "replay: error: nobody subscribes to /imu/data within 0.1 s; start the nodes first" in waited.said[-1]
+    alone = start("replay", tmp_path / "flight.bag", "--wait-matched", 0.1)
+    code, out = alone.end()
+    assert code == 0 and "/imu/data: 100 messages" in out
+
+
+@pytest.mark.slow
+def test_record_everything(tmp_path, start, node):
+    flight = small_flight(seconds=0.5)
+    write_bag(flight, tmp_path / "flight.bag")
+    publisher = node.create_publisher(Imu, "other/imu", DEEP)  # any type, any time, before there is a message
+    recording = start("record", "-o", tmp_path / "all.bag", "--all")
+    recording.until("recording /other/imu (sensor_msgs/msg/Imu, reliable)")
+    publisher.publish(Imu())
+    replaying = start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", *STREAMS)
+    assert replaying.end()[0] == 0
+    assert publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=LIMIT))
+    assert recording.end(signal.SIGINT)[0] == 0
+    assert differences(flight, read_bag(tmp_path / "all.bag")) == []
+    assert len(read_fields(tmp_path / "all.bag", "other/imu")["t"]) == 1
+
+
+def test_nothing_came(tmp_path, start):
+    recording = start("record", "-o", tmp_path / "none.bag", "imu/data")
+    recording.until("waiting for /imu/data")
+    code, out = recording.end(signal.SIGTERM)
+    assert code == 1 and "no message came on /imu/data; there is no bag" in recording.said[-1]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (["replay", "nothing.bag"], "replay: error: nothing.bag: is not a bag"),
+        (["replay", "nothing.bag", "--rate", "0"], "argument -r/--rate: '0' is not a number above 0"),
+        (["replay", "flight.bag", "--wait-topics", "uwb/nothing"], "/uwb/nothing is not in the bag"),
+        (["replay", "flight.bag", "--ros-args", "--nonsense"], "replay: error: ROS arguments: "),
+        (["record", "-o", "flight.bag", "imu/data"], "record: error: flight.bag: exists already"),
+        (["record", "-o", "new.bag"], "name the topics to record"),
+        (["record", "-o", "new.bag", "-a", "imu/data"], "name the topics to record"),
+    ],
+)
+def test_bad_usage(tmp_path, monkeypatch, capsys, arguments, sentence):
+    monkeypatch.chdir(tmp_path)
+    write_bag(small_flight(seconds=0.01), "flight.bag")
+    tool, *arguments = arguments
+    assert {"replay": replay, "record": record}[tool].main(arguments) == 2
+    assert sentence in capsys.readouterr().err.splitlines()[-1]
+    assert [path.name for path in tmp_path.iterdir()] == ["flight.bag"]
