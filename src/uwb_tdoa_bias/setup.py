@@ -19,6 +19,7 @@ setup(
         "numpy>=1.26",
         "onnxruntime>=1.17",
         "PyYAML>=6.0",
+        "scipy>=1.11",
     ],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

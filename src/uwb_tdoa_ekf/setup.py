@@ -15,8 +15,8 @@ setup(
     python_requires=">=3.10",
     install_requires=[
         "setuptools",
-        "numba>=0.57",
         "numpy>=1.26",
+        "PyYAML>=6.0",
         "scipy>=1.11",
         "uwb_tdoa_bias",
     ],
