@@ -70,7 +70,8 @@ def demo(args):
     correction = Corrector(flight.anchors, effects, network)
     length = flight.truth.t[-1] - flight.truth.t[0]
     print(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
-    print(f"correction {correction.model}{f' ({effects_file})' if effects_file else ''}")
+    given = ", ".join(str(path) for path in (effects_file, args.model) if path)
+    print(f"correction {correction.model} ({given or '--effects and --model give one'})")
 
     bag = args.out / "flight.bag"
     write_bag(flight, bag, force=True)
