@@ -1,0 +1,240 @@
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_ekf.config import FilterConfig
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_tools.bag import write_bag
+from uwb_tdoa_tools.bag_files import new_bag
+from uwb_tdoa_tools.evaluate import evaluate, main
+from uwb_tdoa_tools.message_types import typestore
+from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
+
+CLEAN = dict(duration=14.0, floor_time=1.0, imu_rate=200.0, bias=False, multipath=False, outlier_probability=0.0)
+NEEDED = {"flight", "rmse_x", "rmse_y", "rmse_z", "rmse_3d", "median_3d", "max_3d", "frac_gt_1m", "diverged"}
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return simulate(SimulationConfig(seed=1, **CLEAN))
+
+
+@pytest.fixture(scope="module")
+def bag(flight, tmp_path_factory):
+    path = tmp_path_factory.mktemp("evaluate") / "flight"
+    write_bag(flight, path)
+    return path
+
+
+def write_odometry(path, odometry, covariance=None):
+    """A bag with a nav_msgs/Odometry for each estimate on /odometry; covariance: 36 numbers, default the estimate's."""
+    store = typestore()
+    types = store.types
+
+    def of(name, *values):
+        package, kind = name.split("/")
+        return types[f"{package}/msg/{kind}"](*values)
+
+    with new_bag(path) as writer:
+        connection = writer.add_connection("/odometry", "nav_msgs/msg/Odometry", typestore=store)
+        for k in range(len(odometry.t)):
+            stamp = int(round(odometry.t[k] * 1e9))
+            header = of("std_msgs/Header", of("builtin_interfaces/Time", *divmod(stamp, 10**9)), "map")
+            pose = of(
+                "geometry_msgs/Pose",
+                of("geometry_msgs/Point", *odometry.p[k].tolist()),
+                of("geometry_msgs/Quaternion", *odometry.q[k].tolist()),
+            )
+            whole = np.eye(6)
+            whole[:3, :3] = odometry.covariance[k, :3, :3]
+            whole = whole.ravel() if covariance is None else np.asarray(covariance, dtype=float)
+            zero = of("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
+            twist = of("geometry_msgs/TwistWithCovariance", of("geometry_msgs/Twist", zero, zero), np.zeros(36))
+            message = of(
+                "nav_msgs/Odometry", header, "base_link", of("geometry_msgs/PoseWithCovariance", pose, whole), twist
+            )
+            writer.write(connection, stamp, store.serialize_cdr(message, connection.msgtype))
+    return path
+
+
+def report(arguments, tmp_path):
+    """What `evaluate --json` writes."""
+    file = tmp_path / "report.json"
+    assert main([*map(str, arguments), "--json", str(file)]) == 0
+    return json.loads(file.read_text())
+
+
+def test_score_of_a_clean_flight(flight):
+    score, result = evaluate(flight)
+    row = score.row()
+    assert row["rmse_3d"] < 0.1 and not row["diverged"]
+    assert row["rmse_3d"] == pytest.approx(np.linalg.norm([row[f"rmse_{axis}"] for axis in "xyz"]))
+    assert sum(result.counts.values()) == len(flight.tdoa) and result.counts["invalid"] == 0
+
+
+def test_effects_reach_the_filter(flight):
+    ids = flight.anchors.ids
+    a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
+    delay = 0.4 * np.isin(ids, ids[:2])
+    wrong = replace(flight, tdoa=replace(flight.tdoa, d=flight.tdoa.d + delay[b] - delay[a]))
+    effects = EffectSet((AnchorDelay(dict.fromkeys(ids[:2].tolist(), 0.4)),))
+    without, clean = evaluate(wrong)[0].row()["rmse_3d"], evaluate(flight)[0].row()["rmse_3d"]
+    assert evaluate(wrong, effects=effects)[0].row()["rmse_3d"] == pytest.approx(clean, abs=1e-6)
+    assert without > clean + 0.05
+
+
+def test_no_truth_is_bad_input(flight):
+    with pytest.raises(InputError, match="ground truth"):
+        evaluate(replace(flight, truth=None))
+
+
+def test_report_of_one_flight(flight, bag, tmp_path, capsys):
+    told = report([bag], tmp_path)
+    (row,) = told["runs"]
+    assert NEEDED <= set(row) and NEEDED <= set(told["pooled"])
+    assert row["flight"] == flight.name
+    assert row["rmse_3d"] == pytest.approx(evaluate(flight)[0].row()["rmse_3d"], abs=1e-4)  # stamps are rounded to ns
+    assert told["pooled"]["rmse_3d"] == row["rmse_3d"] and told["pooled"]["diverged"] == 0
+    table = capsys.readouterr().out.splitlines()
+    assert table[0].split()[:5] == ["flight", "x", "y", "z", "3D"]
+    assert table[1].startswith(flight.name) and f"{row['rmse_3d']:.3f}" in table[1]
+
+
+def test_no_bias_runs_without_effects(flight, bag, tmp_path):
+    effects = tmp_path / "effects.yaml"
+    EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.8}),)).to_yaml(effects)
+    plain = report([bag], tmp_path)["runs"]
+    spoiled = report([bag, "--effects", effects], tmp_path)["runs"]
+    assert report([bag, "--effects", effects, "--no-bias"], tmp_path)["runs"] == plain
+    assert spoiled[0]["rmse_3d"] > plain[0]["rmse_3d"] + 0.05
+
+
+def test_parameters_reach_the_filter(bag, tmp_path):
+    config = tmp_path / "ekf_node.yaml"
+    config.write_text("ekf_node:\n  ros__parameters:\n    tdoa_std: 2.0\n")
+    plain, other = report([bag], tmp_path), report([bag, "--config", config], tmp_path)
+    assert other["runs"][0]["nis_mean"] < 0.3 * plain["runs"][0]["nis_mean"]
+
+
+def test_several_flights_are_pooled(bag, tmp_path, capsys):
+    told = report([bag, bag], tmp_path)
+    assert len(told["runs"]) == 2
+    assert told["pooled"]["rmse_3d"] == pytest.approx(told["runs"][0]["rmse_3d"])
+    out = capsys.readouterr().out
+    assert "2 pooled" in out and "diverged 0" in out
+
+
+def test_recorded_odometry_is_judged(flight, bag, tmp_path):
+    odometry = run_offline(flight).odometry
+    off = replace(odometry, p=odometry.p + [0.3, 0.0, 0.0])
+    recorded = write_odometry(tmp_path / "recorded", off)
+    own, judged = report([bag], tmp_path)["runs"][0], report([bag, "--odometry", recorded], tmp_path)["runs"][0]
+    assert judged["rmse_x"] == pytest.approx(0.3, abs=0.05)
+    assert judged["rmse_y"] == pytest.approx(own["rmse_y"], abs=1e-3)
+    assert judged["nees_mean"] > own["nees_mean"]
+
+
+def test_recorded_odometry_without_covariance_is_judged(flight, bag, tmp_path):
+    recorded = write_odometry(tmp_path / "recorded", run_offline(flight).odometry, np.zeros(36))
+    assert report([bag, "--odometry", recorded], tmp_path)["runs"][0]["rmse_3d"] < 0.1
+
+
+def test_flights_without_truth_are_told_in_one_sentence(flight, tmp_path, capsys):
+    write_bag(replace(flight, truth=None), tmp_path / "blind")
+    recorded = write_odometry(tmp_path / "recorded", run_offline(flight).odometry)
+    for more in ([], ["--odometry", str(recorded)]):
+        assert main([str(tmp_path / "blind"), *more]) == 2
+        assert "ground truth" in capsys.readouterr().err
+
+
+def test_picture_and_trajectories(flight, bag, tmp_path):
+    assert main([str(bag), "--plot", str(tmp_path / "error.png"), "--tum", str(tmp_path / "tum")]) == 0
+    assert (tmp_path / "error.png").read_bytes()[:4] == b"\x89PNG"
+    for name, rate in ((flight.name, 200.0), (f"{flight.name}_truth", 250.0)):
+        rows = np.loadtxt(tmp_path / "tum" / f"{name}.tum")
+        assert rows.shape[1] == 8 and (np.diff(rows[:, 0]) > 0.0).all()
+        assert np.median(np.diff(rows[:, 0])) == pytest.approx(1.0 / rate, rel=0.2)
+        np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=1e-5)
+
+
+def test_the_picture_of_a_run_that_never_started(flight, tmp_path):
+    few = replace(flight, tdoa=replace(flight.tdoa, **{c: getattr(flight.tdoa, c)[:5] for c in "tabd"}))
+    write_bag(few, tmp_path / "few")
+    assert main([str(tmp_path / "few"), "--plot", str(tmp_path / "error.png")]) == 0
+    assert (tmp_path / "error.png").exists()
+
+
+def test_a_report_is_json_that_everybody_reads(flight, tmp_path):
+    """RFC 8259 has no NaN and no Infinity, which a run that never started could bring in."""
+    few = replace(flight, tdoa=replace(flight.tdoa, **{c: getattr(flight.tdoa, c)[:5] for c in "tabd"}))
+    write_bag(few, tmp_path / "few")
+    assert main([str(tmp_path / "few"), "--json", str(tmp_path / "report.json")]) == 0
+
+    def refuse(word):
+        raise AssertionError(f"{word} is not JSON")
+
+    told = json.loads((tmp_path / "report.json").read_text(), parse_constant=refuse)
+    assert told["runs"][0]["diverged"] is True
+
+
+def test_table_beside_others(flight, bag, tmp_path):
+    peers = tmp_path / "peers.csv"
+    peers.write_text(
+        "flight,peer,mode,rmse_x,rmse_y,rmse_z,rmse_3d,frac_gt_1m,diverged\n"
+        f"{flight.name},firmware,std,0.1,0.1,0.1,0.1734,0.0,False\n"
+        f"{flight.name},firmware,robust,9,9,9,15.6,0.9,True\n"
+        "other,firmware,std,0.1,0.1,0.1,0.5,0.0,False\n"
+    )
+    assert main([str(bag), "--markdown", str(tmp_path / "table.md"), "--beside", str(peers)]) == 0
+    header, rule, row = (line.strip("| ").split(" | ") for line in (tmp_path / "table.md").read_text().splitlines())
+    assert header[0] == "flight" and header[-2:] == ["firmware std", "firmware robust"] and len(rule) == len(header)
+    assert row[0] == flight.name and row[-2:] == ["0.173", "diverged"]
+    peers.write_text("name,error\nx,1\n")
+    assert main([str(bag), "--markdown", str(tmp_path / "table.md"), "--beside", str(peers)]) == 2
+
+
+def test_bad_usage(bag, tmp_path, capsys):
+    assert main([]) == 2
+    assert main([str(tmp_path / "nowhere")]) == 2
+    assert "nowhere: does not exist" in capsys.readouterr().err
+    assert main([str(bag), str(bag), "--plot", str(tmp_path / "x.png")]) == 2
+    assert "--plot: needs exactly one flight, got 2" in capsys.readouterr().err
+    assert main([str(bag), "--config", str(tmp_path / "no.yaml")]) == 2
+    assert main([str(bag), "--effects", str(tmp_path / "no.yaml")]) == 2
+    assert main([str(bag), "--model", str(tmp_path / "no.onnx")]) == 2
+
+
+def test_help_has_examples(capsys):
+    assert main(["--help"]) == 0
+    assert "evaluate flights/ --survey surveys/" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_simulated_flight_without_bias_is_consistent():
+    """White TDOA noise of known size, an inertial sensor with noise and biases of the filter's kind and size: the NEES
+    of the position averaged over 20 flights inside its 95 % chi-square bounds at 90 % of the times after 3 s in the
+    air, and the NIS of 80 % of the flights inside theirs (Bar-Shalom et al., sec. 5.4.2; 19 of 20 are expected, fewer
+    than 16 happen once in 400 times to an honest filter)."""
+    noise = dict(accel_noise=0.05, gyro_noise=0.003, accel_bias_walk=0.01, gyro_bias_walk=1e-4)
+    told = FilterConfig(robust="gate", gate=1e6, tdoa_std=0.1, tdoa_correlation=1.0, **noise)
+    errors = ImuErrors(**noise, accel_bias=told.initial_accel_bias_std, gyro_bias=told.initial_gyro_bias_std)
+    clean = {**CLEAN, "duration": 25.0, "start_in_air": True, "noise_std": 0.1, "protocol": "tdoa3"}
+    nees, nis = [], []
+    for seed in range(20):
+        score, result = evaluate(simulate(SimulationConfig(seed=seed, imu_errors=errors, **clean)), told)
+        times = np.arange(score.first + 3.0, score.last - 0.1, 0.05)
+        nees.append(score.nees[np.searchsorted(score.t, times)])
+        nis.append(score.nis)
+    nees = np.mean([values[: min(map(len, nees))] for values in nees], axis=0)
+    low, high = chi2.ppf([0.025, 0.975], 3 * 20) / 20
+    inside = [np.prod(np.sign(chi2.ppf([0.025, 0.975], len(v)) / len(v) - v.mean())) < 0 for v in nis]
+    print(
+        f"NEES {nees.mean():.2f}, {np.mean((nees > low) & (nees < high)):.0%} of the times inside; "
+        f"NIS {np.mean([v.mean() for v in nis]):.3f}, {np.mean(inside):.0%} of the flights inside"
+    )
+    assert np.mean((nees > low) & (nees < high)) >= 0.9 and np.mean(inside) >= 0.8

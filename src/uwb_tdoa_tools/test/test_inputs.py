@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+from recordings import ANCHORS, SURVEY, log_bytes
+
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_tools.inputs import find_flights, load_flights, survey_for
+
+
+def make(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("x")
+
+
+@pytest.fixture
+def surveys(tmp_path):
+    folder = tmp_path / "surveys"
+    make(folder, *(f"anchor_{key}" for key in ("0422.txt", "0425.txt", "const1.csv", "const10.csv", "const3.csv")))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "recording, survey",
+    [
+        ("flights/0422/0422-log00", "anchor_0422.txt"),
+        ("flights/0425/TDOA2/0425-traj1", "anchor_0425.txt"),
+        ("0422/log00", "anchor_0422.txt"),  # the folder names it
+        ("backup-0422/flights/0425/traj1", "anchor_0425.txt"),  # what is said last is meant
+        ("util/const1-trial1-tdoa2.csv.gz", "anchor_const1.csv"),
+        ("util/const10-trial1-tdoa2.csv.gz", "anchor_const10.csv"),  # the longer key is the better fit
+        ("util/const3-trial2-tdoa3-traj1.csv", "anchor_const3.csv"),
+    ],
+)
+def test_a_folder_of_surveys_serves_the_recordings_whose_path_has_the_key(tmp_path, surveys, recording, survey):
+    assert survey_for(tmp_path / recording, surveys) == surveys / survey
+
+
+def test_the_longest_key_wins_where_keys_overlap(tmp_path, surveys):
+    """As help and docstring say."""
+    make(surveys, "anchor_25.txt")
+    assert survey_for(tmp_path / "0425" / "traj1", surveys) == surveys / "anchor_0425.txt"
+
+
+def test_no_survey_that_fits_is_told_with_those_there_are(tmp_path, surveys):
+    with pytest.raises(InputError, match="holds none of .*const1"):
+        survey_for(tmp_path / "0607" / "log1", surveys)
+
+
+def test_files_that_are_no_surveys_do_not_serve(tmp_path, surveys):
+    make(surveys, "README.md", "notes-log1.txt", "log1.txt")
+    with pytest.raises(InputError):
+        survey_for(tmp_path / "0607" / "log1", surveys)
+
+
+def test_one_survey_serves_all(tmp_path):
+    make(tmp_path, "here.txt")
+    assert survey_for(tmp_path / "any" / "thing", tmp_path / "here.txt") == tmp_path / "here.txt"
+    assert survey_for(tmp_path / "any" / "thing", None) is None
+
+
+def test_folders_are_searched_in_order_and_hidden_files_left_out(tmp_path):
+    make(tmp_path / "b", "2", "1", "deep/er/0", ".hidden", ".cache/x")
+    make(tmp_path / "a", "9")
+    found = find_flights([tmp_path / "b", tmp_path / "a"])
+    assert [str(path.relative_to(tmp_path)) for path, _ in found] == ["b/1", "b/2", "b/deep/er/0", "a/9"]
+    assert [survey for _, survey in found] == [None] * 4
+
+
+def test_a_bag_is_one_recording_with_anchors_of_its_own(tmp_path, surveys):
+    make(tmp_path / "flights", "bag1/metadata.yaml", "bag1/bag1_0.mcap", "loose.mcap", "old.db3", "0422-log")
+    found = find_flights([str(tmp_path / "flights")], surveys)
+    assert [(path.name, survey and survey.name) for path, survey in found] == [
+        ("0422-log", "anchor_0422.txt"),
+        ("bag1", None),
+        ("loose.mcap", None),
+        ("old.db3", None),
+    ]
+    assert find_flights([tmp_path / "flights" / "bag1"]) == [(tmp_path / "flights" / "bag1", None)]
+
+
+def test_nothing_there_is_bad_input(tmp_path):
+    with pytest.raises(InputError, match="nowhere: does not exist"):
+        find_flights([tmp_path / "nowhere"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="empty: holds no recording"):
+        find_flights([tmp_path / "empty"])
+
+
+def test_flights_are_read_one_by_one(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).write_bytes(log_bytes())
+    (tmp_path / "surveys").mkdir()
+    survey = tmp_path / "surveys" / "here.csv"
+    survey.write_text(SURVEY)
+    flights = load_flights([tmp_path / "one", tmp_path / "two"], survey)
+    assert next(flights).name == "one"
+    second = next(flights)
+    assert second.name == "two"
+    np.testing.assert_array_equal(second.anchors.positions, ANCHORS.positions)
+    assert next(flights, None) is None
+
+
+def test_every_measured_recording_finds_its_survey(shared_data):
+    folders = [shared_data / "flights", shared_data / "util"]
+    found = find_flights(folders, shared_data / "surveys")
+    assert {path for path, _ in found} == {file for folder in folders for file in folder.rglob("*") if file.is_file()}
+    for path, survey in found:
+        key = survey.stem.removeprefix("anchor_")
+        day = path.relative_to(shared_data / "flights").parts[0] if "flights" in path.parts else path.name.split("-")[0]
+        assert key == day
