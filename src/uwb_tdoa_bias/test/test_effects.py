@@ -100,9 +100,8 @@ def test_empty_set():
 
 
 def test_yaml_gives_back_what_was_written(tmp_path):
-    written = EffectSet(
-        (TagLeverArm({"x": -0.012, "y": 0.001, "z": 0.091}), AnchorDelay({0: 0.05, 12: -0.02}, {0: 0.004, 12: 0.004}, "bench"))
-    )
+    delay = AnchorDelay({0: 0.05, 12: -0.02}, {0: 0.004, 12: 0.004}, "bench")
+    written = EffectSet((TagLeverArm({"x": -0.012, "y": 0.001, "z": 0.091}), delay))
     written.to_yaml(tmp_path / "effects.yaml")
     read = EffectSet.from_yaml(tmp_path / "effects.yaml")
     assert read == written

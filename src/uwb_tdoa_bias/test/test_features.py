@@ -49,8 +49,8 @@ def test_a_case_worked_by_hand():
     up = np.arctan2(4.0, 3.0)
     hand = {
         "dx_a": 3.0, "dy_a": 0.0, "dz_a": 4.0, "dx_b": 0.0, "dy_b": -2.0, "dz_b": 0.0,
-        "azimuth_A_a": np.pi, "elevation_A_a": -up,  # the tag is at (-3, 0, -4) from anchor a, whose axes are the world's
-        "azimuth_A_b": 0.0, "elevation_A_b": 0.0,  # at (0, 2, 0) from anchor b, whose x axis is world y
+        "azimuth_A_a": np.pi, "elevation_A_a": -up,  # anchor a sees the tag at (-3, 0, -4)
+        "azimuth_A_b": 0.0, "elevation_A_b": 0.0,  # anchor b, whose x axis is world y, sees it ahead
         "azimuth_T_a": -np.pi / 2, "elevation_T_a": up,  # world x is to the right of the tag
         "azimuth_T_b": np.pi, "elevation_T_b": 0.0,
     }  # fmt: skip
@@ -67,11 +67,9 @@ def test_a_rigid_motion_of_everything_turns_positions_and_keeps_angles(seed):
     samples = random_samples(seed)
     turn, shift = random_rotation(rng), rng.uniform(-10, 10, 3)
     old = samples.anchors
-    moved = Samples(
-        samples.t, samples.a, samples.b, turn.apply(samples.p) + shift,
-        (turn * Rotation.from_quat(samples.q)).as_quat(),
-        Anchors(old.ids, turn.apply(np.array(old.positions)) + shift, (turn * Rotation.from_quat(old.orientations)).as_quat()),
-    )  # fmt: skip
+    q, orientations = ((turn * Rotation.from_quat(known)).as_quat() for known in (samples.q, old.orientations))
+    anchors = Anchors(old.ids, turn.apply(np.array(old.positions)) + shift, orientations)
+    moved = Samples(samples.t, samples.a, samples.b, turn.apply(samples.p) + shift, q, anchors)
     before, after = features(samples), features(moved)
     for first in (0, 3):
         np.testing.assert_allclose(after[:, first : first + 3], turn.apply(before[:, first : first + 3]), atol=1e-9)

@@ -50,7 +50,8 @@ class Wave:
 
 def fly(
     seed=0, duration=10.0, imu_rate=200.0, tdoa_rate=200.0, tdoa_std=0.1, accel_noise=0.0, gyro_noise=0.0,
-    accel_bias=0.0, gyro_bias=0.0, accel_bias_walk=0.0, gyro_bias_walk=0.0, anchors=None, outliers=0.0, hover=False, begin=0.0,
+    accel_bias=0.0, gyro_bias=0.0, accel_bias_walk=0.0, gyro_bias_walk=0.0,
+    anchors=None, outliers=0.0, hover=False, begin=0.0,
 ):  # fmt: skip
     """A Flight with random pairs of anchors, and the exact pose every 5 ms. The errors are those of the filter's model:
     tdoa_std, m, white; accel_noise, m/s^2/sqrt(Hz), and gyro_noise, rad/s/sqrt(Hz), white; accel_bias, m/s^2, and
@@ -86,7 +87,8 @@ def fly(
 
 def _inertial_error(rng, n, rate, noise, bias, walk):
     steps = walk / np.sqrt(rate) * rng.standard_normal((n, 3))
-    return bias * rng.standard_normal(3) + np.cumsum(steps, axis=0) + noise * np.sqrt(rate) * rng.standard_normal((n, 3))
+    white = noise * np.sqrt(rate) * rng.standard_normal((n, 3))
+    return bias * rng.standard_normal(3) + np.cumsum(steps, axis=0) + white
 
 
 def position_at(flight, t):

@@ -5,7 +5,8 @@ import pytest
 from uwb_tdoa_bias.errors import InputError
 from uwb_tdoa_ekf.config import LOSSES, ROBUST, FilterConfig, Tuning
 
-NUMBERS = [field.name for field in fields(FilterConfig) if field.name not in ("robust", "loss", "use_imu", "initial_yaw")]
+OTHERS = ("robust", "loss", "use_imu", "initial_yaw")
+NUMBERS = [field.name for field in fields(FilterConfig) if field.name not in OTHERS]
 
 
 def write(tmp_path, text):

@@ -25,7 +25,8 @@ def window(rng, positions, p, v, n=100, std=0.0, outliers=0.0, anchor_std=0.0, l
     a = rng.integers(0, len(positions), n)
     b = (a + rng.integers(1, len(positions), n)) % len(positions)
     late = anchor_std * rng.standard_normal(len(positions))
-    d = tdoa(p + (t - t[-1])[:, None] * v, positions[a], positions[b]) + late[b] - late[a] + std * rng.standard_normal(n)
+    d = tdoa(p + (t - t[-1])[:, None] * v, positions[a], positions[b]) + late[b] - late[a]
+    d += std * rng.standard_normal(n)
     wrong = rng.random(n) < outliers
     return t, a, b, d + np.where(wrong, rng.choice([-1.0, 1.0], n) * rng.uniform(1.0, 5.0, n), 0.0)
 
