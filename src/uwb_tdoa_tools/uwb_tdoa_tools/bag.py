@@ -27,7 +27,7 @@ from . import bag_messages
 from .bag_files import check_output, check_type, deserialize, is_bag, messages, new_bag, open_bag
 from .message_types import typestore
 
-__all__ = ["Odometry", "check_output", "is_bag", "read_bag", "read_fields", "read_odometry", "write_bag"]
+__all__ = ["RecordedOdometry", "check_output", "is_bag", "read_bag", "read_fields", "read_odometry", "write_bag"]
 
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
 
@@ -46,11 +46,11 @@ _LATCHED_QOS = _qos(QosDurability.TRANSIENT_LOCAL, 1)
 
 
 @dataclass(frozen=True)
-class Odometry:
+class RecordedOdometry:
     """Recorded estimates. World frame of the filter and body frame as in nav_msgs/Odometry.
 
     t : (n,) s, header stamps; p : (n, 3) m and v : (n, 3) m/s in the world frame; q : (n, 4) x y z w, body to world;
-    pose_covariance : (n, 6, 6) of position (world) and rotation, m^2 and rad^2;
+    covariance : (n, 6, 6) of position (world) and rotation, m^2 and rad^2;
     twist_covariance : (n, 6, 6) of linear and angular velocity in the body frame, as recorded.
     """
 
@@ -58,7 +58,7 @@ class Odometry:
     p: np.ndarray
     v: np.ndarray
     q: np.ndarray
-    pose_covariance: np.ndarray
+    covariance: np.ndarray
     twist_covariance: np.ndarray
 
     def __len__(self):
@@ -150,7 +150,7 @@ def read_bag(path, namespace="", anchors=None):
 
 
 def read_odometry(path, topic="odometry", namespace=""):
-    """Odometry recorded on a nav_msgs/Odometry topic, in order of header stamps; raises InputError.
+    """RecordedOdometry of a nav_msgs/Odometry topic, in order of header stamps; raises InputError.
 
     nav_msgs/Odometry has the velocity in the child frame; it is turned into the world frame here.
     """
@@ -161,7 +161,7 @@ def read_odometry(path, topic="odometry", namespace=""):
         raise InputError(f"{path}: has no message on {_absolute(namespace, topic)}; record the output of the filter.")
     p, v, q = rows[:, 0:3], rows[:, 3:6], rows[:, 6:10]
     v = Rotation.from_quat(q).apply(v)
-    return Odometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6))
+    return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6))
 
 
 def read_fields(path, topic, namespace=""):

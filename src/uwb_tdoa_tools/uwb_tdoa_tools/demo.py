@@ -3,7 +3,6 @@
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -93,7 +92,7 @@ def demo(args):
     if lost or counts["late"]:
         print(f"demo: TDOAs lost or late: too much load for --rate {args.rate:g}; try less.", file=sys.stderr)
     raw = Score("raw", run_offline(flight).odometry, flight.truth)
-    corrected = Score("corrected", _recorded(live.recorded), flight.truth)
+    corrected = Score("corrected", read_odometry(live.recorded), flight.truth)
     without_ros = Score("corrected, without ROS", run_offline(flight, corrector=correction).odometry, flight.truth)
     _print_errors(raw, corrected, without_ros)
     _plot([raw, corrected], flight, args.out / "error.png")
@@ -127,11 +126,6 @@ def _print_errors(raw, corrected, *others):
         print(f"{score.name:28s}" + "".join(f"{score.row()[key]:9.3f}" for key in FIGURES))
     before, after = raw.row()["rmse_3d"], corrected.row()["rmse_3d"]
     print(f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: {100.0 * (after - before) / before:+.0f} %")
-
-
-def _recorded(bag):
-    odometry = read_odometry(bag)
-    return SimpleNamespace(t=odometry.t, p=odometry.p, covariance=odometry.pose_covariance)
 
 
 def _plot(scores, flight, path):

@@ -74,9 +74,9 @@ def _evaluate(args):
     scores = []
     print(_line("flight", COLUMNS.values()))
     for path, survey in tqdm(found, unit="flight", disable=None, leave=False):
-        flight = read_flight(path, survey)
+        flight = read_flight(path, survey, args.namespace)
         if args.odometry:
-            odometry = read_odometry(args.odometry, args.namespace)
+            odometry = read_odometry(args.odometry, namespace=args.namespace)
             score = Score(flight.name, odometry, flight.truth)
         else:
             score, result = evaluate(flight, config, effects, network)

@@ -27,6 +27,13 @@ MATCHED = {
     "/uwb/tdoa_corrected": (1, 1),
     "/odometry": (1, 2),
 }
+# A replay can wait, a robot cannot: here no link may lose a message, and a stream that falls behind is waited for.
+PATIENCE = {"bias_node": {"hold": 9.0}, "ekf_node": {"lag": 10.0}}  # s of stamps
+RELIABLE = {
+    "bias_node": ("/uwb/tdoa.subscription", "/odometry.subscription", "/uwb/tdoa_corrected.publisher"),
+    "ekf_node": ("/imu/data.subscription", "/uwb/tdoa_corrected.subscription", "/odometry.publisher"),
+}
+DEPTH = 1_000_000  # messages that may wait in a subscription
 READY_LIMIT = 180.0  # s: the very first start compiles the filter
 MATCH_LIMIT = 60.0  # s
 SETTLE_LIMIT = 30.0  # s
@@ -65,8 +72,8 @@ def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, s
     environment = {"ROS_DOMAIN_ID": str(reservation.__enter__()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with _variables(environment), session("demo", []) as (node, stop), _Processes(folder, stop) as processes:
         diagnostics = _Diagnostics(node)
-        processes.start("uwb_tdoa_bias", "bias_node", *_parameters(bias_parameters))
-        processes.start("uwb_tdoa_ekf", "ekf_node", *_parameters(ekf_parameters))
+        processes.start("uwb_tdoa_bias", "bias_node", *_parameters("bias_node", bias_parameters))
+        processes.start("uwb_tdoa_ekf", "ekf_node", *_parameters("ekf_node", ekf_parameters))
         processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
         say("starting the nodes; the very first start compiles the filter, which takes a minute")
         _wait(READY_LIMIT, "the nodes to find each other", processes, node, lambda: _is_ready(node, diagnostics))
@@ -82,10 +89,12 @@ def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, s
     return LiveRun(recorded, diagnostics.newest("bias_node"), diagnostics.newest("ekf_node"))
 
 
-def _parameters(values):
+def _parameters(name, values):
     """Command-line arguments for a node's parameters; JSON is also YAML."""
-    arguments = [part for name, value in (values or {}).items() for part in ("-p", f"{name}:={json.dumps(value)}")]
-    return ["--ros-args", *arguments] if arguments else []
+    values = PATIENCE[name] | (values or {})
+    for end in RELIABLE[name]:
+        values |= {f"qos_overrides.{end}.reliability": "reliable", f"qos_overrides.{end}.depth": DEPTH}
+    return ["--ros-args", *(part for key, value in values.items() for part in ("-p", f"{key}:={json.dumps(value)}"))]
 
 
 def _is_ready(node, diagnostics):
