@@ -1,6 +1,7 @@
 """What everything that talks ROS shares: QoS, stamps, anchors, parameters, diagnostics, and the life of a node."""
 
 import argparse
+from copy import copy
 import gc
 import signal
 import sys
@@ -40,17 +41,17 @@ TF_QOS = QoSProfile(depth=100)  # what tf2 listens with
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 
 
-OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])
+OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])  # written into the given profile
 
 
 def publish_stream(node, kind, topic):
     """Publisher of a stream; QoS by parameter: qos_overrides.<topic>.publisher.reliability and .depth."""
-    return node.create_publisher(kind, topic, STREAM_QOS, qos_overriding_options=OVERRIDES)
+    return node.create_publisher(kind, topic, copy(STREAM_QOS), qos_overriding_options=OVERRIDES)
 
 
 def subscribe_stream(node, kind, topic, callback):
     """Subscription of a stream; QoS by parameter: qos_overrides.<topic>.subscription.reliability and .depth."""
-    return node.create_subscription(kind, topic, callback, STREAM_QOS, qos_overriding_options=OVERRIDES)
+    return node.create_subscription(kind, topic, callback, copy(STREAM_QOS), qos_overriding_options=OVERRIDES)
 
 
 class Epoch:
