@@ -107,7 +107,7 @@ def make_environment():
             ) from failure
         raise
     if not OWN_ROS:
-        run("repair and compile them", "wheels", [PYTHON, ROOT / ".dev" / "wheels.py"])
+        run("repair the ROS wheels", "wheels", [PYTHON, ROOT / ".dev" / "wheels.py"])
 
 
 def install(title, arguments):
@@ -177,16 +177,15 @@ def write_steps(steps):
 def run(title, log_name, command, **variables):
     """Run one step with its output in log/dev_<log_name>.log; on failure show the end of it and raise Failure."""
     log = LOG / f"dev_{log_name}.log"
-    environment = {**os.environ, **variables}
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # what is installed is compiled once, here
     started = time.monotonic()
     live = sys.stderr.isatty()
     if not live:
         say(f"{title} ...")
     with open(log, "wb") as output:
         step = subprocess.Popen(
-            list(map(str, command)), cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output
-        )
+            list(map(str, command)),
+            cwd=ROOT, env={**os.environ, **variables}, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+        )  # fmt: skip
         while True:
             try:
                 code = step.wait(timeout=1.0)

@@ -1,11 +1,9 @@
-"""What freshly installed wheels need before they are used. Run by the Python of their virtual environment.
+"""The two repairs without which the ROS wheels in a virtual environment build no message package. Run by its Python.
 
-1. The CMake files of the ROS wheels name the paths of the machine they were built on: put ours in.
+1. Their CMake files name the paths of the machine they were built on: put ours in.
 2. Their prefix has no local_setup.*: with one, install/setup.bash chains back to it in a clean shell.
-3. Compile every module, on all cores; pip would take one.
 """
 
-import compileall
 import re
 import sys
 import sysconfig
@@ -46,4 +44,3 @@ def write_local_setup():
 if __name__ == "__main__":
     repair_cmake_files()
     write_local_setup()
-    compileall.compile_dir(sysconfig.get_paths()["purelib"], quiet=2, workers=0)
