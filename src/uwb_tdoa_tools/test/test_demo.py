@@ -25,13 +25,14 @@ def figures(line):
 @pytest.mark.slow
 def test_a_simulated_flight_through_the_real_nodes(tmp_path, capsys):
     assert demo.main(["--out", str(tmp_path)]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr()
+    lines = printed.out.splitlines()
     raw, corrected, without_ros = (
         next(figures(line) for line in lines if line.startswith(name))
         for name in ("raw  ", "corrected  ", "corrected, without ROS")
     )
     assert corrected[3] < 0.6 * raw[3]  # 3D RMSE
-    if any(" 0 late, " in line and line.endswith(" 0 lost") for line in lines):
-        assert corrected[:5] == pytest.approx(without_ros[:5], abs=1.01e-3)
+    if "lost or late" not in printed.err:  # a busy machine
+        assert corrected == pytest.approx(without_ros, abs=1.01e-3)
     for name in ("flight.bag", "recorded.bag", "effects.yaml", "error.png"):
         assert (tmp_path / name).exists()

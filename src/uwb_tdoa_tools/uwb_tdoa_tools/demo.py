@@ -86,11 +86,8 @@ def demo(args):
         print(f"demo: error: {error}", file=sys.stderr)
         return 1
 
-    counts = {name: int(live.ekf[name]) for name in VERDICTS}
-    lost = len(flight.tdoa) - sum(counts.values())
-    print(f"nodes      TDOAs {len(flight.tdoa)}: {', '.join(f'{n} {name}' for name, n in counts.items())}, {lost} lost")
-    if lost or counts["late"]:
-        print(f"demo: TDOAs lost or late: too much load for --rate {args.rate:g}; try less.", file=sys.stderr)
+    if not _print_accounts(flight, live):
+        print(f"demo: messages lost or late: too much load for --rate {args.rate:g}; try less.", file=sys.stderr)
     raw = Score("raw", run_offline(flight).odometry, flight.truth)
     corrected = Score("corrected", read_odometry(live.recorded), flight.truth)
     without_ros = Score("corrected, without ROS", run_offline(flight, corrector=correction).odometry, flight.truth)
@@ -118,6 +115,17 @@ def _flight(args):
     effects_file = args.out / "effects.yaml"
     EffectSet((true_delays,)).to_yaml(effects_file)
     return flight, effects_file
+
+
+def _print_accounts(flight, live):
+    """Print what became of every message. Returns whether all were there in time."""
+    counts = {name: int(live.ekf[name]) for name in VERDICTS}
+    counts["lost"] = len(flight.tdoa) - sum(counts.values())
+    print(f"nodes      TDOAs {len(flight.tdoa)}: {', '.join(f'{n} {name}' for name, n in counts.items())}")
+    samples = 0 if flight.imu is None else len(flight.imu)
+    received, late = int(live.ekf["IMU samples received"]), int(live.ekf["imu_late"])
+    print(f"nodes      IMU samples {samples}: {late} late, {samples - received} lost")
+    return not any((counts["lost"], counts["late"], late, samples - received))
 
 
 def _print_errors(raw, corrected, *others):
