@@ -1,0 +1,33 @@
+"""The main job on a measured flight: nodes over topics, at two speeds, against the offline engine and ground truth."""
+
+import pytest
+
+pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
+
+from uwb_tdoa_tools.bag import read_bag, read_odometry, write_bag  # noqa: E402
+from uwb_tdoa_tools.evaluate import evaluate  # noqa: E402
+from uwb_tdoa_tools.live import run_live  # noqa: E402
+from uwb_tdoa_tools.metrics import Score  # noqa: E402
+from uwb_tdoa_tools.readers import read_flight  # noqa: E402
+
+VERDICTS = ("used", "rejected", "late", "invalid", "startup", "waiting")
+
+
+@pytest.mark.slow
+def test_measured_flight_through_the_nodes_at_any_rate_is_the_offline_run(shared_data, tmp_path):
+    log, survey = shared_data / "flights/0607/tdoa2-obs-log1", shared_data / "surveys/anchor_0607.txt"
+    bag = tmp_path / "flight.bag"
+    write_bag(read_flight(log, survey), bag)
+    flight = read_bag(bag)
+    offline, _ = evaluate(flight)
+    expected = offline.row()["rmse_3d"]
+    assert expected < 0.35
+    for rate in (1.0, 4.0):
+        folder = tmp_path / f"rate{rate:g}"
+        folder.mkdir()
+        live = run_live(bag, folder, rate)
+        row = Score("live", read_odometry(live.recorded), flight.truth).row()
+        assert row["rmse_3d"] == pytest.approx(expected, abs=1e-3)
+        counts = {name: int(live.ekf[name]) for name in VERDICTS}
+        assert counts["late"] == counts["invalid"] == 0
+        assert sum(counts.values()) == len(flight.tdoa)  # every message is accounted for
