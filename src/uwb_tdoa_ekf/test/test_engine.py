@@ -249,6 +249,22 @@ def test_nothing_but_finite_states_and_covariances_comes_out(seed, robust, use_i
     assert_sound(memory, rows, covariance)
 
 
+def test_motion_between_samples_is_their_mean():
+    """Two seconds blind with every 20th sample of a perfect sensor end near where those with all of them do: 3.6 cm,
+    where holding each sample instead of their mean gives 7.2 cm."""
+    flight, memory = fly(15, 5.0, imu_rate=1000.0), new_memory()
+    early = replace(flight, imu=cut(flight.imu, 0.0, 3.0), tdoa=cut(flight.tdoa, 0.0, 3.0))
+    drive(early, memory=memory)
+    ends = []
+    for every in (1, 20):
+        blind = cut(flight.imu, 3.0, 5.0)
+        blind = Imu(blind.t[every - 1 :: every], blind.gyro[every - 1 :: every], blind.accel[every - 1 :: every])
+        twin = Memory(*(array.copy() for array in memory))
+        drive(replace(flight, imu=blind, tdoa=cut(flight.tdoa, 9.0, 9.0)), memory=twin)
+        ends.append(twin.x.copy())
+    np.testing.assert_allclose(ends[1][:6], ends[0][:6], atol=0.045)
+
+
 def test_stamps_that_repeat_are_used_and_move_nothing():
     flight = fly(12, 3.0)
     doubled = np.repeat(np.arange(len(flight.imu)), 2)

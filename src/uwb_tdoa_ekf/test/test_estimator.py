@@ -89,7 +89,7 @@ def test_tdoas_wait_for_the_imu_to_pass_them():
     assert len(estimator.advance()[1].t) == 0
     estimator.add_imu(1.007, *REST)
     assert estimator.advance()[1].t.tolist() == [1.0]
-    assert estimator.waiting == (0, 2)
+    assert estimator.waiting[TDOA] == 2
 
 
 def test_a_silent_stream_is_waited_for_no_longer_than_the_lag():
