@@ -11,7 +11,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from geometry_msgs.msg import Quaternion  # noqa: E402
-from rclpy.qos import QoSCompatibility, QoSPresetProfiles, QoSProfile, ReliabilityPolicy, qos_check_compatible  # noqa: E402
+from rclpy.qos import QoSCompatibility, QoSPresetProfiles, QoSProfile, qos_check_compatible  # noqa: E402
 from uwb_tdoa_bias import ros  # noqa: E402
 
 NANOSECONDS = st.integers(0, 10**9 - 1)
@@ -77,7 +77,7 @@ def test_stream_subscriptions_match_every_usual_publisher():
     usual = [QoSPresetProfiles.SENSOR_DATA.value, QoSPresetProfiles.SYSTEM_DEFAULT.value, QoSProfile(depth=10)]
     for publisher in [*usual, ros.STREAM_QOS]:
         assert qos_check_compatible(publisher, ros.STREAM_QOS)[0] != QoSCompatibility.ERROR
-    assert ros.STREAM_QOS.reliability == ReliabilityPolicy.BEST_EFFORT
+    assert ros.STREAM_QOS.reliability == ros.ReliabilityPolicy.BEST_EFFORT
 
 
 def test_anchors_need_a_publisher_that_keeps_them():

@@ -177,6 +177,7 @@ class EkfNode(Node):
                 tf.translation.x, tf.translation.y, tf.translation.z = p
                 tf.rotation = orientation
                 self._tf_publisher.publish(self._tf)
+        self._health.odometry += n
         self._health.last_odometry = time.monotonic()
 
     def _rate_at(self, t, bias):
@@ -199,7 +200,8 @@ class EkfNode(Node):
         values |= {"TDOAs received": self._health.tdoa} | {name: counts[name] for name in VERDICTS.values()}
         values |= {"waiting": tdoa_waiting, "IMU samples received": self._health.imu}
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
-        values |= {"imu_waiting": imu_waiting, "recoveries": counts["recoveries"], "restarts": counts["restarts"]}
+        values |= {"imu_waiting": imu_waiting, "odometry published": self._health.odometry}
+        values |= {name: counts[name] for name in ("recoveries", "restarts")}
         values |= {f"publishers of {name}": input.get_publisher_count() for name, input in self._inputs.items()}
         return level, text, values
 

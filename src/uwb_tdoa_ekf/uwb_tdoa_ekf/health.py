@@ -16,7 +16,7 @@ class Health:
 
     def __init__(self, config, lag):
         """config : FilterConfig; lag : s."""
-        self.imu = self.tdoa = 0  # messages received
+        self.imu = self.tdoa = self.odometry = 0  # messages received, and published
         self.last_odometry = None  # time.monotonic(), s
         self._use_imu, self._lag = config.use_imu, lag
         self._imu_rate, self._tdoa_rate = Rate(), Rate()

@@ -1,0 +1,257 @@
+"""The real nodes as processes of their own, and a node of the test that plays their surroundings and listens."""
+
+from dataclasses import dataclass, replace
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from flights import fly
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import Imu
+from tf2_msgs.msg import TFMessage
+from uwb_tdoa_bias import ros
+from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
+
+EPOCH = 1_700_000_000  # s; stamps of today's size
+PATIENCE = 180.0  # s for anything that must happen; the very first start of ekf_node compiles the filter
+MODULES = {"bias_node": "uwb_tdoa_bias.bias_node", "ekf_node": "uwb_tdoa_ekf.ekf_node"}
+INPUTS = {"bias_node": ("uwb/tdoa", "odometry"), "ekf_node": ("imu/data", "uwb/tdoa_corrected")}
+STREAMS = {
+    "imu/data": Imu,
+    "uwb/tdoa": Tdoa,
+    "uwb/tdoa_corrected": TdoaCorrected,
+    "odometry": Odometry,
+    "uwb/residual": TdoaResidual,
+}
+
+
+@pytest.fixture
+def make_rig():
+    """make_rig() gives a Rig in a namespace of its own; what it started ends with the test."""
+    rclpy.init()
+    rigs = []
+
+    def make(**options):
+        rigs.append(Rig(f"tag{len(rigs)}", **options))
+        return rigs[-1]
+
+    yield make
+    for rig in rigs:
+        rig.close()
+    rclpy.shutdown()
+
+
+def recording(seconds=4.0, imu_rate=200.0, tdoa_rate=100.0):
+    """A Flight whose stamps are what a node reads from the messages that hold them."""
+    flight = fly(seed=5, duration=seconds, imu_rate=imu_rate, tdoa_rate=tdoa_rate, accel_noise=0.01, gyro_noise=0.001)
+    streams = (flight.imu, flight.tdoa)
+    imu, tdoa = (replace(stream, t=np.array([seconds_of(stamp(t)) for t in stream.t])) for stream in streams)
+    return replace(flight, imu=imu, tdoa=tdoa)
+
+
+def stamp(t, epoch=EPOCH):
+    """Stamp of t s after the epoch."""
+    second, nanosecond = divmod(round(t * 1e9), 10**9)
+    return ros.Time(sec=epoch + second, nanosec=nanosecond)
+
+
+def seconds_of(stamp, epoch=EPOCH):
+    """Seconds after the epoch, as a node reads them if its first stamp is in the epoch's first second."""
+    return (stamp.sec - epoch) + 1e-9 * stamp.nanosec
+
+
+@dataclass
+class Process:
+    """A node in a process group of its own; lines: what it wrote so far."""
+
+    process: subprocess.Popen
+    lines: list
+    reader: threading.Thread
+
+    def stop(self, number=signal.SIGINT):
+        """Signal the group; returns the exit code and the seconds it took."""
+        started = time.monotonic()
+        os.killpg(self.process.pid, number)
+        code = self.process.wait(timeout=30.0)
+        self.reader.join(timeout=30.0)
+        return code, time.monotonic() - started
+
+
+class Rig:
+    """Starts nodes in `namespace`, publishes what they take, keeps what they publish.
+
+    received : {topic: messages in order of arrival}, for the streams and "/tf".
+    """
+
+    def __init__(self, namespace, listen=(*STREAMS, "/tf")):
+        """listen : topics to keep."""
+        self.namespace = namespace
+        self.node = rclpy.create_node("rig", namespace=namespace)
+        self.received = {topic: [] for topic in listen}
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._processes, self._publishers, self._status, self._since = {}, {}, {}, 0.0
+        self._anchors = self.node.create_publisher(AnchorArray, "uwb/anchors", ros.ANCHORS_QOS)
+        self._subscriptions = {
+            topic: self.node.create_subscription(STREAMS.get(topic, TFMessage), topic, store.append, ros.STREAM_QOS)
+            for topic, store in self.received.items()
+        }
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, ros.DIAGNOSTICS_QOS)
+
+    @property
+    def odometry(self):
+        return self.received["odometry"]
+
+    @property
+    def corrected(self):
+        return self.received["uwb/tdoa_corrected"]
+
+    @property
+    def residuals(self):
+        return self.received["uwb/residual"]
+
+    def _on_diagnostics(self, message):
+        if seconds_of(message.header.stamp, 0) > self._since:
+            self._status.update((status.name, status) for status in message.status)
+
+    def start(self, *names, **arguments):
+        """Start nodes, with arguments by name of the node; returns when they hear what they need, and we hear them.
+
+        Topics that no started node publishes are played by us. From then on nothing is lost.
+        """
+        for name in names:
+            command = [sys.executable, "-u", "-m", MODULES[name], "--ros-args", "-r", f"__ns:=/{self.namespace}"]
+            process = subprocess.Popen(
+                [*command, *arguments.get(name, ())],
+                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+            )  # fmt: skip
+            lines = []
+            reader = threading.Thread(target=_collect, args=(process.stdout, lines), daemon=True)
+            reader.start()
+            self._processes[name] = Process(process, lines, reader)
+        made = {"uwb/tdoa_corrected"} if "bias_node" in names else set()
+        made |= {"odometry", "uwb/residual"} if "ekf_node" in names else set()
+        for topic in {topic for name in names for topic in INPUTS[name]} - made:
+            self._publishers[topic] = self.node.create_publisher(STREAMS[topic], topic, ros.STREAM_QOS)
+
+        def all_matched():
+            heard = [self.values(name).get(f"publishers of {topic}") for name in names for topic in INPUTS[name]]
+            return (
+                all(count == "1" for count in heard)
+                and all(publisher.get_subscription_count() for publisher in self._publishers.values())
+                and all(self._subscriptions[topic].get_publisher_count() for topic in made & self._subscriptions.keys())
+            )
+
+        self.wait(all_matched, "all to have found each other")
+        return [self._processes[name] for name in names]
+
+    def close(self):
+        """End what was started."""
+        for process in self._processes.values():
+            if process.process.poll() is None:
+                os.killpg(process.process.pid, signal.SIGKILL)
+            process.process.wait()
+            process.reader.join()
+            process.process.stdout.close()
+        self._executor.shutdown()
+        self.node.destroy_node()
+
+    def wait(self, condition, what, patience=PATIENCE):
+        """Listen until condition() holds."""
+        deadline = time.monotonic() + patience
+        while not condition():
+            self._executor.spin_once(timeout_sec=0.1)
+            for name, process in self._processes.items():
+                assert process.process.poll() is None, f"{name} has ended: {''.join(process.lines)}"
+            if time.monotonic() > deadline:
+                said = "".join(line for process in self._processes.values() for line in process.lines)
+                accounts = {name: self.values(name) for name in self._processes}
+                raise AssertionError(f"waited {patience} s for {what}; {accounts}; {said}")
+
+    def values(self, name):
+        """{key: text} of the last diagnostics of a node; empty before."""
+        status = self._status.get(f"/{self.namespace}/{name}")
+        return {entry.key: entry.value for entry in status.values} if status else {}
+
+    def fresh_status(self, name):
+        """Diagnostics of a node that were written after now."""
+        self._since = time.time()
+        self._status.clear()
+        self.wait(lambda: self.values(name), f"diagnostics of {name}")
+        return self._status[f"/{self.namespace}/{name}"]
+
+    def counts(self, name, **expected):
+        """{key: int} of all counts of a node, when those named have the expected values and we have what it sent."""
+        own = {"bias_node": ("published", "uwb/tdoa_corrected"), "ekf_node": ("odometry published", "odometry")}
+        sent, topic = own[name]
+
+        def arrived():
+            values = self.values(name)
+            return (
+                values
+                and all(values[key.replace("_", " ")] == str(value) for key, value in expected.items())
+                and (topic not in self.received or int(values[sent]) == len(self.received[topic]))
+            )
+
+        self.fresh_status(name)
+        self.wait(arrived, f"{name} to count {expected}", 60.0)
+        return {key: int(value) for key, value in self.values(name).items() if value.isdigit()}
+
+    def send_anchors(self, anchors):
+        """anchors : Anchors, or an AnchorArray to be sent as it is."""
+        self._anchors.publish(anchors if isinstance(anchors, AnchorArray) else ros.anchors_to_message(anchors))
+
+    def send(self, topic, message, t, frame="base_link", epoch=EPOCH):
+        """Publish a message with the stamp of t s after the epoch."""
+        message.header.stamp, message.header.frame_id = stamp(t, epoch), frame
+        self._publishers[topic].publish(message)
+
+    def send_imu(self, t, gyro=(0.0, 0.0, 0.0), force=(0.0, 0.0, 9.81), epoch=EPOCH):
+        message = Imu()
+        rate, acceleration = message.angular_velocity, message.linear_acceleration
+        rate.x, rate.y, rate.z = map(float, gyro)
+        acceleration.x, acceleration.y, acceleration.z = map(float, force)
+        self.send("imu/data", message, t, epoch=epoch)
+
+    def send_tdoa(self, t, a, b, d, epoch=EPOCH):
+        self.send("uwb/tdoa", Tdoa(anchor_a=int(a), anchor_b=int(b), distance_difference=float(d)), t, epoch=epoch)
+
+    def send_corrected(self, t, a, b, d, epoch=EPOCH):
+        message = TdoaCorrected(anchor_a=int(a), anchor_b=int(b), raw=float(d), corrected=float(d), model="none")
+        self.send("uwb/tdoa_corrected", message, t, epoch=epoch)
+
+    def send_pose(self, t, p=(0.0, 0.0, 0.0), epoch=EPOCH):
+        message = Odometry(child_frame_id="base_link")
+        message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.position.z = map(float, p)
+        self.send("odometry", message, t, "map", epoch)
+
+    def play(self, flight, epoch=EPOCH, ahead=0.025, send_tdoa=None):
+        """Send a Flight in stamp order, never more than `ahead` s of stamps beyond what the nodes have made of it.
+
+        Returns when every TDOA but those of the last `ahead` s has its residual. (Much further ahead than that, the
+        result would depend on timing while the filter starts: bias_node cannot know yet that there will be poses.)
+        """
+        imu, tdoa = flight.imu, flight.tdoa
+        before, i = len(self.residuals), 0
+        for k, t in enumerate(tdoa.t):
+            while i < len(imu) and imu.t[i] <= t:
+                self.send_imu(imu.t[i], imu.gyro[i], imu.accel[i], epoch)
+                i += 1
+            (send_tdoa or self.send_tdoa)(t, tdoa.a[k], tdoa.b[k], tdoa.d[k], epoch)
+            due = before + np.searchsorted(tdoa.t, t - ahead)
+            self.wait(lambda due=due: len(self.residuals) >= due, f"{due} residuals", 60.0)
+        for t, gyro, force in zip(imu.t[i:], imu.gyro[i:], imu.accel[i:]):
+            self.send_imu(t, gyro, force, epoch)
+
+
+def _collect(stream, lines):
+    for line in stream:
+        lines.append(line)

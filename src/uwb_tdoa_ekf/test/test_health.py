@@ -1,0 +1,78 @@
+from collections import Counter
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from uwb_tdoa_ekf import health  # noqa: E402
+from uwb_tdoa_ekf.config import FilterConfig  # noqa: E402
+from uwb_tdoa_ekf.health import ERROR, OK, WARN  # noqa: E402
+
+STARTING, RUNNING = SimpleNamespace(running=False), SimpleNamespace(running=True)
+
+
+class Clock:
+    """time.monotonic by hand."""
+
+    def __init__(self, monkeypatch):
+        self.now = 1000.0
+        monkeypatch.setattr("time.monotonic", lambda: self.now)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    return Clock(monkeypatch)
+
+
+def second(clock, judge, estimator, imu=1000, tdoa=400, refused=None, **counts):
+    """Let one second pass with so many messages; returns (level, text, values)."""
+    clock.now += 1.0
+    judge.imu += imu
+    judge.tdoa += tdoa
+    return judge.report(refused, estimator, Counter(counts))
+
+
+def test_says_what_is_missing(clock):
+    judge = health.Health(FilterConfig(), lag=0.25)
+    level, text, _ = second(clock, judge, None)
+    assert level == ERROR and "uwb/anchors" in text
+    assert second(clock, judge, STARTING, refused="anchor 3 is nowhere")[:2] == (ERROR, "anchor 3 is nowhere")
+    level, text, _ = second(clock, judge, RUNNING, tdoa=0)
+    assert level == ERROR and "uwb/tdoa_corrected" in text
+    level, text, _ = second(clock, judge, RUNNING, imu=0)
+    assert level == ERROR and "imu/data" in text
+    assert second(clock, health.Health(FilterConfig(use_imu=False), 0.25), RUNNING, imu=0)[0] == OK
+
+
+def test_a_start_that_takes_long_is_a_warning(clock):
+    judge = health.Health(FilterConfig(), lag=0.25)
+    levels = [second(clock, judge, STARTING)[0] for _ in range(8)]
+    assert levels == [OK] * 6 + [WARN] * 2
+    second(clock, judge, STARTING, tdoa=0)  # without data nothing can start
+    assert second(clock, judge, STARTING)[0] == OK
+
+
+@pytest.mark.parametrize("name", ["late", "invalid", "rejected"])
+def test_most_tdoas_lost_for_one_reason_is_a_warning(clock, name):
+    judge = health.Health(FilterConfig(), lag=0.25)
+    assert second(clock, judge, RUNNING, used=400)[:2] == (OK, "running")
+    assert second(clock, judge, RUNNING, used=600, **{name: 199})[0] == OK
+    level, text, _ = second(clock, judge, RUNNING, used=700, **{name: 500})
+    assert level == WARN and ("contradict" if name == "rejected" else name) in text
+    assert second(clock, judge, RUNNING, used=1100, **{name: 500})[0] == OK  # that was then
+
+
+def test_rates_and_age(clock):
+    judge = health.Health(FilterConfig(), lag=0.25)
+    values = second(clock, judge, STARTING)[2]
+    assert (values["state"], values["age of last odometry"]) == ("starting", "none yet")
+    judge.last_odometry = clock.now
+    values = second(clock, judge, RUNNING, imu=500, tdoa=20)[2]
+    assert values == {
+        "state": "running",
+        "age of last odometry": "1.000 s",
+        "IMU rate": "500.0 Hz",
+        "TDOA rate": "20.0 Hz",
+    }

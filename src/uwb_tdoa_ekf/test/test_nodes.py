@@ -1,0 +1,203 @@
+"""Both nodes, as processes, over topics."""
+
+from pathlib import Path
+import signal
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
+from rig import EPOCH, make_rig, recording, seconds_of  # noqa: E402, F401
+from uwb_tdoa_bias.corrector import Corrector  # noqa: E402
+from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
+from uwb_tdoa_bias.network import Network  # noqa: E402
+from uwb_tdoa_ekf.frames import body_velocity, pose_covariance  # noqa: E402
+from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
+from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
+
+SOURCES = Path(__file__).resolve().parents[2]
+MODEL = SOURCES / "uwb_tdoa_bias" / "models" / "known_answer.onnx"
+EFFECTS = "effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, tag_lever_arm: {values: {x: 0.05, z: 0.1}}}"
+
+
+def vector(v):
+    return v.x, v.y, v.z
+
+
+def quaternion(q):
+    return q.x, q.y, q.z, q.w
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "what", [pytest.param("nothing", marks=SLOW), "effects", pytest.param("network", marks=SLOW)]
+)
+def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what):
+    flight = recording()
+    effects = tmp_path / "effects.yaml"
+    effects.write_text(EFFECTS)
+    parameters, corrector = {
+        "nothing": (["--params-file", f"{SOURCES}/uwb_tdoa_bias/config/bias_node.yaml"], Corrector(flight.anchors)),
+        "effects": (["-p", f"effects_file:={effects}"], Corrector(flight.anchors, EffectSet.from_yaml(effects))),
+        "network": (["-p", f"model_file:={MODEL}"], Corrector(flight.anchors, network=Network(MODEL))),
+    }[what]
+    rig = make_rig()
+    rig.start(
+        "bias_node", "ekf_node",
+        bias_node=parameters, ekf_node=["--params-file", f"{SOURCES}/uwb_tdoa_ekf/config/ekf_node.yaml"],
+    )  # fmt: skip
+    rig.send_anchors(flight.anchors)
+    rig.play(flight)
+    ekf = rig.counts("ekf_node", IMU_samples_received=len(flight.imu), TDOAs_received=len(flight.tdoa))
+    bias = rig.counts("bias_node", received=len(flight.tdoa))
+    expected = run_offline(flight, corrector=corrector)
+
+    # Nothing is lost, nothing is late, and the accounts add up.
+    assert ekf["used"] + ekf["rejected"] + ekf["startup"] + ekf["waiting"] == len(flight.tdoa)
+    assert ekf["late"] == ekf["invalid"] == ekf["imu_late"] == ekf["imu_invalid"] == ekf["restarts"] == 0
+    assert ekf["imu_used"] + ekf["imu_waiting"] == len(flight.imu)
+    assert bias["published"] == bias["received"] == len(rig.corrected) == len(flight.tdoa)
+    assert bias["waiting"] == bias["dropped"] == bias["released before their pose"] == 0
+
+    # The corrections are the same.
+    np.testing.assert_allclose([m.bias for m in rig.corrected], expected.bias, atol=1e-6)
+    assert [m.raw for m in rig.corrected] == flight.tdoa.d.tolist()
+    assert [m.raw - m.bias for m in rig.corrected] == [m.corrected for m in rig.corrected]
+    models = {"nothing": {"none"}, "effects": {"anchor_delay+tag_lever_arm"}, "network": {"none", "known_answer"}}
+    assert {m.model for m in rig.corrected} == models[what]
+    assert what == "nothing" or np.ptp(expected.bias) > 0.05
+
+    # The odometry is the same, but for what still waits.
+    odometry = expected.odometry
+    n = len(rig.odometry)
+    assert len(odometry) - 3 <= n <= len(odometry) and n > 500
+    np.testing.assert_array_equal([seconds_of(m.header.stamp) for m in rig.odometry], odometry.t[:n])
+    poses, twists = [m.pose.pose for m in rig.odometry], [m.twist.twist for m in rig.odometry]
+    velocity, spread = body_velocity(odometry.q, odometry.v, odometry.covariance)
+    np.testing.assert_allclose([vector(p.position) for p in poses], odometry.p[:n], atol=1e-6)
+    np.testing.assert_allclose([quaternion(p.orientation) for p in poses], odometry.q[:n], atol=1e-6)
+    np.testing.assert_allclose([vector(t.linear) for t in twists], velocity[:n], atol=1e-6)
+    gyro = flight.imu.gyro[np.searchsorted(flight.imu.t, odometry.t, side="right") - 1] - odometry.gyro_bias
+    np.testing.assert_allclose([vector(t.angular) for t in twists], gyro[:n], atol=1e-6)
+    pose = pose_covariance(odometry.q, odometry.covariance).reshape(-1, 36)
+    np.testing.assert_allclose([m.pose.covariance for m in rig.odometry], pose[:n], atol=1e-6)
+    twist = np.array([m.twist.covariance for m in rig.odometry]).reshape(n, 6, 6)
+    np.testing.assert_allclose(twist[:, :3, :3], spread[:n], atol=1e-6)
+    assert {(m.header.frame_id, m.child_frame_id) for m in rig.odometry} == {("map", "base_link")}
+
+    # And so is what is said beside it.
+    transforms = {seconds_of(t.header.stamp): t for m in rig.received["/tf"] for t in m.transforms}
+    for message in rig.odometry:
+        transform = transforms[seconds_of(message.header.stamp)].transform
+        assert vector(transform.translation) == vector(message.pose.pose.position)
+        assert transform.rotation == message.pose.pose.orientation
+    outcome = {t: i for i, t in enumerate(expected.residuals.t)}
+    for residual in rig.residuals:
+        i = outcome[seconds_of(residual.header.stamp)]
+        assert (residual.anchor_a, residual.anchor_b) == (expected.residuals.a[i], expected.residuals.b[i])
+        assert residual.verdict == expected.residuals.verdict[i]
+        np.testing.assert_allclose(residual.innovation, expected.residuals.innovation[i], atol=1e-6)
+        np.testing.assert_allclose(residual.weight, expected.residuals.weight[i], atol=1e-6)
+    assert len(rig.residuals) + ekf["waiting"] == len(flight.tdoa)
+
+
+def test_quality_of_service(make_rig):
+    rig = make_rig()
+    reliable = f"qos_overrides./{rig.namespace}/odometry.publisher.reliability:=reliable"
+    rig.start("bias_node", "ekf_node", ekf_node=["-p", reliable])
+    best_effort = (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
+    always = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
+    latched = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
+    publishers = {
+        "uwb/tdoa_corrected": {"bias_node": best_effort},
+        "uwb/residual": {"ekf_node": best_effort},
+        "odometry": {"ekf_node": always},  # by the parameter above
+        "/tf": {"ekf_node": always},
+        "/diagnostics": {"bias_node": always, "ekf_node": always},
+    }
+    subscriptions = {
+        "uwb/tdoa": {"bias_node": best_effort},
+        "odometry": {"bias_node": best_effort},
+        "imu/data": {"ekf_node": best_effort},
+        "uwb/tdoa_corrected": {"ekf_node": best_effort},
+        "uwb/anchors": {"bias_node": latched, "ekf_node": latched},
+    }
+    for expected, endpoints in (
+        (publishers, rig.node.get_publishers_info_by_topic),
+        (subscriptions, rig.node.get_subscriptions_info_by_topic),
+    ):
+        for topic, nodes in expected.items():
+            full = topic if topic.startswith("/") else f"/{rig.namespace}/{topic}"
+            found = {
+                end.node_name: (end.qos_profile.reliability, end.qos_profile.durability)
+                for end in endpoints(full)
+                if end.node_namespace == f"/{rig.namespace}" and end.node_name != "rig"
+            }
+            assert found == nodes, topic
+
+
+@SLOW
+def test_two_tags_do_not_disturb_each_other(make_rig):
+    one, other = make_rig(listen=["odometry", "uwb/residual"]), make_rig(listen=["odometry", "uwb/residual", "/tf"])
+    flight = recording(2.0)
+    one.start("bias_node", "ekf_node")
+    other.start("bias_node", "ekf_node", ekf_node=["-p", "world_frame:=hall", "-p", "body_frame:=tag2"])
+    one.send_anchors(flight.anchors)
+    other.send_anchors(flight.anchors)
+    one.play(flight)
+    assert one.counts("ekf_node")["used"] > 0
+    idle = other.counts("ekf_node")
+    assert idle["TDOAs received"] == idle["IMU samples received"] == 0 and not other.odometry
+    other.play(flight, epoch=EPOCH - 86400)
+    for rig in (one, other):
+        rig.counts("ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu))
+    stamps = [
+        [seconds_of(message.header.stamp, epoch) for message in rig.odometry]
+        for rig, epoch in ((one, EPOCH), (other, EPOCH - 86400))
+    ]
+    assert stamps[0] == stamps[1] and len(stamps[0]) > 100
+    assert [m.pose.pose for m in one.odometry] == [m.pose.pose for m in other.odometry]
+    frames = {(t.header.frame_id, t.child_frame_id) for m in other.received["/tf"] for t in m.transforms}
+    assert frames == {("map", "base_link"), ("hall", "tag2")}
+
+
+@SLOW
+def test_a_recording_that_starts_again_gives_the_same_again(make_rig):
+    flight = recording(2.5)
+    rig = make_rig()
+    rig.start("bias_node", "ekf_node", bias_node=["-p", f"model_file:={MODEL}"])
+    rig.send_anchors(flight.anchors)
+    rig.play(flight)
+    ekf = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu))
+    first, waiting = list(rig.odometry), ekf["waiting"]
+    rig.play(flight)
+    ekf = rig.counts("ekf_node", TDOAs_received=2 * len(flight.tdoa), IMU_samples_received=2 * len(flight.imu))
+    assert ekf["restarts"] == 1
+    assert ekf["late"] == waiting  # what the first round left waiting
+    second = rig.odometry[len(first) :]
+    assert [m.header.stamp for m in first] == [m.header.stamp for m in second]
+    assert [m.pose.pose for m in first] == [m.pose.pose for m in second]
+    assert {m.status for m in rig.corrected[len(flight.tdoa) :]} == {
+        TdoaCorrected.STATUS_PASSED,
+        TdoaCorrected.STATUS_NETWORK,
+    }
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_both_in_good_order(make_rig, number):
+    flight = recording(1.0)
+    rig = make_rig()
+    processes = rig.start("bias_node", "ekf_node", bias_node=["-p", f"model_file:={MODEL}"])
+    rig.send_anchors(flight.anchors)
+    rig.play(flight)
+    assert any(m.verdict == TdoaResidual.VERDICT_USED for m in rig.residuals)
+    for process in processes:
+        code, took = process.stop(number)
+        assert code == 0, "".join(process.lines)
+        assert took < 5.0
+        assert "Traceback" not in "".join(process.lines)
