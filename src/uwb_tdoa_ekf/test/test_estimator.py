@@ -44,7 +44,7 @@ def test_in_order_it_is_the_offline_engine():
     assert_same_as_offline(fly(1, 4.0, outliers=0.05))
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(seeds, st.floats(0.0, 0.2), st.sampled_from([0, 1]), st.floats(0.0, 0.0049))
 def test_neither_skew_of_the_streams_nor_disorder_within_reorder_changes_anything(seed, delay, behind, jitter):
     flight, rng = fly(2, 2.0), np.random.default_rng(seed)
