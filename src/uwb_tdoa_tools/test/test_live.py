@@ -81,10 +81,16 @@ def test_a_signal_to_us_ends_the_run(start):
 
 
 def test_parameters_are_yaml_whatever_they_hold():
-    assert live._parameters({}) == []
-    assert live._parameters({"file": "/a: b", "use_imu": False, "lag": 10.0}) == [
-        "--ros-args", "-p", 'file:="/a: b"', "-p", "use_imu:=false", "-p", "lag:=10.0",
-    ]  # fmt: skip
+    arguments = live._parameters("ekf_node", {"file": "/a: b", "use_imu": False, "lag": 0.25})
+    assert arguments[0] == "--ros-args"
+    assert set(arguments[1::2]) == {"-p"}
+    assert {'file:="/a: b"', "use_imu:=false", "lag:=0.25"} <= set(arguments[2::2])
+
+
+def test_what_is_replayed_is_waited_for():
+    arguments = live._parameters("bias_node", None)
+    assert "hold:=9.975" in arguments
+    assert 'qos_overrides./uwb/tdoa.subscription.reliability:="reliable"' in arguments
 
 
 class NoNode:

@@ -27,8 +27,6 @@ them with an effects.yaml that holds their true values, as a calibration would f
 with what --effects and --model give. "raw" is the same filter without any correction, run without ROS.
 """
 SIMULATED = SimulationConfig(anchor_delay_std=0.1, duration=40.0, seed=1)
-# A replay has no deadline: on a busy machine rather wait for a message than leave it out. (hold: see bias_node.yaml)
-PATIENT = {"ekf_node": {"lag": 10.0}, "bias_node": {"hold": 9.975}}
 FIGURES = {"rmse_x": "x", "rmse_y": "y", "rmse_z": "z", "rmse_3d": "3D", "median_3d": "median", "max_3d": "max"}
 VERDICTS = ("used", "rejected", "late", "invalid", "startup", "waiting")
 
@@ -78,8 +76,8 @@ def demo(args):
     try:
         live = run_live(
             bag, args.out, args.rate,
-            {**PATIENT["bias_node"], **{name: str(Path(path).resolve()) for name, path in paths.items() if path}},
-            {**PATIENT["ekf_node"], "use_imu": flight.imu is not None},
+            {name: str(Path(path).resolve()) for name, path in paths.items() if path},
+            {"use_imu": flight.imu is not None},
             lambda text: print(f"nodes      {text}", flush=True),
         )  # fmt: skip
     except LiveError as error:
@@ -133,7 +131,7 @@ def _print_errors(raw, corrected, *others):
     for score in (raw, corrected, *others):
         print(f"{score.name:28s}" + "".join(f"{score.row()[key]:9.3f}" for key in FIGURES))
     before, after = raw.row()["rmse_3d"], corrected.row()["rmse_3d"]
-    print(f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: {100.0 * (after - before) / before:+.0f} %")
+    print(f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: {round(100.0 * (after - before) / before):+d} %")
 
 
 def _plot(scores, flight, path):

@@ -28,7 +28,7 @@ MATCHED = {
     "/odometry": (1, 2),
 }
 # A replay can wait, a robot cannot: here no link may lose a message, and a stream that falls behind is waited for.
-PATIENCE = {"bias_node": {"hold": 9.0}, "ekf_node": {"lag": 10.0}}  # s of stamps
+PATIENCE = {"bias_node": {"hold": 9.975}, "ekf_node": {"lag": 10.0}}  # s of stamps; hold: see config/bias_node.yaml
 RELIABLE = {
     "bias_node": ("/uwb/tdoa.subscription", "/odometry.subscription", "/uwb/tdoa_corrected.publisher"),
     "ekf_node": ("/imu/data.subscription", "/uwb/tdoa_corrected.subscription", "/odometry.publisher"),
@@ -36,7 +36,7 @@ RELIABLE = {
 DEPTH = 1_000_000  # messages that may wait in a subscription
 READY_LIMIT = 180.0  # s: the very first start compiles the filter
 MATCH_LIMIT = 60.0  # s
-SETTLE_LIMIT = 30.0  # s
+SETTLE_LIMIT = 600.0  # s: on a slow machine a replay at a high rate leaves a lot to catch up with
 STOP_LIMIT = 10.0  # s
 
 
