@@ -1,0 +1,75 @@
+"""The volume in which a tag can be trusted, as `plan` saves it and the filter's node asks for it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+import zlib
+
+import numpy as np
+
+from .errors import InputError
+
+_FIELDS = ("frame", "lower", "step", "flyable", "ids", "positions", "planar")
+
+
+@dataclass(frozen=True)
+class FlyableVolume:
+    """A box of cells, each flyable or not, in the world frame of the anchors it was computed for.
+
+    Attributes
+    ----------
+    lower : (3,) corner of the first cell, m; step : (3,) size of a cell, m
+    flyable : (nx, ny, nz) bool
+    ids, positions : (N,) and (N, 3) m, the anchors
+    frame : name of the world frame
+    planar : the tag's height is known and does not matter here; nz is 1
+    """
+
+    lower: np.ndarray
+    step: np.ndarray
+    flyable: np.ndarray
+    ids: np.ndarray
+    positions: np.ndarray
+    frame: str = "map"
+    planar: bool = False
+
+    def __post_init__(self):
+        for name, kind in (("lower", float), ("step", float), ("flyable", bool), ("ids", int), ("positions", float)):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
+        shapes = (self.lower.shape, self.step.shape, self.flyable.ndim, self.positions.shape)
+        if shapes != ((3,), (3,), 3, (len(self.ids), 3)) or not (self.step > 0.0).all():
+            raise InputError("flyable volume: lower, step, flyable, ids and positions do not fit together.")
+
+    def contains(self, p):
+        """Whether positions p (..., 3), m, are flyable: (...) bool. Nothing is outside of the box or where not
+        finite."""
+        p = np.asarray(p, dtype=float)
+        at = np.where(np.isfinite(p), (p - self.lower) / self.step, -1.0)
+        if self.planar:
+            at[..., 2] = 0.0
+        cell = np.floor(np.clip(at, -1.0, self.flyable.shape)).astype(int)
+        inside = ((cell >= 0) & (cell < self.flyable.shape)).all(axis=-1)
+        cell = np.where(inside[..., None], cell, 0)
+        return inside & self.flyable[cell[..., 0], cell[..., 1], cell[..., 2]]
+
+    def belongs_to(self, anchors, tolerance=0.1):
+        """Whether it was computed for these Anchors: the same ids in the same frame, each within `tolerance`, m."""
+        rows = anchors.index(self.ids)
+        if anchors.frame != self.frame or len(anchors) != len(self.ids) or (rows < 0).any():
+            return False
+        return bool((np.linalg.norm(anchors.positions[rows] - self.positions, axis=1) <= tolerance).all())
+
+    def save(self, path):
+        """Write what `load` reads: a numpy .npz file."""
+        with open(path, "wb") as file:
+            np.savez_compressed(file, **{name: getattr(self, name) for name in _FIELDS})
+
+    @classmethod
+    def load(cls, path):
+        """Read a file that `save` wrote; raises InputError."""
+        try:
+            with np.load(Path(path), allow_pickle=False) as content:
+                fields = {name: content[name] for name in _FIELDS}
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
+            raise InputError(f"{path}: is no flyable volume ({error}); make one with `plan ... --volume`.") from error
+        return cls(**{**fields, "frame": str(fields["frame"]), "planar": bool(fields["planar"])})
