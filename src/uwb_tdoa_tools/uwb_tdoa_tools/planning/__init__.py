@@ -1,0 +1,8 @@
+"""Where a tag can be located before a hole is drilled: precision, failure, accuracy, and better anchor layouts.
+
+    from uwb_tdoa_tools.planning.installation import Installation
+    from uwb_tdoa_tools.planning.maps import Grid, chart
+    result = chart(Installation(anchors), Grid.slice((-3, 3), (-4, 4), 1.2, 0.1))
+
+After Grasso, Innocente, Tai, Haas and Dizqah, Sensors 2022, 22, 9136, in two and three dimensions.
+"""

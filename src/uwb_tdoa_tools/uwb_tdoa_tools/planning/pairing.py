@@ -1,0 +1,66 @@
+"""Which TDOAs one round of measurements holds, and how their errors hang together."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """The TDOAs of one round.
+
+    Attributes
+    ----------
+    a, b : (M,) rows of the anchors, d_ab = |p - b| - |p - a|
+    shared : the TDOAs of a round use one reception per anchor, whose error they share; otherwise every TDOA has its own
+    times : how often each TDOA comes in a round (default 1)
+    """
+
+    a: np.ndarray
+    b: np.ndarray
+    shared: bool
+    times: float = 1.0
+
+    def incidence(self):
+        """(M, N) matrix of -1 at a and +1 at b."""
+        rows = np.arange(len(self.a))
+        matrix = np.zeros((len(rows), 1 + max(self.a.max(), self.b.max())))
+        matrix[rows, self.a], matrix[rows, self.b] = -1.0, 1.0
+        return matrix
+
+    def covariance(self, variance, link_std=0.0):
+        """Covariance of the TDOAs: (n, M, M) m^2.
+
+        variance : (n, N) m^2 of the receptions. link_std : m, error that every TDOA has of its own besides (the
+        anchor's reception of the other anchor's packet, which the tag's TDOA also contains). Source: eqs. 4 and 5 of
+        Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference."""
+        own = link_std**2 * np.eye(len(self.a))
+        if self.shared:
+            d = self.incidence()
+            return (d * variance[:, None, :]) @ d.T + own
+        return (variance[:, self.a] + variance[:, self.b])[:, :, None] * np.eye(len(self.a)) + own
+
+
+def ring(n, shared=True):
+    """TDOA2: every anchor with the next one, and the last with the first; N TDOAs."""
+    return Pairing(np.arange(n), (np.arange(n) + 1) % n, shared)
+
+
+def common_reference(n):
+    """Every anchor with anchor 0; N - 1 TDOAs. The case of eq. A18."""
+    return Pairing(np.zeros(n - 1, int), np.arange(1, n), True)
+
+
+def all_pairs(n):
+    """TDOA3: any anchor with any other, each TDOA with an error of its own; weighted to N TDOAs a round."""
+    a, b = np.triu_indices(n, 1)
+    return Pairing(a, b, False, 2.0 / (n - 1))
+
+
+PAIRINGS = {
+    "ring": ring,
+    "ring_uncorrelated": lambda n: ring(n, shared=False),
+    "common_reference": common_reference,
+    "all_pairs": all_pairs,
+}
+OF_PROTOCOL = {"tdoa2": "ring", "tdoa3": "all_pairs"}

@@ -1,0 +1,117 @@
+"""How precise a position can be: Fisher information, the Cramer-Rao bound, dilution of precision and ellipses."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from .noise import FixedNoise, variance_gradient
+
+NORMAL_99 = 2.58  # standard deviations of a normal variable that hold 99 %, as rounded in Grasso et al., sec. 2.2.3
+_CHUNK = 200_000  # numbers in the largest array of one step: what a processor cache holds
+
+
+def information(points, installation, correction=True):
+    """Fisher information about the position from one round of TDOAs: (n, k, k) 1/m^2, k the installation's dimensions.
+
+    points : (n, 3) m. correction : with the second term of eq. 1, the information that lies in the size of the errors.
+    Source: eq. 1 of Grasso et al. (Sensors 2022, 22, 9136).
+    """
+    anchors, pairing = len(installation.anchors), installation.pairing
+    width = len(pairing.a) * (anchors if pairing.shared and installation.link_std else 3) + 9 * anchors
+    chunks = np.array_split(points, max(1, len(points) * width // _CHUNK))
+    return np.concatenate([_information(chunk, installation, correction) for chunk in chunks])
+
+
+def _information(points, installation, correction):
+    anchors, k = installation.anchors, installation.dimensions
+    away = points[:, None, :] - anchors.positions
+    unit = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
+    variance = installation.noise.variance(points, anchors)
+    total = weigh(unit[..., :k], variance, installation)
+    if correction:
+        gradient = variance_gradient(installation.noise, points, anchors, variance, k)
+        total += _from_sizes(gradient, variance, installation)
+    return total
+
+
+def weigh(ranges, variance, installation):
+    """Squared size, in standard deviations, of what changes (n, N, k) of the ranges do to the TDOAs of one round.
+
+    variance : (n, N) m^2 of the receptions. Returns (n, k, k), V' F^-1 V with V (n, M, k) the changes of the TDOAs;
+    with the derivatives of the ranges along x, y, z it is the first term of eq. 1.
+
+    For one shared reception per anchor, whichever N - 1 pairs D connect the anchors, D' (D S D')^-1 D is the same
+    matrix: W - w w' / sum(w) with W = S^-1, that of N ranges with one unknown offset, the tag's clock. A closed ring,
+    whose covariance D S D' is singular, holds the same and nothing more."""
+    pairing, own = installation.pairing, installation.link_std**2
+    if not pairing.shared:
+        v = ranges[:, pairing.b] - ranges[:, pairing.a]
+        weight = pairing.times / (variance[:, pairing.a] + variance[:, pairing.b] + own)
+        return _product(v, weight[..., None] * v)
+    if own > 0.0:
+        return _product(ranges, _inverse(variance, installation) @ ranges)
+    w = 1.0 / variance[..., None]
+    centred = ranges - (w * ranges).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True)
+    return _product(centred, w * centred)
+
+
+def _from_sizes(gradient, variance, installation):
+    """Second term of eq. 1, for the derivatives (n, N, k) of the variances.
+
+    With F = D S D' + own, dF_i = D diag(g_i) D' and P = D' F^-1 D, half the trace is g_i' (P o P) g_j / 2.
+    """
+    pairing, own = installation.pairing, installation.link_std**2
+    if not pairing.shared:
+        weight = 1.0 / (variance[:, pairing.a] + variance[:, pairing.b] + own)
+        g = (gradient[:, pairing.a] + gradient[:, pairing.b]) * weight[..., None]
+        return 0.5 * pairing.times * _product(g, g)
+    if own > 0.0:
+        return 0.5 * _product(gradient, _inverse(variance, installation) ** 2 @ gradient)
+    w = 1.0 / variance[..., None]
+    total, g = w.sum(axis=1, keepdims=True), w * gradient
+    mean = (w * g).sum(axis=1, keepdims=True) / total
+    return 0.5 * (_product(g, (1.0 - 2.0 * w / total) * g) + _product(mean, mean))
+
+
+def _inverse(variance, installation):
+    """D' F^-1 D: (n, N, N)."""
+    d = installation.pairing.incidence()
+    return d.T @ np.linalg.inv(installation.pairing.covariance(variance, installation.link_std)) @ d
+
+
+def _product(left, right):
+    return left.swapaxes(1, 2) @ right
+
+
+def bound(information):
+    """The Cramer-Rao bound: smallest covariance of an unbiased estimate, (n, k, k) m^2; inf where there is none."""
+    finite = np.isfinite(information).all(axis=(1, 2))
+    checked = np.where(finite[:, None, None], information, 0.0)
+    values, vectors = np.linalg.eigh(checked)
+    lost = values[:, 0] <= 1e-12 * np.maximum(values[:, -1], 1e-300)
+    covariance = (vectors / np.where(lost[:, None], 1.0, values)[:, None, :]) @ vectors.swapaxes(1, 2)
+    return np.where(lost[:, None, None], np.inf, covariance)
+
+
+def position_error(covariance):
+    """Root of the summed variances of x, y (and z): (n,) m."""
+    return np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+
+
+def dilution(points, installation):
+    """Dilution of precision: (n, k), error along x, y (and z) over that of one reception, if all are alike.
+
+    Its squares add up: of x and y to the horizontal, of all to the position dilution (PDOP).
+    """
+    alike = replace(installation, noise=FixedNoise(1.0), link_std=0.0)
+    covariance = bound(information(points, alike, correction=False))
+    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+
+
+def ellipses(covariance, share=0.99):
+    """Ellipses that hold `share` of the estimates in the xy plane: (semi-axes (n, 2) m, the longer first; angle (n,)
+    rad of the longer one from x)."""
+    values, vectors = np.linalg.eigh(covariance[:, :2, :2])
+    axes = np.sqrt(chi2.ppf(share, 2) * values[:, ::-1])
+    return axes, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
