@@ -1,0 +1,192 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import norm
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_tools.planning.bifurcation import CLEAR, MOST_SUBSETS, Subsets
+from uwb_tdoa_tools.planning.check import brute_force
+from uwb_tdoa_tools.planning.installation import Installation
+from uwb_tdoa_tools.planning.maps import Grid
+from uwb_tdoa_tools.planning.multistart import same_place, solutions
+from uwb_tdoa_tools.planning.noise import FixedNoise
+from uwb_tdoa_tools.planning.pairing import all_pairs
+from uwb_tdoa_tools.simulation.constellations import constellation, corners
+
+SQUARE = Anchors.from_positions([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]])
+SKEW = Anchors.from_positions([[0.4, 0.3, 0.2], [3.9, 0.9, 0.2], [3.1, 3.7, 0.2], [0.7, 2.6, 0.2]])
+
+
+def tdoas(points, anchors):
+    distances = np.linalg.norm(points[..., None, :] - anchors, axis=-1)
+    return np.diff(distances, axis=-1)
+
+
+def test_in_the_plane_it_is_the_polynomial_of_compagnoni_et_al():
+    """|D_1 a_2 - D_2 a_1|^2 - |a_1 ^ a_2|^2, whose sign decides in Inverse Problems 30, 2014, 035004."""
+    points = np.column_stack([np.random.default_rng(0).uniform(-3, 7, (300, 2)), np.full(300, 0.2)])
+    subsets = Subsets(SKEW, 2)
+    for rows, got in zip(subsets.rows, subsets.discriminant(points).T):
+        corner = SKEW.positions[rows]
+        d = np.linalg.norm(points[:, None] - corner, axis=-1)
+        (a1, a2), d1, d2 = corner[1:, :2] - corner[0, :2], d[:, 1] - d[:, 0], d[:, 2] - d[:, 0]
+        wedge = a1[0] * a2[1] - a1[1] * a2[0]
+        np.testing.assert_allclose(got, np.sum((d1[:, None] * a2 - d2[:, None] * a1) ** 2, axis=1) / wedge**2 - 1)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_the_order_of_the_anchors_does_not_matter(dimensions):
+    """Scheduling does not affect the analysis: Grasso et al., sec. 2.3.1."""
+    rng = np.random.default_rng(1)
+    anchors = constellation("random-5-6")
+    points = rng.uniform([-4, -4, 0], [4, 4, 3], (200, 3))
+    one, order = Subsets(anchors, dimensions), rng.permutation(6)
+    shuffled = Anchors(anchors.ids[order], anchors.positions[order], anchors.orientations[order])
+    np.testing.assert_allclose(Subsets(shuffled, dimensions).ambiguous(points), one.ambiguous(points))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([2, 3]))
+def test_a_mirrored_position_has_the_same_tdoas(seed, dimensions):
+    rng = np.random.default_rng(seed)
+    anchors = Anchors.from_positions(rng.uniform([-4, -4, 0], [4, 4, 3], (dimensions + 1, 3)))  # of any heights
+    try:
+        subsets = Subsets(anchors, dimensions)
+    except InputError:
+        return  # nearly flat
+    points = rng.uniform([-6, -6, -1], [6, 6, 4], (40, 3))
+    row, _, mirror = subsets.mirrors(points)
+    if dimensions == 2:
+        np.testing.assert_array_equal(mirror[:, 2], points[row, 2])
+    near = np.linalg.norm(mirror, axis=1) < 1e4
+    np.testing.assert_allclose(
+        tdoas(mirror[near], anchors.positions), tdoas(points[row[near]], anchors.positions), atol=1e-6
+    )
+    assert len(row) == np.sum(subsets.discriminant(points) > 0.0)
+
+
+def test_towards_the_bifurcation_curve_the_other_position_runs_away():
+    subsets = Subsets(Anchors.from_positions(SQUARE.positions[[0, 1, 3]]), 2)
+    away = []
+    for x in np.linspace(0.1, 0.8, 800):
+        row, _, mirror = subsets.mirrors(np.array([[x, x, 0.2]]))
+        away.append(np.linalg.norm(mirror[0]) if len(row) else np.inf)
+    away = np.array(away)
+    last = np.flatnonzero(np.isfinite(away))[-1]
+    assert np.isinf(away[last + 1 :]).all() and away[last] > 200 and away[0] < 2
+
+
+def agreement(anchors, dimensions, points, chosen=None):
+    subsets = Subsets(anchors, dimensions)
+    predicted, agree = subsets.discriminant(points) < 0.0, []
+    for q in range(len(subsets.rows)) if chosen is None else chosen:
+        corner = anchors.positions[subsets.rows[q]]
+        found = solutions(points, corner, dimensions)
+        assert (same_place(points[:, None], found, corner)).any(axis=1).all()  # it finds at least the point
+        unique = (np.isnan(found[..., 0]) | same_place(points[:, None], found, corner)).all(axis=1)
+        agree.append(unique == predicted[:, q])
+    assert 0.02 < np.mean(predicted) < 0.98
+    return np.mean(agree)
+
+
+@pytest.mark.parametrize("anchors", [SQUARE, SKEW], ids=["square", "skew"])
+def test_brute_force_agrees_in_the_plane(anchors):
+    points = Grid.slice((-0.95, 4.9), (-1.1, 5.2), 0.2, 0.45).points  # clear of the diagonals
+    assert agreement(anchors, 2, points) >= 0.99
+
+
+def test_brute_force_agrees_for_a_known_height_among_anchors_of_others():
+    anchors = Anchors.from_positions([[0, 0, 0.2], [4, 0, 3.0], [4, 4, 0.4], [0, 4, 2.5]])
+    points = Grid.slice((-1.93, 5.97), (-2.07, 6.03), 1.2, 0.7).points
+    assert agreement(anchors, 2, points) >= 0.99
+
+
+def test_brute_force_agrees_in_space():
+    points = np.random.default_rng(2).uniform([-4, -4.5, -0.5], [4, 4.5, 3.5], (60, 3))
+    assert agreement(corners(), 3, points, chosen=range(0, 58, 9)) >= 0.99
+
+
+@pytest.mark.slow
+def test_brute_force_agrees_on_a_whole_grid():
+    for anchors, dimensions, grid in (
+        (SQUARE, 2, Grid.slice((-1, 5), (-1, 5), 0.2, 0.1)),  # with the diagonals, on which two solutions meet in one
+        (corners(), 3, Grid.box((-4, -4.5, -0.5), (4, 4.5, 3.5), 0.5)),
+    ):
+        unique, agrees, points, _ = brute_force(Installation(anchors, dimensions=dimensions), grid)
+        assert len(points) > 200 and 0.1 < unique.mean() < 0.9
+        assert agrees.mean() >= 0.99
+
+
+def test_the_flyable_area_of_the_paper():
+    """Fig. 6c and sec. 5.1: an envelope about each anchor that holds at least all within 0.5 m of it; the middle and
+    the middles of the sides are free; the same at all four corners."""
+    subsets, installation = Subsets(SQUARE, 2), Installation(SQUARE, dimensions=2)
+    assert len(subsets.rows) == 4 and subsets.left_out == 0
+    points = Grid.slice((-1, 5), (-1, 5), 0.2, 0.04).points
+    free = subsets.ambiguous(points) == 0.0
+    near = np.linalg.norm(points[:, None] - SQUARE.positions, axis=-1).min(axis=1)
+    assert not free[near < 0.5].any() and free[np.abs(points[:, :2] - 2).max(axis=1) < 1].all()
+    assert free[(np.abs(points[:, :2] - 2) < 0.5).any(axis=1)].all()
+    square = free.reshape(150, 150)
+    for turned in (square[::-1], square[:, ::-1], square.T):
+        np.testing.assert_array_equal(turned, square)
+    hull = installation.inside_hull(points)
+    assert np.mean(free[hull]) == pytest.approx(0.890, abs=0.002)
+    on_the_diagonal = np.linspace(0.01, 1.5, 150)
+    reach = Subsets(SQUARE, 2).ambiguous(np.column_stack([on_the_diagonal, on_the_diagonal, 0 * on_the_diagonal + 0.2]))
+    assert np.sqrt(2) * on_the_diagonal[np.flatnonzero(reach)[-1]] == pytest.approx(np.sqrt(0.5), abs=0.02)
+
+
+def test_flat_choices_are_left_out():
+    subsets = Subsets(corners(), 3)
+    assert (len(subsets.rows), subsets.left_out) == (58, 12)  # of 70: 6 faces and 6 diagonal planes
+    with pytest.raises(InputError, match="nearly in one line"):
+        Subsets(Anchors.from_positions([[0, 0, 0], [4, 0.02, 0], [8, 0, 0]]), 2)
+
+
+def test_of_many_anchors_those_that_are_heard_together_are_chosen():
+    subsets = Subsets(constellation("random-3-64"), 3)
+    assert len(subsets.rows) + subsets.left_out <= MOST_SUBSETS
+    assert len(subsets.rows) > MOST_SUBSETS / 3 and set(subsets.rows.ravel()) == set(range(64))
+    span = (subsets.rows.max(axis=1) - subsets.rows.min(axis=1)) % 64
+    assert (np.minimum(span, 64 - span) < 32).all()
+    assert len({tuple(sorted(row)) for row in subsets.rows}) == len(subsets.rows)
+    assert subsets.ambiguous(np.zeros((10, 3))).shape == (10,)
+
+
+def test_separation_predicts_how_often_an_estimator_flips():
+    """Phi(-separation / 2) of noisy rounds are explained better by the mirrored position than by the true one."""
+    anchors = constellation("random-3-5")
+    rng = np.random.default_rng(4)
+    for pairing, noise in ((None, 0.05), (all_pairs(5), 0.05)):
+        installation = Installation(anchors, FixedNoise(noise), pairing)
+        subsets = Subsets(anchors, 3)
+        points = rng.uniform(anchors.positions.min(axis=0), anchors.positions.max(axis=0), (400, 3))
+        separation = subsets.separation(points, installation)
+        k = np.argmin(np.abs(separation - 2.0))
+        point, clear = points[k], separation[k]
+        row, _, mirrors = subsets.mirrors(points[k : k + 1])
+        mirrors = mirrors[np.linalg.norm(mirrors - point, axis=1) > 0.5]
+        d = installation.pairing.incidence()[: 4 if pairing is None else None]
+        root = np.linalg.cholesky(0.05**2 * (d @ d.T)) if pairing is None else np.sqrt(2) * noise * np.eye(len(d))
+        h_true, h_other = (
+            d @ np.linalg.norm(p[:, None] - anchors.positions, axis=-1).T for p in (point[None], mirrors)
+        )
+        weight = installation.pairing.times
+        shift = np.linalg.solve(root, h_other - h_true) * np.sqrt(weight)
+        closest = np.argmin(np.linalg.norm(shift, axis=0))
+        assert np.linalg.norm(shift[:, closest]) == pytest.approx(clear, rel=1e-6)
+        draws = rng.standard_normal((40_000, len(d)))
+        flips = np.mean(np.sum((draws - shift[:, closest]) ** 2, axis=1) < np.sum(draws**2, axis=1))
+        assert flips == pytest.approx(norm.cdf(-0.5 * clear), abs=0.01)
+    assert norm.cdf(-0.5 * CLEAR) == pytest.approx(0.01, abs=2e-4)
+
+
+def test_more_anchors_leave_a_round_less_doubt():
+    installation = [Installation(constellation(f"random-3-{n}")) for n in (5, 8)]
+    doubtful = []
+    for each in installation:
+        points = np.random.default_rng(0).uniform([-2, -2, 0.3], [2, 2, 2], (500, 3))
+        doubtful.append(np.mean(Subsets(each.anchors, 3).separation(points, each) < CLEAR))
+    assert doubtful[0] > 0.03 > doubtful[1]
