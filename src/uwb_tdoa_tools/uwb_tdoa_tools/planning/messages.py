@@ -1,0 +1,125 @@
+"""Charts as standard ROS messages, for RViz and Foxglove: to a bag, or published."""
+
+import numpy as np
+
+from ..bag import _LATCHED_QOS
+from ..bag_files import new_bag
+from ..bag_messages import anchors_message
+from ..message_types import typestore
+
+TOPICS = {
+    "plan/flyable": "nav_msgs/msg/OccupancyGrid",
+    "plan/precision": "nav_msgs/msg/OccupancyGrid",
+    "plan/markers": "visualization_msgs/msg/MarkerArray",
+    "uwb/anchors": "uwb_tdoa_msgs/msg/AnchorArray",
+}
+_CUBES, _SPHERES, _TEXT = 6, 7, 9  # visualization_msgs/msg/Marker
+_IDENTITY = (0.0, 0.0, 0.0, 1.0)
+
+
+def messages(chart, anchors, stamp=0):
+    """{topic: rosbags message} of TOPICS. stamp : ns.
+
+    plan/flyable : one slice (the middle layer), 0 flyable, 50 ambiguous inside the hull, 100 outside
+    plan/precision : the same slice, the bound (root of its trace) in cm, at most 100; -1 where there is none
+    plan/markers : the surface of the flyable cells, coloured from green (best bound) to red (worst), and the anchors
+    """
+    store = typestore()
+    k = chart.grid.shape[2] // 2
+    status = np.where(chart.flyable, 0, np.where(chart.hull, 50, 100))
+    cm = np.where(np.isfinite(chart.error), np.minimum(np.rint(100.0 * np.minimum(chart.error, 1e3)), 100), -1)
+    return {
+        "plan/flyable": _occupancy(store, chart.grid, status, k, anchors.frame, stamp),
+        "plan/precision": _occupancy(store, chart.grid, cm, k, anchors.frame, stamp),
+        "plan/markers": _markers(store, chart, anchors, stamp),
+        "uwb/anchors": anchors_message(anchors, stamp, store)[1],
+    }
+
+
+def write(found, path):
+    """Write what `messages` gave as a bag (replaced if it is one), transient local, one message per topic."""
+    store = typestore()
+    with new_bag(path, force=True) as writer:
+        for topic, message in found.items():
+            connection = writer.add_connection(
+                f"/{topic}", TOPICS[topic], typestore=store, offered_qos_profiles=[_LATCHED_QOS]
+            )
+            writer.write(connection, 0, store.serialize_cdr(message, TOPICS[topic]))
+
+
+def publish(found):
+    """Publish what `messages` gave, transient local, until SIGINT or SIGTERM. Needs rclpy."""
+    import rclpy
+    from rclpy.serialization import deserialize_message
+
+    from uwb_tdoa_bias.ros import ANCHORS_QOS
+
+    from ..ros_session import message_class, session
+
+    store = typestore()
+    with session("plan", []) as (node, stop):
+        for topic, message in found.items():
+            kind = message_class(TOPICS[topic])
+            data = bytes(store.serialize_cdr(message, TOPICS[topic]))
+            node.create_publisher(kind, topic, ANCHORS_QOS).publish(deserialize_message(data, kind))
+        while not stop:
+            rclpy.spin_once(node, timeout_sec=0.2)
+
+
+def _header(store, frame, stamp):
+    return store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame)
+
+
+def _pose(store, p=(0.0, 0.0, 0.0)):
+    types = store.types
+    return types["geometry_msgs/msg/Pose"](
+        types["geometry_msgs/msg/Point"](*map(float, p)), types["geometry_msgs/msg/Quaternion"](*_IDENTITY)
+    )
+
+
+def _occupancy(store, grid, values, k, frame, stamp):
+    """Values (n,) of layer k as an OccupancyGrid at the height of the layer's middle."""
+    types, (nx, ny, _) = store.types, grid.shape
+    header = _header(store, frame, stamp)
+    corner = _pose(store, (*grid.lower[:2], grid.axes[2][k]))
+    info = types["nav_msgs/msg/MapMetaData"](header.stamp, grid.step, nx, ny, corner)
+    data = np.ascontiguousarray(grid.layer(values, k).ravel(), dtype=np.int8)
+    return types["nav_msgs/msg/OccupancyGrid"](header, info, data)
+
+
+def _markers(store, chart, anchors, stamp):
+    types, grid = store.types, chart.grid
+    surface = _surface(chart.flyable.reshape(grid.shape)).ravel()
+    error = chart.error[surface]
+    worse = (error - error.min(initial=np.inf)) / max(np.ptp(error) if len(error) else 0.0, 1e-9)
+    green_to_red = np.column_stack([np.minimum(2 * worse, 1), np.minimum(2 - 2 * worse, 1), 0 * worse, 0 * worse + 0.4])
+    found = [_marker(store, anchors.frame, stamp, "flyable", 0, _CUBES, grid.step, grid.points[surface], green_to_red)]
+    found.append(_marker(store, anchors.frame, stamp, "anchors", 0, _SPHERES, 0.15, anchors.positions))
+    for number, p in zip(anchors.ids.tolist(), anchors.positions):
+        found.append(
+            _marker(store, anchors.frame, stamp, "ids", number, _TEXT, 0.25, at=p + [0, 0, 0.25], text=str(number))
+        )
+    return types["visualization_msgs/msg/MarkerArray"](found)
+
+
+def _marker(store, frame, stamp, namespace, number, kind, size, points=(), colours=(), at=(0.0, 0.0, 0.0), text=""):
+    types = store.types
+    colour, zero = types["std_msgs/msg/ColorRGBA"], types["builtin_interfaces/msg/Duration"](0, 0)
+    nothing = types["sensor_msgs/msg/CompressedImage"](_header(store, "", 0), "", np.empty(0, np.uint8))
+    return types["visualization_msgs/msg/Marker"](
+        _header(store, frame, stamp), namespace, number, kind, 0, _pose(store, at),
+        types["geometry_msgs/msg/Vector3"](size, size, size), colour(0.1, 0.3, 0.9, 1.0), zero, False,
+        [types["geometry_msgs/msg/Point"](*p) for p in np.asarray(points).tolist()],
+        [colour(*c) for c in np.asarray(colours).tolist()],
+        "", nothing, [], text, "", types["visualization_msgs/msg/MeshFile"]("", np.empty(0, np.uint8)), False,
+    )  # fmt: skip
+
+
+def _surface(cells):
+    """Cells that are true and have a neighbour, or the edge of the grid, that is not."""
+    padded = np.pad(cells, 1)
+    inner = np.ones_like(cells)
+    for axis in range(3):
+        for shift in (-1, 1):
+            inner &= np.roll(padded, shift, axis)[1:-1, 1:-1, 1:-1]
+    return cells & ~inner
