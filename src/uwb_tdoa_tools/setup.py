@@ -38,6 +38,7 @@ setup(
             "convert = uwb_tdoa_tools.convert:main",
             "demo = uwb_tdoa_tools.demo:main",
             "evaluate = uwb_tdoa_tools.evaluate:main",
+            "plan = uwb_tdoa_tools.plan:main",
             "record = uwb_tdoa_tools.record:main",
             "replay = uwb_tdoa_tools.replay:main",
             "simulate = uwb_tdoa_tools.simulate:main",

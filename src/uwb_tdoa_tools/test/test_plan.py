@@ -1,0 +1,195 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.flyable import FlyableVolume
+from uwb_tdoa_tools import plan
+from uwb_tdoa_tools.bag import write_bag
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.simulation.constellations import corners
+
+FILES = {"failure.png", "flyable.npz", "plan.bag", "plan.json", "precision.png"}
+COARSE = ["--step", "0.5"]
+
+
+@pytest.fixture
+def anchors(tmp_path):
+    corners().to_yaml(tmp_path / "anchors.yaml")
+    return str(tmp_path / "anchors.yaml")
+
+
+@pytest.fixture
+def square(tmp_path):
+    path = tmp_path / "square.yaml"
+    Anchors.from_positions([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]]).to_yaml(path)
+    return str(path)
+
+
+def report(out):
+    return json.loads((out / "plan.json").read_text())
+
+
+def test_a_volume(anchors, tmp_path, capsys):
+    out = tmp_path / "new" / "plan"
+    assert plan.main([anchors, "--volume", *COARSE, "--out", str(out), "--json", str(tmp_path / "copy.json")]) == 0
+    assert {path.name for path in out.iterdir()} == FILES
+    assert report(out) == json.loads((tmp_path / "copy.json").read_text())
+    found = report(out)["map"]
+    assert found["cells"] == [14, 16, 6] and 0.5 < found["flyable_share_of_hull"] < 1.0
+    assert found["flyable_share_of_hull"] == found["unique_share_of_hull"]
+    for name in ("precision.png", "failure.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
+    volume = FlyableVolume.load(out / "flyable.npz")
+    assert volume.belongs_to(corners()) and volume.contains([0.0, 0.0, 1.5]) and not volume.contains([3.4, 3.9, 0.2])
+    assert found["flyable_size"] == pytest.approx(volume.flyable.sum() * 0.125)
+    text = capsys.readouterr().out
+    assert "flyable" in text and str(out) in text
+
+
+def test_a_slice_of_known_height(square, tmp_path, capsys):
+    out = tmp_path / "out"
+    options = ["--planar", "--height", "0.2", "--area", "-1", "5", "-1", "5", "--tx-power", "-3", "--check", *COARSE]
+    assert plan.main([square, *options, "--out", str(out)]) == 0
+    assert {path.name for path in out.iterdir()} == FILES | {"flips.png"}
+    found = report(out)
+    assert found["check"]["agreement"] >= 0.99 and found["check"]["places"] == 144
+    assert list(found["map"]["bound_99_per_axis_in_hull"]) == ["x", "y"] and found["map"]["cells"] == [12, 12, 1]
+    assert FlyableVolume.load(out / "flyable.npz").contains([2.0, 2.0, 77.0])
+    assert "without orientation" in capsys.readouterr().out
+
+
+def test_options_change_the_bound(anchors, tmp_path):
+    def median(*options):
+        assert plan.main([anchors, "--step", "1", *options, "--out", str(tmp_path / "o")]) == 0
+        return report(tmp_path / "o")["map"]["bound_in_hull"]["median"]
+
+    base = median()
+    (tmp_path / "weak.yaml").write_text(
+        "azimuth: [0,0,0,0]\nelevation_1: [0,0,0,0]\nelevation_2: [0,0,0,0]\ngain_offset: -20\n"
+    )
+    assert median("--antenna", str(tmp_path / "weak.yaml")) > 3 * base
+    assert median("--tx-power", "-2.3") == pytest.approx(base / 2, rel=0.01)
+    assert median("--temperature", "60") > 1.2 * base and median("--voltage", "3.5") < 0.95 * base
+    assert median("--link-noise", "0.1") > 1.2 * base
+    assert median("--noise", "0.01") < 0.2 * base
+    assert median("--protocol", "tdoa3") == pytest.approx(median("--covariance", "all_pairs"))
+    assert median("--covariance", "common_reference") == pytest.approx(base)
+    assert median("--covariance", "ring_uncorrelated") != pytest.approx(base, rel=1e-3)
+
+
+def test_measured_accuracy(anchors, tmp_path, capsys):
+    flight = simulate(SimulationConfig(anchors=corners(), trajectory="circle", duration=20))
+    write_bag(flight, tmp_path / "flight.bag")
+    out = tmp_path / "out"
+    assert plan.main([anchors, *COARSE, "--flights", str(tmp_path / "flight.bag"), "--out", str(out)]) == 0
+    assert {path.name for path in out.iterdir()} == FILES | {"accuracy.png"}
+    one, pooled = report(out)["flights"]
+    assert one["flight"] == flight.name and pooled["samples"] == one["samples"] > 1000
+    assert f"{one['achieved_over_bound']:.3f}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("how", ["add", "move"])
+def test_improve(how, tmp_path, capsys):
+    poor = corners()
+    Anchors(poor.ids[:5], poor.positions[:5] * [0.5, 1, 1], poor.orientations[:5]).to_yaml(tmp_path / "poor.yaml")
+    out = tmp_path / "out"
+    options = ["--fly", "-1", "1", "-2", "2", "0.6", "1.6", "--flyable", "round", "--starts", "1"]
+    assert plan.main([str(tmp_path / "poor.yaml"), "--step", "1", *options, "--improve", how, "--out", str(out)]) == 0
+    assert {path.name for path in out.iterdir()} == FILES | {"improved.yaml", "layout.png"}
+    found = report(out)["improve"]
+    assert found["after"]["worst"] < found["before"]["worst"]
+    assert len(Anchors.from_yaml(out / "improved.yaml")) == (6 if how == "add" else 5)
+    assert "worst" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--area", "1", "2", "3"], "area: 3 numbers"),
+        (["--area", "1", "0", "0", "1"], "area: "),
+        (["--step", "-1"], "step: -1"),
+        (["--step", "1e-4"], "cells, more than"),
+        (["--noise", "0"], "noise: 0"),
+        (["--antenna", "none.yaml"], "none.yaml"),
+        (["--voltage", "12"], "voltage: 12"),
+        (["--covariance", "eq8"], "invalid choice: 'eq8'"),
+        (["--flights", "nowhere"], "nowhere"),
+        (["--planar", "--flights", "nowhere"], "flights: "),
+        (["--improve", "add", "--places", "none.yaml"], "none.yaml"),
+        (["--improve", "move", "--count", "3"], "count: 3"),
+        (["--starts", "0", "--improve", "move"], "starts: 0"),
+        (["--fly", "1", "0", "0", "1", "0", "1", "--improve", "add"], "is empty"),
+        (["--height", "1", "--volume"], "not allowed with"),
+    ],
+)
+def test_bad_input_is_told_in_one_sentence(options, says, anchors, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert plan.main([anchors, *COARSE, *options, "--out", "out"]) == 2
+    err = capsys.readouterr().err
+    assert says in err and "Traceback" not in err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("positions", "says"),
+    [
+        ([[0, 0, 1], [4, 0, 1], [4, 4, 1], [0, 4, 1]], "in one plane"),
+        ([[0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 3, 3]], "on one line"),
+        ([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 3], [0, 0, 3]], "same place"),
+        ([[0, 0, 0], [4, 0, 0], [0, 4, 1]], "needs at least 4"),
+        ([[0, 0, 0]], "needs at least 4"),
+    ],
+)
+def test_useless_anchors_are_told_in_one_sentence(positions, says, tmp_path, capsys):
+    Anchors.from_positions(positions).to_yaml(tmp_path / "a.yaml")
+    assert plan.main([str(tmp_path / "a.yaml"), "--out", str(tmp_path / "out")]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("plan: error: anchors: ") and says in err and err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
+    rclpy = pytest.importorskip("rclpy")
+    pytest.importorskip("uwb_tdoa_msgs")
+    from nav_msgs.msg import OccupancyGrid
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from visualization_msgs.msg import MarkerArray
+
+    command = [
+        sys.executable,
+        "-m",
+        "uwb_tdoa_tools.plan",
+        anchors,
+        *COARSE,
+        "--out",
+        str(tmp_path / "out"),
+        "--publish",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ)
+    context, got = rclpy.Context(), {}
+    context.init()
+    try:
+        while "publishing" not in process.stdout.readline():
+            assert process.poll() is None
+        node = rclpy.create_node("viewer", context=context)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        for kind, topic in ((OccupancyGrid, "plan/flyable"), (MarkerArray, "plan/markers")):
+            node.create_subscription(kind, topic, lambda message, topic=topic: got.setdefault(topic, message), latched)
+        executor = rclpy.executors.SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        for _ in range(300):
+            executor.spin_once(timeout_sec=0.1)
+            if len(got) == 2:
+                break
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 0
+    finally:
+        process.kill()
+        process.stdout.close()
+        context.try_shutdown()
+    assert set(np.unique(got["plan/flyable"].data)) <= {0, 50, 100} and len(got["plan/markers"].markers) == 10
