@@ -127,10 +127,8 @@ class BiasNode(Node):
         if not released:
             return
         t = np.array([t for t, _, _ in released])
-        a, b = (
-            self._corrector.anchors.index([getattr(message, name) for _, message, _ in released])
-            for name in ("anchor_a", "anchor_b")
-        )
+        pairs = [(message.anchor_a, message.anchor_b) for _, message, _ in released]
+        a, b = self._corrector.anchors.index(pairs).T
         d = np.array([message.distance_difference for _, message, _ in released])
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
         correction = self._corrector.correct(t[valid], a[valid], b[valid], d[valid])
@@ -165,7 +163,8 @@ class BiasNode(Node):
         values |= {name: counts[name] for name in STATUS.values()}
         values |= {"released before their pose": counts["unready"], "invalid": counts["invalid"]}
         values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
-        values |= {f"publishers of {name}": input.get_publisher_count() for name, input in self._inputs.items()}
+        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._inputs.items()}
+        values |= {"subscribers of uwb/tdoa_corrected": self._publisher.get_subscription_count()}
         return *self._health(rate, unready), values
 
     def _health(self, rate, unready):

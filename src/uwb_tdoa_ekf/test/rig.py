@@ -1,5 +1,6 @@
 """The real nodes as processes of their own, and a node of the test that plays their surroundings and listens."""
 
+from copy import copy
 from dataclasses import dataclass, replace
 import os
 import signal
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias import ros
@@ -23,6 +25,7 @@ from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 EPOCH = 1_700_000_000  # s; stamps of today's size
 PATIENCE = 180.0  # s for anything that must happen; the very first start of ekf_node compiles the filter
 MODULES = {"bias_node": "uwb_tdoa_bias.bias_node", "ekf_node": "uwb_tdoa_ekf.ekf_node"}
+OUTPUTS = {"bias_node": ("uwb/tdoa_corrected",), "ekf_node": ("odometry", "uwb/residual")}
 INPUTS = {"bias_node": ("uwb/tdoa", "odometry"), "ekf_node": ("imu/data", "uwb/tdoa_corrected")}
 STREAMS = {
     "imu/data": Imu,
@@ -91,17 +94,20 @@ class Rig:
     received : {topic: messages in order of arrival}, for the streams and "/tf".
     """
 
-    def __init__(self, namespace, listen=(*STREAMS, "/tf")):
-        """listen : topics to keep."""
+    def __init__(self, namespace, listen=(*STREAMS, "/tf"), reliable=True):
+        """listen : topics to keep; reliable : make the streams so, for a test that cannot bear the loss of a message."""
         self.namespace = namespace
         self.node = rclpy.create_node("rig", namespace=namespace)
+        self._reliable, self._qos = reliable, copy(ros.STREAM_QOS)
+        if reliable:
+            self._qos.reliability = ReliabilityPolicy.RELIABLE
         self.received = {topic: [] for topic in listen}
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._processes, self._publishers, self._status, self._since = {}, {}, {}, 0.0
         self._anchors = self.node.create_publisher(AnchorArray, "uwb/anchors", ros.ANCHORS_QOS)
         self._subscriptions = {
-            topic: self.node.create_subscription(STREAMS.get(topic, TFMessage), topic, store.append, ros.STREAM_QOS)
+            topic: self.node.create_subscription(STREAMS.get(topic, TFMessage), topic, store.append, self._qos)
             for topic, store in self.received.items()
         }
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, ros.DIAGNOSTICS_QOS)
@@ -129,6 +135,9 @@ class Rig:
         """
         for name in names:
             command = [sys.executable, "-u", "-m", MODULES[name], "--ros-args", "-r", f"__ns:=/{self.namespace}"]
+            if self._reliable:
+                for end in (*(f"{i}.subscription" for i in INPUTS[name]), *(f"{o}.publisher" for o in OUTPUTS[name])):
+                    command += ["-p", f"qos_overrides./{self.namespace}/{end}.reliability:=reliable"]
             process = subprocess.Popen(
                 [*command, *arguments.get(name, ())],
                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
@@ -137,15 +146,21 @@ class Rig:
             reader = threading.Thread(target=_collect, args=(process.stdout, lines), daemon=True)
             reader.start()
             self._processes[name] = Process(process, lines, reader)
-        made = {"uwb/tdoa_corrected"} if "bias_node" in names else set()
-        made |= {"odometry", "uwb/residual"} if "ekf_node" in names else set()
-        for topic in {topic for name in names for topic in INPUTS[name]} - made:
-            self._publishers[topic] = self.node.create_publisher(STREAMS[topic], topic, ros.STREAM_QOS)
+        made = {topic for name in names for topic in OUTPUTS[name]}
+        taken = {topic for name in names for topic in INPUTS[name]}
+        for topic in taken - made:
+            self._publishers[topic] = self.node.create_publisher(STREAMS[topic], topic, self._qos)
 
         def all_matched():
             heard = [self.values(name).get(f"publishers of {topic}") for name in names for topic in INPUTS[name]]
+            hearing = [
+                self.values(name).get(f"subscribers of {topic}") == str((topic in taken) + (topic in self.received))
+                for name in names
+                for topic in OUTPUTS[name]
+            ]
             return (
                 all(count == "1" for count in heard)
+                and all(hearing)
                 and all(publisher.get_subscription_count() for publisher in self._publishers.values())
                 and all(self._subscriptions[topic].get_publisher_count() for topic in made & self._subscriptions.keys())
             )

@@ -14,7 +14,7 @@ from rig import EPOCH, make_rig, recording, seconds_of  # noqa: E402, F401
 from uwb_tdoa_bias.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_bias.network import Network  # noqa: E402
-from uwb_tdoa_ekf.frames import body_velocity, pose_covariance  # noqa: E402
+from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
@@ -78,16 +78,17 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what):
     assert len(odometry) - 3 <= n <= len(odometry) and n > 500
     np.testing.assert_array_equal([seconds_of(m.header.stamp) for m in rig.odometry], odometry.t[:n])
     poses, twists = [m.pose.pose for m in rig.odometry], [m.twist.twist for m in rig.odometry]
-    velocity, spread = body_velocity(odometry.q, odometry.v, odometry.covariance)
+    velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
     np.testing.assert_allclose([vector(p.position) for p in poses], odometry.p[:n], atol=1e-6)
     np.testing.assert_allclose([quaternion(p.orientation) for p in poses], odometry.q[:n], atol=1e-6)
     np.testing.assert_allclose([vector(t.linear) for t in twists], velocity[:n], atol=1e-6)
     gyro = flight.imu.gyro[np.searchsorted(flight.imu.t, odometry.t, side="right") - 1] - odometry.gyro_bias
     np.testing.assert_allclose([vector(t.angular) for t in twists], gyro[:n], atol=1e-6)
-    pose = pose_covariance(odometry.q, odometry.covariance).reshape(-1, 36)
-    np.testing.assert_allclose([m.pose.covariance for m in rig.odometry], pose[:n], atol=1e-6)
-    twist = np.array([m.twist.covariance for m in rig.odometry]).reshape(n, 6, 6)
-    np.testing.assert_allclose(twist[:, :3, :3], spread[:n], atol=1e-6)
+    pose, twist = (
+        np.array([getattr(m, name).covariance for m in rig.odometry]).reshape(n, 6, 6) for name in ("pose", "twist")
+    )
+    np.testing.assert_allclose(pose, covariance[:n, :6, :6], atol=1e-6)
+    np.testing.assert_allclose(twist[:, :3, :3], covariance[:n, 6:, 6:], atol=1e-6)
     assert {(m.header.frame_id, m.child_frame_id) for m in rig.odometry} == {("map", "base_link")}
 
     # And so is what is said beside it.
@@ -107,7 +108,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what):
 
 
 def test_quality_of_service(make_rig):
-    rig = make_rig()
+    rig = make_rig(listen=["odometry", "uwb/tdoa_corrected", "uwb/residual"], reliable=False)
     reliable = f"qos_overrides./{rig.namespace}/odometry.publisher.reliability:=reliable"
     rig.start("bias_node", "ekf_node", ekf_node=["-p", reliable])
     best_effort = (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
@@ -139,6 +140,12 @@ def test_quality_of_service(make_rig):
                 if end.node_namespace == f"/{rig.namespace}" and end.node_name != "rig"
             }
             assert found == nodes, topic
+
+    def arrived():
+        rig.send_tdoa(0.1, 10, 11, 0.5)  # best effort: until one is not lost
+        return rig.corrected
+
+    rig.wait(arrived, "a measurement to pass")
 
 
 @SLOW

@@ -26,7 +26,7 @@ from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
 from .config import FilterConfig
 from .engine import INVALID
 from .estimator import TIME_JUMP, VERDICTS, Estimator
-from .frames import body_velocity, pose_covariance
+from .frames import to_odometry
 from .health import Health
 
 EARLY = 5000  # messages kept while there are no anchors
@@ -155,10 +155,9 @@ class EkfNode(Node):
 
     def _publish_odometry(self, odometry):
         n = len(odometry)
-        pose = pose_covariance(odometry.q, odometry.covariance).reshape(n, 36)
-        velocity, spread = body_velocity(odometry.q, odometry.v, odometry.covariance)
-        twist = np.zeros((n, 6, 6))
-        twist[:, :3, :3] = spread
+        velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
+        pose, twist = covariance[:, :6, :6].reshape(n, 36), np.zeros((n, 6, 6))
+        twist[:, :3, :3] = covariance[:, 6:, 6:]
         rates, variances = zip(*map(self._rate_at, odometry.t.tolist(), odometry.gyro_bias.tolist()))
         twist[:, [3, 4, 5], [3, 4, 5]] = np.array(variances)[:, None]
         twist = twist.reshape(n, 36)
@@ -202,7 +201,9 @@ class EkfNode(Node):
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
         values |= {"imu_waiting": imu_waiting, "odometry published": self._health.odometry}
         values |= {name: counts[name] for name in ("recoveries", "restarts")}
-        values |= {f"publishers of {name}": input.get_publisher_count() for name, input in self._inputs.items()}
+        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._inputs.items()}
+        values |= {"subscribers of odometry": self._odometry_publisher.get_subscription_count()}
+        values |= {"subscribers of uwb/residual": self._residual_publisher.get_subscription_count()}
         return level, text, values
 
 
@@ -213,8 +214,7 @@ def _warm_up(config):
         estimator.add_imu(0.01 * step, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
         estimator.add_tdoa(0.01 * step, step % 4, (step + 1) % 4, 0.0)
         odometry, _ = estimator.advance()
-    pose_covariance(odometry.q, odometry.covariance)
-    body_velocity(odometry.q, odometry.v, odometry.covariance)
+    to_odometry(odometry.q, odometry.v, odometry.covariance)
 
 
 def main(argv=None):
