@@ -28,8 +28,8 @@ class Anchors:
     frame: str = "map"
 
     def __post_init__(self):
-        ids = np.asarray(self.ids, dtype=np.int64).reshape(-1)
-        positions = np.ascontiguousarray(self.positions, dtype=float)
+        ids = np.array(self.ids, dtype=np.int64).reshape(-1)
+        positions = np.array(self.positions, dtype=float, order="C")
         orientations = np.array(self.orientations, dtype=float)
         n = len(ids)
         if n == 0:

@@ -130,7 +130,7 @@ def test_covariance_is_phi_p_phi_of_the_documented_phi(seed):
     phi[0:3, 3:6] = dt * np.eye(3)
     phi[3:6, 6:9] = -dt * R @ cross(f)
     phi[3:6, 9:12] = -dt * R @ np.diag(trust)
-    phi[6:9, 6:9] -= dt * cross(gyro - x[13:])
+    phi[6:9, 6:9] = Rotation.from_rotvec(-dt * (gyro - x[13:])).as_matrix()
     phi[6:9, 12:15] = -dt * np.eye(3)
     Q = np.zeros((15, 15))
     Q[3:6, 3:6] = dt * R @ np.diag(psd) @ R.T

@@ -1,5 +1,6 @@
 """Every number that tunes the filter, with its unit and why it is what it is."""
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +34,7 @@ class FilterConfig:
     accel_bias_walk: float = 0.01  # m/s^3/sqrt(Hz)
     gyro_bias_walk: float = 1e-4  # rad/s^2/sqrt(Hz)
     vibration_trust: float = 1.5  # m/s^2, acceleration that is plausible for the vehicle; stronger vibration is not believed
+    vibration_gain: float = 4.0  # variance of a vibrating accelerometer's error over that of its vibration; 0: it has none
 
     initial_yaw: float = 0.0  # rad
     initial_yaw_std: float = 0.5  # rad
@@ -49,8 +51,20 @@ class FilterConfig:
                 raise InputError(f"{name}: {getattr(self, name)!r} is not one of {', '.join(allowed)}.")
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.type in ("float", "int") and field.name != "initial_yaw" and not 0 < value < 1e9:
-                raise InputError(f"{field.name}: {value!r} must be a number above 0.")
+            if field.type is bool and not isinstance(value, bool):
+                raise InputError(f"{field.name}: {value!r} must be true or false.")
+            if field.type not in (float, int):
+                continue
+            try:
+                number = field.type(value)  # one set of types, or the core would be compiled for every mixture
+            except (TypeError, ValueError, OverflowError):
+                number = math.nan
+            low = -1e9 if field.name == "initial_yaw" else 0.0
+            zero = field.name == "vibration_gain" and number == 0.0
+            if not (low < number < 1e9 or zero) or number != value:
+                kind = "whole number" if field.type is int else "number"
+                raise InputError(f"{field.name}: {value!r} must be a {kind} above {low:g}.")
+            object.__setattr__(self, field.name, number)
 
     @classmethod
     def from_yaml(cls, path):
@@ -90,6 +104,7 @@ class Tuning(NamedTuple):
     accel_bias_walk: float
     gyro_bias_walk: float
     vibration_trust: float
+    vibration_gain: float
     initial_yaw: float
     initial_yaw_std: float
     initial_accel_bias_std: float

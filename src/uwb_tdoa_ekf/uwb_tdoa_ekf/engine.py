@@ -19,11 +19,11 @@ MINIMUM = 12  # TDOAs a start needs
 AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a restart, must explain
 AGREEMENT_TIME = 0.3  # s, memory of how well the filter explains its TDOAs
 RETRY = 0.1  # s between two attempts at a start
+LOST_TIME = 60.0  # s without any message after which the filter starts anew
 MAX_STEP = 0.05  # s, longest single prediction
 START_TILT_STD, START_VELOCITY_STD = 0.1, 1.0  # rad, m/s
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 VIBRATION_CORNER, VIBRATION_TIME = 0.05, 0.3  # s: what is faster than the first is vibration; its power is averaged over the second
-VIBRATION_GAIN = 4.0  # error of a vibrating accelerometer over the power of its vibration: it rectifies
 VIBRATION_MEMORY = 0.2  # s over which that error persists
 
 
@@ -111,11 +111,14 @@ def _on_imu(m, c, t, gyro, force):
 @compiled
 def _advance(m, c, t):
     """Predict to stamp t with the inertial sample at hand, or without one if it is too old."""
+    if t - m.clock[NOW] > LOST_TIME:
+        m.clock[RUNNING], m.clock[FIRST_TDOA], m.clock[NEXT_TRY] = 0.0, t, -np.inf
+        return
     trust, psd = m.S[0], m.S[1]  # scratch
     inertial = c.use_imu and t - m.clock[LAST_IMU] < c.imu_timeout
     if inertial:
         for k in range(3):
-            doubt = VIBRATION_GAIN * m.imu[3, k]
+            doubt = c.vibration_gain * m.imu[3, k]
             trust[k] = c.vibration_trust**2 / (c.vibration_trust**2 + doubt)
             psd[k] = c.accel_noise**2 + 2.0 * VIBRATION_MEMORY * trust[k] * doubt
     while m.clock[NOW] < t:
@@ -136,14 +139,19 @@ def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual):
     if not m.clock[RUNNING]:
         residual[0] = residual[1] = np.nan
         residual[2], residual[3] = 0.0, STARTUP
-        if m.clock[FIRST_TDOA] == -np.inf:
+        if t - m.clock[LAST_TDOA] > c.start_window:
             m.clock[FIRST_TDOA] = t
+        m.clock[LAST_TDOA] = t
         waited = t - m.clock[FIRST_TDOA]
         if kept - first >= MINIMUM and waited > 0.9 * c.start_window and t >= m.clock[NEXT_TRY]:
             m.clock[NEXT_TRY] = t + RETRY
             _start(m, c, positions, t, first, kept, waited > c.start_patience)
         return
     _advance(m, c, t)
+    if not m.clock[RUNNING]:
+        residual[0] = residual[1] = np.nan
+        residual[2], residual[3] = 0.0, STARTUP
+        return
     innovation = d - predicted(m.x, positions[a], positions[b], m.g)
     spread = gain_terms(m.P, m.g, m.K)
     variance = c.tdoa_std**2 + bias_std**2
@@ -200,7 +208,7 @@ def _start(m, c, positions, t, first, kept, anyhow):
         return
     force = m.F[0, :3]  # scratch
     for k in range(3):
-        trust = c.vibration_trust**2 / (c.vibration_trust**2 + VIBRATION_GAIN * m.imu[3, k])
+        trust = c.vibration_trust**2 / (c.vibration_trust**2 + c.vibration_gain * m.imu[3, k])
         up = GRAVITY if k == 2 else 0.0
         force[k] = up + trust * (m.imu[4, k] - up)
     level(force, c.initial_yaw, m.x)

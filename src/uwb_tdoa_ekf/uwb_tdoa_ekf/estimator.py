@@ -8,7 +8,7 @@ import numpy as np
 
 from .config import FilterConfig
 from .engine import INVALID, LATE, RECOVERIES, REJECTED, RUNNING, STARTUP, USED, new_memory, run
-from .validity import usable
+from .validity import MAX_FORCE, MAX_RATE, usable
 
 VERDICTS = {USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup"}
 TIME_JUMP = 1.0  # s; a stream that falls back by more has started anew
@@ -91,7 +91,9 @@ class Estimator:
     def add_imu(self, t, gyro, force):
         """Take one inertial sample: t s; gyro (3,) rad/s; force (3,) m/s^2, specific force; body frame."""
         sample = (t, *gyro, *force)
-        if not all(map(math.isfinite, sample)):
+        if not (math.isfinite(t) and max(map(abs, gyro)) < MAX_RATE and max(map(abs, force)) < MAX_FORCE) or any(
+            map(math.isnan, sample)
+        ):
             self.counts["imu_invalid"] += 1
             return
         if t < self._newest_imu - TIME_JUMP:
@@ -121,7 +123,7 @@ class Estimator:
         newest = max(self._newest_imu, self._newest_tdoa)
         both = self._newest_tdoa - self.reorder
         if self.config.use_imu:
-            both = min(both, self._newest_imu)
+            both = min(both, self._newest_imu - self.reorder)
         return self._use(max(both, newest - self.lag))
 
     def finish(self):
@@ -143,10 +145,13 @@ class Estimator:
         tdoa = np.array(self._tdoa[:k]).reshape(k, 5)
         a, b = tdoa[:, 1].astype(np.int64), tdoa[:, 2].astype(np.int64)
         del self._imu[:n], self._tdoa[:k]
+        fed = imu if self.config.use_imu else imu[:0]
+        fed_t, gyro, force = (np.ascontiguousarray(part) for part in (fed[:, 0], fed[:, 1:4], fed[:, 4:7]))
+        t, d, std = (np.ascontiguousarray(tdoa[:, column]) for column in (0, 3, 4))
         rows, covariance, used = np.empty((n + k, 17)), np.empty((n + k, 9, 9)), np.empty((k, 4))
         count = run(
-            self._memory, self._tuning, self.anchors.positions, imu[:, 0], imu[:, 1:4], imu[:, 4:7],
-            tdoa[:, 0], a, b, tdoa[:, 3], tdoa[:, 4], rows, covariance, used,
+            self._memory, self._tuning, self.anchors.positions, fed_t, gyro, force,
+            t, a, b, d, std, rows, covariance, used,
         )  # fmt: skip
         for stream in (imu, tdoa):
             if len(stream):
@@ -180,7 +185,7 @@ _NOTHING = (
 
 
 def _insert(stream, item):
-    if stream and item[0] < stream[-1][0]:
+    if stream and item < stream[-1]:
         insort(stream, item)
     else:
         stream.append(item)

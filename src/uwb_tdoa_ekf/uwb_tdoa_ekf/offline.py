@@ -9,7 +9,7 @@ from uwb_tdoa_bias.corrector import Corrector
 from .config import FilterConfig
 from .engine import INVALID, RECOVERIES, new_memory, run
 from .estimator import VERDICTS, Odometry, Residuals
-from .validity import usable_all
+from .validity import usable_all, usable_imu
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,14 @@ def run_offline(flight, config=None, corrector=None):
     tdoa, imu, positions = flight.tdoa, flight.imu, flight.anchors.positions
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
     n, empty = len(tdoa), np.empty((0, 3))
-    imu_t, gyro, force = (imu.t, imu.gyro, imu.accel) if imu is not None and config.use_imu else (empty[:, 0], empty, empty)
+    imu_t, gyro, force = (empty[:, 0].copy(), empty, empty)
+    if imu is not None and config.use_imu:
+        sane = usable_imu(imu.gyro, imu.accel) & np.isfinite(imu.t)
+        imu_t, gyro, force = (np.ascontiguousarray(column[sane], dtype=float) for column in (imu.t, imu.gyro, imu.accel))
     bias, std, corrected, outcome = np.zeros(n), np.zeros(n), tdoa.d.copy(), np.full((n, 4), np.nan)
     outcome[:, 2], outcome[:, 3] = 0.0, INVALID
     valid = np.flatnonzero(usable_all(a, b, tdoa.d, std, positions) & np.isfinite(tdoa.t))
+    valid = valid[np.lexsort((tdoa.d[valid], b[valid], a[valid], tdoa.t[valid]))]  # siblings of one stamp as on line
     memory, tuning = new_memory(), config.tuning()
     rows, covariances = [], []
 

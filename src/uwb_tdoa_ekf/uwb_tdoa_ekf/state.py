@@ -8,6 +8,8 @@ Motion model: eq. 14 of Zhao et al. (RA-L 2021).
 
 import math
 
+import numpy as np
+
 from uwb_tdoa_bias.compiled import compiled
 
 GRAVITY = 9.81  # m/s^2, along -z of the world
@@ -72,6 +74,11 @@ def predict(x, P, F, R, dt, gyro, force, trust, accel_psd, gyro_psd, accel_walk_
         x[3 + r] += dt * a
     turn(x, w0, w1, w2)
 
+    step = np.zeros(16)
+    step[9] = 1.0
+    turn(step, -w0, -w1, -w2)
+    E = np.empty((3, 3))
+    rotation(step, E)
     # P <- Phi P Phi' + Q, written out for the blocks of Phi that differ from those of the identity:
     #   dp' = dp + dv dt;  dv' = dv - R ([f]x dtheta + T dba) dt;  dtheta' = (I - [w]x) dtheta - dbg dt
     for j in range(15):
@@ -82,14 +89,12 @@ def predict(x, P, F, R, dt, gyro, force, trust, accel_psd, gyro_psd, accel_walk_
         for r in range(3):
             F[r, j] = P[r, j] + dt * P[3 + r, j]
             F[3 + r, j] = P[3 + r, j] - dt * (R[r, 0] * c0 + R[r, 1] * c1 + R[r, 2] * c2)
-        F[6, j] = t0 + w2 * t1 - w1 * t2 - dt * P[12, j]
-        F[7, j] = t1 - w2 * t0 + w0 * t2 - dt * P[13, j]
-        F[8, j] = t2 + w1 * t0 - w0 * t1 - dt * P[14, j]
+        for r in range(3):
+            F[6 + r, j] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * P[12 + r, j]
     for i in range(9):
         t0, t1, t2 = F[i, 6], F[i, 7], F[i, 8]
-        P[i, 6] = t0 + w2 * t1 - w1 * t2 - dt * F[i, 12]
-        P[i, 7] = t1 - w2 * t0 + w0 * t2 - dt * F[i, 13]
-        P[i, 8] = t2 + w1 * t0 - w0 * t1 - dt * F[i, 14]
+        for r in range(3):
+            P[i, 6 + r] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * F[i, 12 + r]
         if i < 6:
             c0 = f1 * t2 - f2 * t1 + trust[0] * F[i, 9]
             c1 = f2 * t0 - f0 * t2 + trust[1] * F[i, 10]

@@ -6,6 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.compiled import compiled
 
+MAX_RATE, MAX_FORCE = 100.0, 1000.0  # rad/s, m/s^2: beyond what any inertial sensor reads
 MARGIN = 1.0  # m by which |d_ab| may exceed the distance between a and b: its largest believable error
 
 
@@ -30,3 +31,8 @@ def usable_all(a, b, d, bias_std, positions):
     for i in range(len(d)):
         out[i] = usable(a[i], b[i], d[i], bias_std[i], positions)
     return out
+
+
+def usable_imu(gyro, force):
+    """(n,) bool: finite and within the range of any sensor. gyro (n, 3) rad/s, force (n, 3) m/s^2."""
+    return (np.abs(gyro) < MAX_RATE).all(axis=-1) & (np.abs(force) < MAX_FORCE).all(axis=-1)

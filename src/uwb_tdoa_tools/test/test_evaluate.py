@@ -221,7 +221,7 @@ def test_a_simulated_flight_without_bias_is_consistent():
     air, and the NIS of 80 % of the flights inside theirs (Bar-Shalom et al., sec. 5.4.2; 19 of 20 are expected, fewer
     than 16 happen once in 400 times to an honest filter)."""
     noise = dict(accel_noise=0.05, gyro_noise=0.003, accel_bias_walk=0.01, gyro_bias_walk=1e-4)
-    told = FilterConfig(robust="gate", gate=1e6, tdoa_std=0.1, tdoa_correlation=1.0, **noise)
+    told = FilterConfig(robust="gate", gate=1e6, tdoa_std=0.1, tdoa_correlation=1.0, vibration_gain=0.0, **noise)
     errors = ImuErrors(**noise, accel_bias=told.initial_accel_bias_std, gyro_bias=told.initial_gyro_bias_std)
     clean = {**CLEAN, "duration": 25.0, "start_in_air": True, "noise_std": 0.1, "protocol": "tdoa3"}
     nees, nis = [], []

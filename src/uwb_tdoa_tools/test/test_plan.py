@@ -125,6 +125,7 @@ def test_improve(how, tmp_path, capsys):
         (["--starts", "0", "--improve", "move"], "starts: 0"),
         (["--fly", "1", "0", "0", "1", "0", "1", "--improve", "add"], "is empty"),
         (["--height", "1", "--volume"], "not allowed with"),
+        (["--planar", "--volume"], "planar: "),
     ],
 )
 def test_bad_input_is_told_in_one_sentence(options, says, anchors, tmp_path, monkeypatch, capsys):

@@ -6,12 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import cho_factor, cho_solve
+from scipy.ndimage import median_filter
 from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.geometry import tdoa
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.noise import RadioNoise
 from uwb_tdoa_tools.planning.pairing import PAIRINGS, Pairing, all_pairs, common_reference, ring
 from uwb_tdoa_tools.planning.precision import NORMAL_99, bound, dilution, ellipses, information, position_error
+from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation.constellations import constellation, corners, facing
 from uwb_tdoa_tools.simulation.schedule import make_schedule
 
@@ -242,3 +245,33 @@ def test_one_more_anchor_never_hurts(seed):
     point = np.random.default_rng(seed).uniform([-2, -2, 0.3], [2, 2, 2.3], (1, 3))
     gain = information(point, Installation(more)) - information(point, Installation(few))
     assert np.linalg.eigvalsh(gain)[0, 0] > -1e-6 * np.abs(gain).max()
+
+
+@pytest.mark.parametrize("name", ["0422/0422-log00", "0425/TDOA2/0425-traj2", "0426/0426-traj1"])
+def test_what_measured_tdoas_share(shared_data, name):
+    """Noise of TDOAs that follow each other in flight: pairs with one anchor in common are anticorrelated, by less than
+    the -1/2 of eq. 5 because each TDOA also has an error of its own; pairs without one are uncorrelated, against eq. 7."""
+    day = name[:4]
+    flight = read_flight(shared_data / "flights" / name, shared_data / "surveys" / f"anchor_{day}.txt")
+    truth, measured, anchors = flight.truth, flight.tdoa, flight.anchors
+    above = truth.t[truth.p[:, 2] > 0.3]
+    flown = (measured.t > above[0] + 1.0) & (measured.t < above[-1] - 1.0)
+    t, a, b, d = measured.t[flown], anchors.index(measured.a[flown]), anchors.index(measured.b[flown]), measured.d[flown]
+    place = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
+    residual = d - tdoa(place, anchors.positions[a], anchors.positions[b])
+    noise = np.full(len(t), np.nan)
+    for pair in set(zip(a.tolist(), b.tolist())):
+        rows = np.flatnonzero((a == pair[0]) & (b == pair[1]))
+        noise[rows] = residual[rows] - median_filter(residual[rows], 31)  # without what lasts longer than about 0.5 s
+    noise[np.abs(noise) > 0.4] = np.nan
+
+    def correlation(lag):
+        one, other = slice(None, -lag), slice(lag, None)
+        near = t[other] - t[one] < 2.2e-3 * lag + 1e-3  # no packet missed in between
+        common = (a[one] == a[other]) | (a[one] == b[other]) | (b[one] == a[other]) | (b[one] == b[other])
+        rows = np.flatnonzero(near & (common == (lag == 1)) & np.isfinite(noise[one]) & np.isfinite(noise[other]))
+        assert len(rows) > 3000
+        return np.corrcoef(noise[rows], noise[rows + lag])[0, 1]
+
+    assert -0.35 < correlation(1) < -0.2
+    assert abs(correlation(2)) < 0.05 and abs(correlation(3)) < 0.05

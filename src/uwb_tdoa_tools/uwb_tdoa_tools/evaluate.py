@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from pathlib import Path
 
 from tqdm import tqdm
@@ -28,8 +29,7 @@ COLUMNS = {
 
 def evaluate(flight, config=None, effects=None, network=None):
     """Run the filter over a Flight with ground truth. Returns (Score, Run). Raises InputError if there is no truth."""
-    if flight.truth is None:
-        raise InputError(f"{flight.name}: it holds no ground truth to compare with.")
+    _need_truth(flight)
     result = run_offline(flight, config, Corrector(flight.anchors, effects, network))
     return Score(flight.name, result.odometry, flight.truth, result.residuals), result
 
@@ -75,6 +75,7 @@ def _evaluate(args):
     print(_line("flight", COLUMNS.values()))
     for path, survey in tqdm(found, unit="flight", disable=None, leave=False):
         flight = read_flight(path, survey, args.namespace)
+        _need_truth(flight)
         if args.odometry:
             odometry = read_odometry(args.odometry, namespace=args.namespace)
             score = Score(flight.name, odometry, flight.truth)
@@ -94,12 +95,22 @@ def _evaluate(args):
         print(f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
               f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
     if args.json:
-        report = {"runs": [score.row() for score in scores], "pooled": together}
-        Path(args.json).write_text(json.dumps(report, indent=1))
+        report = {"runs": [_as_json(score.row()) for score in scores], "pooled": _as_json(together)}
+        Path(args.json).write_text(json.dumps(report, indent=1, allow_nan=False))
     if args.markdown:
         rows = [score.row() for score in scores] + [together] * (len(scores) > 1)
         Path(args.markdown).write_text(_markdown(rows, _others(args.beside) if args.beside else {}))
     return 0
+
+
+def _need_truth(flight):
+    if flight.truth is None:
+        raise InputError(f"{flight.name}: it holds no ground truth to compare with.")
+
+
+def _as_json(row):
+    """JSON has no NaN and no infinity: null."""
+    return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}
 
 
 def _others(path):

@@ -30,9 +30,9 @@ def survey_for(path, survey):
     """The survey of a recording: `survey` itself, or out of a folder the one whose KEY is the longest in the path."""
     if survey is None or not Path(survey).is_dir():
         return survey
-    keys = {file.stem.removeprefix("anchor_"): file for file in sorted(Path(survey).iterdir()) if file.is_file()}
+    keys = {file.stem.removeprefix("anchor_"): file for file in sorted(Path(survey).glob("anchor_?*"))}
     name = str(Path(path).resolve())
-    fitting = sorted((key for key in keys if key in name), key=lambda key: (name.rfind(key), len(key)))
+    fitting = sorted((key for key in keys if key in name), key=lambda key: (name.rfind(key) + len(key), len(key)))
     if not fitting:
         raise InputError(f"{path}: no survey in {survey} fits: its path holds none of {', '.join(keys)}.")
     return keys[fitting[-1]]

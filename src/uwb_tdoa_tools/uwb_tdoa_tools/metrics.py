@@ -28,13 +28,17 @@ def position_errors(odometry, truth):
     chosen = (odometry.t >= first) & (odometry.t <= last)
     t = odometry.t[chosen]
     at = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
-    return t, odometry.p[chosen] - at, odometry.covariance[chosen, :3, :3]
+    return t, odometry.p[chosen] - at, getattr(odometry, "covariance", getattr(odometry, "pose_covariance", None))[chosen, :3, :3]
 
 
 def nees(error, covariance):
     """Normalised estimation error squared, e' P^-1 e: (n,), expected 3 for an honest 3D covariance (Bar-Shalom et al.,
     Estimation with Applications to Tracking and Navigation, sec. 5.4)."""
-    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    out = np.full(len(error), np.nan)
+    usable = np.linalg.det(covariance) > 0.0
+    solved = np.linalg.solve(covariance[usable], error[usable, :, None])[:, :, 0]
+    out[usable] = np.einsum("ni,ni->n", error[usable], solved)
+    return out
 
 
 def nis(residuals):
@@ -78,7 +82,8 @@ class Score:
         """The figures of this run: a dict."""
         out = {"flight": self.name, **summary(self.error, self.nees, self.nis)}
         late = not len(self.t) or self.t[0] > self.first + START_GRACE
-        out["diverged"] = bool(out["diverged"] or late)
+        gone = len(self.t) and self.t[-1] < self.last - START_GRACE
+        out["diverged"] = bool(out["diverged"] or late or gone)
         out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else float("inf")
         return {**out, **_named(coverage(self.error, self.covariance))}
 

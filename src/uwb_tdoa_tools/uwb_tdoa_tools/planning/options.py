@@ -165,7 +165,9 @@ def room_for(args, anchors):
 def grid_of(args, room):
     """Grid of a slice or of the Room. Raises InputError."""
     size = room.upper - room.lower
-    if args.volume and not args.planar:
+    if args.volume and args.planar:
+        raise InputError("planar: with a known height there is no volume; leave out --volume, or --planar.")
+    if args.volume:
         return Grid.box(room.lower, room.upper, args.step or size.max() / ACROSS["volume"])
     height = room.centre[2] if args.height is None else args.height
     step = args.step or size[:2].max() / ACROSS["slice"]

@@ -2,6 +2,7 @@
 
 import numpy as np
 from matplotlib.collections import EllipseCollection
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ..plots import plt
@@ -69,7 +70,7 @@ def plot_flips(installation, points, unique, agrees, mirrors, path):
 
 def plot_accuracy(installation, found, path):
     """Measured bias and RMSE beside the bound and what the filter claims, 3D, one colour scale; seen from above."""
-    figure, axes = _panels(4, 4)
+    figure, axes = _panels(4, 2)
     columns = (
         ("bias", found.bias),
         ("RMSE", found.rmse),
@@ -192,3 +193,6 @@ def _save(figure, title, path):
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=80)
     plt.close(figure)
+    with Image.open(path) as image:  # 256 colours are enough, and a third of the size
+        small = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    small.save(path, optimize=True)
