@@ -133,6 +133,8 @@ def build(done):
         selected += own_tf2 + MESSAGES
     if done.get("packages") != sources["packages"]:
         selected += PACKAGES
+        for name in PACKAGES:  # setuptools copies what is newer, and keeps there what was deleted
+            shutil.rmtree(BUILD / name / "build", ignore_errors=True)
     if not selected:
         return
     if OWN_ROS:
