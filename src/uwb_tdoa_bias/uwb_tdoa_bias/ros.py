@@ -200,11 +200,11 @@ def run(node_class, description, argv=None):
     parser = argparse.ArgumentParser(
         prog=name, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    living, signals = False, []
+    interruptible, signals = True, []
 
     def on_signal(number, _):  # rclpy also ends its context; an exception then would come at any instruction
         signals.append(number)
-        if not living:
+        if interruptible:
             raise KeyboardInterrupt
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -217,7 +217,7 @@ def run(node_class, description, argv=None):
         executor.add_node(node)
         gc.collect()
         gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
-        living = True
+        interruptible = False
         while rclpy.ok():  # not spin(): in the wheels' EventsExecutor it never wakes up
             executor.spin_until_future_complete(Future(), timeout_sec=1.0)
     except SystemExit as stop:  # argparse has said it already
@@ -231,6 +231,7 @@ def run(node_class, description, argv=None):
         if not signals:
             raise  # else rclpy was ended under our feet
     finally:
+        interruptible = False
         if executor is not None:
             executor.remove_node(node)
             executor.shutdown()
