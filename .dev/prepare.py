@@ -133,8 +133,9 @@ def build(done):
         selected += own_tf2 + MESSAGES
     if done.get("packages") != sources["packages"]:
         selected += PACKAGES
-        for name in PACKAGES:  # setuptools copies what is newer, and keeps there what was deleted
-            shutil.rmtree(BUILD / name / "build", ignore_errors=True)
+        for name in PACKAGES:  # setuptools would copy what is newer only, and keep what was deleted
+            for copy in (BUILD / name / "build", *INSTALL.glob(f"lib/python3*/site-packages/{name}")):
+                shutil.rmtree(copy, ignore_errors=True)
     if not selected:
         return
     if OWN_ROS:
