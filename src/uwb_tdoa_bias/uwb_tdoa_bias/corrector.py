@@ -37,6 +37,10 @@ class Corrector:
         parts = [self.effects.name] if len(self.effects) else []
         self.model = "+".join(parts + ([network.name] if network else [])) or "none"
         self._history = history
+        self.reset()
+
+    def reset(self):
+        """Forget all poses."""
         self._t, self._p, self._q = [], [], []
 
     @property

@@ -5,7 +5,8 @@ import pytest
 from uwb_tdoa_bias.errors import InputError
 from uwb_tdoa_ekf.config import LOSSES, ROBUST, FilterConfig, Tuning
 
-OTHERS = ("robust", "loss", "use_imu", "initial_yaw")
+SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover")
+OTHERS = ("robust", "loss", "initial_yaw", *SWITCHES)
 NUMBERS = [field.name for field in fields(FilterConfig) if field.name not in OTHERS]
 
 
@@ -39,6 +40,12 @@ def test_a_number_must_be_above_zero(value):
 def test_yaw_must_be_a_finite_number(value):
     with pytest.raises(InputError, match="initial_yaw"):
         FilterConfig(initial_yaw=value)
+
+
+@pytest.mark.parametrize("name", SWITCHES)
+def test_a_switch_is_true_or_false(name):
+    with pytest.raises(InputError, match=name):
+        FilterConfig(**{name: 1})
 
 
 def test_iterations_are_counted_in_whole_numbers():

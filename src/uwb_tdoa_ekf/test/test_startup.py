@@ -6,10 +6,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.geometry import tdoa
-from uwb_tdoa_ekf.startup import INLIER, OUTSIDE, believable, level, locate, reach, share_of_inliers
+from uwb_tdoa_ekf.startup import INLIER, ROOM, believable, level, locate, reach, share_of_inliers
 
 SIZE = np.array([7.0, 8.0, 3.0])
 STD = 0.25  # m, what locate is told of one TDOA
+MARGIN = 1.0  # m beyond the anchors
 
 
 def constellation(n, rng):
@@ -33,7 +34,7 @@ def window(rng, positions, p, v, n=100, std=0.0, outliers=0.0, anchor_std=0.0, l
 
 def located(tdoas, positions, std=STD):
     x, covariance = np.empty(6), np.empty((6, 6))
-    share = locate(*tdoas, positions, std, x, covariance)
+    share = locate(*tdoas, positions, std, MARGIN, x, covariance)
     return x, covariance, share
 
 
@@ -154,14 +155,14 @@ def test_share_of_inliers_at_the_truth_is_one_less_the_outliers():
 def test_believable_is_within_reach_of_the_anchors():
     positions = np.array(corners().positions)
     low, high = positions.min(axis=0), positions.max(axis=0)
-    for k, half in enumerate((3.5 + OUTSIDE, 4.0 + OUTSIDE, 3.0 * OUTSIDE)):
-        middle, far = reach(positions, k)
+    for k, half in enumerate((3.5 + MARGIN, 4.0 + MARGIN, ROOM)):
+        middle, far = reach(positions, k, MARGIN)
         assert (middle, far) == (0.5 * (low[k] + high[k]), half)
         x = 0.5 * (low + high)
         x[k] += half - 0.01
-        assert believable(positions, x)
+        assert believable(positions, MARGIN, x)
         x[k] += 0.02
-        assert not believable(positions, x)
+        assert not believable(positions, MARGIN, x)
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -32,7 +32,11 @@ def minus(x, y):
 def predicted(x, P, dt, gyro, force, trust, psd=(0.0, 0.0, 0.0), rest=(0.0, 0.0, 0.0)):
     """State and covariance after one prediction; psd of the accelerometer, rest: gyroscope and both bias walks."""
     x, P = x.copy(), P.copy()
-    predict(x, P, np.empty((15, 15)), np.empty((3, 3)), dt, gyro, force, np.asarray(trust), np.asarray(psd), *rest)
+    gyro_psd, accel_walk, gyro_walk = rest
+    scratch = np.empty((15, 15)), np.empty((3, 3)), np.empty((3, 3)), np.empty(16)
+    predict(
+        x, P, *scratch, dt, gyro, force, np.asarray(trust), np.asarray(psd), gyro_psd, np.full(3, accel_walk), gyro_walk
+    )  # fmt: skip
     return x, P
 
 

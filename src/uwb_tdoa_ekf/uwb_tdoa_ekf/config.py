@@ -19,6 +19,8 @@ class FilterConfig:
 
     tdoa_std: float = 0.25  # m, spread of a TDOA about its prediction, systematic part that was not corrected included
     tdoa_correlation: float = 6.0  # n successive TDOAs tell as much as n / this independent ones; 1 for white noise
+    adapt_noise: bool = True  # learn the noise of each anchor beyond tdoa_std from the innovations
+    noise_memory: float = 0.5  # s over which it is learned
     robust: str = "innovation"  # weight from the whitened innovation; "gate": 0 or 1; "m_estimation": Zhao et al. IV-A
     loss: str = "geman_mcclure"  # or "huber", "cauchy": for "innovation" and "m_estimation"
     measurement_scale: float = 2.5  # standard deviations at which the loss bends
@@ -36,8 +38,12 @@ class FilterConfig:
     vibration_trust: float = 1.5  # m/s^2, acceleration that is plausible for the vehicle; stronger vibration is not believed
     vibration_gain: float = 4.0  # variance of a vibrating accelerometer's error over that of its vibration; 0: it has none
 
+    reach: float = 1.0  # m beyond the anchors' extent, where a tag is not believed to be without strong evidence
+    zero_velocity: bool = True  # a tag whose inertial sensors neither shake nor turn stands still
+    recover: bool = True  # find the tag anew, without being told where it is, when the TDOAs agree on another place
+
     initial_yaw: float = 0.0  # rad
-    initial_yaw_std: float = 0.5  # rad
+    initial_yaw_std: float = 6.3  # rad; above 0.6 the yaw counts as unknown: four directions are followed until one is left
     initial_accel_bias_std: float = 0.1  # m/s^2
     initial_gyro_bias_std: float = 0.01  # rad/s
     start_window: float = 0.5  # s of TDOAs from which the start position is found
@@ -90,6 +96,8 @@ class Tuning(NamedTuple):
 
     tdoa_std: float
     tdoa_correlation: float
+    adapt_noise: bool
+    noise_memory: float
     robust: int
     loss: int
     measurement_scale: float
@@ -105,6 +113,9 @@ class Tuning(NamedTuple):
     gyro_bias_walk: float
     vibration_trust: float
     vibration_gain: float
+    reach: float
+    zero_velocity: bool
+    recover: bool
     initial_yaw: float
     initial_yaw_std: float
     initial_accel_bias_std: float

@@ -1,140 +1,114 @@
 """The compiled filter: events in stamp order in, odometry and residuals out. Everything it remembers is in Memory."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from uwb_tdoa_bias.compiled import compiled
 
-from .robust import predicted, gain_terms, update_gate, update_innovation, update_m_estimation
-from .startup import INLIER, believable, level, locate, share_of_inliers
+from . import hypotheses, inertial, noise
+from .memory import (
+    AGREEMENT, BEST, FIRST_TDOA, FORCE, GYRO, HYPOTHESES, KEPT, LAST_IMU, LAST_TDOA, MEAN_FORCE,
+    NEXT_ODOMETRY, NEXT_REST, NEXT_TRY, NOW, RECOVERIES, RUNNING, WINDOW,
+)  # fmt: skip
+from .robust import gain_terms, kalman, predicted, update_gate, update_innovation, update_m_estimation
+from .startup import INLIER, believable, level, locate, reach, share_of_inliers
 from .state import GRAVITY, coast, predict
+from .tape import REPLACED, UPDATE, note_coast, note_prediction, note_update
 
 # verdict on one TDOA; the values of TdoaResidual.VERDICT_*
 USED, REJECTED, LATE, INVALID, STARTUP = range(5)
 
-WINDOW = 512  # TDOAs kept for a start
 MINIMUM = 12  # TDOAs a start needs
 AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a restart, must explain
 AGREEMENT_TIME = 0.3  # s, memory of how well the filter explains its TDOAs
 RETRY = 0.1  # s between two attempts at a start
 LOST_TIME = 60.0  # s without any message after which the filter starts anew
 MAX_STEP = 0.05  # s, longest single prediction
-START_TILT_STD, START_VELOCITY_STD = 0.1, 1.0  # rad, m/s
+START_TILT_STD = 0.1  # rad
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
-VIBRATION_CORNER, VIBRATION_TIME = 0.05, 0.3  # s: what is faster than the first is vibration; its power is averaged over the second
-VIBRATION_MEMORY = 0.2  # s over which that error persists
-
-
-class Memory(NamedTuple):
-    """State of one filter. A copy of its arrays is a copy of the filter."""
-
-    x: np.ndarray  # (16,) nominal state, see state.py
-    P: np.ndarray  # (15, 15) error covariance
-    clock: np.ndarray  # see the indices below
-    imu: np.ndarray  # (5, 3): last gyro, last force, slow force, vibration power, mean force
-    window: np.ndarray  # (4, 2 * WINDOW): t, a, b, d of recent TDOAs, oldest first
-    F: np.ndarray  # the rest is scratch
-    R: np.ndarray
-    K: np.ndarray
-    g: np.ndarray
-    S: np.ndarray
-
-
-# places in Memory.clock
-NOW, LAST_IMU, FIRST_TDOA, LAST_TDOA, NEXT_TRY, NEXT_ODOMETRY, AGREEMENT, RUNNING, RECOVERIES, KEPT = range(10)
-
-
-def new_memory():
-    """Memory of a filter that has seen nothing."""
-    clock = np.full(10, -np.inf)
-    clock[[AGREEMENT, RUNNING, RECOVERIES, KEPT]] = 1.0, 0.0, 0.0, 0.0
-    imu = np.zeros((5, 3))
-    imu[[1, 2, 4], 2] = GRAVITY
-    x = np.zeros(16)
-    x[9] = 1.0
-    shapes = ((15, 15), (3, 3), (15,), (3,), (15, 3))
-    return Memory(x, np.eye(15), clock, imu, np.zeros((4, 2 * WINDOW)), *(np.zeros(shape) for shape in shapes))
+REST_PERIOD, REST_STD = 0.05, 0.02  # s between, and m/s of, zero-velocity updates at rest
+REACH_STD = 1.0  # m, doubt that a tag beyond reach is there, each time a TDOA says so
 
 
 @compiled
-def run(m, c, positions, imu_t, gyro, force, tdoa_t, a, b, d, bias_std, odometry, covariance, residuals):
+def run(m, c, positions, imu_t, gyro, force, tdoa_t, a, b, d, bias_std, odometry, covariance, residuals, tape):
     """Feed events in stamp order.
 
     m : Memory; c : Tuning; positions (N, 3) m. imu_t (n,) s, gyro (n, 3) rad/s, force (n, 3) m/s^2. tdoa_t (k,) s,
     a, b (k,) anchor rows, d (k,) corrected m, bias_std (k,) m. Both rising, neither before what was fed earlier.
     Writes: odometry (>= n + k, 17) rows of stamp and state; covariance (>= n + k, 9, 9) of [p, v, attitude];
-    residuals (k, 4) rows of innovation, its variance, weight, verdict. Returns the number of odometry rows.
+    residuals (k, 4) rows of innovation, its variance, weight, verdict; tape : Tape. Returns the number of odometry rows.
     """
     i = k = rows = 0
     while i < len(imu_t) or k < len(tdoa_t):
         if k == len(tdoa_t) or (i < len(imu_t) and imu_t[i] <= tdoa_t[k]):
             t = imu_t[i]
-            _on_imu(m, c, t, gyro[i], force[i])
+            _on_imu(m, c, t, gyro[i], force[i], tape)
             i += 1
         else:
             t = tdoa_t[k]
-            _on_tdoa(m, c, positions, t, a[k], b[k], d[k], bias_std[k], residuals[k])
+            _on_tdoa(m, c, positions, t, a[k], b[k], d[k], bias_std[k], residuals[k], tape)
             k += 1
         if m.clock[RUNNING] and t >= m.clock[NEXT_ODOMETRY]:
             m.clock[NEXT_ODOMETRY] = (math.floor(t * c.odometry_rate + 1e-6) + 1.0) / c.odometry_rate
+            best = int(m.clock[BEST])
             odometry[rows, 0] = t
-            odometry[rows, 1:] = m.x
-            covariance[rows] = m.P[:9, :9]
+            odometry[rows, 1:] = m.x[best]
+            covariance[rows] = m.P[best, :9, :9]
+            hypotheses.add_doubt(m, covariance[rows])
             rows += 1
     return rows
 
 
 @compiled
-def _on_imu(m, c, t, gyro, force):
-    last_gyro, last_force, slow, power, mean = m.imu[0], m.imu[1], m.imu[2], m.imu[3], m.imu[4]
-    dt = t - m.clock[LAST_IMU]
-    fresh = dt < c.imu_timeout
-    for k in range(3):
-        if fresh:
-            slow[k] += min(1.0, dt / VIBRATION_CORNER) * (force[k] - slow[k])
-            mean[k] += min(1.0, dt / VIBRATION_TIME) * (slow[k] - mean[k])
-            power[k] += min(1.0, dt / VIBRATION_TIME) * ((force[k] - slow[k]) ** 2 - power[k])
-            last_gyro[k], last_force[k] = 0.5 * (last_gyro[k] + gyro[k]), 0.5 * (last_force[k] + force[k])
-        else:
-            slow[k] = mean[k] = force[k]
-            power[k] = 0.0
-            last_gyro[k], last_force[k] = gyro[k], force[k]
+def _on_imu(m, c, t, gyro, force, tape):
+    fresh = inertial.observe(m, t, gyro, force, c.imu_timeout)
     if m.clock[RUNNING]:
-        _advance(m, c, t)
+        _advance(m, c, t, tape)
+        if c.zero_velocity and fresh and t >= m.clock[NEXT_REST] and inertial.at_rest(m):
+            m.clock[NEXT_REST] = t + REST_PERIOD
+            _stand_still(m, t, tape)
     m.clock[LAST_IMU] = t
     for k in range(3):
-        last_gyro[k], last_force[k] = gyro[k], force[k]
+        m.imu[GYRO, k], m.imu[FORCE, k] = gyro[k], force[k]
 
 
 @compiled
-def _advance(m, c, t):
-    """Predict to stamp t with the inertial sample at hand, or without one if it is too old."""
+def _advance(m, c, t, tape):
+    """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old, without one."""
     if t - m.clock[NOW] > LOST_TIME:
         m.clock[RUNNING], m.clock[FIRST_TDOA], m.clock[NEXT_TRY] = 0.0, t, -np.inf
         return
-    trust, psd = m.S[0], m.S[1]  # scratch
-    inertial = c.use_imu and t - m.clock[LAST_IMU] < c.imu_timeout
-    if inertial:
+    trust, psd, walk = m.S[0], m.S[1], m.S[2]  # scratch
+    best = int(m.clock[BEST])
+    sensed = c.use_imu and t - m.clock[LAST_IMU] < c.imu_timeout
+    if sensed:
         for k in range(3):
-            doubt = c.vibration_gain * m.imu[3, k]
-            trust[k] = c.vibration_trust**2 / (c.vibration_trust**2 + doubt)
-            psd[k] = c.accel_noise**2 + 2.0 * VIBRATION_MEMORY * trust[k] * doubt
+            trust[k], error = inertial.trust(m, k, c.vibration_trust, c.vibration_gain)
+            psd[k] = c.accel_noise**2 + 2.0 * inertial.PERSISTENCE * error
+            walk[k] = c.accel_bias_walk**2
     while m.clock[NOW] < t:
         dt = min(t - m.clock[NOW], MAX_STEP)
-        if inertial:
-            predict(
-                m.x, m.P, m.F, m.R, dt, m.imu[0], m.imu[1], trust, psd,
-                c.gyro_noise**2, c.accel_bias_walk**2, c.gyro_bias_walk**2,
-            )  # fmt: skip
-        else:
-            coast(m.x, m.P, dt, c.motion_noise**2, STALE_TURN_PSD if c.use_imu else 0.0)
+        for h in range(HYPOTHESES):
+            if m.belief[h] == -np.inf:
+                continue
+            if sensed:
+                predict(
+                    m.x[h], m.P[h], m.F, m.R, m.E, m.step, dt, m.imu[GYRO], m.imu[FORCE], trust, psd,
+                    c.gyro_noise**2, walk, c.gyro_bias_walk**2,
+                )  # fmt: skip
+                if h == best:
+                    note_prediction(tape, m)
+            else:
+                coast(m.x[h], m.P[h], dt, c.motion_noise**2, STALE_TURN_PSD if c.use_imu else 0.0)
+                if h == best:
+                    note_coast(tape, dt)
         m.clock[NOW] = t if t - m.clock[NOW] <= MAX_STEP else m.clock[NOW] + dt
 
 
 @compiled
-def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual):
+def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual, tape):
     first, kept = _remember(m, c, t, a, b, d)
     if not m.clock[RUNNING]:
         residual[0] = residual[1] = np.nan
@@ -145,35 +119,94 @@ def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual):
         waited = t - m.clock[FIRST_TDOA]
         if kept - first >= MINIMUM and waited > 0.9 * c.start_window and t >= m.clock[NEXT_TRY]:
             m.clock[NEXT_TRY] = t + RETRY
-            _start(m, c, positions, t, first, kept, waited > c.start_patience)
+            _start(m, c, positions, t, first, kept, waited > c.start_patience, tape)
         return
-    _advance(m, c, t)
+    _advance(m, c, t, tape)
     if not m.clock[RUNNING]:
         residual[0] = residual[1] = np.nan
         residual[2], residual[3] = 0.0, STARTUP
         return
-    innovation = d - predicted(m.x, positions[a], positions[b], m.g)
-    spread = gain_terms(m.P, m.g, m.K)
     variance = c.tdoa_std**2 + bias_std**2
-    if c.robust == 0:
-        w = update_innovation(
-            m.x, m.P, m.K, innovation, spread, variance, c.tdoa_correlation, c.loss, c.measurement_scale
-        )
-    elif c.robust == 1:
-        w = update_gate(m.x, m.P, m.K, innovation, spread, variance, c.tdoa_correlation, c.gate)
-    else:
-        w = update_m_estimation(
-            m.x, m.P, m.S, m.K, m.g, innovation, variance, c.tdoa_correlation,
-            c.loss, c.state_scale, c.measurement_scale, c.iterations,
-        )  # fmt: skip
-    residual[0], residual[1], residual[2] = innovation, spread + variance, w
-    residual[3] = USED if w > 0.0 else REJECTED
-    agrees = 1.0 if abs(innovation) < INLIER else 0.0
+    if c.adapt_noise:
+        variance += noise.excess_variance(m, a, b)
+    best = int(m.clock[BEST])
+    for h in range(HYPOTHESES):
+        if m.belief[h] == -np.inf:
+            continue
+        innovation = d - predicted(m.x[h], positions[a], positions[b], m.g)
+        spread = gain_terms(m.P[h], m.g, m.K)
+        hypotheses.blame(m, h, innovation, spread + variance * c.tdoa_correlation)
+        w, total = _update(m, c, m.x[h], m.P[h], innovation, spread, variance)
+        if h == best:
+            residual[0], residual[1], residual[2] = innovation, spread + variance, w
+            residual[3] = USED if w > 0.0 else REJECTED
+            if w > 0.0:
+                note_update(tape, m, t, UPDATE, innovation, total, m.g, 0)
+            if c.adapt_noise:
+                noise.learn(m, t, a, b, innovation, spread, variance, c.tdoa_std, c.noise_memory)
+    _stay_in_reach(m, c, positions, t, tape)
+    hypotheses.choose(m, t)
+    agrees = 1.0 if abs(residual[0]) < INLIER else 0.0
     m.clock[AGREEMENT] += min(1.0, (t - m.clock[LAST_TDOA]) / AGREEMENT_TIME) * (agrees - m.clock[AGREEMENT])
     m.clock[LAST_TDOA] = t
-    if m.clock[AGREEMENT] < 0.5 and kept - first >= MINIMUM and t >= m.clock[NEXT_TRY]:
+    if c.recover and m.clock[AGREEMENT] < 0.5 and kept - first >= MINIMUM and t >= m.clock[NEXT_TRY]:
         m.clock[NEXT_TRY] = t + RETRY
-        _recover(m, c, positions, first, kept)
+        _recover(m, c, positions, first, kept, tape)
+
+
+@compiled
+def _update(m, c, x, P, innovation, spread, variance):
+    """One robust update; K = P g and spread are in m.K and at hand. Returns weight and total variance, m^2."""
+    if c.robust == 0:
+        return update_innovation(
+            x, P, m.K, innovation, spread, variance, c.tdoa_correlation, c.loss, c.measurement_scale
+        )
+    if c.robust == 1:
+        return update_gate(x, P, m.K, innovation, spread, variance, c.tdoa_correlation, c.gate)
+    return update_m_estimation(
+        x, P, m.S, m.K, m.g, innovation, variance, c.tdoa_correlation,
+        c.loss, c.state_scale, c.measurement_scale, c.iterations,
+    )  # fmt: skip
+
+
+@compiled
+def _stand_still(m, t, tape):
+    """Zero velocity, one axis after the other, where the filter does not contradict it."""
+    for axis in range(3):
+        for k in range(3):
+            m.g[k] = 1.0 if k == axis else 0.0
+        for h in range(HYPOTHESES):
+            x, P = m.x[h], m.P[h]
+            total = P[3 + axis, 3 + axis] + REST_STD**2
+            innovation = -x[3 + axis]
+            if m.belief[h] == -np.inf or innovation * innovation > 9.0 * total + 0.1:
+                continue
+            m.K[:] = P[3 + axis]
+            kalman(x, P, m.K, innovation, total)
+            if h == int(m.clock[BEST]):
+                note_update(tape, m, t, UPDATE, innovation, total, m.g, 3)
+
+
+@compiled
+def _stay_in_reach(m, c, positions, t, tape):
+    """Pull a tag that left the surroundings of its anchors towards them, one axis after the other.
+
+    Wrong TDOAs, e.g. late arrivals on a floor, are often explained best by a tag far away."""
+    for axis in range(3):
+        middle, far = reach(positions, axis, c.reach)
+        for h in range(HYPOTHESES):
+            x, P = m.x[h], m.P[h]
+            beyond = abs(x[axis] - middle) - far
+            if m.belief[h] == -np.inf or beyond <= 0.0:
+                continue
+            innovation = -beyond if x[axis] > middle else beyond
+            total = P[axis, axis] + REACH_STD**2
+            m.K[:] = P[axis]
+            kalman(x, P, m.K, innovation, total)
+            if h == int(m.clock[BEST]):
+                for k in range(3):
+                    m.g[k] = 1.0 if k == axis else 0.0
+                note_update(tape, m, t, UPDATE, innovation, total, m.g, 0)
 
 
 @compiled
@@ -199,44 +232,61 @@ def _window(m, first, kept):
 
 
 @compiled
-def _start(m, c, positions, t, first, kept, anyhow):
+def _start(m, c, positions, t, first, kept, anyhow, tape):
     """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
     wt, wa, wb, wd = _window(m, first, kept)
     found, cov = np.empty(6), np.empty((6, 6))
-    share = locate(wt, wa, wb, wd, positions, c.tdoa_std, found, cov)
-    if not anyhow and (share < AGREE or not believable(positions, found)):
+    share = locate(wt, wa, wb, wd, positions, c.tdoa_std, c.reach, found, cov)
+    if not anyhow and (share < AGREE or not believable(positions, c.reach, found)):
         return
     force = m.F[0, :3]  # scratch
     for k in range(3):
-        trust = c.vibration_trust**2 / (c.vibration_trust**2 + c.vibration_gain * m.imu[3, k])
+        felt, _ = inertial.trust(m, k, c.vibration_trust, c.vibration_gain)
         up = GRAVITY if k == 2 else 0.0
-        force[k] = up + trust * (m.imu[4, k] - up)
-    level(force, c.initial_yaw, m.x)
-    m.x[:6] = found
-    m.x[10:] = 0.0
-    m.P[:, :] = 0.0
-    m.P[:6, :6] = cov
-    m.P[6, 6] = m.P[7, 7] = START_TILT_STD**2
-    m.P[8, 8] = c.initial_yaw_std**2
-    for k in range(3):
-        m.P[9 + k, 9 + k] = c.initial_accel_bias_std**2
-        m.P[12 + k, 12 + k] = c.initial_gyro_bias_std**2
+        force[k] = up + felt * (m.imu[MEAN_FORCE, k] - up)
+    unknown = c.use_imu and c.initial_yaw_std > hypotheses.YAW_STD
+    for h in range(HYPOTHESES):
+        turned = hypotheses.quarter(h)
+        off = min(turned, 2.0 * math.pi - turned)
+        m.belief[h] = -0.5 * (off / c.initial_yaw_std) ** 2 if unknown or h == 0 else -np.inf
+        x, P = m.x[h], m.P[h]
+        level(force, c.initial_yaw + turned, x)
+        x[:6] = found
+        x[10:] = 0.0
+        P[:, :] = 0.0
+        P[:6, :6] = cov
+        P[6, 6] = P[7, 7] = START_TILT_STD**2
+        P[8, 8] = min(c.initial_yaw_std, hypotheses.YAW_STD) ** 2
+        for k in range(3):
+            P[9 + k, 9 + k] = c.initial_accel_bias_std**2
+            P[12 + k, 12 + k] = c.initial_gyro_bias_std**2
+    m.clock[BEST] = 0.0
     m.clock[NOW] = m.clock[LAST_TDOA] = t
     m.clock[AGREEMENT] = 1.0
     m.clock[RUNNING] = 1.0
+    _note_replaced(m, tape)
 
 
 @compiled
-def _recover(m, c, positions, first, kept):
+def _recover(m, c, positions, first, kept, tape):
     """If the window agrees on a position that the filter does not believe, go there; attitude and biases stay."""
     wt, wa, wb, wd = _window(m, first, kept)
     found, cov = np.empty(6), np.empty((6, 6))
-    share = locate(wt, wa, wb, wd, positions, c.tdoa_std, found, cov)
-    if not believable(positions, found) or share < AGREE_ANYHOW or share < 0.2 + share_of_inliers(wt, wa, wb, wd, positions, m.x[:6]):
+    share = locate(wt, wa, wb, wd, positions, c.tdoa_std, c.reach, found, cov)
+    believed = share_of_inliers(wt, wa, wb, wd, positions, m.x[int(m.clock[BEST]), :6])
+    if not believable(positions, c.reach, found) or share < AGREE_ANYHOW or share < 0.2 + believed:
         return
-    m.x[:6] = found
-    m.P[:6, :] = 0.0
-    m.P[:, :6] = 0.0
-    m.P[:6, :6] = cov
+    for h in range(HYPOTHESES):
+        m.x[h, :6] = found
+        m.P[h, :6, :] = 0.0
+        m.P[h, :, :6] = 0.0
+        m.P[h, :6, :6] = cov
     m.clock[AGREEMENT] = 1.0
     m.clock[RECOVERIES] += 1.0
+    _note_replaced(m, tape)
+
+
+@compiled
+def _note_replaced(m, tape):
+    m.K[:] = 0.0
+    note_update(tape, m, m.clock[NOW], REPLACED, 0.0, 1.0, m.g, 0)

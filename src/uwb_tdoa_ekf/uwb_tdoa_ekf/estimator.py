@@ -7,7 +7,9 @@ import math
 import numpy as np
 
 from .config import FilterConfig
-from .engine import INVALID, LATE, RECOVERIES, REJECTED, RUNNING, STARTUP, USED, new_memory, run
+from .engine import INVALID, LATE, REJECTED, STARTUP, USED, run
+from .memory import RECOVERIES, RUNNING, new_memory
+from .tape import new_tape
 from .validity import MAX_FORCE, MAX_RATE, usable
 
 VERDICTS = {USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup"}
@@ -69,7 +71,7 @@ class Estimator:
         self._restart()
 
     def _restart(self):
-        self._memory = new_memory()
+        self._memory = new_memory(len(self.anchors))
         self._imu, self._tdoa, self._refused = [], [], []
         self._newest_imu = self._newest_tdoa = self._done = -math.inf
 
@@ -151,7 +153,7 @@ class Estimator:
         rows, covariance, used = np.empty((n + k, 17)), np.empty((n + k, 9, 9)), np.empty((k, 4))
         count = run(
             self._memory, self._tuning, self.anchors.positions, fed_t, gyro, force,
-            t, a, b, d, std, rows, covariance, used,
+            t, a, b, d, std, rows, covariance, used, _NO_TAPE,
         )  # fmt: skip
         for stream in (imu, tdoa):
             if len(stream):
@@ -178,6 +180,7 @@ class Estimator:
         )
 
 
+_NO_TAPE = new_tape()
 _NOTHING = (
     Odometry.from_rows(np.empty((0, 17)), np.empty((0, 9, 9))),
     Residuals(*(np.empty(0) for _ in range(7))),

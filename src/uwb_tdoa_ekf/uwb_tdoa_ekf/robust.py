@@ -7,6 +7,8 @@ because their errors are alike: the update uses variance * dilution, the weight 
 
 import math
 
+import numpy as np
+
 from uwb_tdoa_bias.compiled import compiled
 
 from .state import inject
@@ -47,29 +49,34 @@ def gain_terms(P, g, K):
 
 @compiled
 def update_innovation(x, P, K, innovation, spread, variance, dilution, loss, scale):
-    """Weight from the whitened innovation, then one Kalman update with the variance divided by it. Returns the weight.
+    """Weight from the whitened innovation, then one Kalman update with the variance divided by it.
+    Returns the weight and the total variance used, m^2.
 
     K = P g and spread = g' P g come from gain_terms. Because the prior's own uncertainty whitens the innovation, a
     filter that knows little listens to everything: the redescending weight cannot lock it out.
     """
     w = weight(loss, innovation / math.sqrt(spread + variance), scale)
     if w < NEGLIGIBLE:
-        return 0.0
-    _kalman(x, P, K, innovation, spread + variance * dilution / w)
-    return w
+        return 0.0, np.inf
+    total = spread + variance * dilution / w
+    kalman(x, P, K, innovation, total)
+    return w, total
 
 
 @compiled
 def update_gate(x, P, K, innovation, spread, variance, dilution, gate):
-    """Kalman update if the innovation is within `gate` standard deviations. Returns 1 or 0."""
+    """Kalman update if the innovation is within `gate` standard deviations.
+    Returns the weight, 1 or 0, and the total variance used, m^2."""
     if innovation * innovation > gate * gate * (spread + variance):
-        return 0.0
-    _kalman(x, P, K, innovation, spread + variance * dilution)
-    return 1.0
+        return 0.0, np.inf
+    total = spread + variance * dilution
+    kalman(x, P, K, innovation, total)
+    return 1.0, total
 
 
 @compiled
-def _kalman(x, P, K, innovation, total):
+def kalman(x, P, K, innovation, total):
+    """Scalar Kalman update: K = P h' (15,), total = h P h' + variance."""
     inject(x, K, innovation / total)
     for i in range(15):
         k = K[i] / total
@@ -80,7 +87,8 @@ def _kalman(x, P, K, innovation, total):
 
 @compiled
 def update_m_estimation(x, P, S, K, g, innovation, variance, dilution, loss, state_scale, scale, iterations):
-    """M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13. Returns the measurement's weight.
+    """M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13.
+    Returns the measurement's weight and the total variance used, m^2; K becomes that of the weighted prior.
 
     The error state is scaled by the Cholesky factor of the prior (eq. 9), prior and measurement are re-weighted
     `iterations` times (eq. 10), and the posterior follows from the weighted gain (eqs. 11 - 13). A TDOA moves only the
@@ -111,5 +119,5 @@ def update_m_estimation(x, P, S, K, g, innovation, variance, dilution, loss, sta
         for j in range(15):
             P[i, j] += s0 * S[j, 0] + s1 * S[j, 1] + s2 * S[j, 2]
         K[i] = S[i, 0] * y0 / w0 + S[i, 1] * y1 / w1 + S[i, 2] * y2 / w2
-    _kalman(x, P, K, innovation, total)
-    return w
+    kalman(x, P, K, innovation, total)
+    return w, total

@@ -10,16 +10,17 @@ STARTS = 9  # the middle of the anchors and the corners of the half-size box aro
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
 SPEED = 1.0  # m/s, standard deviation of the velocity before anything is known
-OUTSIDE = 1.0  # m beyond the anchors' extent that a tag may be without further evidence
+ROOM = 3.0  # m from the middle of the anchors that a tag may be at least, however flat they lie
 LEAP = 2.0  # m, longest step
 INLIER = 0.75  # m, a residual below this does not contradict a position
 
 
 @compiled
-def locate(t, a, b, d, positions, std, x, cov):
+def locate(t, a, b, d, positions, std, margin, x, cov):
     """Robust multilateration over a window, with constant velocity.
 
-    t, a, b, d : (n,) TDOAs (s, anchor rows, m), t rising; positions (N, 3), m; std: m, of one TDOA. Writes position and
+    t, a, b, d : (n,) TDOAs (s, anchor rows, m), t rising; positions (N, 3), m; std: m, of one TDOA;
+    margin: as of `reach`. Writes position and
     velocity at t[-1] to x (6,) and their covariance to cov (6, 6). Returns the share of TDOAs that agree with it, 0 to 1.
 
     Graduated Geman-McClure: Gauss-Newton from several starts while the loss narrows; the start with the least final loss
@@ -30,7 +31,7 @@ def locate(t, a, b, d, positions, std, x, cov):
     n = len(t)
     middle, prior = np.zeros(6), np.full(6, SPEED)
     for k in range(3):
-        middle[k], prior[k] = reach(positions, k)
+        middle[k], prior[k] = reach(positions, k, margin)
     heard = np.zeros(len(positions))
     for i in range(n):
         heard[a[i]] = heard[b[i]] = 1.0
@@ -67,17 +68,17 @@ def locate(t, a, b, d, positions, std, x, cov):
 
 
 @compiled
-def reach(positions, k):
-    """Middle of the anchors along axis k, and how far from it a tag is believed without further evidence, m."""
+def reach(positions, k, margin):
+    """Middle of the anchors along axis k, and how far from it a tag is believed to be, m: `margin` beyond them."""
     low, high = np.min(positions[:, k]), np.max(positions[:, k])
-    return 0.5 * (low + high), max(0.5 * (high - low) + OUTSIDE, 3.0 * OUTSIDE)
+    return 0.5 * (low + high), max(0.5 * (high - low) + margin, ROOM)
 
 
 @compiled
-def believable(positions, x):
+def believable(positions, margin, x):
     """True if position x (3,) is within reach of the anchors."""
     for k in range(3):
-        middle, far = reach(positions, k)
+        middle, far = reach(positions, k, margin)
         if abs(x[k] - middle) > far:
             return False
     return True

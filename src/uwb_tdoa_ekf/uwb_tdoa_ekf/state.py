@@ -8,8 +8,6 @@ Motion model: eq. 14 of Zhao et al. (RA-L 2021).
 
 import math
 
-import numpy as np
-
 from uwb_tdoa_bias.compiled import compiled
 
 GRAVITY = 9.81  # m/s^2, along -z of the world
@@ -56,12 +54,13 @@ def inject(x, K, gain):
 
 
 @compiled
-def predict(x, P, F, R, dt, gyro, force, trust, accel_psd, gyro_psd, accel_walk_psd, gyro_walk_psd):
+def predict(x, P, F, R, E, step, dt, gyro, force, trust, accel_psd, gyro_psd, accel_walk_psd, gyro_walk_psd):
     """Advance state and covariance by dt seconds.
 
     gyro (3,) rad/s, force (3,) m/s^2: measured rates and specific force, held over dt; trust (3,): share of the
     measured specific force in what is used, per body axis (the rest is "hovering": gravity along body z);
-    accel_psd (3,) (m/s^2)^2/Hz; the other densities scalar, SI. F (15, 15), R (3, 3): scratch.
+    accel_psd, accel_walk_psd (3,) (m/s^2)^2/Hz and (m/s^3)^2/Hz; the other densities scalar, SI. F (15, 15): scratch;
+    R, E (3, 3) and step (16,): scratch, which then holds what `propagate` needs to repeat the step.
     """
     rotation(x, R)
     f0 = trust[0] * (force[0] - x[10])
@@ -74,46 +73,48 @@ def predict(x, P, F, R, dt, gyro, force, trust, accel_psd, gyro_psd, accel_walk_
         x[3 + r] += dt * a
     turn(x, w0, w1, w2)
 
-    step = np.zeros(16)
+    step[6] = step[7] = step[8] = 0.0
     step[9] = 1.0
     turn(step, -w0, -w1, -w2)
-    E = np.empty((3, 3))
     rotation(step, E)
-    # P <- Phi P Phi' + Q, written out for the blocks of Phi that differ from those of the identity:
-    #   dp' = dp + dv dt;  dv' = dv - R ([f]x dtheta + T dba) dt;  dtheta' = (I - [w]x) dtheta - dbg dt
-    for j in range(15):
-        t0, t1, t2 = P[6, j], P[7, j], P[8, j]
-        c0 = f1 * t2 - f2 * t1 + trust[0] * P[9, j]
-        c1 = f2 * t0 - f0 * t2 + trust[1] * P[10, j]
-        c2 = f0 * t1 - f1 * t0 + trust[2] * P[11, j]
-        for r in range(3):
-            F[r, j] = P[r, j] + dt * P[3 + r, j]
-            F[3 + r, j] = P[3 + r, j] - dt * (R[r, 0] * c0 + R[r, 1] * c1 + R[r, 2] * c2)
-        for r in range(3):
-            F[6 + r, j] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * P[12 + r, j]
-    for i in range(9):
-        t0, t1, t2 = F[i, 6], F[i, 7], F[i, 8]
-        for r in range(3):
-            P[i, 6 + r] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * F[i, 12 + r]
-        if i < 6:
-            c0 = f1 * t2 - f2 * t1 + trust[0] * F[i, 9]
-            c1 = f2 * t0 - f0 * t2 + trust[1] * F[i, 10]
-            c2 = f0 * t1 - f1 * t0 + trust[2] * F[i, 11]
-            for r in range(3):
-                P[i, r] = F[i, r] + dt * F[i, 3 + r]
-                P[i, 3 + r] = F[i, 3 + r] - dt * (R[r, 0] * c0 + R[r, 1] * c1 + R[r, 2] * c2)
-        for j in range(9, 15):
-            P[i, j] = F[i, j]
+    step[0], step[1], step[2], step[3] = dt, f0, f1, f2
+    step[10], step[11], step[12] = trust[0], trust[1], trust[2]
+    propagate(P, F, R, E, step)
+    for i in range(15):
+        for j in range(i):
+            F[i, j], F[j, i] = F[j, i], F[i, j]
+    propagate(F, P, R, E, step)  # P is symmetric: Phi (Phi P)' = Phi P Phi'
     for r in range(3):
         for c in range(3):
             white = R[r, 0] * accel_psd[0] * R[c, 0] + R[r, 1] * accel_psd[1] * R[c, 1] + R[r, 2] * accel_psd[2] * R[c, 2]
             P[3 + r, 3 + c] += dt * white
         P[6 + r, 6 + r] += dt * gyro_psd
-        P[9 + r, 9 + r] += dt * accel_walk_psd
+        P[9 + r, 9 + r] += dt * accel_walk_psd[r]
         P[12 + r, 12 + r] += dt * gyro_walk_psd
     for i in range(15):
         for j in range(i):
             P[i, j] = P[j, i]
+
+
+@compiled
+def propagate(A, out, R, E, step):
+    """out <- Phi A for the transition Phi of the error state over one step; A, out: (15, 15).
+
+    Only the blocks of Phi that differ from those of the identity are written out:
+    dp' = dp + dv dt;  dv' = dv - R ([f]x dtheta + T dba) dt;  dtheta' = Exp(-w dt) dtheta - dbg dt.
+    """
+    dt, f0, f1, f2 = step[0], step[1], step[2], step[3]
+    for j in range(15):
+        t0, t1, t2 = A[6, j], A[7, j], A[8, j]
+        c0 = f1 * t2 - f2 * t1 + step[10] * A[9, j]
+        c1 = f2 * t0 - f0 * t2 + step[11] * A[10, j]
+        c2 = f0 * t1 - f1 * t0 + step[12] * A[11, j]
+        for r in range(3):
+            out[r, j] = A[r, j] + dt * A[3 + r, j]
+            out[3 + r, j] = A[3 + r, j] - dt * (R[r, 0] * c0 + R[r, 1] * c1 + R[r, 2] * c2)
+            out[6 + r, j] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * A[12 + r, j]
+        for r in range(9, 15):
+            out[r, j] = A[r, j]
 
 
 @compiled
@@ -132,3 +133,21 @@ def coast(x, P, dt, accel_psd, turn_psd):
     for i in range(3):
         P[3 + i, 3 + i] += dt * accel_psd
         P[6 + i, 6 + i] += dt * turn_psd
+
+
+@compiled
+def difference(a, b, out):
+    """Error state that leads from nominal state a to b, its first nine elements: out (9,) = [dp, dv, dtheta]."""
+    for k in range(6):
+        out[k] = b[k] - a[k]
+    ax, ay, az, aw = -a[6], -a[7], -a[8], a[9]
+    bx, by, bz, bw = b[6], b[7], b[8], b[9]
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    w = aw * bw - ax * bx - ay * by - az * bz
+    if w < 0.0:
+        x, y, z, w = -x, -y, -z, -w
+    norm = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 if norm < 1e-9 else 2.0 * math.atan2(norm, w) / norm
+    out[6], out[7], out[8] = scale * x, scale * y, scale * z

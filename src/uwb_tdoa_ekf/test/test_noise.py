@@ -1,0 +1,70 @@
+import numpy as np
+from hypothesis import given, strategies as st
+import pytest
+
+from flights import corners, fly
+from dataclasses import replace
+from uwb_tdoa_ekf.config import FilterConfig
+from uwb_tdoa_ekf.memory import new_memory
+from uwb_tdoa_ekf.noise import excess_variance, learn
+from uwb_tdoa_ekf.offline import run_offline
+
+
+def taught(std, noise, seconds=20.0, seed=0):
+    """Excess variances after TDOAs at 400 Hz whose anchors have the standard deviations `noise`, (N,) m."""
+    rng, m, n = np.random.default_rng(seed), new_memory(len(noise)), len(noise)
+    sampled = []
+    for k in range(int(400 * seconds)):
+        a = rng.integers(n)
+        b = (a + 1 + rng.integers(n - 1)) % n
+        innovation = rng.standard_normal() * np.hypot(noise[a], noise[b])
+        learn(m, k / 400.0, a, b, innovation, 0.0, std**2 + excess_variance(m, a, b), std, 0.5)
+        sampled.append(m.noise[0].copy())
+    return np.mean(sampled[len(sampled) // 2 :], axis=0)
+
+
+def test_the_noisy_anchor_is_found():
+    noise = np.full(6, 0.1 / np.sqrt(2.0))
+    noise[2] = 0.6
+    learned = taught(0.1, noise)
+    assert learned[2] == pytest.approx(0.6**2, rel=0.3)
+    assert np.delete(learned, 2).max() < 0.1 * learned[2]
+
+
+def test_what_is_as_noisy_as_believed_is_not_blamed():
+    learned = taught(0.25, np.full(6, 0.25 / np.sqrt(2.0)))
+    assert learned.max() < 0.5 * 0.25**2
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50), st.floats(0.0, 1e3))
+def test_variances_stay_finite_and_not_negative(innovations, spread):
+    m = new_memory(3)
+    for k, innovation in enumerate(innovations):
+        learn(m, 0.01 * k, k % 3, (k + 1) % 3, innovation, spread, 0.01 + excess_variance(m, k % 3, (k + 1) % 3), 0.1, 0.5)
+        assert np.isfinite(m.noise).all() and (m.noise >= 0.0).all()
+
+
+def test_one_outlier_counts_as_few_standard_deviations_at_most():
+    m = new_memory(2)
+    m.noise[1] = 0.0
+    learn(m, 0.01, 0, 1, 1e9, 0.0, 0.01, 0.1, 0.5)
+    assert excess_variance(m, 0, 1) < 0.01
+
+
+def test_an_anchor_that_is_late_for_a_while_disturbs_less():
+    """Anchor 3 is a metre late in every pair for a second at a time, as behind an obstacle."""
+    errors = {}
+    for adapt in (False, True):
+        found = []
+        for seed in range(4):
+            flight = fly(seed, 12.0, tdoa_std=0.05, accel_noise=0.05, gyro_noise=0.003)
+            late = np.where((flight.tdoa.t % 3.0) < 1.0, 1.0, 0.0)
+            three = corners().ids[3]
+            d = flight.tdoa.d + late * ((flight.tdoa.b == three).astype(float) - (flight.tdoa.a == three))
+            result = run_offline(replace(flight, tdoa=replace(flight.tdoa, d=d)), FilterConfig(adapt_noise=adapt))
+            odometry = result.odometry
+            after = odometry.t > 3.0
+            off = odometry.p[after] - flight.meta["wave"].motion(odometry.t[after])[0]
+            found.append(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+        errors[adapt] = np.mean(found)
+    assert errors[True] < 0.9 * errors[False]

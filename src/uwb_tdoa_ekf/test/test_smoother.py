@@ -1,0 +1,134 @@
+from dataclasses import replace
+
+from covariances import assert_covariance
+from flights import fly, position_at
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.flight import Tdoas
+from uwb_tdoa_ekf.config import ROBUST, FilterConfig
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.smoother import smooth
+
+NOISE = dict(accel_noise=0.05, gyro_noise=0.003)
+
+
+def rmse(flight, odometry, after=1.0):
+    chosen = odometry.t > after
+    off = odometry.p[chosen] - position_at(flight, odometry.t[chosen])
+    return np.sqrt(np.mean(np.sum(off**2, axis=1)))
+
+
+def batch(t, a, b, d, positions, p0, prior_std, q, tdoa_std):
+    """Least squares over a whole recording of a tag that moves along a straight line with white acceleration noise,
+    linearised about p0: positions (n, 3) and their covariances, by one large system of equations."""
+    n = len(t)
+    rows, values, weights = [], [], []
+
+    def add(entries, value, std):
+        row = np.zeros(6 * n)
+        for place, number in entries:
+            row[place] += number
+        rows.append(row / std), values.append(value / std)
+
+    for k in range(3):
+        add([(k, 1.0)], 0.0, prior_std[0])
+        add([(3 + k, 1.0)], 0.0, prior_std[1])
+    for i in range(1, n):
+        dt = t[i] - t[i - 1]
+        for k in range(3):
+            add([(6 * i + k, 1.0), (6 * i - 6 + k, -1.0), (6 * i - 3 + k, -dt)], 0.0, 1e-6)
+            add([(6 * i + 3 + k, 1.0), (6 * i - 3 + k, -1.0)], 0.0, q * np.sqrt(dt))
+    for i in range(n):
+        ra, rb = p0 - positions[a[i]], p0 - positions[b[i]]
+        g = rb / np.linalg.norm(rb) - ra / np.linalg.norm(ra)
+        add([(6 * i + k, g[k]) for k in range(3)], d[i] - np.linalg.norm(rb) + np.linalg.norm(ra), tdoa_std)
+    A = np.array(rows)
+    solution = np.linalg.lstsq(A, np.array(values), rcond=None)[0]
+    covariance = np.linalg.inv(A.T @ A)
+    return solution.reshape(n, 6)[:, :3], np.array([covariance[6 * i : 6 * i + 3, 6 * i : 6 * i + 3] for i in range(n)])
+
+
+@pytest.mark.parametrize("use_imu", [True, False])
+def test_smoothing_halves_what_filtering_leaves(use_imu):
+    ratios = []
+    for seed in range(4):
+        flight = fly(seed, 12.0, tdoa_std=0.25, outliers=0.05, **NOISE)
+        config = FilterConfig(use_imu=use_imu, tdoa_correlation=1.0, initial_yaw_std=0.5)
+        ratios.append(rmse(flight, smooth(flight, config).odometry) / rmse(flight, run_offline(flight, config).odometry))
+    assert np.mean(ratios) < 0.75
+
+
+@pytest.mark.parametrize("use_imu", [True, False])
+def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
+    nees = []
+    for seed in range(8):
+        flight = fly(seed, 12.0, tdoa_std=0.1, accel_bias=0.1, gyro_bias=0.01, **NOISE)
+        config = FilterConfig(
+            use_imu=use_imu, tdoa_std=0.1, tdoa_correlation=1.0, robust="gate", gate=1e6, adapt_noise=False,
+            accel_noise=0.05, gyro_noise=0.003, vibration_gain=0.0, initial_yaw_std=0.5,
+        )  # fmt: skip
+        filtered, smoothed = run_offline(flight, config).odometry, smooth(flight, config).odometry
+        assert_covariance(smoothed.covariance)
+        variance = [np.einsum("nii->ni", odometry.covariance)[:, :3] for odometry in (filtered, smoothed)]
+        common = np.isin(filtered.t, smoothed.t), np.isin(smoothed.t, filtered.t)
+        assert (variance[1][common[1]] <= variance[0][common[0]] * (1 + 1e-6)).all()
+        middle = (smoothed.t > 2.0) & (smoothed.t < 11.0)
+        error = smoothed.p[middle] - flight.meta["wave"].motion(smoothed.t[middle])[0]
+        inverse = np.linalg.inv(smoothed.covariance[middle, :3, :3])
+        nees.append(np.einsum("ni,nij,nj->n", error, inverse, error).mean())
+    assert 2.0 < np.mean(nees) < (4.0 if use_imu else 6.0)  # the wave is no white acceleration
+
+
+def test_without_imu_it_is_the_least_squares_solution():
+    """After the start, with white noise and a tag at rest, where nothing is non-linear."""
+    flight = fly(3, 2.0, hover=True, tdoa_rate=50.0, tdoa_std=0.05)
+    config = FilterConfig(
+        use_imu=False, tdoa_std=0.05, tdoa_correlation=1.0, robust="gate", gate=1e6, adapt_noise=False, recover=False,
+        odometry_rate=1e4,
+    )  # fmt: skip
+    first = run_offline(flight, config)
+    smoothed = smooth(flight, config).odometry
+    used = np.isin(flight.tdoa.t, smoothed.t)
+    used[np.flatnonzero(used)[0]] = False  # the one that completed the start
+    t = flight.tdoa.t[used]
+    a, b = flight.anchors.index(flight.tdoa.a[used]), flight.anchors.index(flight.tdoa.b[used])
+    p0 = flight.truth.p[0]
+    p, covariance = batch(
+        t, a, b, flight.tdoa.d[used], flight.anchors.positions, p0, (1e3, 1e3), config.motion_noise, 0.05
+    )
+    late = t > t[0] + 0.6  # by when the start's covariance is forgotten
+    at = np.searchsorted(smoothed.t, t[late])
+    np.testing.assert_allclose(smoothed.p[at] - p0, p[late], atol=0.01)
+    std, expected = (np.sqrt(np.einsum("nii->ni", c)) for c in (smoothed.covariance[at, :3, :3], covariance[late]))
+    np.testing.assert_allclose(std, expected, rtol=0.1)
+    assert len(first.odometry) > 0
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 1000), st.sampled_from(ROBUST), st.booleans())
+def test_sound_for_any_weights_gaps_and_recoveries(seed, robust, use_imu):
+    rng = np.random.default_rng(seed)
+    flight = fly(seed, 6.0, outliers=0.3, **NOISE)
+    kept = (flight.tdoa.t < rng.uniform(1.0, 3.0)) | (flight.tdoa.t > rng.uniform(3.0, 4.0))
+    d = flight.tdoa.d + np.where(flight.tdoa.t > 4.5, 1.5 * rng.standard_normal(), 0.0)
+    flight = replace(flight, tdoa=Tdoas(flight.tdoa.t[kept], flight.tdoa.a[kept], flight.tdoa.b[kept], d[kept]))
+    odometry = smooth(flight, FilterConfig(robust=robust, use_imu=use_imu)).odometry
+    assert np.isfinite(odometry.p).all() and (np.diff(odometry.t) > 0.0).all()
+    assert_covariance(odometry.covariance, tolerance=1e-6)
+
+
+def test_the_unknown_yaw_is_known_from_the_beginning():
+    flight = fly(4, 12.0, **NOISE)
+    odometry = smooth(flight, FilterConfig(initial_yaw=2.0)).odometry
+    attitude = flight.meta["wave"].motion(odometry.t)[2]
+    from scipy.spatial.transform import Rotation
+
+    yaw = (attitude.inv() * Rotation.from_quat(odometry.q)).as_rotvec()[:, 2]
+    assert np.abs(yaw).max() < np.radians(10.0)
+
+
+def test_a_flight_too_short_to_start():
+    flight = fly(5, 0.2)
+    assert len(smooth(flight).odometry) == 0
