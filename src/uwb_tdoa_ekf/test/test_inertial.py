@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_ekf.inertial import at_rest, observe, trust
+from uwb_tdoa_ekf.inertial import quiet, observe, trust
 from uwb_tdoa_ekf.memory import LAST_IMU, FORCE, GYRO, MEAN_FORCE, new_memory
 from uwb_tdoa_ekf.state import GRAVITY
 
@@ -36,15 +36,15 @@ STILL = dict(gyro=(np.zeros(3), 0.002), force=(UP, 0.02))
     ],
 )
 def test_rest(change, rests):
-    assert at_rest(feed(**{**STILL, **change})) == rests
+    assert quiet(feed(**{**STILL, **change})) == rests
 
 
 def test_rest_is_not_believed_at_once_nor_after_a_gap():
     m = feed(**STILL, seconds=0.3)
-    assert not at_rest(m)
+    assert not quiet(m)
     m = feed(**STILL, m=m)
-    assert at_rest(m)
-    assert not at_rest(feed(**STILL, m=m, pause=1.0, seconds=0.3))
+    assert quiet(m)
+    assert not quiet(feed(**STILL, m=m, pause=1.0, seconds=0.3))
 
 
 def test_the_more_an_axis_vibrates_the_less_it_is_believed():

@@ -9,7 +9,7 @@ from uwb_tdoa_bias.compiled import compiled
 from . import hypotheses, inertial, noise
 from .memory import (
     AGREEMENT, BEST, FIRST_TDOA, FORCE, GYRO, HYPOTHESES, KEPT, LAST_IMU, LAST_TDOA, MEAN_FORCE,
-    NEXT_ODOMETRY, NEXT_REST, NEXT_TRY, NOW, RECOVERIES, RUNNING, WINDOW,
+    NEXT_ODOMETRY, NEXT_REST, NEXT_TRY, NOW, QUIET, RECOVERIES, RUNNING, WINDOW,
 )  # fmt: skip
 from .robust import gain_terms, kalman, predicted, update_gate, update_innovation, update_m_estimation
 from .startup import INLIER, believable, level, locate, reach, share_of_inliers
@@ -28,6 +28,8 @@ MAX_STEP = 0.05  # s, longest single prediction
 START_TILT_STD = 0.1  # rad
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 REST_PERIOD, REST_STD = 0.05, 0.02  # s between, and m/s of, zero-velocity updates at rest
+REST_SPEED = 0.05  # m/s; a quiet tag stands still if it is known to be slower: it might also glide
+QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
 REACH_STD = 1.0  # m, doubt that a tag beyond reach is there, each time a TDOA says so
 
 
@@ -66,7 +68,8 @@ def _on_imu(m, c, t, gyro, force, tape):
     fresh = inertial.observe(m, t, gyro, force, c.imu_timeout)
     if m.clock[RUNNING]:
         _advance(m, c, t, tape)
-        if c.zero_velocity and fresh and t >= m.clock[NEXT_REST] and inertial.at_rest(m):
+        m.clock[QUIET] = c.zero_velocity and fresh and inertial.quiet(m)
+        if m.clock[QUIET] and t >= m.clock[NEXT_REST]:
             m.clock[NEXT_REST] = t + REST_PERIOD
             _stand_still(m, t, tape)
     m.clock[LAST_IMU] = t
@@ -86,7 +89,7 @@ def _advance(m, c, t, tape):
     if sensed:
         for k in range(3):
             trust[k], error = inertial.trust(m, k, c.vibration_trust, c.vibration_gain)
-            psd[k] = c.accel_noise**2 + 2.0 * inertial.PERSISTENCE * error
+            psd[k] = QUIET_NOISE**2 if m.clock[QUIET] else c.accel_noise**2 + 2.0 * inertial.PERSISTENCE * error
             walk[k] = c.accel_bias_walk**2
     while m.clock[NOW] < t:
         dt = min(t - m.clock[NOW], MAX_STEP)
@@ -171,19 +174,21 @@ def _update(m, c, x, P, innovation, spread, variance):
 
 @compiled
 def _stand_still(m, t, tape):
-    """Zero velocity, one axis after the other, where the filter does not contradict it."""
-    for axis in range(3):
-        for k in range(3):
-            m.g[k] = 1.0 if k == axis else 0.0
-        for h in range(HYPOTHESES):
-            x, P = m.x[h], m.P[h]
-            total = P[3 + axis, 3 + axis] + REST_STD**2
-            innovation = -x[3 + axis]
-            if m.belief[h] == -np.inf or innovation * innovation > 9.0 * total + 0.1:
-                continue
+    """Zero velocity, one axis after the other, for a quiet tag that the TDOAs have shown to be slow."""
+    for h in range(HYPOTHESES):
+        x, P = m.x[h], m.P[h]
+        slow = m.belief[h] > -np.inf
+        for axis in range(3):
+            slow = slow and abs(x[3 + axis]) < REST_SPEED and P[3 + axis, 3 + axis] < REST_SPEED**2
+        if not slow:
+            continue
+        for axis in range(3):
+            innovation, total = -x[3 + axis], P[3 + axis, 3 + axis] + REST_STD**2
             m.K[:] = P[3 + axis]
             kalman(x, P, m.K, innovation, total)
             if h == int(m.clock[BEST]):
+                for k in range(3):
+                    m.g[k] = 1.0 if k == axis else 0.0
                 note_update(tape, m, t, UPDATE, innovation, total, m.g, 3)
 
 

@@ -1,4 +1,4 @@
-"""What the stream of inertial samples says of itself: how much it vibrates, whether the tag rests."""
+"""What the stream of inertial samples says of itself: how much it vibrates, whether the tag is quiet."""
 
 import math
 
@@ -9,9 +9,9 @@ from .state import GRAVITY
 
 CORNER, AVERAGE = 0.05, 0.3  # s: what is faster than the first is vibration; its power is averaged over the second
 PERSISTENCE = 0.2  # s over which that error stays alike
-REST_FORCE, REST_GYRO = 0.05, 0.02  # m/s^2 and rad/s, rms per axis: less is rest; hovering has 0.1 and 0.03, idling motors more
-RESTLESS = 0.01  # rad^2/s^2 that fades before the first rest is believed, about a second after the first sample
-REST_TILT = 0.5  # m/s^2 by which the mean specific force may differ from gravity at rest
+QUIET_FORCE, QUIET_GYRO = 0.05, 0.02  # m/s^2 and rad/s, rms per axis: less is quiet; hovering has 0.1 and 0.03, idling motors more
+RESTLESS = 0.01  # rad^2/s^2 that fades before a tag counts as quiet, about a second after the first sample
+QUIET_TILT = 0.5  # m/s^2 by which the mean specific force may differ from gravity
 
 
 @compiled
@@ -49,11 +49,11 @@ def trust(m, k, plausible, gain):
 
 
 @compiled
-def at_rest(m):
+def quiet(m):
     """True if the last AVERAGE seconds of samples show neither vibration nor rotation nor acceleration."""
     norm = 0.0
     for k in range(3):
         norm += m.imu[MEAN_FORCE, k] ** 2
-        if m.imu[FORCE_POWER, k] > REST_FORCE**2 or m.imu[GYRO_POWER, k] > REST_GYRO**2:
+        if m.imu[FORCE_POWER, k] > QUIET_FORCE**2 or m.imu[GYRO_POWER, k] > QUIET_GYRO**2:
             return False
-    return abs(math.sqrt(norm) - GRAVITY) < REST_TILT
+    return abs(math.sqrt(norm) - GRAVITY) < QUIET_TILT

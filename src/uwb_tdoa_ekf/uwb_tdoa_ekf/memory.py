@@ -11,7 +11,7 @@ WINDOW = 512  # TDOAs kept for a start
 
 # places in Memory.clock
 (NOW, LAST_IMU, FIRST_TDOA, LAST_TDOA, NEXT_TRY, NEXT_ODOMETRY, NEXT_REST, NEXT_MERGE,
- AGREEMENT, RUNNING, RECOVERIES, KEPT, BEST, TAPED) = range(14)  # fmt: skip
+ AGREEMENT, RUNNING, QUIET, RECOVERIES, KEPT, BEST, TAPED) = range(15)  # fmt: skip
 
 # rows of Memory.imu
 GYRO, FORCE, SLOW_FORCE, FORCE_POWER, MEAN_FORCE, SLOW_GYRO, GYRO_POWER = range(7)
@@ -23,7 +23,7 @@ class Memory(NamedTuple):
     x: np.ndarray  # (HYPOTHESES, 16) nominal states, see state.py
     P: np.ndarray  # (HYPOTHESES, 15, 15) error covariances
     belief: np.ndarray  # (HYPOTHESES,) log probability relative to the best; -inf: given up
-    clock: np.ndarray  # stamps, s, and counters
+    clock: np.ndarray  # stamps, s, counters and flags
     imu: np.ndarray  # (7, 3): last sample and running statistics
     window: np.ndarray  # (4, 2 * WINDOW): t, a, b, d of recent TDOAs, oldest first
     noise: np.ndarray  # (2, N): variance of what is received of each anchor, m^2, and stamp of its last change, s
@@ -38,8 +38,8 @@ class Memory(NamedTuple):
 
 def new_memory(anchors):
     """Memory of a filter that has seen nothing; anchors : how many there are."""
-    clock = np.full(14, -np.inf)
-    clock[[AGREEMENT, RUNNING, RECOVERIES, KEPT, BEST, TAPED]] = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    clock = np.full(15, -np.inf)
+    clock[[AGREEMENT, RUNNING, QUIET, RECOVERIES, KEPT, BEST, TAPED]] = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     imu = np.zeros((7, 3))
     imu[[FORCE, SLOW_FORCE, MEAN_FORCE], 2] = GRAVITY
     x = np.zeros((HYPOTHESES, 16))

@@ -221,7 +221,9 @@ def test_a_simulated_flight_without_bias_is_consistent():
     air, and the NIS of 80 % of the flights inside theirs (Bar-Shalom et al., sec. 5.4.2; 19 of 20 are expected, fewer
     than 16 happen once in 400 times to an honest filter)."""
     noise = dict(accel_noise=0.05, gyro_noise=0.003, accel_bias_walk=0.01, gyro_bias_walk=1e-4)
-    told = FilterConfig(robust="gate", gate=1e6, tdoa_std=0.1, tdoa_correlation=1.0, vibration_gain=0.0, **noise)
+    told = FilterConfig(
+        robust="gate", gate=1e6, tdoa_std=0.1, tdoa_correlation=1.0, vibration_gain=0.0, adapt_noise=False, **noise
+    )  # fmt: skip
     errors = ImuErrors(**noise, accel_bias=told.initial_accel_bias_std, gyro_bias=told.initial_gyro_bias_std)
     clean = {**CLEAN, "duration": 25.0, "start_in_air": True, "noise_std": 0.1, "protocol": "tdoa3"}
     nees, nis = [], []
@@ -238,3 +240,22 @@ def test_a_simulated_flight_without_bias_is_consistent():
         f"NIS {np.mean([v.mean() for v in nis]):.3f}, {np.mean(inside):.0%} of the flights inside"
     )
     assert np.mean((nees > low) & (nees < high)) >= 0.9 and np.mean(inside) >= 0.8
+
+
+def test_parameters_on_the_command_line_are_those_of_a_file(bag, tmp_path):
+    file = tmp_path / "filter.yaml"
+    file.write_text("ekf_node: {ros__parameters: {tdoa_std: 0.1, adapt_noise: false}}")
+    one = report([bag, "--config", file, "-p", "loss:=huber"], tmp_path)
+    other = report([bag, "-p", "adapt_noise:=false", "-p", "tdoa_std:=0.1", "-p", "loss:=huber"], tmp_path)
+    assert one["runs"][0] == other["runs"][0] != report([bag], tmp_path)["runs"][0]
+
+
+@pytest.mark.parametrize("text", ["tdoa_std=0.1", "sdt:=0.1", "tdoa_std:=[", "tdoa_std:=much", "adapt_noise:=1", ":=", ""])
+def test_a_bad_parameter_is_told(bag, text, capsys):
+    assert main([str(bag), "-p", text]) == 2
+    assert "error" in capsys.readouterr().err
+
+
+def test_smoothing_is_better(bag, tmp_path):
+    filtered, smoothed = report([bag], tmp_path), report([bag, "--smooth"], tmp_path)
+    assert smoothed["runs"][0]["rmse_3d"] < 0.9 * filtered["runs"][0]["rmse_3d"]

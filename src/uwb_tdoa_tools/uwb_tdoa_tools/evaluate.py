@@ -1,11 +1,13 @@
 """How good is the estimate? Errors against ground truth, of the filter run here or of a recorded odometry."""
 
 import csv
+from dataclasses import fields, replace
 import json
 import math
 from pathlib import Path
 
 from tqdm import tqdm
+import yaml
 
 from uwb_tdoa_bias.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
@@ -13,6 +15,7 @@ from uwb_tdoa_bias.errors import InputError
 from uwb_tdoa_bias.network import Network
 from uwb_tdoa_ekf.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.smoother import smooth
 
 from . import cli, inputs
 from .bag import read_odometry
@@ -27,10 +30,12 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def evaluate(flight, config=None, effects=None, network=None):
-    """Run the filter over a Flight with ground truth. Returns (Score, Run). Raises InputError if there is no truth."""
+def evaluate(flight, config=None, effects=None, network=None, engine=run_offline):
+    """Run the filter over a Flight with ground truth. Returns (Score, Run). Raises InputError if there is no truth.
+
+    engine : run_offline, or smooth, which uses what came after each estimate too."""
     _need_truth(flight)
-    result = run_offline(flight, config, Corrector(flight.anchors, effects, network))
+    result = engine(flight, config, Corrector(flight.anchors, effects, network))
     return Score(flight.name, result.odometry, flight.truth, result.residuals), result
 
 
@@ -44,6 +49,7 @@ def main(argv=None):
         "evaluate 0425-traj2 --survey anchor_0425.txt --plot error.png",
         "evaluate flights/ --survey surveys/ --no-bias --json errors.json",
         "evaluate flight.bag --odometry recorded.bag --tum out/",
+        "evaluate flights/ --survey surveys/ -p adapt_noise:=false -p loss:=huber",
     )
     parser.add_argument("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
@@ -51,6 +57,10 @@ def main(argv=None):
     parser.add_argument("--model", metavar="FILE", help="ONNX bias network to correct with")
     parser.add_argument("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
     parser.add_argument("--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)")
+    parser.add_argument(
+        "-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[], help="one filter parameter, before --config"
+    )
+    parser.add_argument("--smooth", action="store_true", help="smooth: use what came after each estimate too")
     parser.add_argument("--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT")
     parser.add_argument("--namespace", default="", help="of the topics in the bags, e.g. tag1")
     parser.add_argument("--json", metavar="FILE", help="write all figures: runs, pooled")
@@ -65,6 +75,7 @@ def main(argv=None):
 
 def _evaluate(args):
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
+    config = replace(config, **dict(map(_parameter, args.parameters)))
     effects = EffectSet.from_yaml(args.effects) if args.effects and not args.no_bias else None
     network = Network(args.model) if args.model and not args.no_bias else None
     found = inputs.find_flights(args.flights, args.survey)
@@ -80,7 +91,7 @@ def _evaluate(args):
             odometry = read_odometry(args.odometry, namespace=args.namespace)
             score = Score(flight.name, odometry, flight.truth)
         else:
-            score, result = evaluate(flight, config, effects, network)
+            score, result = evaluate(flight, config, effects, network, smooth if args.smooth else run_offline)
             odometry = result.odometry
         scores.append(score)
         tqdm.write(_row(score.row()))
@@ -101,6 +112,18 @@ def _evaluate(args):
         rows = [score.row() for score in scores] + [together] * (len(scores) > 1)
         Path(args.markdown).write_text(_markdown(rows, _others(args.beside) if args.beside else {}))
     return 0
+
+
+def _parameter(text):
+    """(name, value) of "name:=value". Raises InputError."""
+    name, assigned, value = text.partition(":=")
+    names = [field.name for field in fields(FilterConfig)]
+    if not assigned or name not in names:
+        raise InputError(f"-p {text}: write NAME:=VALUE, where NAME is one of {', '.join(names)}.")
+    try:
+        return name, yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise InputError(f"-p {text}: {value!r} is no value.") from None
 
 
 def _need_truth(flight):

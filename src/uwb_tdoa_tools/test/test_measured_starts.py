@@ -1,0 +1,101 @@
+"""Bad starts on measured flights: put 2 m aside, switched on in flight, with a yaw that is 90 degrees wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.flight import Imu, Tdoas
+from uwb_tdoa_ekf.config import FilterConfig
+from uwb_tdoa_ekf.engine import run
+from uwb_tdoa_ekf.memory import new_memory
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.tape import new_tape
+from uwb_tdoa_tools.inputs import load_flights
+from uwb_tdoa_tools.metrics import airborne
+
+FLIGHTS = (
+    "0422-log00", "0425-traj13", "0425-traj2", "0426-traj1", "0426-traj15", "0426-traj9", "tdoa2-obs-log1",
+)  # fmt: skip
+TIMES = (5.0, 15.0)  # s after take-off at which something goes wrong
+AFTER, WINDOW = 3.0, 2.0  # s until it must be over, and over which that is judged
+YAW_TIME = 10.0  # s in the air by which the yaw must be known
+
+
+@pytest.fixture(scope="module")
+def flights(shared_data):
+    paths = [path for name in FLIGHTS for path in (shared_data / "flights").rglob(name)]
+    assert len(paths) == len(FLIGHTS)
+    return list(load_flights(paths, shared_data / "surveys"))
+
+
+def between(stream, low, high):
+    kept = (stream.t >= low) & (stream.t < high)
+    return type(stream)(*(getattr(stream, name)[kept] for name in stream.__dataclass_fields__))
+
+
+def cut(flight, low, high=np.inf):
+    return replace(flight, imu=between(flight.imu, low, high), tdoa=between(flight.tdoa, low, high))
+
+
+def drive(flight, memory):
+    anchors, imu, tdoa = flight.anchors, flight.imu, flight.tdoa
+    n, k = len(imu), len(tdoa)
+    rows, covariance, residuals = np.empty((n + k, 17)), np.empty((n + k, 9, 9)), np.empty((k, 4))
+    count = run(
+        memory, FilterConfig().tuning(), anchors.positions, imu.t, imu.gyro, imu.accel, tdoa.t,
+        anchors.index(tdoa.a), anchors.index(tdoa.b), tdoa.d, np.zeros(k), rows, covariance, residuals, new_tape(),
+    )  # fmt: skip
+    return rows[:count, 0], rows[:count, 1:4]
+
+
+def rms(flight, t, p, low, high):
+    chosen = (t >= low) & (t < high)
+    assert chosen.any()
+    truth = np.stack([np.interp(t[chosen], flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
+    return np.sqrt(np.mean(np.sum((p[chosen] - truth) ** 2, axis=1)))
+
+
+@pytest.mark.slow
+def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(flights):
+    """Within twice the error of the undisturbed filter: its RMSE, or what it is just then, as beside an obstacle."""
+    kinds = ("usual", "2 m off", "in flight")
+    print(f"\n{'flight':16s}{'RMSE':>8s}" + "".join(f"{kind}@{at:.0f}s".rjust(14) for at in TIMES for kind in kinds))
+    for flight in flights:
+        usual = run_offline(flight).odometry
+        first, last = airborne(flight.truth)
+        steady = rms(flight, usual.t, usual.p, first + 3.0, last)
+        cells = []
+        for at in TIMES:
+            memory = new_memory(len(flight.anchors))
+            drive(cut(flight, -np.inf, first + at), memory)
+            memory.x[:, :3] += 2.0 * np.array([2.0, -2.0, 1.0]) / 3.0
+            off = drive(cut(flight, first + at), memory)
+            anew = drive(cut(flight, first + at), new_memory(len(flight.anchors)))
+            judged = first + at + AFTER, first + at + AFTER + WINDOW
+            now, *found = (rms(flight, *path, *judged) for path in ((usual.t, usual.p), off, anew))
+            assert max(found) < 2.0 * max(steady, now), flight.name
+            cells += [now, *found]
+        print(f"{flight.name:16s}{steady:8.3f}" + "".join(f"{error:14.3f}" for error in cells))
+
+
+@pytest.mark.slow
+def test_a_wrong_yaw_is_mended_or_honestly_doubted(flights):
+    print(f"\n{'flight':16s}" + "".join(f"{name:>22s}" for name in ("told +90: error, std", "told -90: error, std")))
+    mended = []
+    for flight in flights:
+        cells = []
+        for wrong in (0.5 * np.pi, -0.5 * np.pi):
+            first, _ = airborne(flight.truth)
+            true = Rotation.from_quat(flight.truth.q[np.searchsorted(flight.truth.t, first)]).as_euler("ZYX")[0]
+            odometry = run_offline(flight, FilterConfig(initial_yaw=true + wrong)).odometry
+            at = np.minimum(np.searchsorted(flight.truth.t, odometry.t), len(flight.truth) - 1)
+            error = (Rotation.from_quat(flight.truth.q[at]).inv() * Rotation.from_quat(odometry.q)).as_rotvec()[:, 2]
+            std = np.sqrt(odometry.covariance[:, 8, 8])
+            assert np.mean(np.abs(error) < 3.0 * std) > 0.95, flight.name
+            k = np.searchsorted(odometry.t, first + YAW_TIME)
+            mended.append(abs(np.degrees(error[k])) < 15.0)
+            cells.append(f"{np.degrees(error[k]):15.0f},{np.degrees(std[k]):6.0f}")
+        print(f"{flight.name:16s}" + "".join(cells))
+    assert np.mean(mended) > 0.8
