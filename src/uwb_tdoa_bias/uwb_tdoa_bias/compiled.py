@@ -17,9 +17,15 @@ def compiled(function):
     before = config.CACHE_DIR
     config.CACHE_DIR = str(_base() / _digest(Path(function.__code__.co_filename).parent))
     try:
-        return njit(cache=True)(function)
+        return njit(error_model="numpy", cache=True)(function)
     finally:
         config.CACHE_DIR = before
+
+
+def inlined(function):
+    """Decorator for a small function that only compiled ones call: it is pasted into them, because handing over a filter's
+    whole memory costs more than what such a function does."""
+    return njit(error_model="numpy", inline="always")(function)
 
 
 def _base():

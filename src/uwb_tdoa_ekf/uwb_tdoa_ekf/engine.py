@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.compiled import compiled
+from uwb_tdoa_bias.compiled import compiled, inlined
 
 from . import hypotheses, inertial, noise
 from .memory import (
@@ -63,7 +63,7 @@ def run(m, c, positions, imu_t, gyro, force, tdoa_t, a, b, d, bias_std, odometry
     return rows
 
 
-@compiled
+@inlined
 def _on_imu(m, c, t, gyro, force, tape):
     fresh = inertial.observe(m, t, gyro, force, c.imu_timeout)
     if m.clock[RUNNING]:
@@ -77,7 +77,7 @@ def _on_imu(m, c, t, gyro, force, tape):
         m.imu[GYRO, k], m.imu[FORCE, k] = gyro[k], force[k]
 
 
-@compiled
+@inlined
 def _advance(m, c, t, tape):
     """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old, without one."""
     if t - m.clock[NOW] > LOST_TIME:
@@ -112,7 +112,7 @@ def _advance(m, c, t, tape):
 
 @compiled
 def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual, tape):
-    first, kept = _remember(m, c, t, a, b, d)
+    _remember(m, t, a, b, d)
     if not m.clock[RUNNING]:
         residual[0] = residual[1] = np.nan
         residual[2], residual[3] = 0.0, STARTUP
@@ -120,9 +120,8 @@ def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual, tape):
             m.clock[FIRST_TDOA] = t
         m.clock[LAST_TDOA] = t
         waited = t - m.clock[FIRST_TDOA]
-        if kept - first >= MINIMUM and waited > 0.9 * c.start_window and t >= m.clock[NEXT_TRY]:
-            m.clock[NEXT_TRY] = t + RETRY
-            _start(m, c, positions, t, first, kept, waited > c.start_patience, tape)
+        if waited > 0.9 * c.start_window and t >= m.clock[NEXT_TRY]:
+            _start(m, c, positions, t, waited > c.start_patience, tape)
         return
     _advance(m, c, t, tape)
     if not m.clock[RUNNING]:
@@ -147,17 +146,16 @@ def _on_tdoa(m, c, positions, t, a, b, d, bias_std, residual, tape):
                 note_update(tape, m, t, UPDATE, innovation, total, m.g, 0)
             if c.adapt_noise:
                 noise.learn(m, t, a, b, innovation, spread, variance, c.tdoa_std, c.noise_memory)
-    _stay_in_reach(m, c, positions, t, tape)
+    _stay_in_reach(m, t, tape)
     hypotheses.choose(m, t)
     agrees = 1.0 if abs(residual[0]) < INLIER else 0.0
     m.clock[AGREEMENT] += min(1.0, (t - m.clock[LAST_TDOA]) / AGREEMENT_TIME) * (agrees - m.clock[AGREEMENT])
     m.clock[LAST_TDOA] = t
-    if c.recover and m.clock[AGREEMENT] < 0.5 and kept - first >= MINIMUM and t >= m.clock[NEXT_TRY]:
-        m.clock[NEXT_TRY] = t + RETRY
-        _recover(m, c, positions, first, kept, tape)
+    if c.recover and m.clock[AGREEMENT] < 0.5 and t >= m.clock[NEXT_TRY]:
+        _recover(m, c, positions, t, tape)
 
 
-@compiled
+@inlined
 def _update(m, c, x, P, innovation, spread, variance):
     """One robust update; K = P g and spread are in m.K and at hand. Returns weight and total variance, m^2."""
     if c.robust == 0:
@@ -192,19 +190,19 @@ def _stand_still(m, t, tape):
                 note_update(tape, m, t, UPDATE, innovation, total, m.g, 3)
 
 
-@compiled
-def _stay_in_reach(m, c, positions, t, tape):
+@inlined
+def _stay_in_reach(m, t, tape):
     """Pull a tag that left the surroundings of its anchors towards them, one axis after the other.
 
     Wrong TDOAs, e.g. late arrivals on a floor, are often explained best by a tag far away."""
-    for axis in range(3):
-        middle, far = reach(positions, axis, c.reach)
-        for h in range(HYPOTHESES):
-            x, P = m.x[h], m.P[h]
-            beyond = abs(x[axis] - middle) - far
-            if m.belief[h] == -np.inf or beyond <= 0.0:
+    for h in range(HYPOTHESES):
+        if m.belief[h] == -np.inf:
+            continue
+        x, P = m.x[h], m.P[h]
+        for axis in range(3):
+            innovation = min(max(x[axis], m.box[0, axis]), m.box[1, axis]) - x[axis]
+            if innovation == 0.0:
                 continue
-            innovation = -beyond if x[axis] > middle else beyond
             total = P[axis, axis] + REACH_STD**2
             m.K[:] = P[axis]
             kalman(x, P, m.K, innovation, total)
@@ -214,32 +212,35 @@ def _stay_in_reach(m, c, positions, t, tape):
                 note_update(tape, m, t, UPDATE, innovation, total, m.g, 0)
 
 
-@compiled
-def _remember(m, c, t, a, b, d):
-    """Append to the window; returns the places of the first TDOA within start_window and of the end."""
+@inlined
+def _remember(m, t, a, b, d):
+    """Append a TDOA to the window."""
     kept = int(m.clock[KEPT])
     if kept == m.window.shape[1]:
         m.window[:, :WINDOW] = m.window[:, WINDOW:].copy()
         kept = WINDOW
     m.window[0, kept], m.window[1, kept], m.window[2, kept], m.window[3, kept] = t, a, b, d
-    kept += 1
-    m.clock[KEPT] = kept
-    first = kept - 1
-    while first > 0 and kept - first < WINDOW and m.window[0, first - 1] > t - c.start_window:
-        first -= 1
-    return first, kept
+    m.clock[KEPT] = kept + 1.0
 
 
 @compiled
-def _window(m, first, kept):
+def _window(m, c):
+    """The TDOAs of the last start_window seconds: t, a, b, d."""
+    kept = int(m.clock[KEPT])
+    first = kept - 1
+    while first > 0 and kept - first < WINDOW and m.window[0, first - 1] > m.window[0, kept - 1] - c.start_window:
+        first -= 1
     w = m.window[:, first:kept]
     return w[0], w[1].astype(np.int64), w[2].astype(np.int64), w[3]
 
 
 @compiled
-def _start(m, c, positions, t, first, kept, anyhow, tape):
+def _start(m, c, positions, t, anyhow, tape):
     """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
-    wt, wa, wb, wd = _window(m, first, kept)
+    wt, wa, wb, wd = _window(m, c)
+    if len(wt) < MINIMUM:
+        return
+    m.clock[NEXT_TRY] = t + RETRY
     found, cov = np.empty(6), np.empty((6, 6))
     share = locate(wt, wa, wb, wd, positions, c.tdoa_std, c.reach, found, cov)
     if not anyhow and (share < AGREE or not believable(positions, c.reach, found)):
@@ -265,6 +266,9 @@ def _start(m, c, positions, t, first, kept, anyhow, tape):
         for k in range(3):
             P[9 + k, 9 + k] = c.initial_accel_bias_std**2
             P[12 + k, 12 + k] = c.initial_gyro_bias_std**2
+    for k in range(3):
+        middle, far = reach(positions, k, c.reach)
+        m.box[0, k], m.box[1, k] = middle - far, middle + far
     m.clock[BEST] = 0.0
     m.clock[NOW] = m.clock[LAST_TDOA] = t
     m.clock[AGREEMENT] = 1.0
@@ -273,9 +277,12 @@ def _start(m, c, positions, t, first, kept, anyhow, tape):
 
 
 @compiled
-def _recover(m, c, positions, first, kept, tape):
+def _recover(m, c, positions, t, tape):
     """If the window agrees on a position that the filter does not believe, go there; attitude and biases stay."""
-    wt, wa, wb, wd = _window(m, first, kept)
+    wt, wa, wb, wd = _window(m, c)
+    if len(wt) < MINIMUM:
+        return
+    m.clock[NEXT_TRY] = t + RETRY
     found, cov = np.empty(6), np.empty((6, 6))
     share = locate(wt, wa, wb, wd, positions, c.tdoa_std, c.reach, found, cov)
     believed = share_of_inliers(wt, wa, wb, wd, positions, m.x[int(m.clock[BEST]), :6])

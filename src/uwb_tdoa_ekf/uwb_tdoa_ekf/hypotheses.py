@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.compiled import compiled
+from uwb_tdoa_bias.compiled import compiled, inlined
 
 from .memory import BEST, HYPOTHESES, NEXT_MERGE
 from .state import difference
@@ -27,13 +27,13 @@ def quarter(h):
     return h * 2.0 * math.pi / HYPOTHESES
 
 
-@compiled
+@inlined
 def blame(m, h, innovation, total):
     """Hypothesis h met an innovation (m) of variance `total` (m^2), errors alike included."""
     m.belief[h] -= 0.5 * (min(innovation * innovation / total, SURPRISE) + math.log(total))
 
 
-@compiled
+@inlined
 def choose(m, t):
     """Follow the most probable hypothesis; give up those that are hopeless, or have become the same as a better one."""
     best = 0

@@ -2,7 +2,7 @@
 
 import math
 
-from uwb_tdoa_bias.compiled import compiled
+from uwb_tdoa_bias.compiled import inlined
 
 from .memory import FORCE, FORCE_POWER, GYRO, GYRO_POWER, LAST_IMU, MEAN_FORCE, SLOW_FORCE, SLOW_GYRO
 from .state import GRAVITY
@@ -14,7 +14,7 @@ RESTLESS = 0.01  # rad^2/s^2 that fades before a tag counts as quiet, about a se
 QUIET_TILT = 0.5  # m/s^2 by which the mean specific force may differ from gravity
 
 
-@compiled
+@inlined
 def observe(m, t, gyro, force, timeout):
     """Take one sample into the statistics; GYRO and FORCE become the mean of the last sample and this one."""
     imu = m.imu
@@ -36,7 +36,7 @@ def observe(m, t, gyro, force, timeout):
     return fresh
 
 
-@compiled
+@inlined
 def trust(m, k, plausible, gain):
     """Share of the measured specific force to believe along body axis k, 0 to 1, and the variance of its error, m^2/s^4.
 
@@ -48,7 +48,7 @@ def trust(m, k, plausible, gain):
     return share, share * doubt
 
 
-@compiled
+@inlined
 def quiet(m):
     """True if the last AVERAGE seconds of samples show neither vibration nor rotation nor acceleration."""
     norm = 0.0

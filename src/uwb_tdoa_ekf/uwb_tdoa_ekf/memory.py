@@ -27,6 +27,7 @@ class Memory(NamedTuple):
     imu: np.ndarray  # (7, 3): last sample and running statistics
     window: np.ndarray  # (4, 2 * WINDOW): t, a, b, d of recent TDOAs, oldest first
     noise: np.ndarray  # (2, N): variance of what is received of each anchor, m^2, and stamp of its last change, s
+    box: np.ndarray  # (2, 3): lower and upper end of where the tag is believed to be, m
     F: np.ndarray  # the rest is scratch
     R: np.ndarray
     E: np.ndarray
@@ -49,4 +50,4 @@ def new_memory(anchors):
     belief[0] = 0.0
     shapes = ((15, 15), (3, 3), (3, 3), (15,), (3,), (15, 3), (16,))
     scratch = (np.zeros(shape) for shape in shapes)
-    return Memory(x, P, belief, clock, imu, np.zeros((4, 2 * WINDOW)), np.zeros((2, anchors)), *scratch)
+    return Memory(x, P, belief, clock, imu, np.zeros((4, 2 * WINDOW)), np.zeros((2, anchors)), np.zeros((2, 3)), *scratch)

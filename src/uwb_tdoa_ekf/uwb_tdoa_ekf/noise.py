@@ -1,17 +1,17 @@
 """How noisy each anchor is, learned from the innovations while flying."""
 
-from uwb_tdoa_bias.compiled import compiled
+from uwb_tdoa_bias.compiled import inlined
 
 WILD = 5.0  # standard deviations that one outlier counts as at most
 
 
-@compiled
+@inlined
 def excess_variance(m, a, b):
     """Variance of a TDOA beyond tdoa_std, m^2: what was learned of its two anchors (rows a, b)."""
     return m.noise[0, a] + m.noise[0, b]
 
 
-@compiled
+@inlined
 def learn(m, t, a, b, innovation, spread, variance, std, memory):
     """Learn from one innovation (m), whose variance is spread + variance, what it has too much, or too little, of.
 

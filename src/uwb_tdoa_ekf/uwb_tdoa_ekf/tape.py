@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.compiled import compiled
+from uwb_tdoa_bias.compiled import inlined
 
 from .memory import BEST, TAPED
 from .state import propagate
@@ -39,7 +39,7 @@ def new_tape(capacity=0):
     return Tape(*(np.zeros(shape) for shape in shapes), np.eye(15))
 
 
-@compiled
+@inlined
 def note_prediction(tape, m):
     """After `predict` of the best hypothesis: note its transition."""
     if len(tape.t):
@@ -47,14 +47,14 @@ def note_prediction(tape, m):
         tape.moved[:, :] = m.F
 
 
-@compiled
+@inlined
 def note_coast(tape, dt):
     """After `coast`: the same."""
     if len(tape.t):
         tape.moved[:3] += dt * tape.moved[3:6]
 
 
-@compiled
+@inlined
 def note_update(tape, m, t, kind, innovation, total, h, place):
     """After an update of the best hypothesis: h (3,) is the Jacobian from element `place` of the error state on, the
     gain is m.K / total. A full tape takes no more."""
