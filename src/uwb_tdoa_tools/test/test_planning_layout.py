@@ -2,63 +2,20 @@ import numpy as np
 import pytest
 from uwb_tdoa_bias.anchors import Anchors
 from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.layout import Goal, Places, one_more, optimise
-from uwb_tdoa_tools.planning.maps import Grid
+from uwb_tdoa_tools.planning.layout import one_more, optimise
 from uwb_tdoa_tools.planning.noise import FixedNoise
+from uwb_tdoa_tools.planning.places import Places, lattice
 from uwb_tdoa_tools.readers import read_survey
 from uwb_tdoa_tools.simulation.constellations import constellation, facing
 
 ROOM = np.array([0.0, 0.0, 0.0]), np.array([6.0, 5.0, 3.0])
-
-
-def test_places_on_walls():
-    places = Places.walls(*ROOM)
-    assert places.numbers == 2
-    p = places.positions(np.random.default_rng(0).random((2000, 2)))
-    on_x, on_y = np.isin(p[:, 0], (0.0, 6.0)), np.isin(p[:, 1], (0.0, 5.0))
-    assert (on_x | on_y).all() and 0.4 < on_y.mean() < 0.7
-    assert (p >= [0, 0, 0.2]).all() and (p <= ROOM[1]).all()
-    np.testing.assert_allclose(np.ptp(p, axis=0), [6, 5, 2.8], atol=0.02)
-
-
-def test_places_of_all_shapes():
-    places = Places([[0, 0, 0, 1, 2, 3], [5, 5, 5, 5, 5, 5], [7, 0, 1, 9, 0, 1]])
-    assert places.numbers == 3
-    p = places.positions(np.random.default_rng(0).random((4000, 3)))
-    block, post, rail = (p[:, 0] <= 1, (p == 5).all(axis=1), (p[:, 0] >= 7) & (p[:, 1] == 0) & (p[:, 2] == 1))
-    assert (block | post | rail).all() and block.any() and rail.any()
-    np.testing.assert_allclose(p[block].max(axis=0), [1, 2, 3], atol=0.05)
-    np.testing.assert_allclose(Places([[5, 5, 5, 5, 5, 5]]).positions(np.array([0.3, 0.9])), [5, 5, 5])
-
-
-def test_nearest_place():
-    places = Places.walls(*ROOM)
-    wanted = np.array([[6.3, 2.0, 1.0], [3.0, -0.5, 2.8], [0.0, 5.0, 0.2]])
-    got = places.positions(places.nearest(wanted))
-    np.testing.assert_allclose(got, [[6, 2, 1], [3, 0, 2.8], [0, 5, 0.2]], atol=0.15)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        "places: []",
-        "places: [[1, 2, 3]]",
-        "walls: 4",
-        "- 1",
-        "places: [[0, 0, 0, 1, 1, -1]]",
-        "a: [",
-        "places: [[0, 0, 0, 1, 1, x]]",
-    ],
-)
-def test_bad_places(content, tmp_path):
-    (tmp_path / "places.yaml").write_text(content)
-    with pytest.raises(InputError, match="places"):
-        Places.from_yaml(tmp_path / "places.yaml")
+MARGIN = np.array([0.8, 0.8, 0.6])  # m of a room that are not flown
 
 
 def goal(installation, criterion="pairings", objective="worst"):
-    return Goal(Grid.box((1, 1, 0.5), (5, 4, 2), 1.5).points, installation, "ring", objective, criterion)
+    return Goal(lattice((1, 1, 0.5), (5, 4, 2), 1.5), installation, "ring", objective, criterion)
 
 
 def bad_anchors():
@@ -111,16 +68,23 @@ def test_no_layout_at_all():
         optimise(aim, Places([[0, 0, 1, 6, 5, 1]]), 5, starts=2)
 
 
+FLIGHTS = (-1.6, -1.6, 0.3), (1.6, 1.6, 2.1)  # what holds all that was flown higher than 0.3 m on 0422, 0425 and 0426
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("where", ["shared flights", "room"])
 @pytest.mark.slow
-def test_the_surveyed_layout_is_beaten_by_a_fifth(shared_data):
-    """8 anchors on the walls of 7 x 8 x 3 m: the worst bound over the flown volume, on a grid the search has not
-    seen."""
+def test_the_surveyed_layout_is_beaten_by_a_fifth(where, seed, shared_data):
+    """8 anchors in 7 x 8 x 3 m: the worst bound over a flown volume, on a grid the search has not seen. On the walls for
+    the volume of the shared flights; on stands up to 0.5 m before them, for all of the room but 0.8 m at the walls and
+    0.6 m at floor and ceiling (on the bare walls hardly a fifth is possible)."""
     survey = read_survey(shared_data / "surveys" / "anchor_0425.txt")
     lower, upper = np.array([-3.05, -4.2, 0.0]), np.array([3.95, 3.8, 3.0])
-    flown = lower + [0.8, 0.8, 0.6], upper - [0.8, 0.8, 0.6]
-    aim = Goal(Grid.box(*flown, 1.2).points, Installation(survey), criterion="round")
-    better = optimise(aim, Places.walls(lower, upper), 8, starts=8, seed=0)
-    fine = Goal(Grid.box(*flown, 0.4).points, Installation(survey), criterion="round")
+    flown, depth = (FLIGHTS, 0.0) if where == "shared flights" else ((lower + MARGIN, upper - MARGIN), 0.5)
+    step = 0.09 * (np.array(flown[1]) - flown[0]).max()
+    aim = Goal(lattice(*flown, step), Installation(survey), criterion="round")
+    better = optimise(aim, Places.walls(lower, upper, depth=depth), 8, starts=8, seed=seed)
+    fine = Goal(lattice(*flown, 0.6 * step), Installation(survey), criterion="round")
     before, after = fine.judge(survey), fine.judge(better)
     assert after["worst"] < 0.8 * before["worst"] and after["mean"] < before["mean"]
     assert after["failing"] <= before["failing"] + 0.02

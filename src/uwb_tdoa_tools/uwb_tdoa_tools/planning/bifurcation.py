@@ -42,7 +42,7 @@ class Subsets:
         candidates = _choices(len(anchors), dimensions + 1)
         corners = anchors.positions[candidates][:, :, :dimensions]
         extents = principal_extents(corners)
-        flat = extents[:, -1] < FLAT_SUBSET * extents[:, 0]
+        flat = extents[:, -1] <= FLAT_SUBSET * extents[:, 0]
         self.rows, self.left_out = candidates[~flat], int(flat.sum())
         if not len(self.rows):
             raise InputError(
@@ -75,6 +75,24 @@ class Subsets:
         """Share of the subsets with two positions: (n,), 0 where every pairing has one."""
         return np.mean(self.discriminant(points) > 0.0, axis=1)
 
+    def slopes(self, points, weights):
+        """Derivatives of the sum of weights (n, Q) times the discriminants along the anchors' positions: (N, 3) 1/m.
+
+        With A q = -D and u_j the direction from anchor j to the tag, d|q|^2 / dm_j = 2 c_j (q - u_j), where c_j is q
+        times the column of j in q = columns @ distances; along a known height, where q has no part, -2 c_j u_j.
+        """
+        away = points[:, None] - self.anchors.positions
+        distances = np.linalg.norm(away, axis=-1)
+        unit = away / np.maximum(distances, 1e-12)[..., None]
+        size, k = len(self.rows), self.dimensions
+        total = np.zeros_like(self.anchors.positions)
+        for chunk in np.array_split(np.arange(len(points)), max(1, len(points) * size * len(total) // _CHUNK)):
+            q = (distances[chunk] @ self._q.reshape(size * k, -1).T).reshape(-1, size, k)
+            share = 2.0 * weights[chunk, :, None] * np.einsum("nqk,qkj->nqj", q, self._q)  # 0 for anchors not in q
+            total[:, :k] += np.einsum("nqj,nqk->jk", share, q)
+            total -= np.einsum("nqj,njk->jk", share, unit[chunk])
+        return total
+
     def mirrors(self, points):
         """The other positions with the same TDOAs: (row of the point (m,), subset (m,), position (m, 3) m).
 
@@ -106,7 +124,7 @@ class Subsets:
             far = np.linalg.norm(mirror - chunk[row], axis=1) > FLIP
             row, mirror = row[far], mirror[far]
             change = _distances(mirror, self.anchors.positions) - _distances(chunk[row], self.anchors.positions)
-            misfit = weigh(change[..., None], variance[at + row], installation)[:, 0, 0]
+            misfit = weigh(change[..., None], variance[at + row], installation.pairing, installation.link_std)[:, 0, 0]
             np.minimum.at(clear, at + row, np.sqrt(misfit))
             at += len(chunk)
         return clear

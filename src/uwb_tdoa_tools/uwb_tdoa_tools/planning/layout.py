@@ -1,213 +1,155 @@
 """Better places and directions for the anchors."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import yaml
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from scipy.special import expit
 from scipy.stats import qmc
 
 from uwb_tdoa_bias.anchors import Anchors
 from uwb_tdoa_bias.errors import InputError
 
 from ..simulation.constellations import facing
-from .bifurcation import CLEAR, Subsets
-from .pairing import PAIRINGS
-from .precision import bound, information, position_error
+from .descent import descend
+from .goal import UNUSABLE
+from .places import Places, spread
 
-OBJECTIVES = ("worst", "mean")
-UNUSABLE = 100.0  # m, what an infinite bound counts for, and a layout from which no position follows
-SHARP = 16  # power of the mean that stands for the worst case where derivatives are needed
-SOFT = 0.05  # of |q|^2 - 1, over which failure sets in where derivatives are needed
+ROUGH = 80  # points that the starts are judged at
+DRAWN = 16  # layouts drawn for every start; the best are taken
+SWEEPS = 40  # steps of one descent
 FINALISTS = 4  # how many of the layouts that the starts led to are refined
-
-
-class Places:
-    """Where anchors may be: boxes, which may be flat (a wall), thin (a rail) or a point.
-
-    Two numbers between 0 and 1 for a place on flat boxes, three where a box has volume: the first runs through all
-    boxes along their longest sides, the others across."""
-
-    def __init__(self, boxes):
-        """boxes : (B, 6) lower x y z and upper x y z of each, m. Raises InputError."""
-        boxes = np.asarray(boxes, dtype=float)
-        if boxes.ndim != 2 or boxes.shape[1] != 6 or not len(boxes) or not np.isfinite(boxes).all():
-            raise InputError("places: give a list of boxes [x0, y0, z0, x1, y1, z1] in metres.")
-        if (boxes[:, 3:] < boxes[:, :3]).any():
-            raise InputError("places: a box ends before it begins; write [x0, y0, z0, x1, y1, z1], each x1 >= x0.")
-        self.lower, self.size = boxes[:, :3], boxes[:, 3:] - boxes[:, :3]
-        self.order = np.argsort(-self.size, axis=1, kind="stable")  # longest side first
-        lengths = np.take_along_axis(self.size, self.order, axis=1)
-        self.numbers = 3 if (lengths[:, 2] > 0.0).any() else 2
-        self.ends = np.cumsum(np.maximum(lengths[:, 0], 1e-3))
-        self.starts = self.ends - np.maximum(lengths[:, 0], 1e-3)
-
-    @classmethod
-    def walls(cls, lower, upper, lowest=0.2):
-        """The four walls of a room from `lowest` m above its floor to its ceiling."""
-        (x0, y0, z0), (x1, y1, z1) = lower, upper
-        z0 = min(z0 + lowest, z1)
-        return cls(
-            [(x0, y0, z0, x1, y0, z1), (x1, y0, z0, x1, y1, z1), (x0, y1, z0, x1, y1, z1), (x0, y0, z0, x0, y1, z1)]
-        )
-
-    @classmethod
-    def from_yaml(cls, path):
-        """Read `places: [[x0, y0, z0, x1, y1, z1], ...]`; raises InputError."""
-        try:
-            return cls(yaml.safe_load(Path(path).read_text())["places"])
-        except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(
-                f"{path}: is no list of places ({error!r}); write 'places: [[x0, y0, z0, x1, y1, z1]]'."
-            ) from error
-
-    def positions(self, numbers):
-        """(..., 3) m of (..., self.numbers) numbers between 0 and 1."""
-        at = np.clip(numbers[..., 0], 0.0, 1.0) * self.ends[-1]
-        box = np.minimum(np.searchsorted(self.ends, at), len(self.ends) - 1)
-        along = (at - self.starts[box]) / (self.ends[box] - self.starts[box])
-        share = np.zeros((*at.shape, 3))
-        for k, value in enumerate([along, *np.moveaxis(numbers[..., 1:], -1, 0)]):
-            np.put_along_axis(share, self.order[box][..., k : k + 1], value[..., None], axis=-1)
-        return self.lower[box] + share * self.size[box]
-
-    def grid(self, count):
-        """Numbers of about `count` places all over: (n, self.numbers)."""
-        side = max(2, round(count ** (0.8 / self.numbers)))
-        along = max(2, count // side ** (self.numbers - 1))
-        axes = [np.linspace(0.0, 1.0, along), *[np.linspace(0.0, 1.0, side)] * (self.numbers - 1)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.numbers)
-
-    def nearest(self, wanted):
-        """Numbers (n, self.numbers), strictly between 0 and 1, of about the places nearest to `wanted` (n, 3), m."""
-        numbers = 0.01 + 0.98 * self.grid(4000)
-        away = np.linalg.norm(self.positions(numbers) - np.asarray(wanted)[:, None], axis=-1)
-        return numbers[np.argmin(away, axis=1)]
-
-
-@dataclass(frozen=True)
-class Goal:
-    """What a layout is judged by.
-
-    points : (n, 3) m, where the tag is to be located; installation : what is not the anchors; pairing : name of
-    PAIRINGS
-    objective : "worst" or "mean" bound over the points; criterion : of maps.FLYABLE, what counts as failure
-    """
-
-    points: np.ndarray
-    installation: object
-    pairing: str = "ring"
-    objective: str = "worst"
-    criterion: str = "pairings"
-
-    def installed(self, anchors):
-        """The Installation with other Anchors. Raises InputError for anchors that locate nothing."""
-        return replace(self.installation, anchors=anchors, pairing=PAIRINGS[self.pairing](len(anchors)))
-
-    def errors(self, anchors):
-        """Bound at the points, without the small second term of eq. 1: (n,) m. Raises InputError for useless
-        anchors."""
-        found = position_error(bound(information(self.points, self.installed(anchors), correction=False)))
-        return np.minimum(found, UNUSABLE)
-
-    def judge(self, anchors):
-        """{"worst", "mean": m, bound over the points; "failing": share of the points that are not flyable}."""
-        errors, installation = self.errors(anchors), self.installed(anchors)
-        subsets = Subsets(anchors, installation.dimensions)
-        if self.criterion == "pairings":
-            unique = subsets.ambiguous(self.points) == 0.0
-        else:
-            unique = subsets.separation(self.points, installation) > CLEAR
-        failing = 1.0 - np.mean(unique & installation.inside_hull(self.points))
-        return {"worst": float(errors.max()), "mean": float(errors.mean()), "failing": float(failing)}
-
-    def score(self, anchors):
-        """What is minimised: the objective, m, twice that where the tag fails at all points."""
-        try:
-            found = self.judge(anchors)
-        except InputError:
-            return 2.0 * UNUSABLE
-        return found[self.objective] * (1.0 + found["failing"])
-
-    def smooth(self, anchors):
-        """A stand-in for the score that has derivatives, m."""
-        try:
-            errors = self.errors(anchors)
-            single = 1.0
-            if self.criterion == "pairings":
-                subsets = Subsets(anchors, self.installation.dimensions)
-                single = float(expit(-subsets.discriminant(self.points) / SOFT).prod(axis=1).mean())
-        except InputError:
-            return 2.0 * UNUSABLE
-        power = SHARP if self.objective == "worst" else 1
-        return UNUSABLE * float(np.mean((errors / UNUSABLE) ** power) ** (1.0 / power)) * (2.0 - single)
+EXCHANGES = 4  # how often the worst points between those looked at are added
+ADDED = 30  # points each time, about
+CLOSE = 1.002  # worst error over the worst looked at, with which none are added
+_ARM = 3.0  # m; to move an anchor so far changes about as much as to turn it by 1 rad
+_STEP = 1e-6  # of x, for derivatives
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What is free and what is not, as a vector of numbers. count : anchors to place; fixed : Anchors that stay, or
-    None;
-    target : (3,) m, what new antennas face, their axis upright, before they are turned."""
+    """What is free and what is not, as a vector x of numbers that matter alike: for each anchor to place those of
+    Places, times their length over an arm, then a rotation vector, rad.
+
+    count : anchors to place; fixed : Anchors that stay, or None; target : (3,) m, what new antennas face, their axis
+    upright, before they are turned."""
 
     places: Places
     count: int
     fixed: Anchors | None
     target: np.ndarray
 
-    def anchors(self, numbers, turns=()):
-        """Anchors of (count * places.numbers,) numbers between 0 and 1 and of rotation vectors, (3 count,) rad or
-        none."""
-        new = facing(self.places.positions(np.reshape(numbers, (self.count, -1))), self.target)
-        q = new.orientations
-        if len(turns):
-            q = (Rotation.from_rotvec(np.reshape(turns, (-1, 3))) * Rotation.from_quat(q)).as_quat()
+    @property
+    def width(self):
+        """Numbers per anchor."""
+        return self.places.numbers + 3
+
+    @property
+    def bounds(self):
+        """(low, high) of every number of x."""
+        return ([(0.0, length / _ARM) for length in self.places.lengths] + [(-np.pi, np.pi)] * 3) * self.count
+
+    def start(self, numbers):
+        """x of place numbers (count, places.numbers), antennas not turned."""
+        placed = np.reshape(numbers, (self.count, -1)) * self.places.lengths / _ARM
+        return np.hstack([placed, np.zeros((self.count, 3))]).ravel()
+
+    def anchors(self, x):
+        """Anchors of x, after the fixed ones."""
+        positions, orientations = self._placed(np.reshape(x, (self.count, self.width)))
         if self.fixed is None:
-            return Anchors(new.ids, new.positions, q)
+            return Anchors(np.arange(self.count), positions, orientations)
         taken = self.fixed.ids
         ids = np.setdiff1d(np.arange(self.count + taken.max() + 1), taken)[: self.count]
         return Anchors(
             np.append(taken, ids),
-            np.vstack([self.fixed.positions, new.positions]),
-            np.vstack([self.fixed.orientations, q]),
+            np.vstack([self.fixed.positions, positions]),
+            np.vstack([self.fixed.orientations, orientations]),
             self.fixed.frame,
         )
 
+    def nudged(self, x):
+        """The fixed anchors, the free ones, and these again after a small step of each of their numbers in turn:
+        positions (F + (1 + width) count, 3) m, orientations likewise, steps (len(x),)."""
+        rows = np.reshape(x, (self.count, self.width))
+        upper = np.reshape(self.bounds, (self.count, self.width, 2))[:, :, 1]
+        steps = np.where(rows > 0.5 * upper, -_STEP, _STEP)  # not over the upper end of a place
+        moved = np.concatenate([rows[None], rows + steps * np.eye(self.width)[:, None]])
+        positions, orientations = self._placed(moved.reshape(-1, self.width))
+        if self.fixed is not None:
+            positions = np.vstack([self.fixed.positions, positions])
+            orientations = np.vstack([self.fixed.orientations, orientations])
+        return positions, orientations, steps.ravel()
 
-def optimise(goal, places, count, fixed=None, start=None, starts=32, seed=0, progress=iter):
+    def free(self, positions):
+        """Of the positions of `nudged`: the free anchors (count, 3) m, and after each step (count, width, 3) m."""
+        moved = positions[-self.count * (1 + self.width) :].reshape(1 + self.width, self.count, 3)
+        return moved[0], moved[1:].swapaxes(0, 1)
+
+    def columns(self):
+        """Which rows of `nudged` make up each layout, first x, then x after the step of each number:
+        (1 + len(x), N)."""
+        fixed = 0 if self.fixed is None else len(self.fixed)
+        chosen = np.tile(np.arange(fixed + self.count), (1 + self.count * self.width, 1))
+        anchor, number = np.divmod(np.arange(self.count * self.width), self.width)
+        chosen[1 + np.arange(len(anchor)), fixed + anchor] = fixed + self.count * (1 + number) + anchor
+        return chosen
+
+    def _placed(self, rows):
+        """Positions (n, 3) m and orientations (n, 4) of rows (n, width)."""
+        new = facing(self.places.positions(rows[:, :-3] * _ARM / self.places.lengths), self.target)
+        return new.positions, (Rotation.from_rotvec(rows[:, -3:]) * Rotation.from_quat(new.orientations)).as_quat()
+
+
+def optimise(goal, places, count, fixed=None, start=None, starts=16, seed=0, progress=iter):
     """Anchors at the `count` best places, turned in the best directions; after those of `fixed`, which stay.
 
-    goal : Goal; places : Places; start : (count, 3) m, a layout to begin with besides the random ones; progress : wraps
-    the starts, e.g. tqdm. L-BFGS-B (scipy.optimize) over the places from `starts` quasi-random layouts, then over
-    places and directions from the best of what they led to; the one with the best score is taken."""
+    goal : Goal; places : Places; start : (count, 3) m, a layout to begin with besides the quasi-random ones;
+    progress : wraps the starts, e.g. tqdm. Descents from all starts at a few of the goal's points; the best of what
+    they lead to descend again, with the points that turn out to be the worst. The best score at all points wins."""
     layout = Layout(places, count, fixed, goal.points.mean(axis=0))
-    size = count * places.numbers
-    bounds = [(0.0, 1.0)] * size + [(-np.pi, np.pi)] * (3 * count)
-
-    def descend(x):
-        found = minimize(
-            lambda x: goal.smooth(layout.anchors(x[:size], x[size:])), x, method="L-BFGS-B", bounds=bounds[: len(x)],
-            options={"maxiter": 40},
-        )  # fmt: skip
-        return min(((goal.score(layout.anchors(y[:size], y[size:])), k, y) for k, y in enumerate((x, found.x))))[::2]
-
-    begin = list(qmc.Sobol(size, seed=seed).random(starts))
+    rows = _some(goal, ROUGH, seed)
+    looked_at = replace(goal, points=goal.points[rows])
+    drawn = qmc.Halton(count * places.numbers, seed=seed).random(DRAWN * starts)
+    begin = [layout.start(numbers) for numbers in drawn]
+    begin = sorted(begin, key=lambda x: looked_at.score(layout.anchors(x)))[:starts]
     if start is not None:
-        begin.append(places.nearest(start).ravel())
-    ends = sorted((descend(x) for x in progress(begin)), key=lambda end: end[0])
-    ends += [descend(np.append(x, np.zeros(3 * count))) for _, x in progress(ends[:FINALISTS])]
-    score, x = min(ends, key=lambda end: end[0])
-    if score >= UNUSABLE:
+        begin.append(layout.start(places.nearest(start)))
+    ends = [descend(goal, layout, looked_at.points, x, SWEEPS) for x in progress(begin)]
+    ends.sort(key=lambda x: goal.score(layout.anchors(x)))
+    ends = [_refined(goal, layout, x, rows) for x in ends[:FINALISTS]]
+    best = min((layout.anchors(x) for x in ends), key=goal.score)
+    if goal.score(best) >= UNUSABLE:
         raise InputError("places: no layout of these anchors locates a tag; allow more places.")
-    return layout.anchors(x[:size], x[size:])
+    return best
 
 
 def one_more(goal, anchors, places, count=400):
     """What one more anchor would give at places all over: (positions (n, 3) m, scores (n,) m), facing the points."""
     layout = Layout(places, 1, anchors, goal.points.mean(axis=0))
     numbers = places.grid(count)
-    return places.positions(numbers), np.array([goal.score(layout.anchors(x)) for x in numbers])
+    return places.positions(numbers), np.array([goal.score(layout.anchors(layout.start(x))) for x in numbers])
+
+
+def _some(goal, count, seed):
+    """Rows of some of the goal's points."""
+    if goal.objective == "worst":
+        return spread(goal.points, count)
+    return np.random.default_rng(seed).permutation(len(goal.points))[:count]
+
+
+def _refined(goal, layout, x, rows):
+    """x after descents at these rows of the goal's points and at those that turn out to be worse; or x itself."""
+    best, score = x, goal.score(layout.anchors(x))
+    for _ in range(EXCHANGES):
+        try:
+            errors = goal.errors(layout.anchors(x))
+        except InputError:  # two anchors have met
+            break
+        if goal.objective == "worst" and errors.max() <= CLOSE * errors[rows].max():
+            break
+        worst = np.argsort(-errors)[: 1 + len(errors) // 20]
+        rows = np.union1d(rows, worst[spread(goal.points[worst], ADDED)])
+        x = descend(goal, layout, goal.points[rows], x, SWEEPS)
+        if (found := goal.score(layout.anchors(x))) < score:
+            best, score = x, found
+    return best

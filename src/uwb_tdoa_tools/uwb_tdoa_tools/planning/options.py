@@ -11,13 +11,14 @@ from .. import cli, inputs
 from ..simulation.antenna import Antenna
 from ..simulation.room import Room, room_of
 from .installation import Installation
-from .layout import OBJECTIVES, Goal, Places
+from .goal import OBJECTIVES, Goal
 from .maps import FLYABLE, Grid
 from .noise import FixedNoise, RadioNoise, antenna_from_yaml
 from .pairing import OF_PROTOCOL, PAIRINGS
+from .places import Places, lattice
 
 ACROSS = {"slice": 100, "volume": 50}  # cells along the longest side, unless --step says otherwise
-SEARCHED = 100  # about so many places of the flown volume are looked at while better anchors are searched
+SEARCHED = 300  # cells of the flown volume whose corners are looked at while better anchors are searched
 
 
 def parser():
@@ -127,12 +128,12 @@ def _add_more(group):
         metavar="FILE",
         help="where anchors may be, YAML, places: [[x0, y0, z0, x1, y1, z1]] (default: the walls)",
     )
-    add("--starts", metavar="N", type=int, default=32, help="layouts to search from (default: %(default)s)")
+    add("--starts", metavar="N", type=int, default=16, help="layouts to search from (default: %(default)s)")
 
 
 @dataclass(frozen=True)
 class Aim:
-    """What --improve asks for. goal : Goal to search with; judge : Goal on a finer grid, to report; places : Places;
+    """What --improve asks for. goal : Goal to search with; judge : Goal at more points, to report; places : Places;
     count : how many anchors."""
 
     goal: Goal
@@ -181,14 +182,12 @@ def aim_of(args, installation, room, height):
         if value < least:
             raise InputError(f"{name}: {value} is too few; give at least {least}.")
     fly = _box("fly", args.fly) if args.fly else Room(*room.flyable)
-    size = (fly.upper - fly.lower)[: installation.dimensions]
-    step = max(0.1, (np.prod(size) / SEARCHED) ** (1.0 / len(size)))
+    lower, upper, k = fly.lower.copy(), fly.upper.copy(), installation.dimensions
+    lower[k:] = upper[k:] = height
+    step = max(0.1, (np.prod((upper - lower)[:k]) / SEARCHED) ** (1.0 / k))
 
     def goal(step):
-        grid = Grid.box(fly.lower, fly.upper, step)
-        if args.planar:
-            grid = Grid.slice((fly.lower[0], fly.upper[0]), (fly.lower[1], fly.upper[1]), height, step)
-        return Goal(grid.points, installation, _pairing(args), args.objective, args.flyable)
+        return Goal(lattice(lower, upper, step), installation, _pairing(args), args.objective, args.flyable)
 
     places = Places.from_yaml(args.places) if args.places else Places.walls(room.lower, room.upper)
     return Aim(goal(step), goal(0.4 * step), places, count)

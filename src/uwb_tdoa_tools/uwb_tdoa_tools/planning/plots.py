@@ -112,7 +112,8 @@ def plot_layouts(charts, path, candidates=None):
             _room(ax, installation, chart.grid, k)
             ax.set_title(f"{title}{ax.get_title()}", fontsize=9)
     if candidates is not None:
-        positions, scores = candidates
+        worst_first = np.argsort(-candidates[1])
+        positions, scores = candidates[0][worst_first], candidates[1][worst_first]
         for row, (i, j) in zip(axes, ((0, 1), (0, 2), (1, 2))):
             dots = row[-1].scatter(positions[:, i], positions[:, j], c=100.0 * scores, cmap="viridis_r", s=14)
             row[-1].set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal")

@@ -28,29 +28,29 @@ def _information(points, installation, correction):
     away = points[:, None, :] - anchors.positions
     unit = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
     variance = installation.noise.variance(points, anchors)
-    total = weigh(unit[..., :k], variance, installation)
+    total = weigh(unit[..., :k], variance, installation.pairing, installation.link_std)
     if correction:
         gradient = variance_gradient(installation.noise, points, anchors, variance, k)
         total += _from_sizes(gradient, variance, installation)
     return total
 
 
-def weigh(ranges, variance, installation):
+def weigh(ranges, variance, pairing, link_std=0.0):
     """Squared size, in standard deviations, of what changes (n, N, k) of the ranges do to the TDOAs of one round.
 
-    variance : (n, N) m^2 of the receptions. Returns (n, k, k), V' F^-1 V with V (n, M, k) the changes of the TDOAs;
-    with the derivatives of the ranges along x, y, z it is the first term of eq. 1.
+    variance : (n, N) m^2 of the receptions; link_std : m, as for Installation. Returns (n, k, k), V' F^-1 V with V
+    (n, M, k) the changes of the TDOAs; with the derivatives of the ranges along x, y, z it is the first term of eq. 1.
 
     For one shared reception per anchor, whichever N - 1 pairs D connect the anchors, D' (D S D')^-1 D is the same
     matrix: W - w w' / sum(w) with W = S^-1, that of N ranges with one unknown offset, the tag's clock. A closed ring,
     whose covariance D S D' is singular, holds the same and nothing more."""
-    pairing, own = installation.pairing, installation.link_std**2
+    own = link_std**2
     if not pairing.shared:
         v = ranges[:, pairing.b] - ranges[:, pairing.a]
         weight = pairing.times / (variance[:, pairing.a] + variance[:, pairing.b] + own)
         return _product(v, weight[..., None] * v)
     if own > 0.0:
-        return _product(ranges, _inverse(variance, installation) @ ranges)
+        return _product(ranges, _inverse(variance, pairing, link_std) @ ranges)
     w = 1.0 / variance[..., None]
     centred = ranges - (w * ranges).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True)
     return _product(centred, w * centred)
@@ -67,17 +67,17 @@ def _from_sizes(gradient, variance, installation):
         g = (gradient[:, pairing.a] + gradient[:, pairing.b]) * weight[..., None]
         return 0.5 * pairing.times * _product(g, g)
     if own > 0.0:
-        return 0.5 * _product(gradient, _inverse(variance, installation) ** 2 @ gradient)
+        return 0.5 * _product(gradient, _inverse(variance, pairing, installation.link_std) ** 2 @ gradient)
     w = 1.0 / variance[..., None]
     total, g = w.sum(axis=1, keepdims=True), w * gradient
     mean = (w * g).sum(axis=1, keepdims=True) / total
     return 0.5 * (_product(g, (1.0 - 2.0 * w / total) * g) + _product(mean, mean))
 
 
-def _inverse(variance, installation):
+def _inverse(variance, pairing, link_std):
     """D' F^-1 D: (n, N, N)."""
-    d = installation.pairing.incidence()
-    return d.T @ np.linalg.inv(installation.pairing.covariance(variance, installation.link_std)) @ d
+    d = pairing.incidence()
+    return d.T @ np.linalg.inv(pairing.covariance(variance, link_std)) @ d
 
 
 def _product(left, right):

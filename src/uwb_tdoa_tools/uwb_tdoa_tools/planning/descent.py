@@ -1,0 +1,135 @@
+"""Downhill to better anchors: the bound, its derivatives along what moves the anchors, and a descent along them."""
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import ConvexHull, QhullError
+from scipy.special import expit
+
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.errors import InputError
+
+from .bifurcation import Subsets
+from .goal import UNUSABLE
+from .pairing import PAIRINGS
+from .precision import bound, position_error, weigh
+
+SOFT = 0.05  # of |q|^2 - 1, over which failure sets in where derivatives are needed
+EDGE = 0.05  # m over which the hull ends, likewise
+CLOSE = 1e-4  # of the objective: a step that gains less is the last
+_CHUNK = 1_000_000  # numbers in the largest array of one step
+
+
+def errors_and_slopes(goal, layout, x, points):
+    """The bound at points (n, 3): (n,) m, and its derivatives along x: (n, len(x)).
+
+    Only one column of the ranges and of the variances changes with one number of x, so each is computed once, and the
+    information of all changed layouts in one batch. d sqrt(tr J^-1) = -tr(J^-2 dJ) / (2 sqrt(tr J^-1)).
+    """
+    installation, k = goal.installation, goal.installation.dimensions
+    positions, orientations, steps = layout.nudged(x)
+    every = Anchors(np.arange(len(positions)), positions, orientations)
+    variance = installation.noise.variance(points, every)
+    away = points[:, None] - positions
+    unit = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
+    chosen = layout.columns()
+    pairing = PAIRINGS[goal.pairing](chosen.shape[1])
+    information = np.concatenate(
+        [
+            weigh(
+                unit[rows][:, chosen, :k].reshape(-1, chosen.shape[1], k),
+                variance[rows][:, chosen].reshape(-1, chosen.shape[1]),
+                pairing,
+                installation.link_std,
+            )
+            for rows in np.array_split(np.arange(len(points)), max(1, len(points) * chosen.size * k // _CHUNK))
+        ]
+    ).reshape(len(points), -1, k, k)
+    covariance = bound(information[:, 0])
+    errors = position_error(covariance)
+    lost = ~(errors < UNUSABLE)
+    covariance[lost], errors[lost] = 0.0, UNUSABLE
+    change = (information[:, 1:] - information[:, :1]) / steps[:, None, None]
+    slopes = -0.5 * np.einsum("nij,nvji->nv", covariance @ covariance, change) / errors[:, None]
+    return errors, slopes
+
+
+def failing_and_slopes(goal, layout, x, points):
+    """A smooth stand-in for the share of points (n, 3) that are not flyable, and its derivatives along x: (len(x),).
+
+    Outside of the anchors' hull or, for the criterion "pairings", where one of them has two solutions."""
+    try:
+        anchors = layout.anchors(x)
+        good, along = _inside(anchors.positions, points, goal.installation.dimensions)
+        if goal.criterion == "pairings":
+            subsets = Subsets(anchors, goal.installation.dimensions)
+            excess = subsets.discriminant(points) / SOFT
+            single = expit(-excess).prod(axis=1)
+            along = along * single[:, None, None]
+            weights = (good * single)[:, None] * expit(excess) / SOFT
+            good, more = good * single, -subsets.slopes(points, weights)
+        else:
+            more = 0.0
+    except (InputError, QhullError):
+        return 1.0, np.zeros(len(x))
+    along = -(along.sum(axis=0) + more) / len(points)
+    positions, _, steps = layout.nudged(x)
+    here, moved = layout.free(positions)
+    return 1.0 - good.mean(), np.einsum("imk,ik->im", moved - here[:, None], along[-len(here) :]).ravel() / steps
+
+
+def _inside(positions, points, k):
+    """How far inside the hull points (n, 3) are, softly 0 ... 1: (n,), and its derivatives along the anchors' positions
+    (N, 3): (n, N, 3) 1/m.
+
+    With the distance h beyond the facet that is exceeded most, and l_j the barycentric coordinates on it of the point's
+    foot, moving its corner j by dm moves the facet there by l_j dm: dh = -l_j normal . dm."""
+    hull = ConvexHull(positions[:, :k])
+    beyond = points[:, :k] @ hull.equations[:, :k].T + hull.equations[:, k]
+    facet = np.argmax(beyond, axis=1)
+    h, normal = beyond[np.arange(len(points)), facet], hull.equations[facet, :k]
+    corners = hull.simplices[facet]
+    foot = points[:, :k] - h[:, None] * normal
+    spanned = np.concatenate([positions[corners][:, :, :k], np.ones((*corners.shape, 1))], axis=2).swapaxes(1, 2)
+    share = np.einsum("nij,nj->ni", np.linalg.pinv(spanned), np.hstack([foot, np.ones((len(foot), 1))]))
+    inside = expit(-h / EDGE)
+    along = np.zeros((len(points), len(positions), 3))
+    slope = (inside * (1.0 - inside) / EDGE)[:, None, None] * share[:, :, None] * normal[:, None]
+    along[np.arange(len(points))[:, None], corners, :k] = slope
+    return inside, along
+
+
+def descend(goal, layout, points, x, sweeps):
+    """x after at most `sweeps` steps of SLSQP (scipy.optimize) towards the goal at points (n, 3).
+
+    The worst case is not smooth, but the smallest s that no point's log error exceeds is, with a constraint per point.
+    """
+    size, seen = len(x), {}
+
+    def at(x):
+        x = np.clip(np.nan_to_num(x), *np.transpose(layout.bounds))  # SLSQP has been seen to ask for NaN
+        if (key := x.tobytes()) not in seen:
+            seen.clear()
+            errors, slopes = errors_and_slopes(goal, layout, x, points)
+            seen[key] = errors, slopes, *failing_and_slopes(goal, layout, x, points)
+        return seen[key]
+
+    def worst(z):
+        _, _, failing, slopes = at(z[:size])
+        return z[size] + np.log1p(failing), np.append(slopes / (1.0 + failing), 1.0)
+
+    def mean(x):
+        errors, slopes, failing, more = at(x)
+        return np.log(errors.mean() * (1.0 + failing)), slopes.mean(axis=0) / errors.mean() + more / (1.0 + failing)
+
+    options = {"method": "SLSQP", "jac": True, "options": {"maxiter": sweeps, "ftol": CLOSE}}
+    if goal.objective == "mean":
+        found = minimize(mean, x, bounds=layout.bounds, **options)
+    else:
+        below = {
+            "type": "ineq",
+            "fun": lambda z: z[size] - np.log(at(z[:size])[0]),
+            "jac": lambda z: np.column_stack([-at(z[:size])[1] / at(z[:size])[0][:, None], np.ones(len(points))]),
+        }
+        z = np.append(x, np.log(at(x)[0].max()))
+        found = minimize(worst, z, bounds=[*layout.bounds, (None, None)], constraints=[below], **options)
+    return np.clip(found.x[:size], *np.transpose(layout.bounds)) if np.isfinite(found.x).all() else x

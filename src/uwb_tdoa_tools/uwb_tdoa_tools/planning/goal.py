@@ -1,0 +1,59 @@
+"""What a layout of anchors is judged by."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwb_tdoa_bias.errors import InputError
+
+from .bifurcation import CLEAR, Subsets
+from .pairing import PAIRINGS
+from .precision import bound, information, position_error
+
+OBJECTIVES = ("worst", "mean")
+UNUSABLE = 100.0  # m, what an infinite bound counts for, and a layout from which no position follows
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a layout is judged by.
+
+    points : (n, 3) m, where the tag is to be located; installation : what is not the anchors; pairing : name of
+    PAIRINGS
+    objective : "worst" or "mean" bound over the points; criterion : of maps.FLYABLE, what counts as failure
+    """
+
+    points: np.ndarray
+    installation: object
+    pairing: str = "ring"
+    objective: str = "worst"
+    criterion: str = "pairings"
+
+    def installed(self, anchors):
+        """The Installation with other Anchors. Raises InputError for anchors that locate nothing."""
+        return replace(self.installation, anchors=anchors, pairing=PAIRINGS[self.pairing](len(anchors)))
+
+    def errors(self, anchors):
+        """Bound at the points, without the small second term of eq. 1: (n,) m. Raises InputError for useless
+        anchors."""
+        found = position_error(bound(information(self.points, self.installed(anchors), correction=False)))
+        return np.minimum(found, UNUSABLE)
+
+    def judge(self, anchors):
+        """{"worst", "mean": m, bound over the points; "failing": share of the points that are not flyable}."""
+        errors, installation = self.errors(anchors), self.installed(anchors)
+        subsets = Subsets(anchors, installation.dimensions)
+        if self.criterion == "pairings":
+            unique = subsets.ambiguous(self.points) == 0.0
+        else:
+            unique = subsets.separation(self.points, installation) > CLEAR
+        failing = 1.0 - np.mean(unique & installation.inside_hull(self.points))
+        return {"worst": float(errors.max()), "mean": float(errors.mean()), "failing": float(failing)}
+
+    def score(self, anchors):
+        """What is minimised: the objective, m, twice that where the tag fails at all points."""
+        try:
+            found = self.judge(anchors)
+        except InputError:
+            return 2.0 * UNUSABLE
+        return found[self.objective] * (1.0 + found["failing"])
