@@ -15,6 +15,7 @@ setup(
     python_requires=">=3.10",
     install_requires=[
         "setuptools",
+        "joblib>=1.3",
         "matplotlib>=3.6",
         "numba>=0.57",
         "numpy>=1.26",
@@ -25,6 +26,7 @@ setup(
         "uwb_tdoa_bias",
         "uwb_tdoa_ekf",
     ],
+    extras_require={"dask": ["distributed>=2024.1"]},  # for --dask
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+import pickle
 
 import numpy as np
 import pytest
@@ -119,3 +120,10 @@ def test_missing_file_and_no_model(tmp_path):
     text.write_text("I am no model")
     with pytest.raises(InputError, match="cannot be loaded as ONNX"):
         Network(text)
+
+
+def test_a_pickled_network_says_the_same():
+    network = Network(SHIPPED)
+    again = pickle.loads(pickle.dumps(network))
+    for one, other in zip(network.predict(batch()), again.predict(batch())):
+        np.testing.assert_array_equal(one, other)

@@ -24,6 +24,7 @@ class Network:
 
     def __init__(self, path):
         """Load `path`; raises InputError if it is no model or its metadata do not fit."""
+        self._path = Path(path).absolute()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
@@ -53,6 +54,10 @@ class Network:
                 f"{len(self._offset)} offsets and {len(self._scale)} scales; they must agree, and no scale may be 0."
             )
         self._input = entry.name
+
+    def __reduce__(self):
+        """Pickled as the path of its file: a session cannot be."""
+        return Network, (self._path,)
 
     def predict(self, samples):
         """Bias and its standard deviation, two (n,) arrays in metres; NaN where a feature it needs is unknown."""

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import fields, replace
+from functools import partial
 import json
 import math
 from pathlib import Path
@@ -17,7 +18,7 @@ from uwb_tdoa_ekf.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
-from . import cli, inputs
+from . import cli, inputs, parallel
 from .bag import read_odometry
 from .metrics import Score, pooled
 from .plots import plot_error
@@ -50,6 +51,7 @@ def main(argv=None):
         "evaluate flights/ --survey surveys/ --no-bias --json errors.json",
         "evaluate flight.bag --odometry recorded.bag --tum out/",
         "evaluate flights/ --survey surveys/ -p adapt_noise:=false -p loss:=huber",
+        "evaluate flights/ --survey surveys/ --dask tcp://10.0.0.1:8786",
     )
     parser.add_argument("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
@@ -70,6 +72,7 @@ def main(argv=None):
     )
     parser.add_argument("--plot", metavar="FILE", help="picture of the errors over time (one FLIGHT)")
     parser.add_argument("--tum", metavar="DIR", help="write estimates and truths as TUM trajectories, e.g. for evo")
+    parallel.add_options(parser)
     return cli.run(_evaluate, parser, argv)
 
 
@@ -78,28 +81,18 @@ def _evaluate(args):
     config = replace(config, **dict(map(_parameter, args.parameters)))
     effects = EffectSet.from_yaml(args.effects) if args.effects and not args.no_bias else None
     network = Network(args.model) if args.model and not args.no_bias else None
-    found = inputs.find_flights(args.flights, args.survey)
+    found = inputs.find_flights(args.flights, args.survey, absolute=bool(args.dask))
     for option in ("odometry", "plot"):
         if getattr(args, option) and len(found) != 1:
             raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
+    if args.tum:
+        args.tum = Path(args.tum).absolute()
     scores = []
     print(_line("flight", COLUMNS.values()))
-    for path, survey in tqdm(found, unit="flight", disable=None, leave=False):
-        flight = read_flight(path, survey, args.namespace)
-        _need_truth(flight)
-        if args.odometry:
-            odometry = read_odometry(args.odometry, namespace=args.namespace)
-            score = Score(flight.name, odometry, flight.truth)
-        else:
-            score, result = evaluate(flight, config, effects, network, smooth if args.smooth else run_offline)
-            odometry = result.odometry
+    judge = partial(_judge, args=args, config=config, effects=effects, network=network)
+    for score in parallel.over(judge, found, args.jobs, args.dask):
         scores.append(score)
         tqdm.write(_row(score.row()))
-        if args.plot:
-            plot_error(score, odometry, flight.truth, args.plot)
-        if args.tum:
-            write_tum(Path(args.tum) / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
-            write_tum(Path(args.tum) / f"{flight.name}_truth.tum", flight.truth.t, flight.truth.p, flight.truth.q)
     together = pooled(scores)
     if len(scores) > 1:
         print(_row(together))
@@ -124,6 +117,24 @@ def _parameter(text):
         return name, yaml.safe_load(value)
     except yaml.YAMLError:
         raise InputError(f"-p {text}: {value!r} is no value.") from None
+
+
+def _judge(recording, args, config, effects, network):
+    """Score of one (path, survey), after writing its picture and trajectories."""
+    flight = read_flight(*recording, args.namespace)
+    _need_truth(flight)
+    if args.odometry:
+        odometry = read_odometry(args.odometry, namespace=args.namespace)
+        score = Score(flight.name, odometry, flight.truth)
+    else:
+        score, result = evaluate(flight, config, effects, network, smooth if args.smooth else run_offline)
+        odometry = result.odometry
+    if args.plot:
+        plot_error(score, odometry, flight.truth, args.plot)
+    if args.tum:
+        write_tum(args.tum / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
+        write_tum(args.tum / f"{flight.name}_truth.tum", flight.truth.t, flight.truth.p, flight.truth.q)
+    return score
 
 
 def _need_truth(flight):

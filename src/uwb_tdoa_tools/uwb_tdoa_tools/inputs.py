@@ -13,8 +13,11 @@ SURVEY_HELP = (
 )
 
 
-def find_flights(paths, survey=None):
-    """Pairs (recording, survey or None), sorted within each folder. Raises InputError where nothing, or no one survey, fits."""
+def find_flights(paths, survey=None, absolute=False):
+    """Pairs (recording, survey or None), sorted within each folder. Raises InputError where nothing, or no one survey, fits.
+
+    absolute : make them absolute paths, for processes that may have another working directory.
+    """
     found = []
     for path in map(Path, paths):
         if not path.exists():
@@ -23,7 +26,10 @@ def find_flights(paths, survey=None):
         if not inside:
             raise InputError(f"{path}: holds no recording; expected logs, CSV files or bags.")
         found += inside
-    return [(path, None if _is_bag(path) else survey_for(path, survey)) for path in found]
+    pairs = [(path, None if _is_bag(path) else survey_for(path, survey)) for path in found]
+    if absolute:
+        pairs = [(path.absolute(), its_survey and Path(its_survey).absolute()) for path, its_survey in pairs]
+    return pairs
 
 
 def survey_for(path, survey):

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.errors import InputError
 
-from . import cli, inputs
+from . import cli, inputs, parallel
 from .planning import accuracy, layout, messages, options, plots, report
 from .planning.check import brute_force
 from .planning.maps import Grid, chart
@@ -30,7 +30,7 @@ def _plan(args):
     grid = options.grid_of(args, room)
     if args.flights and args.planar:
         raise InputError("flights: are judged in three dimensions; leave out --planar.")
-    recordings = inputs.find_flights(args.flights, args.anchors) if args.flights else []
+    recordings = inputs.find_flights(args.flights, args.anchors, bool(args.dask)) if args.flights else []
     aim = options.aim_of(args, installation, room, grid.axes[2][0]) if args.improve else None
 
     if not np.isfinite(anchors.orientations).all():
@@ -69,16 +69,21 @@ def _check(args, installation, grid):
 
 def _flights(args, installation, room, recordings):
     samples, rows = [], []
-    for path, survey in _watched(recordings, unit="flight"):
-        flight = read_flight(path, survey)
-        samples.append(accuracy.fly(flight))
-        rows.append({"flight": flight.name, **accuracy.comparison(samples[-1], installation)})
+    for name, flown in parallel.over(_fly, recordings, args.jobs, args.dask):
+        samples.append(flown)
+        rows.append({"flight": name, **accuracy.comparison(flown, installation)})
     pooled = accuracy.together(samples)
     rows.append({"flight": f"{len(samples)} pooled", **accuracy.comparison(pooled, installation)})
     report.say_flights(rows)
     found = accuracy.accuracy_map(pooled, installation, Grid.box(room.lower, room.upper, args.step or 0.4))
     plots.plot_accuracy(installation, found, args.out / "accuracy.png")
     return rows
+
+
+def _fly(recording):
+    """(name, Samples) of one (path, survey)."""
+    flight = read_flight(*recording)
+    return flight.name, accuracy.fly(flight)
 
 
 def _improve(args, before, aim):

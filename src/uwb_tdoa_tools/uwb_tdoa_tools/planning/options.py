@@ -7,7 +7,7 @@ import numpy as np
 
 from uwb_tdoa_bias.errors import InputError
 
-from .. import cli, inputs
+from .. import cli, inputs, parallel
 from ..simulation.antenna import Antenna
 from ..simulation.room import Room, room_of
 from .installation import Installation
@@ -113,6 +113,7 @@ def _add_more(group):
     add = group.add_argument
     add("--check", action="store_true", help="compare the failure map with a solver started from many places")
     add("--flights", metavar="FLIGHT", nargs="+", help=f"measured accuracy beside the bound; {inputs.HELP}")
+    parallel.add_options(group)
     add("--improve", choices=("move", "add"), help="better places: move all anchors, or add one")
     add("--count", metavar="N", type=int, help="with --improve move: how many anchors (default: as there are)")
     add("--objective", choices=OBJECTIVES, default="worst", help="what to improve where it flies (default: worst)")

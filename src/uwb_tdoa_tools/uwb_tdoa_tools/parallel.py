@@ -1,0 +1,108 @@
+"""One function over many flights, on every core of this machine or on a Dask cluster that is already there.
+
+    parallel.add_options(parser)                                         # --jobs, --dask
+    for row in parallel.over(judge, found, args.jobs, args.dask):        # in the order of `found`
+"""
+
+import argparse
+import signal
+import warnings
+from contextlib import contextmanager
+
+from joblib import Parallel, cpu_count, delayed, parallel_config
+from tqdm import tqdm
+
+from uwb_tdoa_bias.errors import InputError
+
+CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
+
+
+def add_options(parser):
+    """Add --jobs N and --dask ADDRESS to a tool that runs over many flights."""
+    add = parser.add_mutually_exclusive_group().add_argument
+    add("--jobs", metavar="N", type=_count, help="flights at once (default: as many as there are cores)")
+    add(
+        "--dask", metavar="ADDRESS",
+        help="run on the Dask cluster whose scheduler is there, e.g. tcp://10.0.0.1:8786; its workers need these packages, "
+        "and the recordings at the same paths",
+    )  # fmt: skip
+
+
+def over(function, items, jobs=None, dask=None, unit="flight"):
+    """Generator of function(item) for every item, in order, with a progress bar on a terminal.
+
+    To be called in the main thread. function, items, results : what pickle takes; jobs : processes, default one per core; dask : address of a scheduler.
+    The first item runs in this process, so that what has to be compiled is compiled once, and is in numba's cache when
+    the others start. What the function raises is raised here. Raises InputError where there is no Dask.
+    """
+    items = list(items)
+    with tqdm(total=len(items), unit=unit, disable=None, leave=False) as progress:
+        for result in _results(function, items, jobs, dask):
+            progress.update()
+            yield result
+
+
+def _results(function, items, jobs, dask):
+    with _cluster(dask) as backend:
+        yield from map(function, items[:1])
+        rest = items[1:]
+        if not rest:
+            return
+        with parallel_config(**backend):  # not around the loop: the caller's own use of joblib is its own affair
+            pool = Parallel(n_jobs=min(jobs or cpu_count(), len(rest)), return_as="generator")
+        with _children_ignore_interrupts():
+            outcomes = pool(delayed(_attempt)(function, item) for item in rest)  # starts the processes
+        try:
+            for result, error in outcomes:
+                if error is not None:
+                    raise error
+                yield result
+        finally:
+            with warnings.catch_warnings():  # of what is not done and nobody wants any more
+                warnings.simplefilter("ignore")
+                outcomes.close()
+
+
+def _attempt(function, item):
+    """(result, None), or (None, what cli tells in one sentence): else joblib would raise it before earlier results."""
+    try:
+        return function(item), None
+    except (InputError, OSError) as error:
+        return None, error
+
+
+@contextmanager
+def _children_ignore_interrupts():
+    """What is started in the block does not hear Ctrl-C: this process does, and ends them without their tracebacks."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited; a mask would not do: joblib clears it
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _cluster(address):
+    """Arguments for parallel_config while the block lasts: none for this machine."""
+    if address is None:
+        yield {}
+        return
+    try:
+        from dask.distributed import Client
+        from distributed.comm import get_address_host_port
+    except ImportError as error:
+        raise InputError("--dask: needs dask.distributed, which is not installed; pip install distributed.") from error
+    try:
+        get_address_host_port(address)  # raises ValueError; Client would too, but not end well
+        client = Client(address, timeout=CONNECT_LIMIT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"--dask: no scheduler answers at {address} ({reason}); start one, or correct this.") from error
+    with client:
+        yield {"backend": "dask", "client": client}
+
+
+def _count(text):
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text)
