@@ -8,10 +8,13 @@ from uwb_tdoa_bias.flyable import FlyableVolume
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 3]], ids=[3, 1, 7, 5])
 CELLS = np.random.default_rng(0).random((5, 4, 3)) < 0.5
+BOUND = np.where(CELLS, np.arange(60.0).reshape(5, 4, 3), np.inf)
 
 
 def volume(**changes):
-    fields = {"lower": [-1.0, 0.0, 0.5], "step": [0.5, 0.5, 0.25], "flyable": CELLS}
+    fields = {"lower": [-1.0, 0.0, 0.5], "step": [0.5, 0.5, 0.25], "flyable": CELLS, "bound": BOUND}
+    if "flyable" in changes:
+        fields["bound"] = np.ones(changes["flyable"].shape)
     return FlyableVolume(**{**fields, "ids": ANCHORS.ids, "positions": ANCHORS.positions, **changes})
 
 
@@ -20,11 +23,17 @@ def test_contains_looks_into_the_right_cell(p):
     inside = -1.0 <= p[0] < 1.5 and 0.0 <= p[1] < 2.0 and 0.5 <= p[2] < 1.25
     wanted = inside and CELLS[int((p[0] + 1.0) // 0.5), int(p[1] // 0.5), int((p[2] - 0.5) // 0.25)]
     assert volume().contains(p) == wanted
+    assert np.isfinite(volume().bound_at(p)) == wanted and np.isnan(volume().bound_at(p)) == (not inside)
 
 
 def test_contains_takes_many_and_nothing_strange():
     p = np.array([[[-0.75, 0.25, 0.6], [np.nan, 0.25, 0.6]], [[np.inf, 0.25, 0.6], [1e300, -1e300, 0.6]]])
     assert volume(flyable=np.ones((5, 4, 3), bool)).contains(p).tolist() == [[True, False], [False, False]]
+
+
+def test_the_bound_is_that_of_the_cell():
+    p = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in (5, 4, 3)], indexing="ij"), axis=-1) * [0.5, 0.5, 0.25]
+    np.testing.assert_array_equal(volume().bound_at(p + [-1.0, 0.0, 0.5]), BOUND)
 
 
 def test_a_planar_one_asks_for_no_height():
@@ -38,7 +47,7 @@ def test_a_saved_one_comes_back(tmp_path):
     volume(frame="hall", planar=False).save(file)
     back = FlyableVolume.load(file)
     assert (back.frame, back.planar) == ("hall", False)
-    for name in ("lower", "step", "flyable", "ids", "positions"):
+    for name in ("lower", "step", "flyable", "bound", "ids", "positions"):
         np.testing.assert_array_equal(getattr(back, name), getattr(volume(), name))
 
 
@@ -62,5 +71,6 @@ def test_other_files_are_refused(tmp_path):
     np.savez(tmp_path / "other.npz", lower=np.zeros(3))
     with pytest.raises(InputError, match="is no flyable volume"):
         FlyableVolume.load(tmp_path / "other.npz")
-    with pytest.raises(InputError, match="do not fit together"):
-        volume(step=[0.1, 0.1])
+    for wrong in ({"step": [0.1, 0.1]}, {"bound": np.ones((5, 4, 2))}):
+        with pytest.raises(InputError, match="do not fit together"):
+            volume(**wrong)

@@ -9,7 +9,7 @@ import numpy as np
 
 from .errors import InputError
 
-_FIELDS = ("frame", "lower", "step", "flyable", "ids", "positions", "planar")
+_FIELDS = ("frame", "lower", "step", "flyable", "bound", "ids", "positions", "planar")
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,8 @@ class FlyableVolume:
     ----------
     lower : (3,) corner of the first cell, m; step : (3,) size of a cell, m
     flyable : (nx, ny, nz) bool
+    bound : (nx, ny, nz) m, the smallest error that one round of TDOAs allows: root of the summed variances along x, y
+        and, unless planar, z; inf where there is none
     ids, positions : (N,) and (N, 3) m, the anchors
     frame : name of the world frame
     planar : the tag's height is known and does not matter here; nz is 1
@@ -28,29 +30,41 @@ class FlyableVolume:
     lower: np.ndarray
     step: np.ndarray
     flyable: np.ndarray
+    bound: np.ndarray
     ids: np.ndarray
     positions: np.ndarray
     frame: str = "map"
     planar: bool = False
 
     def __post_init__(self):
-        for name, kind in (("lower", float), ("step", float), ("flyable", bool), ("ids", int), ("positions", float)):
+        kinds = {"lower": float, "step": float, "flyable": bool, "bound": np.float32, "ids": int, "positions": float}
+        for name, kind in kinds.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
         shapes = (self.lower.shape, self.step.shape, self.flyable.ndim, self.positions.shape)
-        if shapes != ((3,), (3,), 3, (len(self.ids), 3)) or not (self.step > 0.0).all():
-            raise InputError("flyable volume: lower, step, flyable, ids and positions do not fit together.")
+        fits = shapes == ((3,), (3,), 3, (len(self.ids), 3)) and self.bound.shape == self.flyable.shape
+        if not (fits and (self.step > 0.0).all()):
+            raise InputError("flyable volume: lower, step, flyable, bound, ids and positions do not fit together.")
 
     def contains(self, p):
         """Whether positions p (..., 3), m, are flyable: (...) bool. Nothing is outside of the box or where not
         finite."""
+        inside, cell = self._cells(p)
+        return inside & self.flyable[cell]
+
+    def bound_at(self, p):
+        """The bound at positions p (..., 3), m: (...) m, NaN outside of the box."""
+        inside, cell = self._cells(p)
+        return np.where(inside, self.bound[cell], np.nan)
+
+    def _cells(self, p):
+        """Whether positions are inside of the box, and the indexes of their cells."""
         p = np.asarray(p, dtype=float)
         at = np.where(np.isfinite(p), (p - self.lower) / self.step, -1.0)
         if self.planar:
             at[..., 2] = 0.0
         cell = np.floor(np.clip(at, -1.0, self.flyable.shape)).astype(int)
         inside = ((cell >= 0) & (cell < self.flyable.shape)).all(axis=-1)
-        cell = np.where(inside[..., None], cell, 0)
-        return inside & self.flyable[cell[..., 0], cell[..., 1], cell[..., 2]]
+        return inside, tuple(np.moveaxis(np.where(inside[..., None], cell, 0), -1, 0))
 
     def belongs_to(self, anchors, tolerance=0.1):
         """Whether it was computed for these Anchors: the same ids in the same frame, each within `tolerance`, m."""

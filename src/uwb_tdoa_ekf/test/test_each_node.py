@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
@@ -15,6 +16,7 @@ from rig import MODULES, make_rig, recording, seconds_of, stamp  # noqa: E402, F
 from sensor_msgs.msg import Imu  # noqa: E402
 from uwb_tdoa_bias import ros  # noqa: E402
 from uwb_tdoa_bias.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
 ANCHORS = corners()  # ids 10 ... 17
@@ -167,14 +169,16 @@ def test_an_imu_without_accelerometer_is_not_believed(make_rig):
     assert len(warnings) == 1
 
 
-def test_other_anchors_start_the_filter_anew_and_the_same_do_not(make_rig):
-    rig = make_rig()
-    rig.start("ekf_node")
-    flight = recording(1.5)
+def test_other_anchors_start_the_filter_anew_and_the_same_do_not(make_rig, tmp_path):
+    rig, flight = make_rig(), recording(1.5)
+    nowhere = np.zeros((1, 1, 1), bool), np.full((1, 1, 1), 0.1), flight.anchors.ids, flight.anchors.positions
+    FlyableVolume([-50, -50, -50], [100, 100, 100], *nowhere).save(tmp_path / "flyable.npz")
+    rig.start("ekf_node", ekf_node=["-p", f"flyable_volume:={tmp_path / 'flyable.npz'}"])
     rig.send_anchors(flight.anchors)
     rig.play(flight, send_tdoa=rig.send_corrected)
     rig.send_anchors(flight.anchors)
     assert rig.counts("ekf_node")["restarts"] == 0 and rig.values("ekf_node")["state"] == "running"
+    assert rig.values("ekf_node")["flyable"] == "no" and float(rig.values("ekf_node")["efficiency"]) > 0.0
     moved = Anchors(flight.anchors.ids, flight.anchors.positions + 0.5, flight.anchors.orientations)
     rig.send_anchors(moved)
     counts = rig.counts("ekf_node", restarts=1, state="starting")

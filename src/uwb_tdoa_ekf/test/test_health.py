@@ -1,7 +1,10 @@
 from collections import Counter
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.flyable import FlyableVolume
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
@@ -76,3 +79,22 @@ def test_rates_and_age(clock):
         "IMU rate": "500.0 Hz",
         "TDOA rate": "20.0 Hz",
     }
+
+
+def test_a_tag_outside_of_the_flyable_volume_is_a_warning(clock):
+    anchors = Anchors.from_positions([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 3]])
+    cells = np.ones((2, 2, 2)), np.full((2, 2, 2), 0.1)
+    volume = FlyableVolume([0, 0, 0], [1, 1, 1], *cells, anchors.ids, anchors.positions)
+    judge = health.Health(FilterConfig(), 0.25, volume)
+    running = SimpleNamespace(running=True, anchors=anchors)
+    assert second(clock, judge, running)[0] == OK  # no odometry yet
+    judge.last_position = np.array([0.5, 1.5, 0.5]), np.diag([0.01, 0.01, 0.02])
+    level, text, values = second(clock, judge, running)
+    assert (level, text, values["flyable"], values["efficiency"]) == (OK, "running", "yes", "0.25")
+    judge.last_position = np.array([0.5, 2.5, 0.5]), np.eye(3)
+    level, text, values = second(clock, judge, running)
+    assert level == WARN and "outside of the flyable volume" in text and values["flyable"] == "no"
+    level, text, values = second(clock, judge, running, used=1, rejected=99)  # what matters more is said
+    assert level == WARN and "contradict" in text and values["flyable"] == "no"
+    judge.last_position = np.array([0.5, 0.5, 0.5]), np.eye(3)
+    assert second(clock, judge, running, used=500, rejected=99)[0] == OK  # it has come back

@@ -21,6 +21,7 @@ from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias import ros
 from uwb_tdoa_bias.anchors import Anchors
 from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.flyable import FlyableVolume
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
 
 from .config import FilterConfig
@@ -49,6 +50,7 @@ class EkfNode(Node):
         self._lag = ros.parameter(self, "lag", 0.25, "how long a silent stream is waited for, s of stamps")
         self._world = ros.parameter(self, "world_frame", "", "frame of the odometry; empty for that of the anchors")
         self._body = ros.parameter(self, "body_frame", "base_link", "frame of the tag and the IMU")
+        volume = ros.parameter(self, "flyable_volume", "", "file of plan: where the tag can be located; empty for none")
         publish_tf = ros.parameter(self, "publish_tf", True, "publish world -> body on /tf")
         if not 0.0 <= self._reorder < self._lag < math.inf:
             raise InputError(f"reorder, lag: {self._reorder!r}, {self._lag!r} must be seconds with 0 <= reorder < lag.")
@@ -60,7 +62,7 @@ class EkfNode(Node):
         self._early = deque()
         self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
         self._gyros, self._gyro = deque(maxlen=EARLY), None  # (t, x, y, z) not used yet, and the last one used
-        self._health = Health(self._config, self._lag)
+        self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
         # One message object each, for all: what is published is copied.
         self._odometry = Odometry(child_frame_id=self._body)
         self._transform = TransformStamped(child_frame_id=self._body)
@@ -178,6 +180,7 @@ class EkfNode(Node):
                 self._tf_publisher.publish(self._tf)
         self._health.odometry += n
         self._health.last_odometry = time.monotonic()
+        self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
 
     def _rate_at(self, t, bias):
         """Angular velocity at stamp t, (3,) rad/s, and its variance: that of its mean over one odometry interval."""

@@ -5,6 +5,8 @@ import time
 from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_tdoa_bias.ros import Rate
 
+from .place import Place
+
 PATIENCE = 5.0  # s of data without a start position before it becomes a warning
 DOUBT = 0.5  # share of TDOAs that are not used that becomes a warning
 
@@ -14,11 +16,13 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 class Health:
     """Judges once a second, by the wall clock."""
 
-    def __init__(self, config, lag):
-        """config : FilterConfig; lag : s."""
+    def __init__(self, config, lag, volume=None):
+        """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
         self.imu = self.tdoa = self.odometry = 0  # messages received, and published
         self.last_odometry = None  # time.monotonic(), s
+        self.last_position = None  # (3,) m and its covariance (3, 3) m^2
         self._use_imu, self._lag = config.use_imu, lag
+        self._place = Place(volume)
         self._imu_rate, self._tdoa_rate = Rate(), Rate()
         self._starting = None
         self._judged = {}
@@ -50,10 +54,15 @@ class Health:
             judgement = WARN, "no start position found: check ids and positions of the anchors, and that four are heard"
         else:
             judgement = OK, "looking for the start position"
+        there = {}
+        if running and self.last_position is not None:
+            trouble, there = self._place.judge(estimator.anchors, *self.last_position)
+            if trouble and judgement[0] == OK:
+                judgement = WARN, trouble
         age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
         values = {"state": "running" if running else "starting", "age of last odometry": age}
         values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
-        return *judgement, values
+        return *judgement, values | there
 
     def _judge_use(self, counts):
         """What became of the TDOAs since the last time."""

@@ -93,6 +93,7 @@ class Chart:
             self.grid.lower,
             np.full(3, self.grid.step),
             self.flyable.reshape(self.grid.shape),
+            self.error.reshape(self.grid.shape),
             installation.anchors.ids,
             installation.anchors.positions,
             installation.anchors.frame,
