@@ -37,6 +37,7 @@ setup(
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [
+            "bench = uwb_tdoa_tools.bench:main",
             "convert = uwb_tdoa_tools.convert:main",
             "demo = uwb_tdoa_tools.demo:main",
             "evaluate = uwb_tdoa_tools.evaluate:main",

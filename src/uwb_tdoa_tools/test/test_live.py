@@ -1,83 +1,9 @@
-"""The life of the processes of a live run. (test_demo.py runs the real ones.)"""
-
-import signal
-import time
+"""How the nodes are started for a live run. (test_demo.py runs the real ones.)"""
 
 import pytest
 
 pytest.importorskip("rclpy")
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue  # noqa: E402
 from uwb_tdoa_tools import live  # noqa: E402
-
-
-@pytest.fixture
-def start(tmp_path, monkeypatch):
-    """start(name, script lines): run a shell script as an executable of a package. Ends everything afterwards."""
-    folder = tmp_path / "lib" / "some_package"
-    folder.mkdir(parents=True)
-    monkeypatch.setattr(live, "get_package_prefix", lambda package: str(tmp_path))
-    asked = []
-
-    with live._Processes(tmp_path, asked) as processes:
-
-        def start(name, *lines, **options):
-            (folder / name).write_text("\n".join(("#!/bin/sh", *lines, "")))
-            (folder / name).chmod(0o755)
-            return processes.start("some_package", name, **options)
-
-        start.processes, start.asked = processes, asked
-        yield start
-
-
-def wait_for_output(file, text):
-    until = time.monotonic() + 20.0
-    while text not in file.read_text():
-        assert time.monotonic() < until, f"{text!r} never came"
-        time.sleep(0.01)
-
-
-def test_a_process_that_dies_is_named_with_its_last_words(start, tmp_path):
-    start("node", "echo starting", "echo no such file >&2", "exit 3").wait(20)
-    with pytest.raises(live.LiveError, match=r"node ended with code 3 \(no such file\); all of its output is in .*log"):
-        start.processes.check()
-
-
-def test_a_process_that_must_stay_may_not_even_end_well(start):
-    start("node", "exit 0").wait(20)
-    with pytest.raises(live.LiveError, match="node ended with code 0"):
-        start.processes.check()
-
-
-def test_a_process_that_may_end_must_end_well(start):
-    start("player", "exit 0", may_end=True).wait(20)
-    start.processes.check()
-    start("failing", "exit 1", may_end=True).wait(20)
-    with pytest.raises(live.LiveError, match="failing ended with code 1"):
-        start.processes.check()
-
-
-def test_stop_interrupts_the_whole_group(start, tmp_path):
-    node = start("node", "trap 'echo interrupted; exit 0' INT", "sleep 60 &", "echo ready", "wait")
-    wait_for_output(tmp_path / "node.log", "ready")
-    start.processes.stop("node")
-    assert node.returncode == 0
-    assert "interrupted" in (tmp_path / "node.log").read_text()
-
-
-def test_what_ignores_the_interrupt_is_killed(start, tmp_path, monkeypatch):
-    monkeypatch.setattr(live, "STOP_LIMIT", 0.2)
-    node = start("node", "trap '' INT", "echo ready", "while true; do sleep 1; done")
-    wait_for_output(tmp_path / "node.log", "ready")
-    with pytest.raises(live.LiveError, match="node ended with code -9"):
-        start.processes.stop("node")
-    assert node.returncode == -signal.SIGKILL
-
-
-def test_a_signal_to_us_ends_the_run(start):
-    start.processes.check()
-    start.asked.append(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        start.processes.check()
 
 
 def test_parameters_are_yaml_whatever_they_hold():
@@ -91,28 +17,3 @@ def test_what_is_replayed_is_waited_for():
     arguments = live._parameters("bias_node", None)
     assert "hold:=9.975" in arguments
     assert 'qos_overrides./uwb/tdoa.subscription.reliability:="reliable"' in arguments
-
-
-class NoNode:
-    def create_subscription(self, *_):
-        pass
-
-
-def status(node, **values):
-    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return DiagnosticArray(status=[DiagnosticStatus(name=f"/{node}", values=pairs)])
-
-
-def test_settled_when_every_node_repeats_its_counts():
-    diagnostics = live._Diagnostics(NoNode())
-    diagnostics._take(status("bias_node", received=5, rate="3.0 Hz"))
-    diagnostics._take(status("ekf_node", received=4, rate="3.0 Hz"))
-    diagnostics.forget()
-    assert not diagnostics.is_settled()
-    diagnostics._take(status("bias_node", received=5, rate="0.0 Hz"))
-    assert not diagnostics.is_settled()  # the other has not spoken
-    diagnostics._take(status("ekf_node", received=5, rate="0.0 Hz"))
-    assert not diagnostics.is_settled()  # it has received one more
-    diagnostics._take(status("ekf_node", received=5, rate="0.0 Hz"))
-    assert diagnostics.is_settled()
-    assert diagnostics.newest("ekf_node") == {"received": "5", "rate": "0.0 Hz"}

@@ -28,7 +28,6 @@ with what --effects and --model give. "raw" is the same filter without any corre
 """
 SIMULATED = SimulationConfig(anchor_delay_std=0.1, duration=40.0, seed=1)
 FIGURES = {"rmse_x": "x", "rmse_y": "y", "rmse_z": "z", "rmse_3d": "3D", "median_3d": "median", "max_3d": "max"}
-VERDICTS = ("used", "rejected", "late", "invalid", "startup", "waiting")
 
 
 def main(argv=None):
@@ -53,7 +52,8 @@ def main(argv=None):
 def demo(args):
     """Do as the parsed arguments say; returns the exit code."""
     try:
-        from .live import LiveError, run_live  # here, because --help needs no ROS
+        from .live import accounts, run_live  # here, because --help needs no ROS
+        from .processes import LiveError
     except ImportError as error:
         raise InputError(f"ROS: {error}; build and source the workspace, or use ./dev demo.") from error
     if not 0.0 < args.rate < float("inf"):
@@ -84,7 +84,7 @@ def demo(args):
         print(f"demo: error: {error}", file=sys.stderr)
         return 1
 
-    if not _print_accounts(flight, live):
+    if not _print_accounts(flight, accounts(live.ekf, flight)):
         print(f"demo: messages lost or late: too much load for --rate {args.rate:g}; try less.", file=sys.stderr)
     raw = Score("raw", run_offline(flight).odometry, flight.truth)
     corrected = Score("corrected", read_odometry(live.recorded), flight.truth)
@@ -115,15 +115,13 @@ def _flight(args):
     return flight, effects_file
 
 
-def _print_accounts(flight, live):
-    """Print what became of every message. Returns whether all were there in time."""
-    counts = {name: int(live.ekf[name]) for name in VERDICTS}
-    counts["lost"] = len(flight.tdoa) - sum(counts.values())
-    print(f"nodes      TDOAs {len(flight.tdoa)}: {', '.join(f'{n} {name}' for name, n in counts.items())}")
+def _print_accounts(flight, became):
+    """Print what became of every message, as live.accounts says. Returns whether all were there in time."""
+    told = ", ".join(f"{count} {name}" for name, count in became.items() if not name.startswith("imu_"))
+    print(f"nodes      TDOAs {len(flight.tdoa)}: {told}")
     samples = 0 if flight.imu is None else len(flight.imu)
-    received, late = int(live.ekf["IMU samples received"]), int(live.ekf["imu_late"])
-    print(f"nodes      IMU samples {samples}: {late} late, {samples - received} lost")
-    return not any((counts["lost"], counts["late"], late, samples - received))
+    print(f"nodes      IMU samples {samples}: {became['imu_late']} late, {became['imu_lost']} lost")
+    return not any(became[name] for name in ("lost", "late", "imu_late", "imu_lost"))
 
 
 def _print_errors(raw, corrected, *others):

@@ -1,0 +1,96 @@
+"""us per prediction and per robust update in the compiled core."""
+
+import time
+
+import numpy as np
+
+from uwb_tdoa_ekf.config import ROBUST, FilterConfig
+from uwb_tdoa_ekf.engine import run
+from uwb_tdoa_ekf.memory import HYPOTHESES, RUNNING, Memory, new_memory
+from uwb_tdoa_ekf.tape import new_tape
+
+from .figures import Figure
+from .flights import make_flight
+
+ANCHORS = (4, 8, 16, 32, 64)
+BEFORE, MEASURED = 3.0, 4.0  # s of a flight: until it is measured, and measured
+RARELY = 1e-3  # Hz of odometry: the core alone is measured
+TARGET = 3.5  # us of one prediction and one robust update
+SECTION = "compiled core, one core"
+
+
+def measure(progress, quick=False):
+    """Generator of Figures. progress(text) is told what comes next.
+
+    Each pair of figures comes from the same stretch of a flight, run from the same state: with its inertial samples
+    alone, and with TDOAs at the stamps of inertial samples, so that the difference is their updates and nothing else.
+    """
+    repeats = 9 if quick else 41
+    for anchors in ANCHORS[1:2] if quick else ANCHORS:
+        progress(f"core, {anchors} anchors")
+        yield from _pair(f"{anchors} anchors, {ROBUST[0]}", anchors, ROBUST[0], 1, repeats, TARGET if anchors == 8 else None)
+    for robust in ROBUST[1:]:
+        progress(f"core, {robust}")
+        yield from _pair(f"8 anchors, {robust}", 8, robust, 1, repeats)
+    progress("core, yaw unknown")
+    yield from _pair(f"8 anchors, {ROBUST[0]}, while {HYPOTHESES} yaws are followed", 8, ROBUST[0], HYPOTHESES, repeats)
+
+
+def _pair(name, anchors, robust, hypotheses, repeats, target=None):
+    prediction, update = per_event(anchors, robust, hypotheses, repeats)
+    yield Figure.of(SECTION, f"prediction, {name}", "us", prediction)
+    yield Figure.of(SECTION, f"robust update, {name}", "us", update)
+    yield Figure.of(SECTION, f"both, {name}", "us", prediction + update, target)
+
+
+def per_event(anchors, robust, hypotheses, repeats):
+    """us per prediction and per update, two (repeats,) arrays, while 1 or HYPOTHESES yaws are followed."""
+    # A tag that hovers tells nothing about its yaw.
+    path = {"trajectory": "hover" if hypotheses > 1 else "sines", "start_in_air": True, "multipath": False}
+    flight = make_flight(BEFORE + MEASURED, anchors, **path)
+    config = FilterConfig(
+        robust=robust, initial_yaw_std=FilterConfig.initial_yaw_std if hypotheses > 1 else 0.5, odometry_rate=RARELY
+    )
+    core = Core(flight, config)
+    core.run(BEFORE, core.memory)
+    if not core.memory.clock[RUNNING]:
+        raise RuntimeError("the filter has not started, so that there is nothing to measure")
+    seconds = np.array([[core.timed(False), core.timed(True)] for _ in range(repeats + 1)])[1:]  # the first fills caches
+    alive = np.count_nonzero(np.isfinite(core.last.belief))
+    if alive != hypotheses:
+        raise RuntimeError(f"{alive} yaws were followed instead of {hypotheses}")
+    return 1e6 * seconds[:, 0] / core.samples, 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.tdoas
+
+
+class Core:
+    """engine.run on a stretch of a flight, again and again from the same Memory."""
+
+    def __init__(self, flight, config):
+        self.memory, self.last = new_memory(len(flight.anchors)), None
+        self._tuning, self._tape, self._positions = config.tuning(), new_tape(), flight.anchors.positions
+        imu, tdoa = flight.imu, flight.tdoa
+        self._imu = (imu.t, *(np.ascontiguousarray(columns) for columns in (imu.gyro, imu.accel)))
+        # no prediction of their own: at the stamp of the inertial sample before
+        stamps = imu.t[np.maximum(np.searchsorted(imu.t, tdoa.t, side="right") - 1, 0)]
+        rows = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
+        self._tdoa = (stamps, *rows, tdoa.d, np.zeros(len(tdoa)))
+        self._begin = imu.t[0]
+
+    def run(self, until, memory):
+        """Feed the flight's first seconds; what is measured is the rest."""
+        k, n = (int(np.searchsorted(stream[0], self._begin + until)) for stream in (self._imu, self._tdoa))
+        self._feed(memory, [c[:k] for c in self._imu], [c[:n] for c in self._tdoa])
+        self._imu, self._tdoa = [c[k:] for c in self._imu], [c[n:] for c in self._tdoa]
+        self.samples, self.tdoas = len(self._imu[0]), len(self._tdoa[0])
+
+    def timed(self, tdoa):
+        """s that the rest takes, with or without its TDOAs."""
+        self.last = Memory(*(array.copy() for array in self.memory))
+        return self._feed(self.last, self._imu, self._tdoa if tdoa else [c[:0] for c in self._tdoa])
+
+    def _feed(self, memory, imu, tdoa):
+        n = len(imu[0]) + len(tdoa[0])
+        out = np.empty((n, 17)), np.empty((n, 9, 9)), np.empty((len(tdoa[0]), 4))
+        began = time.perf_counter()
+        run(memory, self._tuning, self._positions, *imu, *tdoa, *out, self._tape)
+        return time.perf_counter() - began

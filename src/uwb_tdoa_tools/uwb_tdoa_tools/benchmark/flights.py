@@ -1,0 +1,35 @@
+"""The flights that are measured with: simulated, 1 kHz IMU and 400 Hz TDOA."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..simulation import SimulationConfig, simulate
+
+SHORTEST = 16.0  # s that the simulation needs to take off and land
+TDOA_RATE = 400.0  # Hz
+
+
+def make_flight(seconds, anchors=8, **more):
+    """A Flight of at least `seconds` among so many anchors; more : of SimulationConfig. Its first `seconds` count."""
+    room = "corners" if anchors == 8 else f"random-1-{anchors}"
+    flight = simulate(SimulationConfig(seed=1, constellation=room, duration=max(seconds, SHORTEST), **more))
+    return first(thinned(flight), seconds)
+
+
+def thinned(flight):
+    """The flight with TDOA_RATE of its TDOAs, evenly left out."""
+    duration = flight.imu.t[-1] - flight.imu.t[0]
+    kept = np.linspace(0, len(flight.tdoa) - 1, min(len(flight.tdoa), round(TDOA_RATE * duration))).astype(int)
+    return replace(flight, tdoa=_rows(flight.tdoa, kept))
+
+
+def first(flight, seconds):
+    """Its first seconds."""
+    end = flight.imu.t[0] + seconds
+    streams = {name: getattr(flight, name) for name in ("tdoa", "imu", "truth")}
+    return replace(flight, **{name: _rows(stream, stream.t < end) for name, stream in streams.items()})
+
+
+def _rows(stream, chosen):
+    return type(stream)(**{name: values[chosen] for name, values in vars(stream).items()})

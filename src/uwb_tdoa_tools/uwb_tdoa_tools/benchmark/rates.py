@@ -1,0 +1,43 @@
+"""The highest rate of a replay at which nothing is lost."""
+
+import numpy as np
+
+from ..bag import read_odometry, write_bag
+from ..bag_files import messages, open_bag
+from ..live import accounts, run_live
+from .figures import Figure
+from .flights import make_flight
+
+RATES = (4.0, 8.0, 16.0, 32.0, 64.0)
+KEPT_UP = 0.8  # of the rate that was asked for; a run that is slower than that has found the limit
+NEEDED = 4.0
+SECTION = "replay of a bag through both nodes, reliable links, odometry recorded"
+
+
+def measure(progress, folder, quick=False):
+    """Generator of Figures; folder : for bags and the output of the processes. progress(text)."""
+    flight = make_flight(16.0 if quick else 45.0)
+    bag, highest = folder / "flight.bag", 0.0
+    write_bag(flight, bag, force=True)
+    for rate in RATES[:1] if quick else RATES:
+        progress(f"replay at rate {rate:g}")
+        live = run_live(bag, folder, rate, say=lambda text: None)
+        became, reached = accounts(live.ekf, flight), speed(live.recorded)
+        lost = became["lost"] + became["imu_lost"]
+        late = became["late"] + became["imu_late"]
+        yield Figure.of(SECTION, f"lost at rate {rate:g}", "messages", lost, 0.0 if rate == NEEDED else None)
+        yield Figure.of(SECTION, f"too late at rate {rate:g}", "messages", late, 0.0 if rate == NEEDED else None)
+        yield Figure.of(SECTION, f"reached at rate {rate:g}", "s of flight/s", reached)
+        if lost or late:
+            break
+        highest = max(highest, reached)
+        if reached < KEPT_UP * rate:
+            break
+    yield Figure.of(SECTION, "highest without loss", "s of flight/s", highest, None if quick else NEEDED * KEPT_UP, True)
+
+
+def speed(recorded):
+    """s of flight per s of which a bag with odometry was recorded."""
+    with open_bag(recorded) as reader:
+        arrived = [stamp for _, stamp, _ in messages(recorded, reader, list(reader.connections))]
+    return float(np.ptp(read_odometry(recorded).t) / (1e-9 * np.ptp(arrived)))

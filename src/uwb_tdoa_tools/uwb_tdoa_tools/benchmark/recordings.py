@@ -1,0 +1,58 @@
+"""s that a whole recording takes without ROS: filter, correction, smoother."""
+
+import time
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+
+from uwb_tdoa_bias.corrector import Corrector
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.network import Network
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.smoother import smooth
+
+from .figures import Figure
+from .flights import make_flight
+
+SECONDS = 45.0
+TARGET = 0.5  # s for such a flight
+ANCHORS = (4, 16, 32, 64)
+
+
+def measure(progress, quick=False, model=None):
+    """Generator of Figures; model : path of an ONNX network, default the one that is shipped. progress(text)."""
+    repeats = 3 if quick else 7
+    flight = make_flight(SECONDS)
+    section = f"recording of {SECONDS:g} s, 1 kHz IMU, 400 Hz TDOA"
+    progress("recording, first call")
+    yield Figure.of(section, "first call, compiled code read from its cache", "s", _seconds(run_offline, flight))
+    network = Network(model or Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "known_answer.onnx")
+    effects = EffectSet((
+        AnchorDelay(flight.meta["parameters"]["anchor_delays"]), TagLeverArm({"x": 0.01, "y": 0.0, "z": 0.05}),
+    ))  # fmt: skip
+    ways = {
+        "no correction": (run_offline, None),
+        f"effects ({effects.name})": (run_offline, Corrector(flight.anchors, effects)),
+        f"network ({network.name})": (run_offline, Corrector(flight.anchors, network=network)),
+        f"effects and network ({network.name})": (run_offline, Corrector(flight.anchors, effects, network)),
+        "no correction, smoothed": (smooth, None),
+    }
+    for name, (function, corrector) in ways.items():
+        progress(f"recording, {name}")
+        function(flight, None, corrector)
+        taken = [_seconds(function, flight, None, corrector) for _ in range(repeats)]
+        yield Figure.of(section, name, "s", taken, None if function is smooth else TARGET)
+        if corrector is None and function is run_offline:
+            yield Figure.of(section, "the same per second of flight", "ms/s", [1e3 * s / SECONDS for s in taken])
+    for anchors in () if quick else ANCHORS:
+        progress(f"recording, {anchors} anchors")
+        flight = make_flight(SECONDS, anchors)
+        yield Figure.of(
+            section, f"no correction, {anchors} anchors", "s", [_seconds(run_offline, flight) for _ in range(repeats)]
+        )
+
+
+def _seconds(function, *arguments):
+    began = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - began

@@ -1,0 +1,111 @@
+"""The surroundings of the nodes: publishes a flight in real time and takes the odometry that comes back."""
+
+import struct
+import time
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from nav_msgs.msg import Odometry
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Imu
+from uwb_tdoa_bias import ros
+from uwb_tdoa_msgs.msg import AnchorArray, Tdoa
+
+HEADER_STAMP = struct.Struct("<iI")  # of a little-endian CDR message that begins with a header, after 4 bytes
+AHEAD = 0.5  # s from the call to the first message
+SHORTEST_SLEEP = 5e-5  # s
+
+
+class Source:
+    """Publishes imu/data, uwb/tdoa and uwb/anchors with the default QoS; subscribes to `odometry` in each namespace.
+
+    Takes messages from the middleware without callbacks: what is published is not delayed by what is received, and the
+    arrival of an odometry is when the middleware of this process had it.
+    """
+
+    def __init__(self, node, namespaces):
+        self.publishers = {
+            kind: ros.publish_stream(node, kind, topic) for kind, topic in ((Imu, "/imu/data"), (Tdoa, "/uwb/tdoa"))
+        }
+        self._anchors = node.create_publisher(AnchorArray, "/uwb/anchors", ros.ANCHORS_QOS)
+        # never spun, so that no callback runs
+        self.subscriptions = [
+            node.create_subscription(Odometry, f"{space}/odometry", lambda _: None, ros.STREAM_QOS, raw=True)
+            for space in namespaces
+        ]
+        self.received = [[] for _ in namespaces]  # (arrival, stamp), ns
+
+    def play(self, flight, block, on_block):
+        """Publish a Flight as fast as it was flown. on_block(): called first, after every `block` s, and at the end.
+
+        Returns (sent, stamps, late): of each TDOA when it was published and its stamp, (n,) ns since 1970; s by which
+        each message was late.
+        """
+        self._anchors.publish(ros.anchors_to_message(flight.anchors))
+        start = time.time_ns() // 10**9 + 1  # stamps are of now, too
+        events = self._events(flight, start - flight.imu.t[0])
+        began = time.perf_counter() + AHEAD
+        sent, stamps, late, next_block = [], [], np.empty(len(events)), began
+        for k, (due, stamp, publisher, data) in enumerate(events):
+            due += began
+            if due >= next_block:
+                on_block()
+                next_block += block
+            while (left := due - time.perf_counter()) > 0.0:
+                self.take()
+                if left > SHORTEST_SLEEP:
+                    time.sleep(max(due - time.perf_counter(), 0.0))
+            late[k] = -left
+            if stamp:
+                sent.append(time.time_ns())
+                stamps.append(stamp)
+            publisher.publish(data)
+        on_block()
+        return np.array(sent), np.array(stamps), late
+
+    def take(self):
+        """Keep what has arrived."""
+        for subscription, received in zip(self.subscriptions, self.received):
+            with subscription.handle:
+                while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                    data, information = taken
+                    second, nanosecond = HEADER_STAMP.unpack_from(data, 4)
+                    received.append((information["received_timestamp"], second * 10**9 + nanosecond))
+
+    def _events(self, flight, epoch):
+        """(due s, stamp ns of a TDOA or 0, publisher, bytes) in the order in which they are due."""
+        imu, tdoa, events = flight.imu, flight.tdoa, []
+        message, publisher = Imu(), self.publishers[Imu]
+        for t, (gx, gy, gz), (fx, fy, fz) in zip(imu.t.tolist(), imu.gyro.tolist(), imu.accel.tolist()):
+            message.header.stamp, _ = _stamp(t + epoch)
+            rate, force = message.angular_velocity, message.linear_acceleration
+            rate.x, rate.y, rate.z, force.x, force.y, force.z = gx, gy, gz, fx, fy, fz
+            events.append((t - imu.t[0], 0, publisher, serialize_message(message)))
+        message, publisher = Tdoa(), self.publishers[Tdoa]
+        for t, a, b, d in zip(*(column.tolist() for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))):
+            message.header.stamp, stamp = _stamp(t + epoch)
+            message.anchor_a, message.anchor_b, message.distance_difference = a, b, d
+            events.append((t - imu.t[0], stamp, publisher, serialize_message(message)))
+        return sorted(events, key=lambda event: event[0])
+
+
+def latencies(sent, stamps, arrivals, of):
+    """s from the publication of each TDOA to the arrival of the first odometry whose stamp is not older: (n,), NaN for
+    those that were published before there was any odometry, or that none contains.
+
+    sent, stamps : (n,) ns, of TDOAs; arrivals, of : (k,) ns, arrival and stamp of each odometry in order of arrival.
+    """
+    out = np.full(len(sent), np.nan)
+    if len(arrivals) == 0:
+        return out
+    place = np.searchsorted(np.maximum.accumulate(of), stamps)
+    known = (place < len(of)) & (sent >= arrivals[0])
+    out[known] = 1e-9 * (arrivals[place[known]] - sent[known])
+    return out
+
+
+def _stamp(seconds):
+    """(Time, ns) of seconds since 1970, to the microsecond: a float holds no more."""
+    ns = round(seconds * 1e6) * 1000
+    second, nanosecond = divmod(ns, 10**9)
+    return Time(sec=second, nanosec=nanosecond), ns

@@ -1,0 +1,154 @@
+"""Executables of our packages as processes in a ROS domain of their own, and what they say on /diagnostics."""
+
+import os
+import signal
+import subprocess
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import rclpy
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from diagnostic_msgs.msg import DiagnosticArray
+from domain_coordinator import domain_id
+
+STOP_LIMIT = 10.0  # s
+
+
+class LiveError(Exception):
+    """A process of the run failed, or did not get where it should; the message says which and where its output is."""
+
+
+@contextmanager
+def variables(values):
+    """Environment variables, for the block and what it starts."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def own_domain():
+    """A ROS domain that nobody else has, on this machine only, for the block and what it starts."""
+    with domain_id() as number:
+        with variables({"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}):
+            yield
+
+
+def wait(limit, what, processes, node, condition):
+    """Serve the node until condition(); raises LiveError after `limit` s, or if a process has ended that should not."""
+    until = None if limit is None else time.monotonic() + limit
+    while not condition():
+        processes.check()
+        if until is not None and time.monotonic() > until:
+            raise LiveError(f"waited {limit:g} s for {what}; their output is in {processes.folder}/*.log.")
+        rclpy.spin_once(node, timeout_sec=0.05)
+    processes.check()
+
+
+class Diagnostics:
+    """The newest status of each node on /diagnostics, and whether it still changes."""
+
+    def __init__(self, node):
+        self._newest, self._repeated = {}, {}
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
+
+    def _take(self, message):
+        for status in message.status:
+            name = status.name.strip("/")
+            values = {pair.key: pair.value for pair in status.values}
+            counts = {key: value for key, value in values.items() if value.isdigit()}
+            before = self._newest.get(name, {})
+            same = bool(before) and all(before.get(key) == value for key, value in counts.items())
+            self._repeated[name] = self._repeated.get(name, 0) + 1 if same else 0
+            self._newest[name] = values
+
+    def newest(self, name):
+        """{key: text}; empty before the first status."""
+        return self._newest.get(name, {})
+
+    def forget(self):
+        """Count anew how often a status has repeated."""
+        self._repeated.clear()
+
+    def is_settled(self):
+        """Whether each node has said the same counts twice in a row: nothing is on its way any more."""
+        return len(self._repeated) == len(self._newest) and all(self._repeated.values())
+
+
+class Processes:
+    """Executables of our packages, each in a process group of its own, output in a file. Ends what it started."""
+
+    def __init__(self, folder, stop):
+        self.folder = Path(folder)
+        self._stop, self._running, self._may_end = stop, {}, set()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for title in list(self._running)[::-1]:
+            self._end(title)
+
+    def start(self, package, name, *arguments, title=None, may_end=False):
+        """The Popen of the executable; title : to tell it from others, default its name, output in `file(title)`;
+        with may_end, ending with code 0 is no failure."""
+        try:
+            program = Path(get_package_prefix(package)) / "lib" / package / name
+        except PackageNotFoundError as error:
+            raise LiveError(f"{package} is not installed; build and source the workspace.") from error
+        title = title or name
+        with open(self.file(title), "wb") as log:
+            self._running[title] = subprocess.Popen(
+                [str(part) for part in (program, *arguments)],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+            )  # fmt: skip
+        if may_end:
+            self._may_end.add(title)
+        return self._running[title]
+
+    def pid(self, title):
+        """Process id of a running executable."""
+        return self._running[title].pid
+
+    def file(self, title):
+        """Where the output of a process goes."""
+        return self.folder / f"{title.replace('/', '.')}.log"
+
+    def check(self):
+        """Raise LiveError if a process ended that should not have, KeyboardInterrupt if we are asked to end."""
+        if self._stop:
+            raise KeyboardInterrupt
+        for title, process in self._running.items():
+            code = process.poll()
+            if code is not None and not (code == 0 and title in self._may_end):
+                raise self._failure(title, code)
+
+    def stop(self, title):
+        """Interrupt a process and wait for it; raises LiveError if it does not end well."""
+        code = self._end(title)
+        if code != 0:
+            raise self._failure(title, code)
+
+    def _end(self, title):
+        process = self._running.pop(title)
+        for number, patience in ((signal.SIGINT, STOP_LIMIT), (signal.SIGKILL, None)):
+            if process.poll() is None:
+                os.killpg(process.pid, number)
+                try:
+                    process.wait(patience)
+                except subprocess.TimeoutExpired:
+                    continue
+        return process.returncode
+
+    def _failure(self, title, code):
+        file = self.file(title)
+        last = file.read_text(errors="replace").strip().splitlines()[-1:]
+        return LiveError(f"{title} ended with code {code} ({' '.join(last)}); all of its output is in {file}.")
