@@ -4,7 +4,6 @@ import json
 import os
 import platform
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +42,10 @@ def main(argv=None):
         "--only", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=f"of {', '.join(PARTS)} (default: all)"
     )
     parser.add_argument("--model", metavar="FILE", help="ONNX bias network for offline (default: the one shipped)")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("out/bench"),
+        help="for the bags and the output of the nodes (default: out/bench)",
+    )  # fmt: skip
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the machine and all figures")
     return cli.run(_bench, parser, argv)
 
@@ -56,11 +59,10 @@ def _bench(args):
         raise InputError(f"ROS: {error}; build and source the workspace, or use ./dev run.") from error
     if args.json is not None and not args.json.absolute().parent.is_dir():
         raise InputError(f"{args.json}: its directory does not exist; make it first.")
+    args.out.mkdir(parents=True, exist_ok=True)
     machine, figures = _machine(), []
-    with tempfile.TemporaryDirectory(prefix="uwb_tdoa_bench_") as name, tqdm(
-        unit=" figures", bar_format="{desc}: {n} figures, {elapsed}", disable=None, leave=False
-    ) as progress:
-        folder, quick, say = Path(name), args.quick, progress.set_description
+    with tqdm(bar_format="{desc}: {n} figures, {elapsed}", disable=None, leave=False) as progress:
+        folder, quick, say = args.out, args.quick, progress.set_description
         parts = {  # recordings first: their first call is to be the first of this process
             "offline": lambda: recordings.measure(say, quick, args.model),
             "core": lambda: core.measure(say, quick),
