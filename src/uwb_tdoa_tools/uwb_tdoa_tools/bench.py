@@ -22,7 +22,8 @@ and replays. Figures are medians with their quartiles, beside their targets.
   tags    the same for 1, 2, 4 and 8 tags, all of which hear the same streams
   replay  how fast a bag goes through both nodes without loss
 
-Real nodes run in a ROS domain of their own. Whatever else the machine does shows in the figures: the load is printed.
+Real nodes run in a ROS domain of their own. Whatever else the machine does shows in the figures, above all in the
+latencies: what others used is printed. The last example keeps them away.
 """
 PARTS = ("core", "offline", "nodes", "tags", "replay")
 
@@ -36,6 +37,7 @@ def main(argv=None):
         "bench --json bench.json",
         "bench --quick --only core offline",
         "bench --only offline --model network.onnx",
+        "sudo -E env PATH=$PATH chrt --fifo 10 bench --only nodes tags",
     )
     parser.add_argument("--quick", action="store_true", help="fewer repetitions, shorter flights, fewer cases")
     parser.add_argument(
@@ -54,13 +56,14 @@ def _bench(args):
     try:
         from .benchmark import core, nodes, rates, recordings  # here, because --help needs no ROS
         from .benchmark.figures import as_json, table
+        from .benchmark.usage import used_by_all, used_by_others
         from .processes import LiveError
     except ImportError as error:
         raise InputError(f"ROS: {error}; build and source the workspace, or use ./dev run.") from error
     if args.json is not None and not args.json.absolute().parent.is_dir():
         raise InputError(f"{args.json}: its directory does not exist; make it first.")
     args.out.mkdir(parents=True, exist_ok=True)
-    machine, figures = _machine(), []
+    machine, figures, before = _machine(), [], used_by_all()
     with tqdm(bar_format="{desc}: {n} figures, {elapsed}", disable=None, leave=False) as progress:
         folder, quick, say = args.out, args.quick, progress.set_description
         parts = {  # recordings first: their first call is to be the first of this process
@@ -80,9 +83,9 @@ def _bench(args):
             progress.close()
             print(f"bench: error: {error}", file=sys.stderr)
             return 1
-    machine["load_after"] = os.getloadavg()[0]
+    machine |= used_by_others(before)
     print(f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy {machine['numpy']}")
-    print(f"load of the machine {machine['load_before']:.1f} before, {machine['load_after']:.1f} after, ours included")
+    print(f"meanwhile others used {machine['others']:.0%} of its CPU time, its host {machine['stolen']:.0%}")
     print("\n".join(table(figures)))
     if args.json is not None:
         args.json.write_text(json.dumps({"machine": machine, "figures": as_json(figures)}, indent=1) + "\n")
@@ -97,7 +100,6 @@ def _machine():
         "cores": len(os.sched_getaffinity(0)),
         "python": platform.python_version(),
         "numpy": np.__version__,
-        "load_before": os.getloadavg()[0],
     }
 
 

@@ -1,4 +1,4 @@
-"""What a process of this machine has used, by Linux's /proc (see man proc_pid_stat, proc_pid_status)."""
+"""What processes of this machine have used, by Linux's /proc (see man proc_stat, proc_pid_stat, proc_pid_status)."""
 
 import os
 from pathlib import Path
@@ -18,3 +18,16 @@ def memory(pid):
         if line.startswith("VmRSS:"):
             return 1024 * int(line.split()[1])
     raise ProcessLookupError(f"{pid} has ended")
+
+
+def used_by_all():
+    """(total, idle, stolen, ours) CPU time of all cores so far, s. ours : this process and its children that have ended."""
+    user, nice, system, idle, waiting, irq, soft, stolen = map(int, Path("/proc/stat").read_text().split()[1:9])
+    ours = sum(os.times()[:4])
+    return TICK * (user + nice + system + idle + waiting + irq + soft + stolen), TICK * (idle + waiting), TICK * stolen, ours
+
+
+def used_by_others(before):
+    """Shares of all CPU time since `before` (used_by_all): {"others": other processes, "stolen": the host of this VM}."""
+    total, idle, stolen, ours = (now - then for now, then in zip(used_by_all(), before))
+    return {"others": max(0.0, total - idle - stolen - ours) / max(total, TICK), "stolen": stolen / max(total, TICK)}
