@@ -1,0 +1,143 @@
+"""The pieces of bench, and one quick run of the real thing."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from uwb_tdoa_tools import bench
+from uwb_tdoa_tools.benchmark import usage
+from uwb_tdoa_tools.benchmark.figures import Figure, as_json, table
+from uwb_tdoa_tools.benchmark.flights import TDOA_RATE, make_flight
+
+KEYS = {"section", "name", "unit", "median", "low", "high", "count", "target", "at_least", "met"}
+
+
+def test_a_figure_is_the_median_and_the_quartiles_of_what_is_known():
+    figure = Figure.of("core", "prediction", "us", [1.0, 2.0, np.nan, 3.0, 4.0, 100.0], target=3.0)
+    assert (figure.low, figure.median, figure.high, figure.count) == (2.0, 3.0, 4.0, 5)
+    assert figure.met is True
+    assert Figure.of("core", "prediction", "us", 3.1, target=3.0).met is False
+    assert Figure.of("replay", "rate", "1", 3.1, target=3.0, at_least=True).met is True
+    assert Figure.of("core", "prediction", "us", 3.1).met is None
+    assert Figure.of("core", "prediction", "us", np.nan, target=3.0).met is False  # not known is not met
+
+
+def test_table():
+    figures = [
+        Figure.of("core", "prediction", "us", [1.0, 1.25, 1.5], target=3.5),
+        Figure.of("core", "update", "us", 12.0, target=3.5),
+        Figure.of("replay", "rate", "s/s", 8.0, target=4.0, at_least=True),
+    ]
+    lines = table(figures)
+    assert lines[0].split() == ["median", "quartiles", "unit", "target"]
+    assert [line for line in lines if line and not line.startswith(" ")] == ["core", "replay"]
+    assert lines[3].split() == ["prediction", "1.25", "1.12", "..", "1.38", "us", "<=", "3.5"]
+    assert lines[4].split() == ["update", "12", "us", "<=", "3.5", "MISSED"]
+    assert lines[-1].split() == ["rate", "8", "s/s", ">=", "4"]
+    assert len({line.index("us") for line in lines[3:5]}) == 1  # columns
+
+
+def test_json_is_what_everybody_reads():
+    rows = as_json([Figure.of("core", "prediction", "us", np.nan), Figure.of("core", "update", "us", 1.0, 3.5)])
+    assert all(set(row) == KEYS for row in rows)
+    assert json.loads(json.dumps(rows, allow_nan=False))[0]["median"] is None
+    assert [row["met"] for row in rows] == [None, True]
+
+
+def test_a_flight_of_the_rates_it_is_measured_at():
+    flight = make_flight(4.0, anchors=16)
+    assert len(flight.anchors) == 16
+    assert len(flight.imu) == pytest.approx(4000, abs=1)
+    assert len(flight.tdoa) == pytest.approx(4.0 * TDOA_RATE, rel=0.02)
+    assert flight.truth.t[-1] < flight.imu.t[0] + 4.0
+    assert (np.diff(flight.tdoa.t) >= 0.0).all()
+
+
+def test_cpu_time_and_memory_of_a_process():
+    code = "import time; a = bytearray(50_000_000)\nwhile time.process_time() < 0.5: pass\nprint('x', flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        assert usage.cpu_seconds(process.pid) == pytest.approx(0.5, abs=0.1)
+        assert 50e6 < usage.memory(process.pid) < 150e6
+        process.stdin.write(b"\n")
+
+
+def test_what_others_use():
+    before = usage.used_by_all()
+    until = time.process_time() + 0.3
+    while time.process_time() < until:
+        pass
+    shares = usage.used_by_others(before)
+    assert set(shares) == {"others", "stolen"} and all(0.0 <= share <= 1.0 for share in shares.values())
+    ours = usage.used_by_all()[3] - before[3]
+    assert ours == pytest.approx(0.3, abs=0.05)
+    assert shares["others"] + shares["stolen"] <= 1.0 - 0.8 * ours / (usage.used_by_all()[0] - before[0])
+
+
+def test_the_core_is_measured_per_event():
+    core = pytest.importorskip("uwb_tdoa_tools.benchmark.core")
+    prediction, update = core.per_event(8, "innovation", 1, 5)
+    assert prediction.shape == update.shape == (5,)
+    assert 0.1 < np.median(prediction) < 100.0 and 0.1 < np.median(update) < 100.0
+    several, _ = core.per_event(8, "innovation", 4, 5)
+    assert np.median(several) > 1.3 * np.median(prediction)  # four filters instead of one
+
+
+def test_latency_is_that_of_the_first_odometry_that_contains_a_tdoa():
+    source = pytest.importorskip("uwb_tdoa_tools.benchmark.source")
+    ms = 1_000_000
+    stamps = np.array([0, 10, 12, 20, 30, 90]) * ms
+    sent = 1000 * ms + stamps
+    of = np.array([5, 15, 10, 30]) * ms  # stamps in order of arrival; the third is one that came late
+    arrivals = 1000 * ms + np.array([8, 18, 19, 37]) * ms
+    found = source.latencies(sent, stamps, arrivals, of)
+    # before the first arrival: unknown; 10 and 12 are in 15; 20 and 30 in 30; 90 in none
+    np.testing.assert_allclose(found, [np.nan, 0.008, 0.006, 0.017, 0.007, np.nan], atol=1e-12)
+    assert np.isnan(source.latencies(sent, stamps, np.empty(0, np.int64), np.empty(0, np.int64))).all()
+
+
+def test_ready_is_read_from_the_log():
+    nodes = pytest.importorskip("uwb_tdoa_tools.benchmark.nodes")
+    log = "[INFO] [17.5] [tag1.ekf_node]: loading\nnot ready\n[INFO] [18.25] [tag1.ekf_node]: ready\n"
+    assert nodes.READY.findall(log) == ["18.25"]
+    assert not nodes.READY.findall(log[:-30])
+
+
+def test_bad_usage(tmp_path, capsys):
+    pytest.importorskip("uwb_tdoa_msgs.msg")
+    assert bench.main(["--only", "cpu"]) == 2
+    assert "core, offline, nodes, tags, replay" in capsys.readouterr().err.replace("'", "")
+    assert bench.main(["--json", str(tmp_path / "no" / "bench.json"), "--out", str(tmp_path)]) == 2
+    assert "its directory does not exist" in capsys.readouterr().err
+    assert bench.main(["--only", "offline", "--model", str(tmp_path / "no.onnx"), "--out", str(tmp_path)]) == 2
+    assert "no.onnx does not exist" in capsys.readouterr().err
+
+
+def test_help_has_examples(capsys):
+    assert bench.main(["--help"]) == 0
+    assert "bench --json bench.json" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_quick_run_of_the_real_nodes(tmp_path, capsys):
+    pytest.importorskip("uwb_tdoa_msgs.msg")
+    report = tmp_path / "bench.json"
+    before = dict(os.environ)
+    only = ["core", "offline", "nodes", "replay"]
+    assert bench.main(["--quick", "--only", *only, "--json", str(report), "--out", str(tmp_path / "out")]) == 0
+    assert dict(os.environ) == before
+    told = json.loads(report.read_text())
+    assert told["machine"]["cores"] >= 1 and 0.0 <= told["machine"]["others"] <= 1.0
+    value = {row["name"]: row["median"] for row in told["figures"]}
+    assert None not in value.values()
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in value)
+    # What must hold however slow the machine is
+    assert all(value[f"lost, {what}"] == 0 for what in ("TDOAs", "IMU samples"))
+    assert value["lost at rate 4"] == value["too late at rate 4"] == 0
+    assert 0.0 < value["latency p50, TDOA published to odometry arrived"] < 1000.0
+    assert value["ready after its start, ekf_node"] > 0.1 and value["CPU, all nodes"] > 1.0
