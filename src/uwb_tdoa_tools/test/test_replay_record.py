@@ -242,6 +242,10 @@ def test_record_everything(tmp_path, start, node):
     publisher = node.create_publisher(Imu, "other/imu", DEEP)  # any type, any time, before there is a message
     recording = start("record", "-o", tmp_path / "all.bag", "--all")
     recording.until("recording /other/imu (sensor_msgs/msg/Imu, reliable)")
+    deadline = time.monotonic() + LIMIT
+    while not publisher.get_subscription_count():  # each end learns of the other in its own time
+        assert time.monotonic() < deadline
+        rclpy.spin_once(node, timeout_sec=0.05)
     publisher.publish(Imu())
     replaying = start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", *STREAMS)
     assert replaying.end()[0] == 0
