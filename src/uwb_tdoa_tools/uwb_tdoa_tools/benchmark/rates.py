@@ -16,7 +16,7 @@ SECTION = "replay of a bag through both nodes, reliable links, odometry recorded
 
 def measure(progress, folder, quick=False):
     """Generator of Figures; folder : for bags and the output of the processes. progress(text)."""
-    flight = make_flight(16.0 if quick else 45.0)
+    flight = make_flight(8.0 if quick else 45.0)
     bag, highest = folder / "flight.bag", 0.0
     write_bag(flight, bag, force=True)
     for rate in RATES[:1] if quick else RATES:
