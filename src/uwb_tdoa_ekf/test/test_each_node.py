@@ -127,7 +127,7 @@ def test_every_measurement_is_accounted_for(make_rig):
     rig.send_corrected(late, a, b, 0.0)
     # Out of order, but within `reorder`: used in the order of their stamps.
     rig.send_corrected(now + 0.013, a, b, 0.0)
-    rig.send_corrected(now + 0.010, b, a, 0.0)
+    rig.send_corrected(now + 0.011, b, a, 0.0)
     rig.send_imu(now + 0.1)
     rig.send_corrected(now + 0.1, a, b, 0.0)
     # All but the very last, and the last one of the flight that had been waiting.
@@ -139,7 +139,7 @@ def test_every_measurement_is_accounted_for(make_rig):
     assert [seconds_of(m.header.stamp) for m in said[TdoaResidual.VERDICT_LATE]] == pytest.approx([late], abs=1e-9)
     filtered = (TdoaResidual.VERDICT_USED, TdoaResidual.VERDICT_REJECTED)
     stamps = [seconds_of(m.header.stamp) for m in rig.residuals[before:] if m.verdict in filtered]
-    assert stamps == sorted(stamps) and stamps[-2:] == pytest.approx([now + 0.010, now + 0.013], abs=1e-9)
+    assert stamps == sorted(stamps) and stamps[-2:] == pytest.approx([now + 0.011, now + 0.013], abs=1e-9)
     assert {m.header.frame_id for m in rig.residuals} == {"map"}
     counts = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa) + 2 + len(invalid) + 4)
     verdicts = ("used", "rejected", "late", "invalid", "startup")

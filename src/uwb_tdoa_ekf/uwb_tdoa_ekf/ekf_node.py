@@ -46,7 +46,7 @@ class EkfNode(Node):
             for field in fields(FilterConfig)
         }
         self._config = FilterConfig(**tuning)
-        self._reorder = ros.parameter(self, "reorder", 0.005, "how long a TDOA waits for older ones, s of stamps")
+        self._reorder = ros.parameter(self, "reorder", 0.003, "how long a TDOA waits for older ones, s of stamps")
         self._lag = ros.parameter(self, "lag", 0.25, "how long a silent stream is waited for, s of stamps")
         self._world = ros.parameter(self, "world_frame", "", "frame of the odometry; empty for that of the anchors")
         self._body = ros.parameter(self, "body_frame", "base_link", "frame of the tag and the IMU")

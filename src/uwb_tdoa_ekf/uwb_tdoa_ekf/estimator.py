@@ -60,7 +60,7 @@ class Estimator:
     for `lag` seconds of stamps; TDOAs wait `reorder` more for late siblings. What is older than what was used is late.
     """
 
-    def __init__(self, anchors, config=None, reorder=0.005, lag=0.25):
+    def __init__(self, anchors, config=None, reorder=0.003, lag=0.25):
         """anchors : Anchors; config : FilterConfig; reorder, lag : s."""
         self.anchors = anchors
         self.config = config or FilterConfig()
