@@ -25,7 +25,7 @@ def measure(progress, quick=False, model=None):
     flight = make_flight(SECONDS)
     section = f"recording of {SECONDS:g} s, 1 kHz IMU, 400 Hz TDOA"
     progress("recording, first call")
-    yield Figure.of(section, "first call, compiled code read from its cache", "s", _seconds(run_offline, flight))
+    yield Figure.of(section, "first call: compiled, or compiled code read from numba's cache", "s", _seconds(run_offline, flight))
     network = Network(model or Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "known_answer.onnx")
     effects = EffectSet((
         AnchorDelay(flight.meta["parameters"]["anchor_delays"]), TagLeverArm({"x": 0.01, "y": 0.0, "z": 0.05}),
