@@ -58,7 +58,7 @@ def test_a_flight_of_the_rates_it_is_measured_at():
 
 
 def test_cpu_time_and_memory_of_a_process():
-    code = "import time; a = bytearray(50_000_000)\nwhile time.process_time() < 0.5: pass\nprint('x', flush=True); input()"
+    code = "import time; a = bytearray(50_000_000)\nwhile time.process_time() < 0.5: pass\nprint(flush=True); input()"
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         process.stdout.readline()
         assert usage.cpu_seconds(process.pid) == pytest.approx(0.5, abs=0.1)

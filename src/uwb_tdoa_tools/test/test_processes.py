@@ -38,7 +38,8 @@ def wait_for_output(file, text):
 
 def test_a_process_that_dies_is_named_with_its_last_words(start, tmp_path):
     start("node", "echo starting", "echo no such file >&2", "exit 3").wait(20)
-    with pytest.raises(processes.LiveError, match=r"node ended with code 3 \(no such file\); all of its output is in .*log"):
+    said = r"node ended with code 3 \(no such file\); all of its output is in .*log"
+    with pytest.raises(processes.LiveError, match=said):
         start.processes.check()
 
 

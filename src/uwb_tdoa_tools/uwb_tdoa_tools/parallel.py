@@ -23,15 +23,16 @@ def add_options(parser):
     add("--jobs", metavar="N", type=_count, help="flights at once (default: as many as there are cores)")
     add(
         "--dask", metavar="ADDRESS",
-        help="run on the Dask cluster whose scheduler is there, e.g. tcp://10.0.0.1:8786; its workers need these packages, "
-        "and the recordings at the same paths",
+        help="run on the Dask cluster whose scheduler is there, e.g. tcp://10.0.0.1:8786; its workers need these "
+        "packages, and the recordings at the same paths",
     )  # fmt: skip
 
 
 def over(function, items, jobs=None, dask=None, unit="flight"):
     """Generator of function(item) for every item, in order, with a progress bar on a terminal.
 
-    To be called in the main thread. function, items, results : what pickle takes; jobs : processes, default one per core; dask : address of a scheduler.
+    To be called in the main thread. function, items, results : what pickle takes; jobs : processes, default one per
+    core; dask : address of a scheduler.
     The first item runs in this process, so that what has to be compiled is compiled once, and is in numba's cache when
     the others start. What the function raises is raised here. Raises InputError where there is no Dask.
     """
@@ -43,24 +44,42 @@ def over(function, items, jobs=None, dask=None, unit="flight"):
 
 
 def _results(function, items, jobs, dask):
+    first, rest = items[:1], items[1:]
+    if not rest or (jobs == 1 and dask is None):
+        yield from map(function, items)
+        return
     with _cluster(dask) as backend:
-        yield from map(function, items[:1])
-        rest = items[1:]
-        if not rest:
-            return
-        with parallel_config(**backend):  # not around the loop: the caller's own use of joblib is its own affair
-            pool = Parallel(n_jobs=min(jobs or cpu_count(), len(rest)), return_as="generator")
-        with _children_ignore_interrupts():
-            outcomes = pool(delayed(_attempt)(function, item) for item in rest)  # starts the processes
-        try:
+        count = min(jobs or cpu_count(), len(rest))
+
+        def spread(calls):
+            with parallel_config(**backend):  # not around the loop: the caller's own use of joblib is its own affair
+                pool = Parallel(count, return_as="generator", batch_size=1)
+            with _children_ignore_interrupts():
+                return pool(calls)
+
+        with _closing(spread(delayed(_import)(function) for _ in range(count))) as starting:
+            yield from map(function, first)
+            for _ in starting:
+                pass
+        with _closing(spread(delayed(_attempt)(function, item) for item in rest)) as outcomes:
             for result, error in outcomes:
                 if error is not None:
                     raise error
                 yield result
-        finally:
-            with warnings.catch_warnings():  # of what is not done and nobody wants any more
-                warnings.simplefilter("ignore")
-                outcomes.close()
+
+
+def _import(function):
+    """For a process that starts while the first item is done here: to have been handed `function` has imported it."""
+
+
+@contextmanager
+def _closing(outcomes):
+    try:
+        yield outcomes
+    finally:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what is not done and nobody wants any more
+            outcomes.close()
 
 
 def _attempt(function, item):

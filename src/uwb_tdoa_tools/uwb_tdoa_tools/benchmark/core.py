@@ -28,7 +28,8 @@ def measure(progress, quick=False):
     repeats = 9 if quick else 41
     for anchors in ANCHORS[1:2] if quick else ANCHORS:
         progress(f"core, {anchors} anchors")
-        yield from _pair(f"{anchors} anchors, {ROBUST[0]}", anchors, ROBUST[0], 1, repeats, TARGET if anchors == 8 else None)
+        target = TARGET if anchors == 8 else None
+        yield from _pair(f"{anchors} anchors, {ROBUST[0]}", anchors, ROBUST[0], 1, repeats, target)
     for robust in ROBUST[1:]:
         progress(f"core, {robust}")
         yield from _pair(f"8 anchors, {robust}", 8, robust, 1, repeats)
@@ -55,7 +56,8 @@ def per_event(anchors, robust, hypotheses, repeats):
     core.run(BEFORE, core.memory)
     if not core.memory.clock[RUNNING]:
         raise RuntimeError("the filter has not started, so that there is nothing to measure")
-    seconds = np.array([[core.timed(False), core.timed(True)] for _ in range(repeats + 1)])[1:]  # the first fills caches
+    seconds = np.array([[core.timed(False), core.timed(True)] for _ in range(repeats + 1)])
+    seconds = seconds[1:]  # the first fills caches
     alive = np.count_nonzero(np.isfinite(core.last.belief))
     if alive != hypotheses:
         raise RuntimeError(f"{alive} yaws were followed instead of {hypotheses}")

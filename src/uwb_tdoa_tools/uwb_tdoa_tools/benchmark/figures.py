@@ -63,7 +63,7 @@ def as_json(figures):
 def _cells(figure):
     target = ""
     if figure.target is not None:
-        target = f"{'>=' if figure.at_least else '<='} {_number(figure.target)} {'' if figure.met else 'MISSED'}".rstrip()
+        target = f"{'>=' if figure.at_least else '<='} {_number(figure.target)}{'' if figure.met else ' MISSED'}"
     spread = f"{_number(figure.low)} .. {_number(figure.high)}" if figure.count > 1 else ""
     return f"  {figure.name}", _number(figure.median), spread, figure.unit, target
 

@@ -117,8 +117,9 @@ def fly(flight, folder, namespaces):
 @contextmanager
 def _surroundings(folder):
     """(node of ours, Processes) in a domain of their own, whose logs READY understands."""
-    plain = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": "[{severity}] [{time}] [{name}]: {message}", "RCUTILS_COLORIZED_OUTPUT": "0"}
-    with own_domain(), variables(plain), session("bench", []) as (node, stop), Processes(folder, stop) as processes:
+    form = "[{severity}] [{time}] [{name}]: {message}"
+    logs = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": form, "RCUTILS_COLORIZED_OUTPUT": "0"}
+    with own_domain(), variables(logs), session("bench", []) as (node, stop), Processes(folder, stop) as processes:
         yield node, processes
 
 
@@ -190,7 +191,8 @@ def _figures(section, measured, target_cpu=None, target_latency=None):
         yield Figure.of(section, f"lost, {name}", "messages", count)
     yield Figure.of(section, "too late to be used", "messages", measured.late)
     yield Figure.of(section, "this process: CPU of source and listener", "% of a core", 100.0 * measured.source_cpu)
-    yield Figure.of(section, "this process: p99 of how late it published", "ms", np.percentile(measured.source_late, 99))
+    late = np.percentile(measured.source_late, 99)
+    yield Figure.of(section, "this process: p99 of how late it published", "ms", late)
 
 
 def _known(values):

@@ -33,7 +33,8 @@ def measure(progress, folder, quick=False):
         highest = max(highest, reached)
         if reached < KEPT_UP * rate:
             break
-    yield Figure.of(SECTION, "highest without loss", "s of flight/s", highest, None if quick else NEEDED * KEPT_UP, True)
+    target = None if quick else NEEDED * KEPT_UP
+    yield Figure.of(SECTION, "highest without loss", "s of flight/s", highest, target, at_least=True)
 
 
 def speed(recorded):

@@ -20,12 +20,13 @@ ANCHORS = (4, 16, 32, 64)
 
 
 def measure(progress, quick=False, model=None):
-    """Generator of Figures; model : path of an ONNX network, default the one that is shipped. progress(text)."""
+    """Generator of Figures; model : path of an ONNX network, default the one shipped. progress(text)."""
     repeats = 2 if quick else 7
     flight = make_flight(SECONDS)
     section = f"recording of {SECONDS:g} s, 1 kHz IMU, 400 Hz TDOA"
     progress("recording, first call")
-    yield Figure.of(section, "first call: compiled, or compiled code read from numba's cache", "s", _seconds(run_offline, flight))
+    name = "first call: compiled, or compiled code read from numba's cache"
+    yield Figure.of(section, name, "s", _seconds(run_offline, flight))
     network = Network(model or Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "known_answer.onnx")
     effects = EffectSet((
         AnchorDelay(flight.meta["parameters"]["anchor_delays"]), TagLeverArm({"x": 0.01, "y": 0.0, "z": 0.05}),

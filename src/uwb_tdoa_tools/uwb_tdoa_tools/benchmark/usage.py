@@ -21,13 +21,13 @@ def memory(pid):
 
 
 def used_by_all():
-    """(total, idle, stolen, ours) CPU time of all cores so far, s. ours : this process and its children that have ended."""
+    """(total, idle, stolen, ours) CPU time of all cores so far, s. ours : this process and children that have ended."""
     user, nice, system, idle, waiting, irq, soft, stolen = map(int, Path("/proc/stat").read_text().split()[1:9])
-    ours = sum(os.times()[:4])
-    return TICK * (user + nice + system + idle + waiting + irq + soft + stolen), TICK * (idle + waiting), TICK * stolen, ours
+    total = user + nice + system + idle + waiting + irq + soft + stolen
+    return TICK * total, TICK * (idle + waiting), TICK * stolen, sum(os.times()[:4])
 
 
 def used_by_others(before):
-    """Shares of all CPU time since `before` (used_by_all): {"others": other processes, "stolen": the host of this VM}."""
+    """Shares of all CPU time since `before` (used_by_all): {"others": other processes, "stolen": this VM's host}."""
     total, idle, stolen, ours = (now - then for now, then in zip(used_by_all(), before))
     return {"others": max(0.0, total - idle - stolen - ours) / max(total, TICK), "stolen": stolen / max(total, TICK)}
