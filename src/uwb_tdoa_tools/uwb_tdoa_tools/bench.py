@@ -13,8 +13,8 @@ from uwb_tdoa_bias.errors import InputError
 
 from . import cli
 
-DESCRIPTION = """Measure on this machine, in this run: the compiled core, whole recordings, both nodes live, several tags,
-and replays. Figures are medians with their quartiles, beside their targets.
+DESCRIPTION = """Measure on this machine, in this run: the compiled core, whole recordings, both nodes live, several
+tags, and replays. Figures are medians with their quartiles, beside their targets.
 
   core    us per IMU prediction and per robust TDOA update, by anchors and kind of robustness
   offline seconds for a recording of 45 s, with correction, network and smoother

@@ -116,7 +116,7 @@ def _cluster(address):
         client = Client(address, timeout=CONNECT_LIMIT, set_as_default=False)
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"--dask: no scheduler answers at {address} ({reason}); start one, or correct this.") from error
+        raise InputError(f"--dask: no scheduler answers at {address} ({reason}); start one, or correct it.") from error
     with client:
         yield {"backend": "dask", "client": client}
 
