@@ -11,8 +11,7 @@ HEADER = ("", "median", "quartiles", "unit", "target")
 class Figure:
     """One line of the table: the median of repeated measurements and their quartiles, in `unit`.
 
-    section, name : unique together; count : of the measurements; target : limit in the same unit, or None;
-    at_least : the target is a lower limit.
+    section, name : unique together; count : of the measurements; target : upper limit in the same unit, or None.
     """
 
     section: str
@@ -23,22 +22,21 @@ class Figure:
     high: float
     count: int
     target: float | None = None
-    at_least: bool = False
 
     @classmethod
-    def of(cls, section, name, unit, values, target=None, at_least=False):
+    def of(cls, section, name, unit, values, target=None):
         """From repeated measurements, a number or (n,) of them; NaN where there is none."""
         values = np.atleast_1d(np.asarray(values, dtype=float))
         values = values[np.isfinite(values)]
         low, median, high = np.percentile(values, [25, 50, 75]) if len(values) else (np.nan,) * 3
-        return cls(section, name, unit, float(median), float(low), float(high), len(values), target, at_least)
+        return cls(section, name, unit, float(median), float(low), float(high), len(values), target)
 
     @property
     def met(self):
         """Whether the median meets the target; None if there is none."""
         if self.target is None:
             return None
-        return bool(self.median >= self.target if self.at_least else self.median <= self.target)
+        return bool(self.median <= self.target)
 
 
 def table(figures):
@@ -63,7 +61,7 @@ def as_json(figures):
 def _cells(figure):
     target = ""
     if figure.target is not None:
-        target = f"{'>=' if figure.at_least else '<='} {_number(figure.target)}{'' if figure.met else ' MISSED'}"
+        target = f"<= {_number(figure.target)}{'' if figure.met else ' MISSED'}"
     spread = f"{_number(figure.low)} .. {_number(figure.high)}" if figure.count > 1 else ""
     return f"  {figure.name}", _number(figure.median), spread, figure.unit, target
 
