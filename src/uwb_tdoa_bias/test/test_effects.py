@@ -1,3 +1,5 @@
+from pathlib import Path
+
 from finite_differences import numerical_jacobian
 from hypothesis import given, strategies as st
 import numpy as np
@@ -6,20 +8,25 @@ from random_samples import random_samples
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, Samples, TagLeverArm
+from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, ImuCorrector, Samples, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.errors import InputError
 from uwb_tdoa_bias.geometry import tdoa
 
 seeds = st.integers(0, 2**32 - 1)
 
 
+FITTED = [effect for effect in EFFECTS.values() if effect.fitted and "tdoa" in effect.channels]
+STAMPS = ("tdoa_time_offset", "truth_time_offset")  # act on stamps: their bias is zero, their regressors are not
+
+
 def parameters(effect, samples, rng):
     """Some parameters of an effect for these samples: {name: value}."""
-    keys = samples.anchors.ids if effect is AnchorDelay else "xyz"
-    return {str(key): rng.uniform(-0.5, 0.5) for key in keys}
+    ids = samples.anchors.ids
+    keys = effect.groups(samples.anchors, np.column_stack([ids[samples.a], ids[samples.b]]))[0]
+    return {key: 0.1 * min(1.0, effect.bound_of(key)) * rng.uniform(-1.0, 1.0) for key in keys}
 
 
-@pytest.mark.parametrize("effect", EFFECTS.values())
+@pytest.mark.parametrize("effect", [effect for effect in FITTED if effect.name not in STAMPS])
 @given(seeds)
 def test_regressors_against_finite_differences(effect, seed):
     samples = random_samples(seed)
@@ -34,7 +41,7 @@ def test_regressors_against_finite_differences(effect, seed):
     np.testing.assert_allclose(found, numerical_jacobian(bias, [values[k] for k in keys]), atol=1e-5)
 
 
-@pytest.mark.parametrize("effect", EFFECTS.values())
+@pytest.mark.parametrize("effect", FITTED)
 def test_regressors_of_some_parameters_are_those_columns(effect):
     samples = random_samples(5)
     values = parameters(effect, samples, np.random.default_rng(5))
@@ -46,11 +53,14 @@ def test_regressors_of_some_parameters_are_those_columns(effect):
 @pytest.mark.parametrize("effect", EFFECTS.values())
 def test_is_declared_in_full(effect):
     assert EFFECTS[effect.name] is effect
-    assert effect.bound > 0.0 and effect.unit and effect.reference
+    assert effect.bound > effect.negligible > 0.0 and effect.unit and effect.reference and effect.physics
+    assert set(effect.confounded_with) <= set(EFFECTS) and set(effect.channels) <= {"tdoa", "gyro", "accel"}
     np.testing.assert_array_equal(effect().bias(random_samples(1)), 0.0)  # no parameter, no effect
-    for wrong in (np.nan, np.inf, 1.01 * effect.bound, -1.01 * effect.bound, "much", None, [0.1]):
+    np.testing.assert_array_equal(effect().spread(random_samples(1)), 0.0)
+    bound = effect.bound_of(effect.example)
+    for wrong in (np.nan, np.inf, 1.01 * bound, -1.01 * bound, "much", None, [0.1]):
         with pytest.raises(InputError, match="values"):
-            effect({"x" if effect is TagLeverArm else "0": wrong})
+            effect({effect.example: wrong})
     with pytest.raises(InputError, match="parameter 'sideways'"):
         effect({"sideways": 0.1})
 
@@ -137,3 +147,84 @@ def test_an_effect_without_values_is_one_that_is_zero(tmp_path):
     (tmp_path / "effects.yaml").write_text("effects: {anchor_delay: }")
     effects = EffectSet.from_yaml(tmp_path / "effects.yaml")
     assert effects.name == "anchor_delay" and effects.effects[0].values == {}
+
+
+@pytest.mark.parametrize("effect", EFFECTS.values())
+def test_is_in_the_document(effect):
+    text = (Path(__file__).resolve().parents[3] / "docs" / "effects.md").read_text()
+    section = text.partition(f"### {effect.name}\n")[2].partition("\n### ")[0]
+    assert (
+        effect.physics in section and effect.reference in section and all(o in section for o in effect.confounded_with)
+    )
+    assert (
+        f"| {effect.bound:g} | {effect.typical:g} | {effect.negligible:g} |"
+        in text.partition(f"[`{effect.name}`]")[2].split("\n")[0]
+    )
+
+
+def term(**changes):
+    settings = {"channel": "tdoa", "covariate": "range", "form": "arrival", "knots": [1.0, 4.0, 9.0]}
+    return SmoothTerm({"c0": 0.1, "c1": -0.2, "c2": 0.05, "c3": 0.3}, **{**settings, **changes})
+
+
+@pytest.mark.parametrize(
+    "form, covariate", [("common", "height"), ("arrival", "elevation_in_anchor"), ("anchor", "range")]
+)
+@given(seed=seeds)
+def test_smooth_term_is_linear_in_its_coefficients(form, covariate, seed):
+    samples, rng = random_samples(seed), np.random.default_rng(seed)
+    empty = term(form=form, covariate=covariate)
+    keys = empty.keys(samples.anchors)
+    values = dict(zip(keys, rng.standard_normal(len(keys))))
+    full = SmoothTerm(values, {}, "", "tdoa", covariate, form, empty.knots)
+    np.testing.assert_allclose(full.bias(samples), full.regressors(samples, keys) @ list(values.values()), atol=1e-12)
+
+
+def test_smooth_term_is_constant_beyond_its_knots_and_survives_a_file(tmp_path):
+    one = term()
+    np.testing.assert_allclose(one.curve(np.array([-5.0, 1.0, 9.0, 50.0])), [0.1, 0.1, 0.3, 0.3], atol=1e-12)
+    EffectSet((one, term(covariate="height", form="common"))).to_yaml(tmp_path / "effects.yaml")
+    again = EffectSet.from_yaml(tmp_path / "effects.yaml")
+    assert [e.covariate for e in again.effects] == ["range", "height"]
+    np.testing.assert_array_equal(
+        again.bias(random_samples(3)), EffectSet((one, term(covariate="height", form="common"))).bias(random_samples(3))
+    )
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"knots": [1.0]}, {"knots": [2.0, 1.0]}, {"covariate": "colour"}, {"channel": "gyro.w"}, {"form": "odd"}],
+)
+def test_smooth_term_refuses_nonsense(changes):
+    with pytest.raises(InputError, match="smooth_term"):
+        term(**changes)
+
+
+def test_inertial_samples_are_corrected_the_same_at_once_and_one_by_one():
+    rng = np.random.default_rng(0)
+    effects = [
+        EFFECTS["gyro_bias"]({"z": 0.02}),
+        EFFECTS["imu_misalignment"]({"x": 0.1}),
+        EFFECTS["accel_scale"]({"y": 0.03}),
+    ]
+    effects += [SmoothTerm({"c0": 0.1, "c3": 0.4}, {}, "", "accel.z", "vibration", "common", [0.0, 1.0, 2.0])]
+    t, gyro, accel = np.arange(200) / 1000.0, rng.standard_normal((200, 3)), rng.standard_normal((200, 3))
+    together = ImuCorrector(effects).correct(t, gyro, accel)
+    corrector = ImuCorrector(effects)
+    single = [corrector.correct(t[k : k + 1], gyro[k : k + 1], accel[k : k + 1]) for k in range(200)]
+    for sensor in range(2):
+        np.testing.assert_allclose(np.concatenate([s[sensor] for s in single]), together[sensor], atol=1e-12)
+
+
+def test_stamps_and_spread():
+    from uwb_tdoa_bias.flight import Flight, Tdoas
+
+    samples = random_samples(4)
+    ids = samples.anchors.ids
+    noisy = EFFECTS["noise_level"]({f"{ids[0]}-{ids[1]}": 0.3})
+    hit = np.isin(samples.a, (0, 1)) & np.isin(samples.b, (0, 1))
+    np.testing.assert_allclose(EffectSet((noisy,)).spread(samples), 0.3 * hit)
+    late = EffectSet((EFFECTS["tdoa_time_offset"]({"offset": 0.03}),))
+    flight = Flight("f", samples.anchors, Tdoas(samples.t, ids[samples.a], ids[samples.b], samples.t))
+    assert late.tdoa_offset == 0.03
+    np.testing.assert_allclose(late.correct_streams(flight).tdoa.t, samples.t - 0.03)

@@ -114,7 +114,7 @@ class BiasNode(Node):
             self._take(message)
 
     def _take(self, message):
-        t = self._epoch.seconds(message.header.stamp)
+        t = self._epoch.seconds(message.header.stamp) - self._effects.tdoa_offset
         if t < self._newest - TIME_JUMP:
             self.get_logger().info("time has gone back: starting over")
             self._start_over()
@@ -135,8 +135,10 @@ class BiasNode(Node):
         bias, std, status = np.zeros(len(t)), np.zeros(len(t)), np.full(len(t), PASSED)
         bias[valid], std[valid], status[valid] = correction.bias, correction.std, correction.status
         self._counts["invalid"] += len(t) - int(valid.sum())
-        for (_, message, ready), *values in zip(released, bias.tolist(), std.tolist(), status.tolist()):
+        for (at, message, ready), *values in zip(released, bias.tolist(), std.tolist(), status.tolist()):
             self._counts["unready"] += not ready
+            if self._effects.tdoa_offset:
+                message.header.stamp = self._epoch.stamp(at)
             self._publish(message, *values)
 
     def _is_ready(self, t):

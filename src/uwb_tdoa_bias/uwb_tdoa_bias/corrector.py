@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .effects import EffectSet, Samples
+from .motion import motion
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
@@ -42,6 +43,7 @@ class Corrector:
     def reset(self):
         """Forget all poses."""
         self._t, self._p, self._q = [], [], []
+        self._first = self._last = None  # stamp of the first TDOA; stamp and later anchor of the last one
 
     @property
     def idle(self):
@@ -73,19 +75,30 @@ class Corrector:
         zeros = np.zeros(n)
         if self.idle or n == 0:
             return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
-        p, q = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
+        p, q, places = np.full((n, 3), np.nan), np.full((n, 4), np.nan), []
         for i in range(n):
             k = bisect_right(self._t, t[i] - self.lag) - 1
+            places.append(k)
             if k >= 0:
                 p[i], q[i] = self._p[k], self._q[k]
-        samples = Samples(t, a, b, p, q, self.anchors)
+        extra = self._extra(t, b, places) if self.effects.needs_motion else {}
+        self._first = t[0] if self._first is None else self._first
+        samples = Samples(t, a, b, p, q, self.anchors, self._first, **extra)
         bias = self.effects.bias(samples)
-        std = zeros
+        std = self.effects.spread(samples)
         status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
         if self.network is not None:
             learned, std = self.network.predict(samples)
             known = np.isfinite(learned)
             bias = bias + np.where(known, learned, 0.0)
-            std = np.where(known & np.isfinite(std), std, 0.0)
+            std = np.hypot(self.effects.spread(samples), np.where(known & np.isfinite(std), std, 0.0))
             status[known] = NETWORK
         return Correction(bias, std, d - bias, status)
+
+    def _extra(self, t, b, places):
+        """Motion of the tag at the poses numbered `places`, and what was heard before each TDOA: for Samples."""
+        t_last, b_last = self._last or (t[0], -1)
+        before = np.concatenate([[t_last], t[:-1]])
+        previous = np.concatenate([[b_last], self.anchors.ids[b[:-1]]])
+        self._last = (t[-1], self.anchors.ids[b[-1]])
+        return {**motion(self._t, self._p, self._q, places), "interval": t - before, "previous": previous}

@@ -20,6 +20,7 @@ from sensor_msgs.msg import Imu
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias import ros
 from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.effects import EffectSet, ImuCorrector
 from uwb_tdoa_bias.errors import InputError
 from uwb_tdoa_bias.flyable import FlyableVolume
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
@@ -28,7 +29,8 @@ from .config import FilterConfig
 from .engine import INVALID
 from .estimator import TIME_JUMP, VERDICTS, Estimator
 from .frames import to_odometry
-from .health import Health
+from .health import OK, WARN, Health
+from .monitor import Monitor
 
 EARLY = 5000  # messages kept while there are no anchors
 UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
@@ -51,6 +53,8 @@ class EkfNode(Node):
         self._world = ros.parameter(self, "world_frame", "", "frame of the odometry; empty for that of the anchors")
         self._body = ros.parameter(self, "body_frame", "base_link", "frame of the tag and the IMU")
         volume = ros.parameter(self, "flyable_volume", "", "file of plan: where the tag can be located; empty for none")
+        effects_file = ros.parameter(self, "effects_file", "", "effects.yaml whose inertial effects are taken out")
+        self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         publish_tf = ros.parameter(self, "publish_tf", True, "publish world -> body on /tf")
         if not 0.0 <= self._reorder < self._lag < math.inf:
             raise InputError(f"reorder, lag: {self._reorder!r}, {self._lag!r} must be seconds with 0 <= reorder < lag.")
@@ -84,6 +88,7 @@ class EkfNode(Node):
             self._publish(*self._estimator.finish())
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
         self._estimator = Estimator(anchors, self._config, self._reorder, self._lag)
+        self._imu_corrector, self._monitor = ImuCorrector(self._effects.effects), Monitor(anchors)
         world = self._world or anchors.frame
         for message in (self._odometry, self._transform, self._residual):
             message.header.frame_id = world
@@ -124,6 +129,8 @@ class EkfNode(Node):
                 once=True,
             )
             gyro = (math.nan,) * 3
+        if not self._imu_corrector.idle:
+            gyro, force = (x[0].tolist() for x in self._imu_corrector.correct(*map(np.array, ([t], [gyro], [force]))))
         self._estimator.add_imu(t, gyro, force)
         if self._gyros and t < self._gyros[-1][0]:
             if t > self._gyros[-1][0] - TIME_JUMP:
@@ -139,7 +146,9 @@ class EkfNode(Node):
     def _publish(self, odometry, residuals):
         if len(odometry.t):
             self._publish_odometry(odometry)
+            self._monitor.add_odometry(odometry)
         if len(residuals.t):
+            self._monitor.add(residuals)
             columns = (
                 residuals.t, residuals.a, residuals.b, residuals.innovation, residuals.variance, residuals.weight,
                 residuals.verdict,
@@ -199,6 +208,10 @@ class EkfNode(Node):
             counts.update(estimator.counts, recoveries=estimator.recoveries)
             imu_waiting, tdoa_waiting = estimator.waiting
         level, text, values = self._health.report(self._anchors.refused, estimator, counts)
+        alarms = self._monitor.alarms if estimator is not None else []
+        if alarms and level == OK:
+            level, text = WARN, alarms[0]
+        values |= {"changed since the start": "; ".join(alarms) or "nothing"}
         values |= {"TDOAs received": self._health.tdoa} | {name: counts[name] for name in VERDICTS.values()}
         values |= {"waiting": tdoa_waiting, "IMU samples received": self._health.imu}
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}

@@ -46,6 +46,7 @@ def run_offline(flight, config=None, corrector=None, tape=None):
     corrector = corrector or Corrector(flight.anchors)
     corrector.reset()
     tape = new_tape() if tape is None else tape
+    flight = corrector.effects.correct_streams(flight)
     tdoa, imu, positions = flight.tdoa, flight.imu, flight.anchors.positions
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
     n, empty = len(tdoa), np.empty((0, 3))

@@ -3,9 +3,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_tools.simulation.antenna import Antenna
+from uwb_tdoa_bias.antenna import Antenna
+from uwb_tdoa_bias.radio import RadioLink, arrival_bias, into_frame, power_bias, received_power_dbm
 from uwb_tdoa_tools.simulation.constellations import pair
-from uwb_tdoa_tools.simulation.radio import RadioLink, arrival_bias, into_frame, power_bias, received_power_dbm
 from uwb_tdoa_tools.simulation.ranging import tag_link
 
 ISOTROPIC = Antenna((0.0,) * 4, (0.0,) * 4, (0.0,) * 4)

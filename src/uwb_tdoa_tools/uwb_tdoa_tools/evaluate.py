@@ -37,7 +37,8 @@ def evaluate(flight, config=None, effects=None, network=None, engine=run_offline
     engine : run_offline, or smooth, which uses what came after each estimate too."""
     _need_truth(flight)
     result = engine(flight, config, Corrector(flight.anchors, effects, network))
-    return Score(flight.name, result.odometry, flight.truth, result.residuals), result
+    truth = effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth
+    return Score(flight.name, result.odometry, truth, result.residuals), result
 
 
 def main(argv=None):
@@ -99,7 +100,7 @@ def _evaluate(args):
         print(f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
               f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
     if args.json:
-        report = {"runs": [_as_json(score.row()) for score in scores], "pooled": _as_json(together)}
+        report = {"runs": [as_json(score.row()) for score in scores], "pooled": as_json(together)}
         Path(args.json).write_text(json.dumps(report, indent=1, allow_nan=False))
     if args.markdown:
         rows = [score.row() for score in scores] + [together] * (len(scores) > 1)
@@ -142,7 +143,7 @@ def _need_truth(flight):
         raise InputError(f"{flight.name}: it holds no ground truth to compare with.")
 
 
-def _as_json(row):
+def as_json(row):
     """JSON has no NaN and no infinity: null."""
     return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from ..errors import InputError
-from .base import Effect
+from .base import Effect, check_anchor, known_anchors
 
 
 class AnchorDelay(Effect):
@@ -15,16 +14,24 @@ class AnchorDelay(Effect):
     name = "anchor_delay"
     unit = "m"
     bound = 5.0
+    negligible = 0.01
+    typical = 0.3
+    example = "0"
+    physics = "the antenna delay of an anchor is not calibrated: it always seems farther away by the same distance"
     confounded_with = ("anchor_position", "pair_offset")
     reference = "DW1000 user manual, antenna delay calibration: 10 - 50 cm from module to module"
 
     @classmethod
     def check_key(cls, key):
-        if not key.isdigit():
-            raise InputError(f"effects: anchor_delay: parameter {key!r} is not an anchor id; write '3: 0.05' for 5 cm.")
+        check_anchor(cls.name, key, key)
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        ids = known_anchors(anchors)
+        return [ids, *((key,) for key in ids)]
 
     def bias(self, samples):
-        delay = np.array([self.values.get(str(i), 0.0) for i in samples.anchors.ids])
+        delay = np.array([self.values.get(str(i), 0.0) for i in samples.anchors.ids.tolist()])
         return delay[samples.b] - delay[samples.a]
 
     def regressors(self, samples, keys):

@@ -1,38 +1,23 @@
 """What a systematic effect is."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
-from ..anchors import Anchors
 from ..errors import InputError
+from .samples import Samples, true_samples
 
-
-@dataclass(frozen=True)
-class Samples:
-    """A batch of TDOAs and the pose the tag had, or was believed to have, when they were taken.
-
-    t : (n,) s; a, b : (n,) rows of `anchors`; p : (n, 3) m, world; q : (n, 4) x y z w, body to world, NaN if unknown.
-    """
-
-    t: np.ndarray
-    a: np.ndarray
-    b: np.ndarray
-    p: np.ndarray
-    q: np.ndarray
-    anchors: Anchors
-
-    def __len__(self):
-        return len(self.t)
+__all__ = ["ArrivalEffect", "Effect", "Samples"]
 
 
 @dataclass
 class Effect:
-    """A named systematic error of a TDOA with scalar parameters. One effect, one file: subclass and list it in EFFECTS.
+    """A named systematic error with scalar parameters. One effect, one file: subclass and list it in EFFECTS.
 
     values : {parameter name: value in `unit`}; std : the same keys, standard errors, empty if unknown;
     source : where the values came from, free text.
+    An effect acts on the TDOAs (`bias`, `spread`), or on whole streams (`correct_streams`: stamps, inertial samples).
     """
 
     values: dict = field(default_factory=dict)
@@ -42,8 +27,14 @@ class Effect:
     name: ClassVar[str]
     unit: ClassVar[str]
     bound: ClassVar[float]  # a larger magnitude is refused as a mistake, in `unit`
+    negligible: ClassVar[float]  # a smaller magnitude is not worth a term in the model, in `unit`
+    typical: ClassVar[float]  # a plausible size, standard deviation of what fits expect before they see data, in `unit`
+    example: ClassVar[str]  # the parameter that a value without a name is for; see `from_text`
+    physics: ClassVar[str]  # one sentence for the catalogue
     confounded_with: ClassVar[tuple] = ()
     reference: ClassVar[str]
+    channels: ClassVar[tuple] = ("tdoa",)  # where it shows: tdoa, gyro, accel
+    fitted: ClassVar[bool] = True  # False: found by a search of its own, not by linear regression
 
     def __post_init__(self):
         for group in ("values", "std"):
@@ -55,22 +46,105 @@ class Effect:
                     read[key] = float(value)
                 except (TypeError, ValueError):
                     read[key] = np.nan
-                if not np.isfinite(read[key]) or abs(read[key]) > self.bound:
+                bound = self.bound_of(key)
+                if not np.isfinite(read[key]) or abs(read[key]) > bound:
                     raise InputError(
                         f"effects: {self.name}: {group}: {key} is {value!r}; expected a number of {self.unit} "
-                        f"between -{self.bound:g} and {self.bound:g}."
+                        f"between -{bound:g} and {bound:g}."
                     )
             setattr(self, group, read)
 
     @classmethod
     def check_key(cls, key):
         """Raise InputError if `key` is no parameter of this effect."""
+        if key not in cls.groups(None, None)[0]:
+            known = ", ".join(cls.groups(None, None)[0])
+            raise InputError(f"effects: {cls.name}: parameter {key!r} is not one of {known}.")
+
+    @classmethod
+    def bound_of(cls, key):
+        """Largest magnitude of the parameter `key`, in its unit."""
+        return cls.bound
+
+    @classmethod
+    def typical_of(cls, key):
+        """Plausible size of the parameter `key`, in its unit."""
+        return cls.typical
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        """Sets of parameters that make sense together, as tuples of names, the full set first.
+
+        anchors : Anchors; pairs : (m, 2) ids of the pairs that were heard. Both may be None where they do not matter.
+        """
         raise NotImplementedError
 
     def bias(self, samples):
         """Contribution to the measured d_ab, (n,) metres; NaN where it cannot be told (unknown pose)."""
-        raise NotImplementedError
+        return np.zeros(len(samples))
 
     def regressors(self, samples, keys):
         """Derivative of `bias` with respect to the parameters named in `keys`, (n, len(keys)), metres per `unit`."""
+        return np.zeros((len(samples), len(keys)))
+
+    def spread(self, samples):
+        """Standard deviation that it adds to d_ab, (n,) metres."""
+        return np.zeros(len(samples))
+
+    def inject(self, flight, rng=None):
+        """The Flight that would have been recorded with this effect on top. Raises InputError where that needs a ground
+        truth, or an attitude, that the flight does not have. rng : numpy Generator, for random effects."""
+        need_truth(self, flight)
+        samples, rows = true_samples(flight)
+        bias = self.bias(samples)
+        if not np.isfinite(bias).all():
+            raise InputError(f"{flight.name}: has no attitude in its ground truth, which {self.name} needs.")
+        d = flight.tdoa.d.copy()
+        d[rows] += bias
+        return replace(flight, tdoa=replace(flight.tdoa, d=d))
+
+    def correct_streams(self, flight):
+        """The Flight without this effect's part in stamps and inertial samples. TDOA biases are the Corrector's."""
+        return flight
+
+
+class ArrivalEffect(Effect):
+    """An effect that makes the signals of single anchors arrive late: bias of d_ab = late_b - late_a."""
+
+    def late(self, samples, rows):
+        """By how much the anchors in `rows` (k * n,), the samples repeated k times, seem too far: (k * n,) m."""
         raise NotImplementedError
+
+    def late_regressors(self, samples, rows, keys):
+        """Its derivative with respect to `keys`, (k * n, len(keys))."""
+        raise NotImplementedError
+
+    def bias(self, samples):
+        both = self.late(samples, np.concatenate([samples.a, samples.b]))
+        return both[len(samples) :] - both[: len(samples)]
+
+    def regressors(self, samples, keys):
+        both = self.late_regressors(samples, np.concatenate([samples.a, samples.b]), keys)
+        return both[len(samples) :] - both[: len(samples)]
+
+
+def need_truth(effect, flight):
+    """Raise InputError if the flight has no ground truth to compute `effect` at."""
+    if flight.truth is None or len(flight.truth) == 0:
+        raise InputError(f"{flight.name}: holds no ground truth, which {effect.name} needs.")
+
+
+def tile(samples, values):
+    """Per-sample values (n, ...) repeated for both anchors: (2n, ...)."""
+    return np.concatenate([values, values])
+
+
+def check_anchor(name, text, key):
+    """Raise InputError if `text`, of the parameter `key` of effect `name`, is not an anchor id."""
+    if not (text.isdigit() and int(text) <= 65535):
+        raise InputError(f"effects: {name}: parameter {key!r} is not an anchor id; write for example '3: 0.05'.")
+
+
+def known_anchors(anchors):
+    """Ids as text; () without anchors."""
+    return () if anchors is None else tuple(str(i) for i in anchors.ids.tolist())

@@ -3,7 +3,6 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import InputError
 from ..geometry import tdoa, tdoa_jacobian
 from .base import Effect
 
@@ -14,24 +13,27 @@ class TagLeverArm(Effect):
     name = "tag_lever_arm"
     unit = "m"
     bound = 2.0
+    negligible = 0.01
+    typical = 0.15
+    example = "z"
+    physics = "the tag's antenna is off the origin of the body frame, by an arm that turns with the body"
     confounded_with = ("truth_frame", "anchor_position")
     reference = "any text on strapdown navigation: lever arm compensation"
 
     @classmethod
-    def check_key(cls, key):
-        if key not in ("x", "y", "z"):
-            raise InputError(f"effects: tag_lever_arm: parameter {key!r} is not one of x, y, z.")
+    def groups(cls, anchors, pairs):
+        return [("x", "y", "z"), ("x",), ("y",), ("z",)]
 
     def _arm(self):
         return np.array([self.values.get(key, 0.0) for key in "xyz"])
 
     def bias(self, samples):
-        a, b = samples.anchors.positions[samples.a], samples.anchors.positions[samples.b]
+        a, b = samples.position_a, samples.position_b
         return tdoa(samples.p + _rotate(samples.q, self._arm()), a, b) - tdoa(samples.p, a, b)
 
     def regressors(self, samples, keys):
-        a, b = samples.anchors.positions[samples.a], samples.anchors.positions[samples.b]
-        jacobian = tdoa_jacobian(samples.p + _rotate(samples.q, self._arm()), a, b)
+        antenna = samples.p + _rotate(samples.q, self._arm())
+        jacobian = tdoa_jacobian(antenna, samples.position_a, samples.position_b)
         axes = np.eye(3)[["xyz".index(key) for key in keys]]
         return np.stack([np.sum(jacobian * _rotate(samples.q, axis), axis=1) for axis in axes], axis=1)
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from uwb_tdoa_bias.antenna import Antenna
 from uwb_tdoa_bias.errors import InputError
 
 from .. import cli, inputs, parallel
-from ..simulation.antenna import Antenna
 from ..simulation.room import Room, room_of
 from .installation import Installation
 from .goal import OBJECTIVES, Goal

@@ -4,11 +4,11 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.antenna import Antenna
 from uwb_tdoa_bias.flight import Tdoas
 from uwb_tdoa_bias.geometry import tdoa
+from uwb_tdoa_bias.radio import FLAT_MOUNT, RadioLink, arrival_bias
 
-from .antenna import Antenna
-from .radio import FLAT_MOUNT, RadioLink, arrival_bias
 from .schedule import make_schedule
 
 UNIT_GAIN_SPREAD = 0.7  # dB, tag to tag

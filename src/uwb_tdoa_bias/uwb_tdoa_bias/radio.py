@@ -16,6 +16,8 @@ SPEED_OF_LIGHT = 299792458.0  # m/s
 APS011_POWER_DBM = np.arange(-61.0, -97.0, -2.0)
 APS011_BIAS_MM = np.array([-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86.0])
 
+NOMINAL_GAIN = -3.3  # dBi, mean gain of the default antenna, for one whose attitude is not known
+
 # An assumption: the tag's module lies flat on the vehicle, front (antenna x) up, null axis (antenna z) along body x.
 FLAT_MOUNT = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
 
@@ -39,6 +41,10 @@ class RadioLink:
     tx_power_dbm: float = -8.3
     frequency: float = 3.9936e9
 
+    def path_loss_db(self, distance):
+        """Free-space loss over `distance` m (not nearer than 1 cm), dB."""
+        return 20.0 * np.log10(4.0 * np.pi * self.frequency * np.maximum(distance, 0.01) / SPEED_OF_LIGHT)
+
 
 def received_power_dbm(p_tag, q_tag, p_anchor, q_anchor, link=RadioLink()):
     """Power that arrives at the tag, dBm, with the shape the arguments broadcast to.
@@ -49,10 +55,8 @@ def received_power_dbm(p_tag, q_tag, p_anchor, q_anchor, link=RadioLink()):
     Polarisation is not modelled, and nearer than 1 cm the distance counts as 1 cm.
     """
     seen_from_tag, seen_from_anchor = _directions(p_tag, q_tag, p_anchor, q_anchor, link)
-    distance = np.maximum(np.linalg.norm(seen_from_tag, axis=-1), 0.01)
-    path_loss = 20.0 * np.log10(4.0 * np.pi * link.frequency * distance / SPEED_OF_LIGHT)
     gains = link.anchor_antenna.gain(seen_from_anchor) + link.tag_antenna.gain(seen_from_tag)
-    return link.tx_power_dbm + gains - path_loss
+    return link.tx_power_dbm + gains - link.path_loss_db(np.linalg.norm(seen_from_tag, axis=-1))
 
 
 def power_bias(power_dbm):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from uwb_tdoa_bias.errors import InputError
+from .errors import InputError
 
 # Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These are not measured
 # numbers: they are drawn in the shape of the plots in the DWM1000 data sheet (an uneven doughnut: 3 dB of ripple around

@@ -1,0 +1,23 @@
+"""The accelerometer is off by a constant."""
+
+import numpy as np
+
+from .imu_error import Affine, ImuEffect
+
+
+class AccelBias(ImuEffect):
+    """Measured force = true specific force + (x, y, z), body axes."""
+
+    name = "accel_bias"
+    unit = "m/s^2"
+    bound = 10.0
+    negligible = 0.03
+    typical = 0.5
+    example = "x"
+    physics = "zero-g offset of a MEMS accelerometer, and vibration that it rectifies"
+    confounded_with = ("imu_misalignment", "imu_gravity", "accel_scale")
+    reference = "BMI088 data sheet: zero-g offset 20 mg"
+    channels = ("accel",)
+
+    def accel(self):
+        return Affine(np.eye(3), self.vector())

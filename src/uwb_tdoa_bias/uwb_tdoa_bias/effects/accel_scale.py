@@ -1,0 +1,23 @@
+"""The accelerometer reads too much or too little."""
+
+import numpy as np
+
+from .imu_error import Affine, ImuEffect
+
+
+class AccelScale(ImuEffect):
+    """Measured force = (1 + (x, y, z)) true specific force, axis by axis."""
+
+    name = "accel_scale"
+    unit = "1"
+    bound = 0.5
+    negligible = 0.004
+    typical = 0.05
+    example = "z"
+    physics = "sensitivity error of a MEMS accelerometer"
+    confounded_with = ("accel_bias", "imu_gravity")
+    reference = "BMI088 data sheet: sensitivity tolerance 0.7 %"
+    channels = ("accel",)
+
+    def accel(self):
+        return Affine(np.eye(3) + np.diag(self.vector()), np.zeros(3))

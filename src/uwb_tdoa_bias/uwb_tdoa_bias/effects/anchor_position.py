@@ -1,0 +1,66 @@
+"""An anchor does not stand where the survey says."""
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry import tdoa
+from .base import Effect, check_anchor, known_anchors
+
+
+class AnchorPosition(Effect):
+    """Anchor i really stands `values["i.x"]`, ... metres away from its surveyed position, along the world's axes."""
+
+    name = "anchor_position"
+    unit = "m"
+    bound = 5.0
+    negligible = 0.01
+    typical = 0.15
+    example = "0.x"
+    physics = (
+        "the antenna of an anchor is not where the survey has it: the range is wrong by the shift along the "
+        "line of sight"
+    )
+    confounded_with = ("anchor_delay", "truth_frame", "tag_lever_arm")
+    reference = "geometry; survey repeatability of a total station is millimetres, of a tape some centimetres"
+
+    @classmethod
+    def check_key(cls, key):
+        anchor, _, axis = key.partition(".")
+        if axis not in ("x", "y", "z") or not axis:
+            raise InputError(f"effects: {cls.name}: parameter {key!r} is not an anchor and an axis; write '3.x: 0.05'.")
+        check_anchor(cls.name, anchor, key)
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        each = [tuple(f"{i}.{axis}" for axis in "xyz") for i in known_anchors(anchors)]
+        return [sum(each, ()), *each, *((key,) for keys in each for key in keys)]
+
+    def _moved(self, anchors):
+        positions = anchors.positions.copy()
+        rows = {i: row for row, i in enumerate(known_anchors(anchors))}
+        for key, value in self.values.items():
+            anchor, axis = key.split(".")
+            if anchor in rows:
+                positions[rows[anchor], "xyz".index(axis)] += value
+        return positions
+
+    def bias(self, samples):
+        moved = self._moved(samples.anchors)
+        after = tdoa(samples.p, moved[samples.a], moved[samples.b])
+        return after - tdoa(samples.p, samples.position_a, samples.position_b)
+
+    def regressors(self, samples, keys):
+        moved, ids = self._moved(samples.anchors), samples.anchors.ids
+        unit_a, unit_b = (_unit(moved[rows] - samples.p) for rows in (samples.a, samples.b))
+        out = np.empty((len(samples), len(keys)))
+        for column, key in enumerate(keys):
+            anchor, axis = key.split(".")
+            k = "xyz".index(axis)
+            out[:, column] = (ids[samples.b] == int(anchor)) * unit_b[:, k] - (ids[samples.a] == int(anchor)) * unit_a[
+                :, k
+            ]
+        return out
+
+
+def _unit(v):
+    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)

@@ -1,0 +1,44 @@
+"""Antennas delay a signal by an amount that depends on its direction."""
+
+import numpy as np
+
+from ..antenna import Antenna
+from ..radio import FLAT_MOUNT, into_frame
+from .base import ArrivalEffect, tile
+
+UNIT = Antenna(delay_span=1.0)
+
+
+class AntennaPattern(ArrivalEffect):
+    """`tag` and `anchor` metres times the shape of a DWM1000-like module's group delay over direction (0 ... 1)."""
+
+    name = "antenna_pattern"
+    unit = "m"
+    bound = 3.0
+    negligible = 0.02
+    typical = 0.2
+    example = "tag"
+    physics = "off its best direction an antenna radiates over longer ways: the group delay grows towards its nulls"
+    confounded_with = ("received_power_bias", "tag_lever_arm")
+    reference = "Qorvo support: 10 - 15 cm over direction for a module; the shape is that of uwb_tdoa_bias.antenna"
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [("tag", "anchor"), ("tag",), ("anchor",)]
+
+    def late(self, samples, rows):
+        keys = tuple(self.values)
+        return self.late_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
+
+    def late_regressors(self, samples, rows, keys):
+        to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
+        out = np.zeros((len(rows), len(keys)))
+        for column, key in enumerate(keys):
+            if key == "tag":
+                seen = into_frame(FLAT_MOUNT, into_frame(tile(samples, samples.q), to_anchor))
+                out[:, column] = UNIT.group_delay(seen)
+            else:  # an anchor whose orientation was not surveyed adds nothing
+                seen = into_frame(samples.anchors.orientations[rows], -to_anchor)
+                known = np.isfinite(samples.anchors.orientations[rows]).all(axis=1)
+                out[:, column] = np.where(known, UNIT.group_delay(seen), 0.0)
+        return out

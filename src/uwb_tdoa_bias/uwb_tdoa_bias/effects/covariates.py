@@ -1,0 +1,99 @@
+"""What a systematic error may depend on: quantities that a node can compute, by name."""
+
+import math
+
+import numpy as np
+
+from ..compiled import compiled
+from ..radio import into_frame
+from .base import tile
+
+CATEGORIES = ("previous_anchor",)  # values are names, not sizes
+OF_MOTION = ("speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor")  # need a history
+VIBRATION_CORNER, VIBRATION_TIME = 0.05, 0.3  # s: faster is vibration; its power is averaged over the second
+
+
+def _norm(v):
+    return None if v is None else np.linalg.norm(v, axis=1)
+
+
+# One value per TDOA, of Samples: (n,), or None if the samples do not hold it.
+OF_TDOA = {
+    "time": lambda s: s.t - s.start,
+    "x": lambda s: s.p[:, 0],
+    "y": lambda s: s.p[:, 1],
+    "height": lambda s: s.p[:, 2],
+    "speed": lambda s: _norm(s.v),
+    "climb_rate": lambda s: None if s.v is None else s.v[:, 2],
+    "acceleration": lambda s: _norm(s.acceleration),
+    "turning_rate": lambda s: _norm(s.rate),
+    "interval": lambda s: s.interval,
+    "previous_anchor": lambda s: s.previous,
+    "vibration": lambda s: s.vibration,
+}
+
+
+def _to_anchor(samples, rows):
+    return samples.anchors.positions[rows] - tile(samples, samples.p)
+
+
+def _bearing(v):
+    return np.arctan2(v[:, 1], v[:, 0])
+
+
+def _elevation(v):
+    return np.arctan2(v[:, 2], np.hypot(v[:, 0], v[:, 1]))
+
+
+# One value per arrival: of the anchors in rows (2n,), the samples repeated twice.
+OF_ARRIVAL = {
+    "range": lambda s, rows: np.linalg.norm(_to_anchor(s, rows), axis=1),
+    "bearing": lambda s, rows: _bearing(_to_anchor(s, rows)),
+    "elevation": lambda s, rows: _elevation(_to_anchor(s, rows)),
+    "bearing_in_tag": lambda s, rows: _bearing(into_frame(tile(s, s.q), _to_anchor(s, rows))),
+    "elevation_in_tag": lambda s, rows: _elevation(into_frame(tile(s, s.q), _to_anchor(s, rows))),
+    "bearing_in_anchor": lambda s, rows: _bearing(into_frame(s.anchors.orientations[rows], -_to_anchor(s, rows))),
+    "elevation_in_anchor": lambda s, rows: _elevation(into_frame(s.anchors.orientations[rows], -_to_anchor(s, rows))),
+}
+
+# One value per inertial sample: columns of what ImuFeatures gives.
+OF_IMU = (
+    "time", "vibration", "turning_rate", "rate_x", "rate_y", "rate_z", "force", "force_x", "force_y", "force_z",
+)  # fmt: skip
+
+
+class ImuFeatures:
+    """The covariates OF_IMU along a stream of inertial samples; they depend on the past of the stream alone."""
+
+    def __init__(self):
+        self._state = np.zeros((4, 3))  # last stamp and first stamp, slow rate, slow force, vibration power
+        self._state[0, :2] = np.nan
+
+    def __call__(self, t, gyro, accel):
+        """t (n,) s; gyro (n, 3) rad/s; accel (n, 3) m/s^2. Returns (n, len(OF_IMU))."""
+        out = np.empty((len(t), len(OF_IMU)))
+        _features(self._state, np.ascontiguousarray(t), np.ascontiguousarray(gyro), np.ascontiguousarray(accel), out)
+        return out
+
+
+@compiled
+def _features(state, t, gyro, accel, out):
+    rate, force, power = state[1], state[2], state[3]
+    for i in range(len(t)):
+        dt = t[i] - state[0, 0]
+        if not 0.0 <= dt < 1.0:  # the first sample, or one after a gap
+            if not (state[0, 1] <= t[i]):
+                state[0, 1] = t[i]
+            rate[:], force[:], power[:] = gyro[i], accel[i], 0.0
+            dt = 0.0
+        state[0, 0] = t[i]
+        for k in range(3):
+            rate[k] += min(1.0, dt / VIBRATION_CORNER) * (gyro[i, k] - rate[k])
+            force[k] += min(1.0, dt / VIBRATION_CORNER) * (accel[i, k] - force[k])
+            power[k] += min(1.0, dt / VIBRATION_TIME) * ((accel[i, k] - force[k]) ** 2 - power[k])
+            out[i, 3 + k] = rate[k]
+            out[i, 7 + k] = force[k]
+        out[i, 0] = t[i] - state[0, 1]
+        out[i, 1] = math.sqrt(power[0] + power[1] + power[2])
+        out[i, 2] = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+        out[i, 6] = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)

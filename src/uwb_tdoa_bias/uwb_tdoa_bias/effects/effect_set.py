@@ -1,0 +1,113 @@
+"""`effects.yaml`: which effects are in the model, with which values."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from ..errors import InputError
+from .catalogue import EFFECTS
+from .covariates import OF_MOTION
+from .imu_corrector import ImuCorrector
+from .smooth_term import SmoothTerm
+from .tdoa_time_offset import TdoaTimeOffset
+
+ENTRY = ("values", "std", "source")
+
+
+@dataclass(frozen=True)
+class EffectSet:
+    """The effects that are in the model, in the order in which they are listed."""
+
+    effects: tuple = ()
+
+    @property
+    def name(self):
+        """Names joined by '+', or "none"."""
+        return "+".join(effect.name for effect in self.effects) or "none"
+
+    def __len__(self):
+        return len(self.effects)
+
+    def bias(self, samples):
+        """Sum of all contributions to d_ab, (n,) metres. An effect that cannot tell (unknown attitude) adds nothing."""
+        total = np.zeros(len(samples))
+        for effect in self.effects:
+            part = effect.bias(samples)
+            total += np.where(np.isfinite(part), part, 0.0)
+        return total
+
+    def spread(self, samples):
+        """Standard deviation that the effects add to d_ab, (n,) metres."""
+        return np.sqrt(sum((effect.spread(samples) ** 2 for effect in self.effects), np.zeros(len(samples))))
+
+    @property
+    def needs_motion(self):
+        """True if an effect looks at more than poses."""
+        return any(isinstance(effect, SmoothTerm) and effect.covariate in OF_MOTION for effect in self.effects)
+
+    @property
+    def tdoa_offset(self):
+        """Seconds by which the stamps of TDOAs are late."""
+        return sum(effect.offset for effect in self.effects if isinstance(effect, TdoaTimeOffset))
+
+    def correct_streams(self, flight):
+        """The Flight without the effects' part in stamps and inertial samples. TDOA biases are the Corrector's."""
+        for effect in self.effects:
+            flight = effect.correct_streams(flight)
+        corrector = ImuCorrector(self.effects)
+        if flight.imu is None or corrector.idle:
+            return flight
+        imu = flight.imu
+        gyro, accel = corrector.correct(imu.t, imu.gyro, imu.accel)
+        return replace(flight, imu=replace(imu, gyro=gyro, accel=accel))
+
+    @classmethod
+    def from_yaml(cls, path):
+        """Read effects.yaml; raises InputError."""
+        try:
+            content = yaml.safe_load(Path(path).read_text())
+        except (OSError, yaml.YAMLError) as error:
+            raise InputError(f"{path}: cannot be read as YAML ({error}).") from error
+        entries = content.get("effects") if isinstance(content, dict) else None
+        if not isinstance(entries, dict):
+            raise InputError(f"{path}: expected a mapping 'effects' of effect name to values.")
+        effects = []
+        for name, entry in entries.items():
+            kind = _kind(str(name))
+            if kind is None:
+                known = ", ".join([*EFFECTS, "smooth_term_1, ..."])
+                raise InputError(f"{path}: effect {name!r} is not known; known are {known}.")
+            allowed = (*ENTRY, *getattr(kind, "settings", ()))
+            entry = entry or {}
+            unknown = set(entry) - set(allowed) if isinstance(entry, dict) else {"(not a mapping)"}
+            if unknown:
+                raise InputError(f"{path}: {name}: {sorted(unknown)[0]!r} is not one of {', '.join(allowed)}.")
+            try:
+                effects.append(kind(**entry))
+            except (TypeError, AttributeError) as error:
+                raise InputError(f"{path}: {name}: values and std must be mappings of parameter to number.") from error
+        return cls(tuple(effects))
+
+    def to_yaml(self, path):
+        """Write what `from_yaml` reads."""
+        entries, terms = {}, 0
+        for effect in self.effects:
+            name = effect.name
+            entry = {"values": dict(effect.values), "std": dict(effect.std), "source": effect.source}
+            if isinstance(effect, SmoothTerm):
+                terms += 1
+                name = f"{name}_{terms}"
+                entry = {**{key: getattr(effect, key) for key in effect.settings}, **entry}
+                entry["knots"] = list(effect.knots)
+            entries[name] = {key: value for key, value in entry.items() if value}
+        Path(path).write_text(yaml.safe_dump({"effects": entries}, sort_keys=False))
+
+
+def _kind(name):
+    """Class of an entry: a declared effect, or smooth_term with an optional _NUMBER; None if there is none."""
+    head, _, number = name.rpartition("_")
+    if name == SmoothTerm.name or (head == SmoothTerm.name and number.isdigit()):
+        return SmoothTerm
+    return EFFECTS.get(name)

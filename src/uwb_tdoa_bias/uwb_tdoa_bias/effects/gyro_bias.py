@@ -1,0 +1,22 @@
+"""The gyroscope reads something at rest."""
+
+import numpy as np
+
+from .imu_error import Affine, ImuEffect
+
+
+class GyroBias(ImuEffect):
+    """Measured rate = true rate + (x, y, z), body axes."""
+
+    name = "gyro_bias"
+    unit = "rad/s"
+    bound = 1.0
+    negligible = 0.002
+    typical = 0.05
+    example = "z"
+    physics = "zero-rate offset of a MEMS gyroscope, with temperature and age"
+    reference = "BMI088 data sheet: zero-rate offset 1 degree/s"
+    channels = ("gyro",)
+
+    def gyro(self):
+        return Affine(np.eye(3), self.vector())

@@ -1,0 +1,23 @@
+"""The gyroscope reads too much or too little."""
+
+import numpy as np
+
+from .imu_error import Affine, ImuEffect
+
+
+class GyroScale(ImuEffect):
+    """Measured rate = (1 + (x, y, z)) true rate, axis by axis."""
+
+    name = "gyro_scale"
+    unit = "1"
+    bound = 0.5
+    negligible = 0.01
+    typical = 0.05
+    example = "z"
+    physics = "sensitivity error of a MEMS gyroscope"
+    confounded_with = ("truth_time_offset", "imu_misalignment")
+    reference = "BMI088 data sheet: sensitivity tolerance 1 %"
+    channels = ("gyro",)
+
+    def gyro(self):
+        return Affine(np.eye(3) + np.diag(self.vector()), np.zeros(3))

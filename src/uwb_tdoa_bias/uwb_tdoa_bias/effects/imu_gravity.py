@@ -1,0 +1,51 @@
+"""Gravity is not what the filter takes it for."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .base import need_truth
+from .imu_error import Affine, ImuEffect, need_imu
+from .samples import samples_at
+
+
+class ImuGravity(ImuEffect):
+    """Gravity is 9.81 m/s^2 + `excess`, along the world's z. Corrected along the body's z: at the tilt of a flight that
+    is right to a few percent of the excess, and needs no attitude."""
+
+    name = "imu_gravity"
+    unit = "m/s^2"
+    bound = 1.0
+    negligible = 0.03
+    typical = 0.1
+    example = "excess"
+    physics = "local gravity, or the factor from g to m/s^2, differs from the 9.81 m/s^2 of the filter"
+    confounded_with = ("accel_bias", "accel_scale")
+    reference = "gravity is 9.780 to 9.832 m/s^2 between equator and pole"
+    channels = ("accel",)
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [("excess",)]
+
+    @property
+    def excess(self):
+        """m/s^2"""
+        return self.values.get("excess", 0.0)
+
+    def accel(self):
+        return Affine(np.eye(3), np.array([0.0, 0.0, self.excess]))
+
+    def inject(self, flight, rng=None):
+        need_truth(self, flight)
+        need_imu(self, flight)
+        imu = flight.imu
+        none = np.zeros(len(imu), dtype=int)
+        q = samples_at(imu.t, none, none, flight.truth, flight.anchors, motion=False).q
+        up = (
+            Rotation.from_quat(q).inv().apply([0.0, 0.0, self.excess])
+            if np.isfinite(q).all()
+            else [0.0, 0.0, self.excess]
+        )
+        return replace(flight, imu=replace(imu, accel=imu.accel + up))

@@ -1,0 +1,31 @@
+"""The IMU is not mounted along the body's axes."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .imu_error import Affine, ImuEffect
+
+
+class ImuMisalignment(ImuEffect):
+    """The IMU's axes are the body's, turned by the rotation vector (x, y, z): it measures R^T of what the body
+    feels."""
+
+    name = "imu_misalignment"
+    unit = "rad"
+    bound = 0.6
+    negligible = 0.004
+    typical = 0.05
+    example = "x"
+    physics = "the sensor, or the frame of the ground truth, is turned against the body's axes"
+    confounded_with = ("accel_bias", "gyro_scale")
+    reference = "strapdown navigation: mounting misalignment"
+    channels = ("gyro", "accel")
+
+    def _turn(self):
+        return Affine(Rotation.from_rotvec(self.vector()).as_matrix().T, np.zeros(3))
+
+    def gyro(self):
+        return self._turn()
+
+    def accel(self):
+        return self._turn()

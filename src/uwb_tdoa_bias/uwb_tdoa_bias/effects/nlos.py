@@ -1,0 +1,61 @@
+"""One anchor is blocked, for a while or from a region."""
+
+import numpy as np
+
+from ..errors import InputError
+from .base import ArrivalEffect, check_anchor, tile
+
+PARTS = ("delay", "start", "end", "x", "y", "z", "radius")
+
+
+class Nlos(ArrivalEffect):
+    """Anchor i is "i.delay" metres late: from "i.start" to "i.end" seconds after the first TDOA, or while the tag is
+    within "i.radius" metres of ("i.x", "i.y", "i.z"); what is not given does not limit it."""
+
+    name = "nlos"
+    unit = "m, s"
+    bound = 100.0
+    negligible = 0.02
+    typical = 0.5
+    example = "0.delay"
+    physics = "something between tag and anchor: the direct path is slowed or lost, and a later one is taken for it"
+    confounded_with = ("anchor_delay", "anchor_clock_drift", "anchor_position")
+    reference = "UTIL identification data: metal 0.2 - 0.6 m, wood 0.03 - 0.24 m, people up to 2 m"
+    fitted = False
+
+    @classmethod
+    def check_key(cls, key):
+        anchor, _, part = key.partition(".")
+        if part not in PARTS:
+            raise InputError(f"effects: {cls.name}: parameter {key!r} is not an anchor and one of {', '.join(PARTS)}.")
+        check_anchor(cls.name, anchor, key)
+
+    @classmethod
+    def bound_of(cls, key):
+        return 1e6 if key.endswith(("start", "end")) else cls.bound
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [()]
+
+    def _blocked(self, samples, rows, anchor):
+        """(k * n,) bool"""
+        get = self.values.get
+        since = tile(samples, samples.t) - samples.start
+        blocked = samples.anchors.ids[rows] == int(anchor)
+        blocked &= (since >= get(f"{anchor}.start", -np.inf)) & (since <= get(f"{anchor}.end", np.inf))
+        if f"{anchor}.radius" in self.values:
+            centre = np.array([get(f"{anchor}.{axis}", 0.0) for axis in "xyz"])
+            near = np.linalg.norm(samples.p - centre, axis=1) <= self.values[f"{anchor}.radius"]  # False where NaN
+            blocked &= tile(samples, near)
+        return blocked
+
+    def late(self, samples, rows):
+        keys = [key for key in self.values if key.endswith(".delay")]
+        return self.late_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
+
+    def late_regressors(self, samples, rows, keys):
+        out = np.zeros((len(rows), len(keys)))
+        for column, key in enumerate(keys):
+            out[:, column] = self._blocked(samples, rows, key.partition(".")[0])
+        return out

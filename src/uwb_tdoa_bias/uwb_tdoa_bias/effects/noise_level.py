@@ -1,0 +1,47 @@
+"""One pair is noisier than the others."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .base import Effect
+from .pair_offset import PairOffset, link_keys
+
+
+class NoiseLevel(Effect):
+    """The link "a-b", in both directions, has white noise of `values["a-b"]` metres on top of what all have."""
+
+    name = "noise_level"
+    unit = "m"
+    bound = 10.0
+    negligible = 0.03
+    typical = 0.2
+    example = "0-1"
+    physics = "a weak or disturbed link: its arrivals scatter more"
+    confounded_with = ("outlier_rate", "noise_correlation")
+    reference = "DW1000 user manual: ranging precision over received power"
+    fitted = False
+
+    check_key = PairOffset.check_key
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        keys = link_keys(pairs)
+        return [keys, *((key,) for key in keys)]
+
+    def spread(self, samples):
+        a, b = samples.anchors.ids[samples.a], samples.anchors.ids[samples.b]
+        variance = np.zeros(len(samples))
+        for key, value in self.values.items():
+            i, k = map(int, key.split("-"))
+            variance += value**2 * (((a == i) & (b == k)) | ((a == k) & (b == i)))
+        return np.sqrt(variance)
+
+    def inject(self, flight, rng=None):
+        from .samples import Samples
+
+        tdoa, n = flight.tdoa, len(flight.tdoa)
+        a, b = np.maximum(flight.anchors.index(tdoa.a), 0), np.maximum(flight.anchors.index(tdoa.b), 0)
+        samples = Samples(tdoa.t, a, b, np.zeros((n, 3)), np.full((n, 4), np.nan), flight.anchors)
+        rng = rng or np.random.default_rng()
+        return replace(flight, tdoa=replace(tdoa, d=tdoa.d + self.spread(samples) * rng.standard_normal(n)))

@@ -1,0 +1,33 @@
+"""Some TDOAs are plainly wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .base import Effect
+
+
+class OutlierRate(Effect):
+    """A `share` of the TDOAs is wrong by something else: 0.5 to 5 m, either sign. The filter's robust weights are the
+    remedy; there is nothing to subtract."""
+
+    name = "outlier_rate"
+    unit = "1"
+    bound = 1.0
+    negligible = 0.02
+    typical = 0.05
+    example = "share"
+    physics = "lost or mixed-up packets and reflections: single measurements that have nothing to do with the geometry"
+    confounded_with = ("noise_level",)
+    reference = "crazyflie-firmware issues 277, 305, 375"
+    fitted = False
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [("share",)]
+
+    def inject(self, flight, rng=None):
+        rng, tdoa = rng or np.random.default_rng(), flight.tdoa
+        hit = rng.random(len(tdoa)) < self.values.get("share", 0.0)
+        size = np.copysign(rng.uniform(0.5, 5.0, len(tdoa)), rng.uniform(-1.0, 1.0, len(tdoa)))
+        return replace(flight, tdoa=replace(tdoa, d=tdoa.d + np.where(hit, size, 0.0)))

@@ -1,0 +1,60 @@
+"""An error of the link between two anchors."""
+
+import numpy as np
+
+from ..errors import InputError
+from .base import Effect
+
+
+class PairOffset(Effect):
+    """d_ab of the ordered pair "a-b" is `values["a-b"]` metres too large, and d_ba as much too small."""
+
+    name = "pair_offset"
+    unit = "m"
+    bound = 5.0
+    negligible = 0.01
+    typical = 0.3
+    example = "0-1"
+    physics = (
+        "the tag subtracts the time of flight that two anchors measured between them; its error is a "
+        "constant of the pair"
+    )
+    confounded_with = ("anchor_delay", "anchor_position")
+    reference = "Bitcraze documentation of TDoA2: anchor-to-anchor time of flight"
+
+    @classmethod
+    def check_key(cls, key):
+        if len(key.split("-")) != 2 or not all(part.isdigit() for part in key.split("-")):
+            raise InputError(f"effects: {cls.name}: parameter {key!r} is not a pair of anchors; write '0-1: 0.05'.")
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        keys = link_keys(pairs)
+        return [keys, *((key,) for key in keys)]
+
+    def bias(self, samples):
+        table = {}
+        for key, value in self.values.items():
+            a, b = map(int, key.split("-"))
+            table[a, b] = table.get((a, b), 0.0) + value
+            table[b, a] = table.get((b, a), 0.0) - value
+        offsets = np.zeros((len(samples.anchors),) * 2)
+        rows = {i: row for row, i in enumerate(samples.anchors.ids.tolist())}
+        for (a, b), value in table.items():
+            if a in rows and b in rows:
+                offsets[rows[a], rows[b]] = value
+        return offsets[samples.a, samples.b]
+
+    def regressors(self, samples, keys):
+        a, b = samples.anchors.ids[samples.a], samples.anchors.ids[samples.b]
+        links = [tuple(map(int, key.split("-"))) for key in keys]
+        return np.stack([1.0 * ((a == i) & (b == k)) - ((a == k) & (b == i)) for i, k in links], axis=1)
+
+
+def link_keys(pairs):
+    """Names of the links that were heard, each once, in the direction that was heard more or first."""
+    keys = []
+    for a, b in [] if pairs is None else np.asarray(pairs).tolist():
+        if f"{b}-{a}" not in keys and f"{a}-{b}" not in keys:
+            keys.append(f"{a}-{b}")
+    return tuple(keys)

@@ -1,0 +1,30 @@
+"""The error of an arrival grows with the square of the range."""
+
+import numpy as np
+
+from .base import ArrivalEffect, tile
+
+
+class RangeBias(ArrivalEffect):
+    """An anchor at range r seems farther by quadratic * r^2. (A constant cancels in a TDOA; a slope is range_scale.)"""
+
+    name = "range_bias"
+    unit = "1/m"
+    bound = 0.5
+    negligible = 5e-4
+    typical = 0.01
+    example = "quadratic"
+    physics = "the detector fires later on weak, far signals: a range error that bends over range"
+    confounded_with = ("received_power_bias", "range_scale")
+    reference = "Decawave APS011: the range error is a bent function of received power, hence of range"
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [("quadratic",)]
+
+    def late(self, samples, rows):
+        return self.values.get("quadratic", 0.0) * self.late_regressors(samples, rows, ("quadratic",))[:, 0]
+
+    def late_regressors(self, samples, rows, keys):
+        to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
+        return np.repeat(np.sum(to_anchor**2, axis=1)[:, None], len(keys), axis=1)

@@ -1,0 +1,32 @@
+"""All ranges are too long by one factor."""
+
+import numpy as np
+
+from ..geometry import tdoa
+from .base import Effect
+
+
+class RangeScale(Effect):
+    """d_ab is measured as (1 + scale) d_ab."""
+
+    name = "range_scale"
+    unit = "1"
+    bound = 0.5
+    negligible = 0.002
+    typical = 0.02
+    example = "scale"
+    physics = (
+        "the tag converts ticks to metres with a wrong length: a wrong clock frequency, speed of propagation or unit"
+    )
+    confounded_with = ("range_bias", "anchor_position", "truth_frame")
+    reference = "DW1000 user manual: one tick is 15.65 ps, 4.69 mm"
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [("scale",)]
+
+    def bias(self, samples):
+        return self.values.get("scale", 0.0) * tdoa(samples.p, samples.position_a, samples.position_b)
+
+    def regressors(self, samples, keys):
+        return np.repeat(tdoa(samples.p, samples.position_a, samples.position_b)[:, None], len(keys), axis=1)

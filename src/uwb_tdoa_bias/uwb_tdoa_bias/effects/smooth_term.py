@@ -1,0 +1,143 @@
+"""An effect without a name: a smooth function of something, found in residuals."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from ..errors import InputError
+from .base import Effect, known_anchors, tile
+from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_TDOA
+
+DEGREE = 2
+IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
+FORMS = ("common", "arrival", "anchor")
+
+
+@dataclass
+class SmoothTerm(Effect):
+    """A quadratic B-spline of one covariate, held constant beyond its knots; `values` are its coefficients c0, c1, ...
+
+    channel : "tdoa", or "gyro.x" ... "accel.z"
+    covariate : a name of covariates.OF_TDOA or OF_ARRIVAL, or for the inertial channels of OF_IMU
+    form : for "tdoa" only: "common", the same f(covariate) on every d_ab; "arrival", f of each anchor's own
+        covariate, as d_ab = f_b - f_a; "anchor", the same with a function for each anchor, coefficients "3.c0", ...
+    knots : where the pieces meet, ends included, rising; for a covariate of names: the names, one coefficient each
+    """
+
+    channel: str = "tdoa"
+    covariate: str = "time"
+    form: str = "common"
+    knots: tuple = field(default_factory=tuple)
+
+    name: ClassVar[str] = "smooth_term"
+    settings: ClassVar[tuple] = ("channel", "covariate", "form", "knots")
+    unit: ClassVar[str] = "m, rad/s or m/s^2"
+    bound: ClassVar[float] = 100.0
+    negligible: ClassVar[float] = 0.0
+    typical: ClassVar[float] = 0.1
+    physics: ClassVar[str] = "unknown: what is left when the declared effects are taken out"
+    reference: ClassVar[str] = "found in residuals by diagnose"
+    fitted: ClassVar[bool] = False
+
+    def __post_init__(self):
+        try:
+            self.knots = tuple(float(knot) for knot in self.knots)
+        except (TypeError, ValueError):
+            self.knots = ()
+        if len(self.knots) < 2 or not (np.diff(self.knots) > 0.0).all():
+            raise InputError(f"effects: smooth_term: knots: {self.knots!r} are not two or more rising numbers.")
+        known = {**dict.fromkeys(IMU_CHANNELS, (*OF_IMU, *OF_TDOA)), "tdoa": (*OF_TDOA, *OF_ARRIVAL)}
+        extra = self.covariate.startswith("extra.")
+        if self.form not in FORMS or self.channel not in known or not (extra or self.covariate in known[self.channel]):
+            raise InputError(
+                f"effects: smooth_term: no {self.form!r} function of {self.covariate!r} acts on {self.channel!r}."
+            )
+        super().__post_init__()
+
+    @classmethod
+    def check_key(cls, key):
+        if not key.rpartition(".")[2].removeprefix("c").isdigit():
+            raise InputError(f"effects: smooth_term: parameter {key!r} is not a coefficient such as c0 or 3.c0.")
+
+    @classmethod
+    def typical_of(cls, key):
+        return 0.5 * cls.typical if "." in key else cls.typical  # a function for each anchor: many, hence small
+
+    @property
+    def usable(self):
+        """Whether the nodes, and the filter off line, have the covariate at hand."""
+        if self.channel == "tdoa":
+            return self.covariate in (*OF_TDOA, *OF_ARRIVAL) and self.covariate != "vibration"
+        return self.covariate in OF_IMU
+
+    def keys(self, anchors=None):
+        """All coefficients: of every anchor for the form "anchor"."""
+        count = len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
+        each = tuple(f"c{k}" for k in range(count))
+        return tuple(f"{i}.{c}" for i in known_anchors(anchors) for c in each) if self.form == "anchor" else each
+
+    def basis(self, values):
+        """The functions that the coefficients c0, c1, ... multiply, at covariate values (n,): (n, k), NaN stays NaN."""
+        if self.covariate in CATEGORIES:
+            return (np.asarray(values)[:, None] == np.array(self.knots)).astype(float)
+        return self._spline(np.clip(values, self.knots[0], self.knots[-1]))
+
+    def curve(self, values, prefix=""):
+        """The function at covariate values (n,): (n,). prefix : "3." for that of anchor 3 of the form "anchor"."""
+        basis = self.basis(values)
+        return basis @ self._weights(prefix, basis.shape[1])
+
+    @cached_property
+    def _spline(self):
+        t = np.array([self.knots[0]] * DEGREE + list(self.knots) + [self.knots[-1]] * DEGREE)
+        return BSpline(t, np.eye(len(t) - DEGREE - 1), DEGREE)
+
+    def _weights(self, prefix, count):
+        return np.array([self.values.get(f"{prefix}c{k}", 0.0) for k in range(count)])
+
+    def _covariate(self, samples):
+        """(values per TDOA or None, values per arrival or None)"""
+        if self.covariate in OF_ARRIVAL:
+            return None, OF_ARRIVAL[self.covariate](samples, np.concatenate([samples.a, samples.b]))
+        if self.covariate in OF_TDOA:
+            values = OF_TDOA[self.covariate](samples)
+        else:
+            values = (samples.extra or {}).get(self.covariate.removeprefix("extra."))
+        return values, None if values is None else tile(samples, values)
+
+    def bias(self, samples):
+        n = len(samples)
+        values, both = self._covariate(samples)
+        if self.channel != "tdoa" or both is None:
+            return np.zeros(n)
+        if self.form == "common":
+            return self.curve(values)
+        if self.form == "arrival":
+            late = self.curve(both)
+        else:
+            late, basis = np.zeros(2 * n), self.basis(both)
+            ids = samples.anchors.ids[np.concatenate([samples.a, samples.b])]
+            for i in set(ids.tolist()):
+                late[ids == i] = basis[ids == i] @ self._weights(f"{i}.", basis.shape[1])
+        return late[n:] - late[:n]
+
+    def regressors(self, samples, keys):
+        n, out = len(samples), np.zeros((len(samples), len(keys)))
+        values, both = self._covariate(samples)
+        if self.channel != "tdoa" or both is None:
+            return out
+        if self.form == "common":
+            return self.basis(values)[:, [int(key[1:]) for key in keys]]
+        basis, ids = self.basis(both), samples.anchors.ids[np.concatenate([samples.a, samples.b])]
+        for column, key in enumerate(keys):
+            anchor, _, c = key.rpartition(".")
+            late = basis[:, int(c[1:])] * (1.0 if not anchor else ids == int(anchor))
+            out[:, column] = late[n:] - late[:n]
+        return out
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [()]

@@ -1,0 +1,53 @@
+"""The frame of the survey is not quite that of the ground truth."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..geometry import tdoa
+from .base import Effect
+
+KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+class TruthFrame(Effect):
+    """In the frame of the truth, an anchor surveyed at A stands at R A + (x, y, z), R of the rotation vector (roll,
+    pitch, yaw). Correcting it moves the anchors, so that estimates come out in the frame of the truth."""
+
+    name = "truth_frame"
+    unit = "m, rad"
+    bound = 5.0
+    negligible = 0.01
+    typical = 0.15
+    example = "z"
+    physics = "survey and motion capture do not share one frame: all anchors are shifted and turned together"
+    confounded_with = ("tag_lever_arm", "anchor_position")
+    reference = "rigid alignment of two coordinate frames"
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [KEYS, KEYS[:3], KEYS[3:], *((key,) for key in KEYS)]
+
+    @classmethod
+    def bound_of(cls, key):
+        return cls.bound if key in "xyz" else 0.5
+
+    @classmethod
+    def typical_of(cls, key):
+        return cls.typical if key in "xyz" else 0.03
+
+    def _moved(self, anchors):
+        at = np.array([self.values.get(key, 0.0) for key in KEYS])
+        return anchors.positions @ Rotation.from_rotvec(at[3:]).as_matrix().T + at[:3]
+
+    def bias(self, samples):
+        moved = self._moved(samples.anchors)
+        after = tdoa(samples.p, moved[samples.a], moved[samples.b])
+        return after - tdoa(samples.p, samples.position_a, samples.position_b)
+
+    def regressors(self, samples, keys):
+        out, step = np.empty((len(samples), len(keys))), 1e-5
+        for column, key in enumerate(keys):
+            here = self.values.get(key, 0.0)
+            ends = [TruthFrame({**self.values, key: here + s}).bias(samples) for s in (-step, step)]
+            out[:, column] = (ends[1] - ends[0]) / (2.0 * step)
+        return out

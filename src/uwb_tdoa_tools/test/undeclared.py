@@ -1,0 +1,95 @@
+"""Effects that nobody declared: they exist here only, for tests and benchmarks of diagnose to find.
+
+Each takes a Flight and returns the Flight with the effect. CASES: {name: (function, channel, covariates that name it)}.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import true_samples
+
+
+def _tdoa(flight, error):
+    samples, rows = true_samples(flight)
+    d = flight.tdoa.d.copy()
+    d[rows] += error(samples)
+    return replace(flight, tdoa=replace(flight.tdoa, d=d))
+
+
+def _arrivals(late):
+    def error(samples):
+        to_a, to_b = samples.position_a - samples.p, samples.position_b - samples.p
+        return late(to_b) - late(to_a)
+
+    return error
+
+
+def _imu(flight, gyro=0.0, accel=0.0):
+    imu = flight.imu
+    return replace(flight, imu=replace(imu, gyro=imu.gyro + gyro, accel=imu.accel + accel))
+
+
+def _since(flight):
+    return (flight.imu.t - flight.imu.t[0])[:, None]
+
+
+def drag_on_cable(flight):
+    """TDOAs grow with the square of the speed."""
+    return _tdoa(flight, lambda s: 0.1 * np.sum(s.v**2, axis=1))
+
+
+def warming_tag(flight):
+    """All TDOAs start too large and settle within a quarter of a minute."""
+    return _tdoa(flight, lambda s: 0.3 * np.exp(-(s.t - s.start) / 15.0))
+
+
+def layered_air(flight):
+    """TDOAs wave with the height of the tag."""
+    return _tdoa(flight, lambda s: 0.15 * np.sin(3.0 * s.p[:, 2]))
+
+
+def standing_wave(flight):
+    """Arrivals wave with the range."""
+    return _tdoa(flight, _arrivals(lambda to: 0.15 * np.sin(2.0 * np.linalg.norm(to, axis=1))))
+
+
+def mirror_wall(flight):
+    """One anchor is late on one side of the room."""
+    anchor = flight.anchors.ids[2]
+    ids = flight.anchors.ids
+
+    def error(s):
+        late = 0.2 * np.tanh(2.0 * (s.p[:, 0] - np.median(s.p[:, 0])))
+        return late * (1.0 * (ids[s.b] == anchor) - (ids[s.a] == anchor))
+
+    return _tdoa(flight, error)
+
+
+def cooling_gyro(flight):
+    """The gyroscope's x drifts after it is switched on."""
+    return _imu(flight, gyro=np.array([0.05, 0.0, 0.0]) * np.exp(-_since(flight) / 20.0))
+
+
+def loaded_gyro(flight):
+    """The gyroscope's z feels the load on the vehicle."""
+    force = np.linalg.norm(flight.imu.accel, axis=1, keepdims=True)
+    return _imu(flight, gyro=np.array([0.0, 0.0, 0.05]) * (force - 9.81) ** 2)
+
+
+def spun_accelerometer(flight):
+    """The accelerometer sits off the centre: its y feels the square of the turning rate."""
+    rate = np.linalg.norm(flight.imu.gyro, axis=1, keepdims=True)
+    return _imu(flight, accel=np.array([0.0, 0.8, 0.0]) * rate**2)
+
+
+CASES = {
+    "drag_on_cable": (drag_on_cable, "tdoa", ("speed",)),
+    "warming_tag": (warming_tag, "tdoa", ("time",)),
+    "layered_air": (layered_air, "tdoa", ("height",)),
+    "standing_wave": (standing_wave, "tdoa", ("range",)),
+    "mirror_wall": (mirror_wall, "tdoa", ("x",)),
+    "cooling_gyro": (cooling_gyro, "gyro.x", ("time",)),
+    "loaded_gyro": (loaded_gyro, "gyro.z", ("force", "force_z")),
+    "spun_accelerometer": (spun_accelerometer, "accel.y", ("turning_rate", "rate_z")),
+}

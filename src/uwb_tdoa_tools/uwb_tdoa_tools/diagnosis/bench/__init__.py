@@ -1,0 +1,1 @@
+"""Benchmarks of diagnose: the figures of docs/diagnosis.md."""
