@@ -75,13 +75,17 @@ def _bank(args):
 def _no_truth(args):
     cases = [case for case in bank.cases(min(args.seeds, 2)) if case[0] == "large"]
     results = _each(cases, lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed, truth=False)})
-    seen = [r for r in results if r["put_in"][0] not in r["unobservable"] and r["put_in"][0] not in bank.INVISIBLE]
-    right = [r["found"][:1] == r["put_in"] for r in seen]
-    named = sorted({r["put_in"][0] for r in results} - {r["put_in"][0] for r in seen})
-    return {
-        "figures": {"cases": len(seen), "first": round(float(np.mean(right)), 3), "not observable": named},
-        "cases": results,
+    seen = [r for r in results if r["put_in"][0] not in bank.INVISIBLE]
+    hidden = [r for r in results if r["put_in"][0] in bank.INVISIBLE]
+    figures = {
+        "observable": len(seen),
+        "right first": round(float(np.mean([r["found"][:1] == r["put_in"] for r in seen])), 3),
+        "not observable": len(hidden),
+        "named as such, and nothing found": round(
+            float(np.mean([r["put_in"][0] in r["unobservable"] and not r["found"] for r in hidden])), 3
+        ),
     }
+    return {"figures": figures, "cases": results}
 
 
 def _undeclared(args):

@@ -261,35 +261,31 @@ def _plot_terms(result, plt):
 
 
 def _plot_residuals(result, plt):
-    one, two = result.attribution.found[0], result.attribution.left[0]
-    panels = [("TDOA [m]", one.tdoa.samples.t, one.tdoa.residual, two.tdoa.residual, one.tdoa.airborne)]
-    for name, unit in (("gyro", "rad/s"), ("accel", "m/s^2")):
-        parts = getattr(one, name), getattr(two, name)
-        if parts[0] is not None and parts[1] is not None and len(parts[0].t) == len(parts[1].t):
-            for k, axis in enumerate("xyz"):
-                panels.append(
-                    (
-                        f"{name}.{axis} [{unit}]",
-                        parts[0].t,
-                        parts[0].residual[:, k],
-                        parts[1].residual[:, k],
-                        slice(None),
-                    )
-                )
+    sides = [_series(found[0]) for found in (result.attribution.found, result.attribution.left)]
+    names = [name for name in sides[0] if name in sides[1]]
     figure, axes = plt.subplots(
-        len(panels), 1, figsize=(11, 1.7 * len(panels) + 0.6), layout="constrained", sharex=True, squeeze=False
+        len(names), 1, figsize=(11, 1.7 * len(names) + 0.6), layout="constrained", sharex=True, squeeze=False
     )
-    for ax, (name, t, before, after, chosen) in zip(axes[:, 0], panels):
-        t, before = t[chosen], before[chosen]
-        ax.plot(t, before, ".", ms=1.5, color="0.65", label="before")
-        if len(after[chosen]) == len(t):
-            ax.plot(t, after[chosen], ".", ms=1.5, color="tab:blue", label="after")
-        limit = 1.3 * np.quantile(np.abs(before), 0.99) + 1e-9
+    for ax, name in zip(axes[:, 0], names):
+        for side, colour, label in zip(sides, ("0.65", "tab:blue"), ("before", "after")):
+            ax.plot(*side[name], ".", ms=1.5, color=colour, label=label)
+        limit = 1.3 * np.quantile(np.abs(sides[0][name][1]), 0.99) + 1e-9
         ax.set(ylabel=name, ylim=(-limit, limit))
         ax.grid(alpha=0.3)
-    axes[-1, 0].set_xlabel(f"time [s], {one.flight.name}")
+    axes[-1, 0].set_xlabel(f"time [s], {result.flights[0]}")
     axes[0, 0].legend(loc="upper right", markerscale=6)
     return figure
+
+
+def _series(found):
+    """{channel: (stamps, residuals)} of FlightResiduals."""
+    chosen = found.tdoa.airborne
+    out = {"TDOA [m]": (found.tdoa.samples.t[chosen], found.tdoa.residual[chosen])}
+    for name, unit in (("gyro", "rad/s"), ("accel", "m/s^2")):
+        part = getattr(found, name)
+        for k, axis in enumerate("xyz") if part is not None else ():
+            out[f"{name}.{axis} [{unit}]"] = (part.t, part.residual[:, k])
+    return out
 
 
 def _plot_pairs(result, plt):

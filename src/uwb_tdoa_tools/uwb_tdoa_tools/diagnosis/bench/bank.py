@@ -50,13 +50,16 @@ PAIRS = (
     ("received_power_bias", "anchor_delay"),
     ("truth_frame", "imu_misalignment"),
 )
+# Without ground truth an error of the position explains these as well, or nothing else is measured on their channel.
 INVISIBLE = (
+    "tag_lever_arm",
     "tdoa_time_offset",
     "truth_time_offset",
     "truth_frame",
     "gyro_scale",
     "accel_bias",
     "accel_scale",
+    "imu_misalignment",
     "imu_gravity",
 )
 
