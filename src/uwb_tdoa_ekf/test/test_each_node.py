@@ -71,6 +71,16 @@ def test_a_measurement_waits_for_its_pose(make_rig, delays):
     assert rig.counts("bias_node", published=4)["released before their pose"] == 0
 
 
+def test_late_stamps_are_moved(make_rig, tmp_path):
+    (tmp_path / "effects.yaml").write_text("effects: {tdoa_time_offset: {values: {offset: 0.03}}}")
+    rig = make_rig()
+    rig.start("bias_node", bias_node=["-p", f"effects_file:={tmp_path / 'effects.yaml'}"])
+    rig.send_anchors(ANCHORS)
+    rig.send_tdoa(1.25, 10, 14, 1.0)
+    rig.wait(lambda: len(rig.corrected) == 1, "no waiting for poses while there are none at all")
+    assert rig.corrected[0].header.stamp == stamp(1.22) and rig.corrected[0].corrected == 1.0
+
+
 def test_a_measurement_does_not_wait_for_ever(make_rig, delays):
     rig = make_rig()
     rig.start("bias_node", bias_node=delays)
