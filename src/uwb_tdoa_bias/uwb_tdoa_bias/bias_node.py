@@ -22,8 +22,8 @@ from .effects import EffectSet
 from .errors import InputError
 from .hold import Hold
 from .network import Network
+from .stamps import StampWatch
 
-TIME_JUMP = 1.0  # s; a stream that falls back by more has started anew
 EARLY = 2000  # TDOAs kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
@@ -49,7 +49,7 @@ class BiasNode(Node):
         self._corrector = None
         self._epoch, self._counts, self._rate = ros.Epoch(), Counter(), ros.Rate()
         self._early, self._hold = deque(), Hold(self._limit)
-        self._newest = self._newest_pose = -math.inf
+        self._tdoas, self._poses = StampWatch(), StampWatch()
         self._reported_unready = 0
         self._message = TdoaCorrected()  # one for all: what is published is copied
 
@@ -73,7 +73,6 @@ class BiasNode(Node):
         """Forget poses and whatever waits for one."""
         self._counts["dropped"] += len(self._hold)
         self._hold = Hold(self._limit)
-        self._newest = self._newest_pose = -math.inf
         self._corrector = Corrector(self._anchors.anchors, self._effects, self._network, self._lag)
 
     def _on_anchors(self, _):
@@ -92,14 +91,19 @@ class BiasNode(Node):
                 "taken as the same frame",
                 once=True,
             )
-        t = self._epoch.seconds(message.header.stamp)
-        if t < self._newest_pose - TIME_JUMP:
-            self._start_over()
-        self._newest_pose = max(self._newest_pose, t)
-        position = message.pose.pose.position
-        orientation = ros.orientation_of(message.pose.pose.orientation)
-        self._corrector.add_pose(t, (position.x, position.y, position.z), orientation)
+        self._take_pose(self._epoch.seconds(message.header.stamp), message.pose.pose)
         self._release()
+
+    def _take_pose(self, t, pose):
+        believed, _, fell_back = self._poses.take(t, pose)
+        if fell_back:
+            self._start_over()
+            held, self._tdoas = self._tdoas.finish(), StampWatch()
+            for _, message in held:
+                self._take(message)
+        for t, pose in believed:
+            position = pose.position
+            self._corrector.add_pose(t, (position.x, position.y, position.z), ros.orientation_of(pose.orientation))
 
     def _on_tdoa(self, message):
         self._counts["received"] += 1
@@ -115,11 +119,17 @@ class BiasNode(Node):
 
     def _take(self, message):
         t = self._epoch.seconds(message.header.stamp) - self._effects.tdoa_offset
-        if t < self._newest - TIME_JUMP:
+        believed, strays, fell_back = self._tdoas.take(t, message)
+        for _, stray in strays:  # ekf_node says of it that its stamp is wrong
+            self._publish(stray, 0.0, 0.0, PASSED)
+        if fell_back:
             self.get_logger().info("time has gone back: starting over")
             self._start_over()
-        self._newest = max(self._newest, t)
-        self._hold.add(t, message)
+            held, self._poses = self._poses.finish(), StampWatch()
+            for t_held, pose in held:
+                self._take_pose(t_held, pose)
+        for t, message in believed:
+            self._hold.add(t, message)
         self._release()
 
     def _release(self):
@@ -142,7 +152,7 @@ class BiasNode(Node):
             self._publish(message, *values)
 
     def _is_ready(self, t):
-        return self._newest_pose == -math.inf or self._corrector.ready(t)
+        return self._poses.newest == -math.inf or self._corrector.ready(t)
 
     def _publish(self, message, bias, std, status):
         out = self._message
@@ -161,7 +171,7 @@ class BiasNode(Node):
         rate = self._rate.of(counts["received"])
         unready, self._reported_unready = counts["unready"] - self._reported_unready, counts["unready"]
         values = {"model": self._model[NETWORK], "received": counts["received"], "published": counts["published"]}
-        values |= {"waiting": len(self._hold) + len(self._early), "dropped": counts["dropped"]}
+        values |= {"waiting": len(self._hold) + len(self._tdoas) + len(self._early), "dropped": counts["dropped"]}
         values |= {name: counts[name] for name in STATUS.values()}
         values |= {"released before their pose": counts["unready"], "invalid": counts["invalid"]}
         values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
@@ -178,7 +188,7 @@ class BiasNode(Node):
             return DiagnosticStatus.ERROR, "no anchors yet: publish them on uwb/anchors, reliable and transient local"
         if not rate:
             return DiagnosticStatus.WARN, "no TDOAs on uwb/tdoa: check that the tag's driver runs in this namespace"
-        if self._newest_pose == -math.inf:
+        if self._poses.newest == -math.inf:
             return DiagnosticStatus.WARN, "no poses on odometry yet: what needs one is not corrected; start ekf_node"
         if unready:
             return DiagnosticStatus.WARN, "odometry is late: TDOAs leave before their pose; check the load of ekf_node"

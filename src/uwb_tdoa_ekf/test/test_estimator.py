@@ -8,9 +8,10 @@ import pytest
 
 from uwb_tdoa_bias.anchors import Anchors
 from uwb_tdoa_bias.flight import Tdoas
+from uwb_tdoa_bias.stamps import BACK
 from uwb_tdoa_ekf.config import FilterConfig
 from uwb_tdoa_ekf.engine import INVALID, LATE, STARTUP, USED
-from uwb_tdoa_ekf.estimator import TIME_JUMP, VERDICTS, Estimator
+from uwb_tdoa_ekf.estimator import VERDICTS, Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
 seeds = st.integers(0, 2**32 - 1)
@@ -230,11 +231,45 @@ def test_falling_back_by_less_is_late_not_a_restart():
     flight = fly(8, 2.0)
     estimator = Estimator(flight.anchors)
     feed(estimator, flight)
-    estimator.add_tdoa(flight.tdoa.t[-1] - 0.9 * TIME_JUMP, FIRST, SECOND, 0.0)
-    estimator.add_imu(flight.imu.t[-1] - 0.9 * TIME_JUMP, *REST)
+    estimator.add_tdoa(flight.tdoa.t[-1] - 0.9 * BACK, FIRST, SECOND, 0.0)
+    estimator.add_imu(flight.imu.t[-1] - 0.9 * BACK, *REST)
     _, residuals = estimator.advance()
     assert residuals.verdict.tolist() == [LATE]
     assert estimator.running and estimator.counts["restarts"] == 0 and estimator.counts["imu_late"] == 1
+
+
+@pytest.mark.parametrize("off, verdict, count", [(-500.0, LATE, "imu_late"), (500.0, INVALID, "imu_invalid")])
+def test_one_stamp_far_from_its_neighbours_changes_nothing(off, verdict, count):
+    flight = fly(8, 3.0)
+    half = len(flight.tdoa) // 2
+    plain, clean = feed(Estimator(flight.anchors), flight)
+    estimator, parts = Estimator(flight.anchors), []
+    for t, stream, i in messages(flight):
+        if stream == IMU:
+            estimator.add_imu(t, flight.imu.gyro[i], flight.imu.accel[i])
+            if i == len(flight.imu) // 2:
+                estimator.add_imu(t + off, *REST)
+        else:
+            estimator.add_tdoa(t, int(flight.tdoa.a[i]), int(flight.tdoa.b[i]), flight.tdoa.d[i])
+            if i in (half, len(flight.tdoa) - 1):  # the last has no successor that would tell
+                estimator.add_tdoa(t + off, FIRST, SECOND, 0.0)
+        parts.append(estimator.advance())
+    assert estimator.waiting[TDOA] > 0
+    parts.append(estimator.finish())
+    assert_same(joined([part[0] for part in parts]), plain)
+    residuals = joined([part[1] for part in parts])
+    stray = np.abs(residuals.t - flight.tdoa.t[half]) > 100.0
+    assert residuals.verdict[stray].tolist() == [verdict, verdict] and len(residuals.t) == len(clean.t) + 2
+    assert estimator.counts[count] == 1 and estimator.counts["restarts"] == 0
+
+
+def test_rates_are_those_measured_last():
+    flight = fly(8, 1.0)
+    estimator = Estimator(flight.anchors)
+    assert np.isnan(estimator.rates_at(np.array([0.0]))).all()
+    feed(estimator, flight)
+    t = flight.imu.t[-1]
+    np.testing.assert_array_equal(estimator.rates_at(np.array([t, t + 1.0])), [flight.imu.gyro[-1], [np.nan] * 3])
 
 
 def test_finish_leaves_nothing_behind():

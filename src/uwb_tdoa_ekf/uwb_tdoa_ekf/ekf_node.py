@@ -27,7 +27,7 @@ from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
 
 from .config import FilterConfig
 from .engine import INVALID
-from .estimator import TIME_JUMP, VERDICTS, Estimator
+from .estimator import VERDICTS, Estimator
 from .frames import to_odometry
 from .health import OK, WARN, Health
 from .monitor import Monitor
@@ -65,7 +65,6 @@ class EkfNode(Node):
         self._epoch = ros.Epoch()
         self._early = deque()
         self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
-        self._gyros, self._gyro = deque(maxlen=EARLY), None  # (t, x, y, z) not used yet, and the last one used
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
         # One message object each, for all: what is published is copied.
         self._odometry = Odometry(child_frame_id=self._body)
@@ -132,12 +131,6 @@ class EkfNode(Node):
         if not self._imu_corrector.idle:
             gyro, force = (x[0].tolist() for x in self._imu_corrector.correct(*map(np.array, ([t], [gyro], [force]))))
         self._estimator.add_imu(t, gyro, force)
-        if self._gyros and t < self._gyros[-1][0]:
-            if t > self._gyros[-1][0] - TIME_JUMP:
-                return
-            self._gyros.clear()
-        if math.isfinite(sum(gyro)):
-            self._gyros.append((t, *gyro))
 
     def _take_tdoa(self, message):
         t = self._epoch.seconds(message.header.stamp)
@@ -169,12 +162,14 @@ class EkfNode(Node):
         velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
         pose, twist = covariance[:, :6, :6].reshape(n, 36), np.zeros((n, 6, 6))
         twist[:, :3, :3] = covariance[:, 6:, 6:]
-        rates, variances = zip(*map(self._rate_at, odometry.t.tolist(), odometry.gyro_bias.tolist()))
-        twist[:, [3, 4, 5], [3, 4, 5]] = np.array(variances)[:, None]
+        rates = self._estimator.rates_at(odometry.t) - odometry.gyro_bias
+        known = np.isfinite(rates[:, 0])
+        rate_variance = self._config.gyro_noise**2 * self._config.odometry_rate  # of the mean over one odometry interval
+        twist[:, [3, 4, 5], [3, 4, 5]] = np.where(known, rate_variance, UNKNOWN_RATE)[:, None]
         twist = twist.reshape(n, 36)
         out, tf = self._odometry, self._transform.transform
-        columns = (odometry.t, odometry.p, odometry.q, velocity)
-        for i, (t, p, q, u, rate) in enumerate(zip(*(column.tolist() for column in columns), rates)):
+        columns = (odometry.t, odometry.p, odometry.q, velocity, np.where(known[:, None], rates, 0.0))
+        for i, (t, p, q, u, rate) in enumerate(zip(*(column.tolist() for column in columns))):
             out.header.stamp = self._transform.header.stamp = self._epoch.stamp(t)
             position, orientation, twist_out = out.pose.pose.position, out.pose.pose.orientation, out.twist.twist
             position.x, position.y, position.z = p
@@ -190,15 +185,6 @@ class EkfNode(Node):
         self._health.odometry += n
         self._health.last_odometry = time.monotonic()
         self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
-
-    def _rate_at(self, t, bias):
-        """Angular velocity at stamp t, (3,) rad/s, and its variance: that of its mean over one odometry interval."""
-        while self._gyros and self._gyros[0][0] <= t:
-            self._gyro = self._gyros.popleft()
-        if self._gyro is None or abs(t - self._gyro[0]) > self._config.imu_timeout:
-            return (0.0, 0.0, 0.0), UNKNOWN_RATE
-        rate = tuple(measured - wrong for measured, wrong in zip(self._gyro[1:], bias))
-        return rate, self._config.gyro_noise**2 * self._config.odometry_rate
 
     def _report(self):
         counts, estimator = Counter(self._past), self._estimator

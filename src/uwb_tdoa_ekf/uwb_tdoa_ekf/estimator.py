@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from uwb_tdoa_bias.stamps import StampWatch
+
 from .config import FilterConfig
 from .engine import INVALID, LATE, REJECTED, STARTUP, USED, run
 from .memory import RECOVERIES, RUNNING, new_memory
@@ -13,7 +15,7 @@ from .tape import new_tape
 from .validity import MAX_FORCE, MAX_RATE, usable
 
 VERDICTS = {USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup"}
-TIME_JUMP = 1.0  # s; a stream that falls back by more has started anew
+IMU, TDOA = range(2)  # the streams
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ class Estimator:
 
     Messages wait until every stream has passed them and are used in stamp order. A stream that is silent is waited for
     for `lag` seconds of stamps; TDOAs wait `reorder` more for late siblings. What is older than what was used is late.
+    A stream that falls back in time starts the filter anew; a single stamp far from its neighbours only counts as late, or
+    as invalid if it lies ahead.
     """
 
     def __init__(self, anchors, config=None, reorder=0.003, lag=0.25):
@@ -68,12 +72,15 @@ class Estimator:
         self._rows = {int(i): row for row, i in enumerate(anchors.ids)}
         self._tuning = self.config.tuning()
         self.counts = dict.fromkeys([*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts"], 0)
+        self._refused = []
         self._restart()
 
     def _restart(self):
         self._memory = new_memory(len(self.anchors))
-        self._imu, self._tdoa, self._refused = [], [], []
-        self._newest_imu = self._newest_tdoa = self._done = -math.inf
+        self._waiting = [], []  # items of each stream in order of their stamps
+        self._watches = [StampWatch(), StampWatch()]
+        self._done = -math.inf
+        self._last_imu = np.array([[-math.inf] + [math.nan] * 6])  # samples used last, the newest before them in front
 
     @property
     def running(self):
@@ -88,7 +95,7 @@ class Estimator:
     @property
     def waiting(self):
         """Messages received and neither used nor refused yet: (imu, tdoa)."""
-        return len(self._imu), len(self._tdoa)
+        return tuple(len(stream) + len(watch) for stream, watch in zip(self._waiting, self._watches))
 
     def add_imu(self, t, gyro, force):
         """Take one inertial sample: t s; gyro (3,) rad/s; force (3,) m/s^2, specific force; body frame."""
@@ -98,13 +105,7 @@ class Estimator:
         ):
             self.counts["imu_invalid"] += 1
             return
-        if t < self._newest_imu - TIME_JUMP:
-            self._start_anew()
-        if t < self._done:
-            self.counts["imu_late"] += 1
-            return
-        _insert(self._imu, sample)
-        self._newest_imu = max(self._newest_imu, t)
+        self._take(IMU, t, sample)
 
     def add_tdoa(self, t, a, b, d, bias_std=0.0):
         """Take one corrected TDOA: t s; a, b anchor ids; d m; bias_std m."""
@@ -112,41 +113,72 @@ class Estimator:
         if not (math.isfinite(t) and usable(i, k, d, bias_std, self.anchors.positions)):
             self._refused.append((t, a, b, INVALID))
             return
-        if t < self._newest_tdoa - TIME_JUMP:
-            self._start_anew()
-        if t < self._done:
-            self._refused.append((t, a, b, LATE))
-            return
-        _insert(self._tdoa, (t, i, k, d, bias_std))
-        self._newest_tdoa = max(self._newest_tdoa, t)
+        self._take(TDOA, t, (t, i, k, d, bias_std))
 
     def advance(self):
         """Use every message that nothing earlier can precede any more. Returns (Odometry, Residuals), possibly empty."""
-        newest = max(self._newest_imu, self._newest_tdoa)
-        both = self._newest_tdoa - self.reorder
-        if self.config.use_imu:
-            both = min(both, self._newest_imu - self.reorder)
-        return self._use(max(both, newest - self.lag))
+        imu, tdoa = (watch.newest for watch in self._watches)
+        both = min(imu, tdoa) if self.config.use_imu else tdoa
+        return self._use(max(both - self.reorder, max(imu, tdoa) - self.lag))
 
     def finish(self):
         """Use everything that still waits. Returns (Odometry, Residuals)."""
+        for stream, watch in enumerate(self._watches):
+            self._refuse_strays(stream, watch.finish())
         return self._use(math.inf)
 
-    def _start_anew(self):
-        refused = self._refused + [(t, *self.anchors.ids[[i, k]].tolist(), LATE) for t, i, k, _, _ in self._tdoa]
-        self.counts["imu_late"] += len(self._imu)
+    def rates_at(self, t):
+        """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample is
+        near."""
+        place = np.searchsorted(self._last_imu[:, 0], t, side="right") - 1
+        sample = self._last_imu[np.maximum(place, 0)]
+        near = (place >= 0) & (np.abs(t - sample[:, 0]) <= self.config.imu_timeout)
+        return np.where(near[:, None], sample[:, 1:4], math.nan)
+
+    def _take(self, stream, t, item):
+        """Keep an item of a stream, and one that was held because of its stamp, if their stamps can be believed."""
+        believed, strays, fell_back = self._watches[stream].take(t, item)
+        if fell_back:
+            self._start_anew(stream)
+        self._refuse_strays(stream, strays)
+        for t, item in believed:
+            if t < self._done:
+                self._refuse(stream, item, LATE)
+            else:
+                _insert(self._waiting[stream], item)
+
+    def _refuse_strays(self, stream, strays):
+        """Account for items whose stamps are far from those of their neighbours."""
+        for t, item in strays:
+            self._refuse(stream, item, INVALID if t > self._watches[stream].newest else LATE)
+
+    def _refuse(self, stream, item, verdict):
+        if stream == IMU:
+            self.counts["imu_invalid" if verdict == INVALID else "imu_late"] += 1
+        else:
+            t, i, k, _, _ = item
+            self._refused.append((t, *self.anchors.ids[[i, k]].tolist(), verdict))
+
+    def _start_anew(self, stream):
+        """Forget everything but the time that the stream has fallen back to."""
+        for k, waiting in enumerate(self._waiting):
+            for item in waiting:
+                self._refuse(k, item, LATE)
         self.counts["restarts"] += 1
+        other, watch, held = 1 - stream, self._watches[stream], self._watches[1 - stream].finish()
         self._restart()
-        self._refused = refused
+        self._watches[stream] = watch
+        for t, item in held:  # was doubtful in the time that is over
+            self._take(other, t, item)
 
     def _use(self, until):
-        n, k = (bisect_right(stream, (until, math.inf)) for stream in (self._imu, self._tdoa))
+        n, k = (bisect_right(stream, (until, math.inf)) for stream in self._waiting)
         if not (n or k or self._refused):
             return _NOTHING
-        imu = np.array(self._imu[:n]).reshape(n, 7)
-        tdoa = np.array(self._tdoa[:k]).reshape(k, 5)
+        imu, tdoa = (np.array(stream[:m]).reshape(m, size) for stream, m, size in zip(self._waiting, (n, k), (7, 5)))
         a, b = tdoa[:, 1].astype(np.int64), tdoa[:, 2].astype(np.int64)
-        del self._imu[:n], self._tdoa[:k]
+        for stream, m in zip(self._waiting, (n, k)):
+            del stream[:m]
         fed = imu if self.config.use_imu else imu[:0]
         fed_t, gyro, force = (np.ascontiguousarray(part) for part in (fed[:, 0], fed[:, 1:4], fed[:, 4:7]))
         t, d, std = (np.ascontiguousarray(tdoa[:, column]) for column in (0, 3, 4))
@@ -158,6 +190,7 @@ class Estimator:
         for stream in (imu, tdoa):
             if len(stream):
                 self._done = max(self._done, stream[-1, 0])
+        self._last_imu = np.concatenate([self._last_imu[-1:], imu])
         self.counts["imu_used"] += n
         residuals = self._residuals(tdoa[:, 0], self.anchors.ids[a], self.anchors.ids[b], used)
         return Odometry.from_rows(rows[:count], covariance[:count]), residuals
