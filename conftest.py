@@ -1,10 +1,13 @@
 """What the tests of all packages share."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
+# A shell that starts us in the background has interrupts ignored, and so would have every process that a test interrupts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before anything imports rclpy: this session talks to itself only, beside others on the same machine.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 try:

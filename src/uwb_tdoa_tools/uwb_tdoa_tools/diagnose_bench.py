@@ -79,10 +79,10 @@ def _no_truth(args):
     hidden = [r for r in results if r["put_in"][0] in bank.INVISIBLE]
     figures = {
         "observable": len(seen),
-        "right first": round(float(np.mean([r["found"][:1] == r["put_in"] for r in seen])), 3),
+        "right first": bank.share(r["found"][:1] == r["put_in"] for r in seen),
         "not observable": len(hidden),
-        "named as such, and nothing found": round(
-            float(np.mean([r["put_in"][0] in r["unobservable"] and not r["found"] for r in hidden])), 3
+        "named as such, and nothing found": bank.share(
+            r["put_in"][0] in r["unobservable"] and not r["found"] for r in hidden
         ),
     }
     return {"figures": figures, "cases": results}
@@ -101,12 +101,12 @@ def _undeclared(args):
 
 def _injected(args):
     results = measured.injected(args.data, lambda cases, function: _each(cases, function))
-    hit, said = [r["hit"] for r in results], [r["hit"] or r["put_in"] in r["ambiguous"] for r in results]
-    shares = {
-        "found on top": round(float(np.mean(hit)), 3),
-        "found, or named as an alternative": round(float(np.mean(said)), 3),
+    figures = {
+        "cases": len(results),
+        "found on top": bank.share(r["hit"] for r in results),
+        "found, or named as an alternative": bank.share(r["hit"] or r["put_in"] in r["ambiguous"] for r in results),
     }
-    return {"figures": {"cases": len(hit), **shares}, "cases": results}
+    return {"figures": figures, "cases": results}
 
 
 def _measured(args):

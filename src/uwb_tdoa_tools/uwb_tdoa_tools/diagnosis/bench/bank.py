@@ -181,17 +181,18 @@ def figures(results):
         near = [r["found_rmse"] <= 1.1 * r["told_rmse"] + 0.002 for r in mine if "found_rmse" in r]
         out[kind] = {
             "cases": len(mine),
-            "exactly": _share(exact),
-            "found": _share(among),
-            "first": _share(bool(x) for x in first),
-            "parameters_right": _share(r["parameters_right"] for r in mine),
-            "rmse_as_if_told": _share(near),
+            "exactly": share(exact),
+            "found": share(among),
+            "first": share(bool(x) for x in first),
+            "parameters_right": share(r["parameters_right"] for r in mine),
+            "rmse_as_if_told": share(near),
         }
     clean = [r for r in results if r["kind"] == "clean"]
-    out["clean"] = {"cases": len(clean), "false_alarms": _share(bool(r["found"]) for r in clean)}
+    out["clean"] = {"cases": len(clean), "false_alarms": share(bool(r["found"]) for r in clean)}
     return out
 
 
-def _share(values):
+def share(values):
+    """Mean of truth values; None of none."""
     values = list(values)
     return round(float(np.mean(values)), 3) if values else None
