@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 
-from . import cli
+from . import cli, inputs
 from .bag import check_output, write_bag
 from .bag_files import STORAGES
 from .readers import read_flight
@@ -26,9 +26,7 @@ def main(argv=None):
         "convert flight.log --survey anchors.yaml --out flight.bag --force --json",
     )
     parser.add_argument("input", metavar="IN", help="the recording; its kind is found by its content")
-    parser.add_argument(
-        "--survey", metavar="S", help="anchors: total-station .txt, const .csv or .yaml; a bag brings its own"
-    )
+    parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
     parser.add_argument("--out", metavar="BAG", required=True, help="the bag to write, a new directory")
     parser.add_argument("--storage", choices=STORAGES, default="mcap", help="default: mcap")
     parser.add_argument("--force", action="store_true", help="replace an existing bag")
@@ -39,7 +37,7 @@ def main(argv=None):
 def convert(args):
     """Convert as the parsed arguments say; raises InputError."""
     check_output(args.out, args.force)  # before the work, not after it
-    flight = read_flight(args.input, args.survey)
+    flight = read_flight(args.input, inputs.survey_for(args.input, args.survey))
     counts = write_bag(flight, args.out, args.storage, args.force)
     streams = [stream for stream in (flight.tdoa, flight.imu, flight.truth) if stream is not None and len(stream)]
     known = (flight.anchors.index(flight.tdoa.a) >= 0) & (flight.anchors.index(flight.tdoa.b) >= 0)

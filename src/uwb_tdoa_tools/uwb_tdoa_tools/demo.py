@@ -12,7 +12,7 @@ from uwb_tdoa_bias.errors import InputError
 from uwb_tdoa_bias.network import Network
 from uwb_tdoa_ekf.offline import run_offline
 
-from . import cli
+from . import cli, inputs
 from .bag import read_odometry, write_bag
 from .metrics import Score, airborne
 from .plots import plt
@@ -41,7 +41,7 @@ def main(argv=None):
     )
     add = parser.add_argument
     add("--flight", metavar="LOG", help="a recording: micro-SD log, UTIL CSV or bag (default: simulate one)")
-    add("--survey", metavar="S", help="where the anchors are; a bag brings its own")
+    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
     add("--rate", metavar="R", type=float, default=1.0, help="replay R times as fast as flown (default 1)")
     add("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="for all files (default out/demo)")
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
@@ -99,7 +99,7 @@ def demo(args):
 def _flight(args):
     """(Flight, path of effects.yaml or None)."""
     if args.flight:
-        flight = read_flight(args.flight, args.survey)
+        flight = read_flight(args.flight, inputs.survey_for(args.flight, args.survey))
         if flight.truth is None:
             raise InputError(f"{args.flight}: holds no ground truth to compare with; take a flight that has it.")
         airborne(flight.truth)

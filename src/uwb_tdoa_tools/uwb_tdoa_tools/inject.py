@@ -7,7 +7,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.errors import InputError
 
-from . import cli
+from . import cli, inputs
 from .bag import check_output, write_bag
 from .bag_files import STORAGES
 from .readers import read_flight
@@ -31,9 +31,7 @@ def main(argv=None):
     )
     parser.add_argument("flight", metavar="FLIGHT", nargs="?", help="a raw log, a UTIL CSV file or a bag")
     parser.add_argument("--list", action="store_true", help="list effects, parameters and units, and do nothing else")
-    parser.add_argument(
-        "--survey", metavar="S", help="anchors: total-station .txt, const .csv or .yaml; a bag brings its own"
-    )
+    parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
     parser.add_argument("--namespace", default="", help="of the topics in a bag, e.g. tag1")
     parser.add_argument("--effect", metavar="NAME", choices=EFFECTS, help="the effect to add")
     parser.add_argument("--value", metavar="KEY=NUMBER", nargs="+", default=[], help="its parameters")
@@ -65,7 +63,7 @@ def _inject(args):
             raise InputError(f"{option}: is missing; see inject --help.")
     effect = parse_effect(args.effect, args.value)
     check_output(args.out, args.force)  # before the work, not after it
-    flight = read_flight(args.flight, args.survey, args.namespace)
+    flight = read_flight(args.flight, inputs.survey_for(args.flight, args.survey), args.namespace)
     write_bag(effect.inject(flight, np.random.default_rng(args.seed)), args.out, args.storage, args.force)
     told = ", ".join(f"{key} = {value:g}" for key, value in effect.values.items())
     print(f"{flight.name}: added {effect.name} ({told}, in {effect.unit}) -> {args.out}")

@@ -4,7 +4,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry import tdoa
-from .base import Effect, check_anchor, known_anchors
+from .base import Effect, check_anchor, known_anchors, once_per_anchors
 
 
 class AnchorPosition(Effect):
@@ -35,6 +35,7 @@ class AnchorPosition(Effect):
         each = [tuple(f"{i}.{axis}" for axis in "xyz") for i in known_anchors(anchors)]
         return [sum(each, ()), *each, *((key,) for keys in each for key in keys)]
 
+    @once_per_anchors
     def _moved(self, anchors):
         positions = anchors.positions.copy()
         rows = {i: row for row, i in enumerate(known_anchors(anchors))}

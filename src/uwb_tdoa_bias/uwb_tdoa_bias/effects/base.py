@@ -1,6 +1,7 @@
 """What a systematic effect is."""
 
 from dataclasses import dataclass, field, replace
+from functools import wraps
 from typing import ClassVar
 
 import numpy as np
@@ -148,3 +149,17 @@ def check_anchor(name, text, key):
 def known_anchors(anchors):
     """Ids as text; () without anchors."""
     return () if anchors is None else tuple(str(i) for i in anchors.ids.tolist())
+
+
+def once_per_anchors(method):
+    """A method(self, anchors) that is computed once as long as it is asked for the same Anchors object."""
+    name = f"_{method.__name__}_of"
+
+    @wraps(method)
+    def remembered(self, anchors):
+        known = self.__dict__.get(name)
+        if known is None or known[0] is not anchors:
+            known = self.__dict__[name] = anchors, method(self, anchors)
+        return known[1]
+
+    return remembered

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from ..errors import InputError
-from .base import Effect, known_anchors, tile
+from .base import Effect, known_anchors, once_per_anchors, tile
 from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_TDOA
 
 DEGREE = 2
@@ -98,6 +98,12 @@ class SmoothTerm(Effect):
     def _weights(self, prefix, count):
         return np.array([self.values.get(f"{prefix}c{k}", 0.0) for k in range(count)])
 
+    @once_per_anchors
+    def _anchor_weights(self, anchors):
+        """Coefficients of every anchor's function, (m, k); zero for an anchor without one."""
+        count = self.basis(np.array(self.knots[:1])).shape[1]
+        return np.stack([self._weights(f"{i}.", count) for i in known_anchors(anchors)])
+
     def _covariate(self, samples):
         """(values per TDOA or None, values per arrival or None)"""
         if self.covariate in OF_ARRIVAL:
@@ -118,10 +124,8 @@ class SmoothTerm(Effect):
         if self.form == "arrival":
             late = self.curve(both)
         else:
-            late, basis = np.zeros(2 * n), self.basis(both)
-            ids = samples.anchors.ids[np.concatenate([samples.a, samples.b])]
-            for i in set(ids.tolist()):
-                late[ids == i] = basis[ids == i] @ self._weights(f"{i}.", basis.shape[1])
+            weights = self._anchor_weights(samples.anchors)[np.concatenate([samples.a, samples.b])]
+            late = np.einsum("nk,nk->n", self.basis(both), weights)
         return late[n:] - late[:n]
 
     def regressors(self, samples, keys):

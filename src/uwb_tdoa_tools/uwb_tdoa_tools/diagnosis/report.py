@@ -6,6 +6,8 @@ import io
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import EFFECTS
+
 _STYLE = """body{font:15px/1.5 sans-serif;max-width:62em;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:.6em 0}td,th{border:1px solid #bbb;padding:.25em .6em;text-align:left}
 th{background:#eee}img{max-width:100%}h2{margin-top:1.8em}.good{color:#060}.bad{color:#900}small{color:#555}"""
@@ -16,8 +18,7 @@ def text(result):
     lines = []
     for found in result.findings:
         lines.append(
-            f"found     {found['effect']}: {_parameters(found)} "
-            f"(explains {found['variance_explained']:.0%} of {found['channel']})"
+            f"found     {found['effect']}: {_parameters(found)}{_share(found)}"
             + ("" if found["added"] else ", not added: the filter does as well without it")
         )
     for term in result.unattributed:
@@ -69,6 +70,12 @@ def html(result):
 
 def _e(value):
     return escape_html.escape(str(value))
+
+
+def _share(found):
+    """Of the variance of a channel; noise explains none."""
+    share = found["variance_explained"]
+    return f", explains {share:.0%} of {found['channel']}" if share else ""
 
 
 def _table(head, rows):
@@ -127,14 +134,14 @@ def _findings(result):
         rows.append(
             [
                 found["effect"],
-                _parameters(found, 30),
-                f"{found['variance_explained']:.0%} of {found['channel']}",
+                EFFECTS[found["effect"]].physics,
+                _parameters(found, 30) + _share(found),
                 evidence,
                 mistaken or "nothing in these flights",
                 "yes" if found["added"] else "no",
             ]
         )
-    return _table(["effect", "parameters", "explains", "evidence", "could here be mistaken for", "added"], rows)
+    return _table(["effect", "what it is", "parameters", "evidence", "could here be mistaken for", "added"], rows)
 
 
 def _terms(result):
