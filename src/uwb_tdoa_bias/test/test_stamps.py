@@ -33,6 +33,14 @@ def test_two_that_agree_are_another_time():
     assert through([0.0, 60.0, 60.1]) == ([(0.0, 0), (60.0, 1), (60.1, 2)], [], [])
 
 
+def test_the_time_of_useless_items_is_seen():
+    watch = StampWatch()
+    watch.take(1.0, "x")
+    for t, newest in ((float("nan"), 1.0), (1.5, 1.5), (1.2, 1.5), (500.0, 1.5), (-500.0, 1.5)):
+        watch.see(t)
+        assert watch.newest == newest
+
+
 @given(st.lists(st.floats(-1e6, 1e6) | st.floats(0.0, 3.0)))
 def test_nothing_is_lost_or_told_twice(stamps):
     believed, strays, _ = through(stamps)

@@ -19,7 +19,7 @@ class StampWatch:
     def take(self, t, item):
         """Take an item stamped t, s. Returns (believed, strays, fell_back): lists of (t, item), and whether the believed
         ones are the first of an earlier time: the stream has started anew."""
-        if not self._held and (self.newest - BACK <= t <= self.newest + AHEAD or self.newest == -math.inf):
+        if not self._held and (self._near(t) or self.newest == -math.inf):
             self.newest = max(self.newest, t)
             return [(t, item)], [], False
         strays, self._held = self._held, []
@@ -27,11 +27,19 @@ class StampWatch:
             fell_back = t < self.newest
             self.newest = max(t, strays[0][0])
             return [*strays, (t, item)], [], fell_back
-        if self.newest - BACK <= t <= self.newest + AHEAD:
+        if self._near(t):
             self.newest = max(self.newest, t)
             return [(t, item)], strays, False
         self._held = [(t, item)]
         return [], strays, False
+
+    def see(self, t):
+        """Note the time t, s, of an item that is good for nothing else."""
+        if self._near(t):
+            self.newest = max(self.newest, t)
+
+    def _near(self, t):
+        return self.newest - BACK <= t <= self.newest + AHEAD
 
     def finish(self):
         """What is held when nothing follows, a list of (t, item): strays."""

@@ -263,6 +263,20 @@ def test_one_stamp_far_from_its_neighbours_changes_nothing(off, verdict, count):
     assert estimator.counts[count] == 1 and estimator.counts["restarts"] == 0
 
 
+def test_what_is_invalid_does_not_hold_up_the_others():
+    flight = fly(8, 2.0)
+    estimator = Estimator(flight.anchors, lag=10.0)
+    for t, gyro, force in zip(flight.imu.t, flight.imu.gyro, flight.imu.accel):
+        estimator.add_imu(t, gyro, force)
+    half, last = len(flight.tdoa) // 2, flight.imu.t[-1]
+    for t, a, b, d in zip(flight.tdoa.t[:half], flight.tdoa.a, flight.tdoa.b, flight.tdoa.d):
+        estimator.add_tdoa(t, int(a), int(b), d)
+    assert estimator.advance()[0].t[-1] < flight.tdoa.t[half]
+    estimator.add_tdoa(last, FIRST, SECOND, 1e3)
+    odometry, residuals = estimator.advance()
+    assert odometry.t[-1] > last - 0.02 and residuals.verdict[residuals.t == last].tolist() == [INVALID]
+
+
 def test_rates_are_those_measured_last():
     flight = fly(8, 1.0)
     estimator = Estimator(flight.anchors)

@@ -104,6 +104,7 @@ class Estimator:
             map(math.isnan, sample)
         ):
             self.counts["imu_invalid"] += 1
+            self._watches[IMU].see(t)
             return
         self._take(IMU, t, sample)
 
@@ -112,6 +113,7 @@ class Estimator:
         i, k = self._rows.get(a, -1), self._rows.get(b, -1)
         if not (math.isfinite(t) and usable(i, k, d, bias_std, self.anchors.positions)):
             self._refused.append((t, a, b, INVALID))
+            self._watches[TDOA].see(t)  # or whoever waits for our pose of this time would wait for the next one
             return
         self._take(TDOA, t, (t, i, k, d, bias_std))
 
