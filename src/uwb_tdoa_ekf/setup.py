@@ -30,6 +30,7 @@ setup(
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [
+            "debias_node = uwb_tdoa_ekf.debias_node:main",
             "ekf_node = uwb_tdoa_ekf.ekf_node:main",
         ]
     },

@@ -40,6 +40,7 @@ setup(
             "bench = uwb_tdoa_tools.bench:main",
             "convert = uwb_tdoa_tools.convert:main",
             "demo = uwb_tdoa_tools.demo:main",
+            "debias = uwb_tdoa_tools.debias:main",
             "diagnose = uwb_tdoa_tools.diagnose:main",
             "diagnose_bench = uwb_tdoa_tools.diagnose_bench:main",
             "evaluate = uwb_tdoa_tools.evaluate:main",

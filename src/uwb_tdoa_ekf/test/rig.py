@@ -24,14 +24,27 @@ from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
 EPOCH = 1_700_000_000  # s; stamps of today's size
 PATIENCE = 180.0  # s for anything that must happen; the very first start of ekf_node compiles the filter
-MODULES = {"bias_node": "uwb_tdoa_bias.bias_node", "ekf_node": "uwb_tdoa_ekf.ekf_node"}
-OUTPUTS = {"bias_node": ("uwb/tdoa_corrected",), "ekf_node": ("odometry", "uwb/residual")}
-INPUTS = {"bias_node": ("uwb/tdoa", "odometry"), "ekf_node": ("imu/data", "uwb/tdoa_corrected")}
+MODULES = {
+    "bias_node": "uwb_tdoa_bias.bias_node",
+    "ekf_node": "uwb_tdoa_ekf.ekf_node",
+    "debias_node": "uwb_tdoa_ekf.debias_node",
+}
+OUTPUTS = {
+    "bias_node": ("uwb/tdoa_corrected",),
+    "ekf_node": ("odometry", "uwb/residual"),
+    "debias_node": ("odometry/debiased",),
+}
+INPUTS = {
+    "bias_node": ("uwb/tdoa", "odometry"),
+    "ekf_node": ("imu/data", "uwb/tdoa_corrected"),
+    "debias_node": ("odometry",),
+}
 STREAMS = {
     "imu/data": Imu,
     "uwb/tdoa": Tdoa,
     "uwb/tdoa_corrected": TdoaCorrected,
     "odometry": Odometry,
+    "odometry/debiased": Odometry,
     "uwb/residual": TdoaResidual,
 }
 
@@ -115,6 +128,10 @@ class Rig:
     @property
     def odometry(self):
         return self.received["odometry"]
+
+    @property
+    def debiased(self):
+        return self.received["odometry/debiased"]
 
     @property
     def corrected(self):
@@ -205,7 +222,11 @@ class Rig:
 
     def counts(self, name, **expected):
         """{key: int} of all counts of a node, when those named have the expected values and we have what it sent."""
-        own = {"bias_node": ("published", "uwb/tdoa_corrected"), "ekf_node": ("odometry published", "odometry")}
+        own = {
+            "bias_node": ("published", "uwb/tdoa_corrected"),
+            "ekf_node": ("odometry published", "odometry"),
+            "debias_node": ("received", "odometry/debiased"),
+        }
         sent, topic = own[name]
 
         def arrived():

@@ -1,1 +1,1 @@
-"""The estimation side: error-state filter, robust weights, start-up, time ordering. No ROS outside ekf_node."""
+"""The estimation side: error-state filter, robust weights, start-up, time ordering. No ROS outside the nodes."""

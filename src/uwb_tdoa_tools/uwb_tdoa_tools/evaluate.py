@@ -37,8 +37,12 @@ def evaluate(flight, config=None, effects=None, network=None, engine=run_offline
     engine : run_offline, or smooth, which uses what came after each estimate too."""
     _need_truth(flight)
     result = engine(flight, config, Corrector(flight.anchors, effects, network))
-    truth = effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth
-    return Score(flight.name, result.odometry, truth, result.residuals), result
+    return Score(flight.name, result.odometry, judging_truth(flight, effects), result.residuals), result
+
+
+def judging_truth(flight, effects=None):
+    """The Truth to compare estimates with: that of the Flight, without what the EffectSet says is wrong with it."""
+    return effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth
 
 
 def main(argv=None):

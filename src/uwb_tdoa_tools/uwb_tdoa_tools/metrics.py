@@ -19,6 +19,11 @@ def airborne(truth):
     return truth.t[above[0]], truth.t[above[-1]]
 
 
+def position_at(t, truth):
+    """True positions at stamps t (n,), s: (n, 3) m, linear in between."""
+    return np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
+
+
 def position_errors(odometry, truth):
     """Errors over the airborne part, the truth interpolated to the stamps of the estimate.
 
@@ -27,8 +32,7 @@ def position_errors(odometry, truth):
     first, last = airborne(truth)
     chosen = (odometry.t >= first) & (odometry.t <= last)
     t = odometry.t[chosen]
-    at = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
-    return t, odometry.p[chosen] - at, getattr(odometry, "covariance", getattr(odometry, "pose_covariance", None))[chosen, :3, :3]
+    return t, odometry.p[chosen] - position_at(t, truth), getattr(odometry, "covariance", getattr(odometry, "pose_covariance", None))[chosen, :3, :3]
 
 
 def nees(error, covariance):

@@ -69,12 +69,26 @@ def sines(s, config, room, rng):
 
 def square(s, config, room, rng):
     """A level square around the place, its edges `radius` away from it, at constant speed, with rounded corners."""
-    edge = 2.0 * config.radius
-    laps = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]]) * edge
+    return _laps(s, config, [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], config.radius)
+
+
+def line_x(s, config, room, rng):
+    """Back and forth along x through the place, `radius` to each side, at constant speed, with smooth turns."""
+    return _laps(s, config, [[-1, 0], [1, 0], [-1, 0]], 0.0)
+
+
+def line_y(s, config, room, rng):
+    """The same along y."""
+    return _laps(s, config, [[0, -1], [0, 1], [0, -1]], 0.0)
+
+
+def _laps(s, config, corners, ahead):
+    """Round the corners, (n, 2) in units of the radius and as far apart each, level, `ahead` m further at the start."""
+    edge, n = 2.0 * config.radius, len(corners) - 1
     dt = 0.01
     s_fine = np.arange(-CORNER_TIME, s[-1] + CORNER_TIME + dt, dt)
-    along = np.mod(config.speed * s_fine + 0.5 * edge, 4.0 * edge)
-    sharp = np.column_stack([np.interp(along, edge * np.arange(5), laps[:, k]) for k in range(2)])
+    along = np.mod(config.speed * s_fine + ahead, n * edge)
+    sharp = np.column_stack([np.interp(along, edge * np.arange(n + 1), config.radius * x) for x in np.transpose(corners)])
     rounded = CubicSpline(s_fine, _smoothed(sharp, int(CORNER_TIME / dt) | 1))(s)
     return np.column_stack([rounded + config.place, np.full(len(s), config.height)])
 
@@ -89,6 +103,8 @@ TRAJECTORIES = {
     "rising_circle": rising_circle,
     "sines": sines,
     "square": square,
+    "line_x": line_x,
+    "line_y": line_y,
     "hover": hover,
     "spin": hover,  # with the yaw rotating
 }

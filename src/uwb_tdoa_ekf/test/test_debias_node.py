@@ -1,0 +1,138 @@
+"""debias_node: its parameters, and alone as a process over topics."""
+
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
+from rig import MODULES, make_rig, stamp  # noqa: E402, F401
+from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
+from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
+
+CONFIG = Path(__file__).resolve().parents[1] / "config" / "debias_node.yaml"
+PLACES = [[0.7, 0.7, 0.7], [2.0, 0.7, 0.7], [9.0, 0.7, 0.7]]  # known, half a metre outside, far away
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A map of 0.1, -0.2 and 0.3 m in 1.5 x 1.5 x 1.5 m."""
+    cell = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    bias = np.tile([0.1, -0.2, 0.3], (64, 1))
+    BiasMap(cell, 0.5 * cell, bias, 0 * bias + 0.05, np.full(64, 50), 0.01 * np.eye(3), 0.5).save(tmp_path / "map.npz")
+    return tmp_path / "map.npz"
+
+
+def odometry(p, speed=0.0):
+    message = Odometry(child_frame_id="base_link")
+    place, orientation = message.pose.pose.position, message.pose.pose.orientation
+    place.x, place.y, place.z = map(float, p)
+    orientation.z = orientation.w = np.sqrt(0.5)  # 90 degrees to the left: forward is +y
+    message.twist.twist.linear.x = speed
+    message.pose.covariance = np.arange(36.0) + 100.0 * np.eye(6).ravel()
+    return message
+
+
+def xyz(message):
+    p = message.pose.pose.position
+    return np.array([p.x, p.y, p.z])
+
+
+def test_every_parameter_is_in_the_parameter_file_with_its_default_described_and_fixed(file):
+    rclpy.init(args=["--ros-args", "-p", f"map:={file}"])
+    node = DebiasNode()
+    (parameters,) = (entry["ros__parameters"] for entry in yaml.safe_load(CONFIG.read_text()).values())
+    general = ("qos_overrides.", "use_sim_time", "start_type_description_service")
+    declared = {name: p.value for name, p in node.get_parameters_by_prefix("").items() if not name.startswith(general)}
+    descriptors = [node.describe_parameter(name) for name in declared]
+    node.destroy_node()
+    rclpy.shutdown()
+    declared = {name: value if np.ndim(value) == 0 else list(value) for name, value in declared.items()}
+    assert parameters == declared | {"map": ""}
+    assert all(descriptor.description and descriptor.read_only for descriptor in descriptors)
+
+
+def test_positions_are_debiased_and_accounted_for(make_rig, file):
+    rig = make_rig()
+    rig.start("debias_node", debias_node=["-p", f"map:={file}"])
+    sent = [odometry(p) for p in (*PLACES, [0.7, np.nan, 0.7])]
+    for k, message in enumerate(sent):
+        rig.send("odometry", message, 0.1 * k, "map")
+    rig.send("odometry", odometry(PLACES[0]), 0.9, "elsewhere")
+    rig.wait(lambda: len(rig.debiased) == 5, "all of them")
+    for k, message in enumerate(rig.debiased[:4]):
+        assert message.header.stamp == stamp(0.1 * k) and message.header.frame_id == "map"
+        assert message.child_frame_id == "base_link" and message.twist == sent[k].twist
+        assert message.pose.pose.orientation == sent[k].pose.pose.orientation
+    expected = BiasMap.load(file)
+    before = np.arange(36.0).reshape(6, 6) + 100.0 * np.eye(6)
+    for place, message in zip(PLACES, rig.debiased):
+        (p,), (covariance,), _ = expected.correct(np.array([place]), before[None, :3, :3])
+        np.testing.assert_allclose(xyz(message), p, atol=1e-12)
+        np.testing.assert_allclose(np.reshape(message.pose.covariance, (6, 6))[:3, :3], covariance)
+        np.testing.assert_array_equal(np.reshape(message.pose.covariance, (6, 6))[3:], before[3:])
+    np.testing.assert_allclose(xyz(rig.debiased[0]), np.array(PLACES[0]) - [0.1, -0.2, 0.3], atol=1e-9)
+    np.testing.assert_allclose(xyz(rig.debiased[2]), PLACES[2])
+    np.testing.assert_array_equal(xyz(rig.debiased[3]), [0.7, np.nan, 0.7])
+    np.testing.assert_array_equal(xyz(rig.debiased[4]), PLACES[0])  # of another frame: as it was
+    assert rig.debiased[4].header.frame_id == "elsewhere"
+    counts = rig.counts("debias_node", received=5)
+    assert (counts["corrected"], counts["faded"], counts["outside"], counts["invalid"]) == (1, 1, 1, 2)
+
+
+def test_it_says_what_is_wrong(make_rig, file):
+    rig = make_rig()
+    rig.start("debias_node", debias_node=["-p", f"map:={file}"])
+    rig.wait(lambda: "no odometry" in rig.fresh_status("debias_node").message, "nothing to do")
+
+    def says(p, frame, text):
+        for _ in range(100):  # reports come once a second, and tell of what came since the last one
+            rig.send("odometry", odometry(p), 0.0, frame)
+            status = rig.fresh_status("debias_node")
+            if text in status.message:
+                return status.level
+        raise AssertionError(f"never {text!r}; last {status.message!r}")
+
+    assert says(PLACES[0], "map", "debiasing") == DiagnosticStatus.OK
+    assert says(PLACES[2], "map", "outside of the map") == DiagnosticStatus.WARN
+    assert says(PLACES[0], "odom", "not in the map's frame 'map'") == DiagnosticStatus.ERROR
+
+
+def test_layers_act_before_the_map(make_rig, file):
+    """A jump is spread over steps of the largest speed, and the velocity, of the body, is turned into the world."""
+    rig = make_rig()
+    limits = ["-p", "saturate:=true", "-p", "max_speed:=[0.5, 1.0, 0.5]", "-p", "max_acceleration:=1000.0"]
+    rig.start("debias_node", debias_node=["-p", f"map:={file}", *limits])
+    for k, y in enumerate((0.5, 0.7, 0.7, 0.7)):
+        rig.send("odometry", odometry([0.7, y, 0.7], speed=2.0), 0.1 * k, "map")
+    rig.send("odometry", odometry([0.7, 0.4, 0.7]), 10.0, "map")  # after a gap the past does not count
+    rig.wait(lambda: len(rig.debiased) == 5, "all of them")
+    y = [xyz(message)[1] - 0.2 for message in rig.debiased]
+    np.testing.assert_allclose(y, [0.5, 0.6, 0.7, 0.7, 0.4], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([], "map: is empty"),
+        (["-p", "map:=nowhere.npz"], "nowhere.npz: is no position bias map"),
+        (["-p", "map:=MAP", "-p", "smooth:=2.0"], "smooth: 2.0"),
+        (["-p", "map:=MAP", "-p", "max_speed:=[1.0, 1.0]"], "max_speed: .* three numbers"),
+        (["-p", "map:=MAP", "-p", "history:=many"], "history: "),
+    ],
+)
+def test_bad_parameters_are_refused_in_one_sentence(file, arguments, named):
+    command = [sys.executable, "-m", MODULES["debias_node"], "--ros-args", *(a.replace("MAP", str(file)) for a in arguments)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 2
+    assert result.stderr.splitlines()[-1].startswith("debias_node: error: ")
+    assert "Traceback" not in result.stderr
+    assert re.search(named, result.stderr)

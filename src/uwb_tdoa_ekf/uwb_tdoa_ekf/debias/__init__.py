@@ -1,0 +1,14 @@
+"""Debiasing of estimated positions with a map of their bias, after Grasso et al., *Analysis and Accuracy Improvement of
+UWB-TDoA-Based Indoor Positioning System* (Sensors 2022, 22, 9136).
+
+    from uwb_tdoa_ekf.debias import BiasMap, Part, fit
+    found = fit([Part(odometry.p, truth_p, odometry.covariance[:, :3, :3])], step=0.35)
+    found.save("map.npz")
+    p, covariance, trust = BiasMap.load("map.npz").correct(p, covariance)
+"""
+
+from .bias_map import INTERPOLATORS, BiasMap
+from .fit import Part, fit
+from .layers import LayerConfig, Layers
+
+__all__ = ["INTERPOLATORS", "BiasMap", "LayerConfig", "Layers", "Part", "fit"]

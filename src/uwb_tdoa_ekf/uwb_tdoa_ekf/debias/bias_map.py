@@ -1,0 +1,134 @@
+"""The map from a measured position to its bias, after Grasso et al. (Sensors 2022, 22, 9136), eqs. 20 and 21; and its file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+import zlib
+
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from uwb_tdoa_bias.errors import InputError
+
+from .network import AngularNetwork
+
+FORMAT, VERSION = "uwb_tdoa position bias map", 1
+UNITS = "metres, square metres for added, in the world frame named by frame; bias is measured minus true"
+INTERPOLATORS = ("thin_plate", "network")
+SMOOTHING = 0.3  # of the thin plate, at a marker of median count; see docs/debiasing.md
+FADE = 1.0  # m beyond the known region over which the correction goes to nothing; see docs/debiasing.md
+_ARRAYS = {"cell": int, "at": float, "bias": float, "std": float, "count": int, "added": float}
+
+
+@dataclass(frozen=True)
+class BiasMap:
+    """Biases at n markers in d = 2 or 3 dimensions, and what lies between them.
+
+    cell : (n, d) int, place in the grid of `step` m; at : (n, d) m, where the markers are measured, eq. 19
+    bias : (n, d) m, b* of eqs. 17 and 18; std : (n, d) m, scatter of the measurements; count : (n,) measurements
+    added : (d, d) m^2, to be added to the covariance of a position that is corrected; see `fit`
+    interpolator : "thin_plate" (scipy's RBFInterpolator: passes near all markers, the nearer the more was measured there) or
+        "network" (Grasso et al., appendix A)
+    frame : name of the world frame; source : where it came from, free text
+
+    A position is known inside the convex hull of the markers and no further than one step from the next of them. Beyond, the
+    correction fades to nothing over FADE.
+    """
+
+    cell: np.ndarray
+    at: np.ndarray
+    bias: np.ndarray
+    std: np.ndarray
+    count: np.ndarray
+    added: np.ndarray
+    step: float
+    interpolator: str = "thin_plate"
+    frame: str = "map"
+    source: str = ""
+
+    def __post_init__(self):
+        for name, kind in _ARRAYS.items():
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
+        n, d = self.at.shape if self.at.ndim == 2 else (0, 0)
+        shapes = (self.cell.shape, self.bias.shape, self.std.shape, self.count.shape, self.added.shape)
+        if d not in (2, 3) or shapes != ((n, d), (n, d), (n, d), (n,), (d, d)):
+            raise InputError("bias map: cell, at, bias, std, count and added do not fit together.")
+        arrays = (self.at, self.bias, self.std, self.added)
+        if not (all(np.isfinite(array).all() for array in arrays) and self.step > 0.0):
+            raise InputError("bias map: it holds a number that is not finite, or a step that is not above 0.")
+        if self.interpolator not in INTERPOLATORS:
+            raise InputError(f"interpolator: {self.interpolator!r} is not one of {', '.join(INTERPOLATORS)}.")
+        try:
+            hull = ConvexHull(self.at).equations
+        except (QhullError, ValueError) as error:
+            remedy = "lie on one line" if d == 2 else "lie in one plane: make a planar map of them"
+            raise InputError(f"bias map: its {n} markers are too few, or {remedy}; measure more places.") from error
+        if self.interpolator == "network":
+            surface = AngularNetwork(self.cell, self.at, self.bias, self.step)
+        else:
+            smoothing = SMOOTHING * np.median(self.count) / self.count
+            surface = RBFInterpolator(self.at, self.bias, kernel="thin_plate_spline", smoothing=smoothing)
+        object.__setattr__(self, "_hull", (hull[:, :d], hull[:, d]))
+        object.__setattr__(self, "_tree", cKDTree(self.at))
+        object.__setattr__(self, "_surface", surface)
+        object.__setattr__(self, "_typical", self.bias.T @ self.bias / n)
+
+    @property
+    def planar(self):
+        """Whether it knows x and y only; z is then left as it is."""
+        return self.at.shape[1] == 2
+
+    def trust(self, p):
+        """How far positions p (m, 3), m, are known: (m,), 1 inside of the known region to 0 from FADE beyond it on."""
+        p = p[:, : self.at.shape[1]]
+        normals, offsets = self._hull
+        outside = (p @ normals.T + offsets).max(axis=1)
+        lonely = self._tree.query(p)[0] - self.step
+        return np.clip(1.0 - np.maximum(outside, lonely) / FADE, 0.0, 1.0)
+
+    def bias_at(self, p):
+        """beta of eq. 20 at measured positions p (m, 3), m: (m, 3) m, already faded; 0 in z if the map is planar."""
+        return self._faded(p, self.trust(p))
+
+    def _faded(self, p, trust):
+        out = np.zeros((len(p), 3))
+        known = trust > 0.0
+        if known.any():
+            d = self.at.shape[1]
+            out[known, :d] = trust[known, None] * self._surface(p[known, :d])
+        return out
+
+    def correct(self, p, covariance):
+        """Positions without their bias (eq. 21) and the covariance of what is left.
+
+        p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, trust). With trust w, what is added to the
+        covariance is w^2 `added` for what the map does not know, and (1 - w)^2 of the mean square of all biases, for one that was
+        not taken out.
+        """
+        trust, d = self.trust(p), self.at.shape[1]
+        covariance = covariance.copy()
+        known, unknown = trust[:, None, None] ** 2, (1.0 - trust[:, None, None]) ** 2
+        covariance[:, :d, :d] += known * self.added + unknown * self._typical
+        return p - self._faded(p, trust), covariance, trust
+
+    def save(self, path):
+        """Write what `load` reads: a numpy .npz file that names its format, version and units."""
+        about = {"format": FORMAT, "version": VERSION, "units": UNITS, "frame": self.frame, "source": self.source}
+        content = {"step": self.step, "interpolator": self.interpolator, **{name: getattr(self, name) for name in _ARRAYS}}
+        with open(path, "wb") as file:
+            np.savez_compressed(file, **about, **content)
+
+    @classmethod
+    def load(cls, path):
+        """Read a file that `save` wrote; raises InputError."""
+        try:
+            with np.load(Path(path), allow_pickle=False) as content:
+                if str(content["format"]) != FORMAT or int(content["version"]) != VERSION:
+                    raise ValueError(f"format {content['format']}, version {content['version']}")
+                fields = {name: content[name] for name in _ARRAYS}
+                texts = {name: str(content[name]) for name in ("interpolator", "frame", "source")}
+                step = float(content["step"])
+        except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, BadZipFile, zlib.error) as error:
+            raise InputError(f"{path}: is no position bias map of version {VERSION} ({error}); make one with `debias`.") from error
+        return cls(**fields, **texts, step=step)

@@ -1,0 +1,108 @@
+"""debias_node: odometry in, odometry with the bias of its position taken out.
+
+odometry (nav_msgs/Odometry)
+  -> odometry/debiased (nav_msgs/Odometry: one for each, same stamp and frames), /diagnostics (diagnostic_msgs/DiagnosticArray).
+Every parameter is documented in config/debias_node.yaml.
+"""
+
+from collections import Counter
+import math
+import sys
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+import numpy as np
+from rclpy.node import Node
+from scipy.spatial.transform import Rotation
+from uwb_tdoa_bias import ros
+from uwb_tdoa_bias.errors import InputError
+
+from .debias import BiasMap, LayerConfig, Layers
+
+GAP = 1.0  # s; after a longer silence, or when time goes back, the layers start anew
+DOUBT = 0.5  # share of positions outside of the map that becomes a warning
+
+
+class DebiasNode(Node):
+    """Converts messages for a BiasMap and keeps the accounts: received = corrected + faded + outside + invalid."""
+
+    NAME = "debias_node"
+
+    def __init__(self):
+        super().__init__(self.NAME)
+        file = ros.parameter(self, "map", "", "file of `debias`: the bias of every measured position")
+        if not file:
+            raise InputError("map: is empty; give a file that `debias` wrote.")
+        self._map, defaults = BiasMap.load(file), LayerConfig()
+        about = "of appendix C of Grasso et al.; see config/debias_node.yaml"
+        layers = {
+            name: ros.parameter(self, name, list(value) if isinstance(value, tuple) else value, about)
+            for name, value in vars(defaults).items()
+        }
+        self._layers = Layers(LayerConfig(**layers))
+        self._epoch, self._counts, self._rate, self._judged = ros.Epoch(), Counter(), ros.Rate(), Counter()
+        self._newest = -math.inf
+        self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
+        self._publisher = ros.publish_stream(self, Odometry, "odometry/debiased")
+        self._input = ros.subscribe_stream(self, Odometry, "odometry", self._on_odometry)
+        self._diagnostics = ros.Diagnostics(self, self._report)
+        self.get_logger().info(f"ready; {len(self._map.at)} markers, {self._map.interpolator}")
+
+    def _on_odometry(self, message):
+        self._counts["received"] += 1
+        point = message.pose.pose.position
+        p = np.array([point.x, point.y, point.z])
+        if not self._layers.idle:
+            p = self._layered(message, p)
+        if message.header.frame_id != self._map.frame or not np.isfinite(p).all():
+            kind = "invalid"
+        else:
+            covariance = np.array(message.pose.covariance).reshape(6, 6)
+            (p,), (covariance[:3, :3],), (trust,) = self._map.correct(p[None], covariance[None, :3, :3])
+            kind = "corrected" if trust == 1.0 else "faded" if trust > 0.0 else "outside"
+            point.x, point.y, point.z = p.tolist()
+            message.pose.covariance = covariance.ravel()
+        self._counts[kind] += 1
+        self._publisher.publish(message)
+
+    def _layered(self, message, p):
+        """The position after the layers, which also need the velocity, in the world frame; NaN where one is not known."""
+        u = message.twist.twist.linear
+        state = np.array([*p, u.x, u.y, u.z, *ros.orientation_of(message.pose.pose.orientation)])
+        if not np.isfinite(state).all():
+            return np.full(3, math.nan)
+        t = self._epoch.seconds(message.header.stamp)
+        if not 0.0 <= t - self._newest <= GAP:
+            self._layers.reset()
+        self._newest = t
+        return self._layers.filter(t, p, Rotation.from_quat(state[6:]).apply(state[3:6]))
+
+    def _report(self):
+        kinds = ("corrected", "faded", "outside", "invalid")
+        recent = {name: self._counts[name] - self._judged[name] for name in kinds}
+        self._judged = Counter(self._counts)
+        rate = self._rate.of(self._counts["received"])
+        values = {name: self._counts[name] for name in ("received", *kinds)}
+        values |= {"odometry rate": f"{rate:.1f} Hz", "map": self._map.source, "markers": len(self._map.at)}
+        values |= {"publishers of odometry": self._input.get_publisher_count()}
+        values |= {"subscribers of odometry/debiased": self._publisher.get_subscription_count()}
+        return *self._judge(recent, sum(recent.values())), values
+
+    def _judge(self, recent, total):
+        if not total:
+            return DiagnosticStatus.WARN, "no odometry: start ekf_node in this namespace"
+        if recent["invalid"]:
+            what = f"odometry is not finite, or not in the map's frame '{self._map.frame}', and is passed on as it is"
+            return DiagnosticStatus.ERROR, f"{what}: correct world_frame of ekf_node, or make a map in its frame"
+        if recent["outside"] > DOUBT * total:
+            return DiagnosticStatus.WARN, "most positions are outside of the map and not corrected: map more of the room"
+        return DiagnosticStatus.OK, "debiasing"
+
+
+def main(argv=None):
+    """Run the node; returns the exit code."""
+    return ros.run(DebiasNode, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""Measured flights: a map fitted to some, judged on others, beside what `diagnose` reaches on the same flights."""
+
+from functools import partial
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_ekf.debias import fit
+
+from .. import inputs, parallel
+from ..diagnosis.bench.measured import SPLITS
+from .judge import fly, judge
+from .parts import LEAST, part_of
+
+STEP = 0.35  # m, chosen by leaving out one flight after the other among those to fit
+MAPS = {"thin plate": ("thin_plate", STEP, False), "thin plate, planar": ("thin_plate", STEP, True), "network": ("network", 0.5, False)}
+
+
+def cases():
+    """{name: (split whose effects to compare with or None, flights to fit, flights to judge)}; flights are paths in the data."""
+    a25, b25 = SPLITS["0425 a"]
+    a26, b26 = SPLITS["0426 a"]
+    found = {name: (name, *split) for name, split in SPLITS.items() if split[1]}
+    found["0425 a, another day"] = ("0425 a", a25, a26 + b26)
+    found["0426 a, another day"] = ("0426 a", a26, a25 + b25)
+    found["0425 TDOA2, judged on TDOA3"] = (None, *([path for path in a25 + b25 if kind in path] for kind in ("TDOA2", "TDOA3")))
+    found["const3, another constellation"] = ("const3", SPLITS["const3"][0], SPLITS["const4 trial 1"][1])
+    return found
+
+
+def run(data, diagnosed=None, jobs=None):
+    """[{"case", "fitted", "runs": [{"flight", name of the estimate: {"rmse": m, "nees": mean}}]}] over all cases.
+
+    data : folder of the flights; diagnosed : folder that `diagnose_bench measured` wrote, or None.
+    """
+    if diagnosed is not None and not any(_effects_file(diagnosed, name).is_file() for name in SPLITS):
+        raise InputError(f"--diagnosed: {diagnosed} holds no */effects.yaml; run `diagnose_bench measured --out {diagnosed}`.")
+    tasks = [(name, *case) for name, case in cases().items()]
+    return list(parallel.over(partial(_case, data=data, diagnosed=diagnosed), tasks, jobs, unit="case"))
+
+
+def _case(task, data, diagnosed):
+    name, split, to_fit, to_judge = task
+    rows = {}
+    for words, effects in _corrections(split, diagnosed).items():
+        fitted, judged = ([_fly(data, path, effects) for path in paths] for paths in (to_fit, to_judge))
+        parts = [part_of(score, odometry) for _, score, odometry in fitted]
+        kinds = MAPS if effects is None else {"thin plate": MAPS["thin plate"]}
+        maps = {kind: fit(parts, step, LEAST, planar, how) for kind, (how, step, planar) in kinds.items()}
+        for flown in judged:
+            row = rows.setdefault(flown[1].name, {})
+            row[words or "before"] = _figures(flown[1])
+            row |= {f"{words}{' + ' * bool(words)}{kind}": _figures(judge(flown, one, effects)) for kind, one in maps.items()}
+    return {"case": name, "fitted": to_fit, "runs": [{"flight": flight, **row} for flight, row in rows.items()]}
+
+
+def _corrections(split, diagnosed):
+    """{"": None, "effects": EffectSet}: what the TDOAs are corrected with before the filter."""
+    out = {"": None}
+    if diagnosed is not None and split is not None:
+        out["effects"] = EffectSet.from_yaml(_effects_file(diagnosed, split))
+    return out
+
+
+def _effects_file(diagnosed, split):
+    return diagnosed / split.replace(" ", "-") / "effects.yaml"
+
+
+def _fly(data, path, effects):
+    (recording,) = inputs.find_flights([data / path], data / "surveys")
+    return fly(recording, effects=effects)
+
+
+def _figures(score):
+    row = score.row()
+    return {"rmse": row["rmse_3d"], "nees": float(np.mean(score.nees)), "diverged": row["diverged"]}
