@@ -124,9 +124,7 @@ def test_layers_act_before_the_map(make_rig, file):
     [
         ([], "map: is empty"),
         (["-p", "map:=nowhere.npz"], "nowhere.npz: is no position bias map"),
-        (["-p", "map:=MAP", "-p", "smooth:=2.0"], "smooth: 2.0"),
         (["-p", "map:=MAP", "-p", "max_speed:=[1.0, 1.0]"], "max_speed: .* three numbers"),
-        (["-p", "map:=MAP", "-p", "history:=many"], "history: "),
     ],
 )
 def test_bad_parameters_are_refused_in_one_sentence(file, arguments, named):

@@ -90,6 +90,18 @@ def test_square_keeps_its_speed_on_the_edges_and_slows_in_the_corners():
     assert 1.0 < np.linalg.norm(motion.a, axis=1).max() < 4.0
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_line_goes_back_and_forth_along_its_axis(axis):
+    trajectory = fly(replace(CONFIG, trajectory=f"line_{'xy'[axis]}", radius=2.0, place=(0.2, -0.3), height=1.0))[0]
+    motion = trajectory.motion(np.linspace(10.0, 30.0, 2000))
+    middle = [0.2, -0.3, 1.0]
+    assert motion.p[:, axis].min() == pytest.approx(middle[axis] - 2.0, abs=0.3)  # the turns are smooth
+    assert motion.p[:, axis].max() == pytest.approx(middle[axis] + 2.0, abs=0.3)
+    np.testing.assert_allclose(np.delete(motion.p, axis, axis=1), np.tile(np.delete(middle, axis), (2000, 1)), atol=1e-6)
+    assert np.median(np.abs(motion.v[:, axis])) == pytest.approx(1.2, abs=1e-3)
+    assert (np.diff(np.sign(motion.v[:, axis])) != 0).sum() >= 4
+
+
 def test_sines_are_seeded_fill_the_room_and_keep_the_mean_speed():
     paths = []
     for seed in (1, 1, 2):

@@ -1,6 +1,7 @@
 """Pairs of measured and true positions, to fit a bias map to: from flights, and from places where a tag stood still."""
 
 import csv
+from pathlib import Path
 
 import numpy as np
 
@@ -34,9 +35,10 @@ def static_parts(path, survey=None, config=None, effects=None, planar=False):
         position; or any recording with ground truth, through which the filter is run, and of which the time at rest counts, but
         for the first SETTLE s at each place. Raises InputError.
     """
-    with open(path, "rb") as file:
-        if b"true_x" in file.readline():
-            return _from_table(path, planar)
+    if not Path(path).is_dir():
+        with open(path, "rb") as file:
+            if b"true_x" in file.readline():
+                return _from_table(path, planar)
     flight = read_flight(path, inputs.survey_for(path, survey))
     if flight.truth is None:
         raise InputError(f"{path}: holds no ground truth; record where the tag stood as ground_truth/pose.")

@@ -83,13 +83,13 @@ def set_up_tables(figures):
 
 
 def measured_tables(figures):
-    """Markdown of what measured.run found: mean 3D RMSE of the runs, m, and beneath it every run."""
+    """Markdown of what measured.run found: means of the runs, m, and beneath them every run."""
     names = list(dict.fromkeys(name for case in figures for row in case["runs"] for name in row if name != "flight"))
-    lines = _head(["fitted to", "runs", *names])
-    lines += [_line([case["case"], len(case["runs"]), *_means(case["runs"], names, "rmse")]) for case in figures]
-    lines += ["", "NEES, mean of the runs (3 is honest).", "", *_head(["fitted to", "runs", *names])]
-    lines += [_line([case["case"], len(case["runs"]), *_means(case["runs"], names, "nees")]) for case in figures]
-    lines += ["", "Every run.", "", *_head(["fitted to", "flight", *names])]
+    lines = []
+    for title, key in (("3D RMSE, m", "rmse"), ("Horizontal RMSE, m", "rmse_xy"), ("NEES (3 is honest)", "nees")):
+        lines += [f"{title}, mean of the runs.", "", *_head(["fitted to", "runs", *names])]
+        lines += [_line([case["case"], len(case["runs"]), *_means(case["runs"], names, key)]) for case in figures] + [""]
+    lines += ["3D RMSE of every run, m.", "", *_head(["fitted to", "flight", *names])]
     lines += [_line([case["case"], row["flight"], *_means([row], names, "rmse")]) for case in figures for row in case["runs"]]
     return "\n".join(lines) + "\n"
 
@@ -111,19 +111,19 @@ def _line(cells):
 
 
 def plot_set_up(found, maps, path):
-    """Bias at the validation points before and after the static maps, as arrows from the true place, ten times as long."""
+    """Bias before and after the static maps, as arrows from the true place, five times as long."""
     sides = {"before": None, "network": maps["static, network"], "thin plate": maps["static, thin_plate"]}
-    figure, axes = plt.subplots(1, 3, figsize=(13, 4.6), layout="constrained", sharey=True)
+    figure, axes = plt.subplots(1, 3, figsize=(13, 5), layout="constrained", sharey=True)
     for ax, (title, one) in zip(axes, sides.items()):
         for name, colour in (("calibration", "tab:gray"), ("validation", "tab:red")):
             true = np.array([stay.true[0, :2] for stay in found[name]])
             bias = np.array([_mean_error(stay, one) for stay in found[name]])
             ax.quiver(*true.T, *bias.T, angles="xy", scale_units="xy", scale=0.2, color=colour, width=0.004, label=name)
         size = np.mean([np.hypot(*_mean_error(stay, one)) for stay in found["validation"]])
-        ax.set(title=f"{title}: {100 * size:.1f} cm at the validation points", xlabel="x, m", aspect="equal")
+        ax.set(title=f"{title}: {100 * size:.1f} cm at the validation points", xlabel="x, m", aspect="equal", xlim=(-2.7, 2.9), ylim=(-2.6, 2.6))
         ax.plot([-2, 2, 2, -2], [-2, -2, 2, 2], "k^")
     axes[0].set_ylabel("y, m")
-    axes[0].legend(loc="upper right", fontsize="small")
+    axes[0].legend(loc="lower left", fontsize="small")
     figure.suptitle("Bias of the position, arrows five times as long as the bias")
     figure.savefig(path, dpi=80)
     plt.close(figure)

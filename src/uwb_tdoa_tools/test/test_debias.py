@@ -1,0 +1,103 @@
+import json
+import re
+
+import numpy as np
+import pytest
+from uwb_tdoa_ekf.debias import BiasMap
+
+from uwb_tdoa_tools.bag import write_bag
+from uwb_tdoa_tools.debias import main
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+
+BIAS = np.array([0.1, -0.2, 0.05])
+
+
+@pytest.fixture
+def points(tmp_path):
+    """A CSV file of 4 x 4 x 3 places, five positions at each, all BIAS off."""
+    places = np.stack(np.meshgrid(range(4), range(4), range(3), indexing="ij"), axis=-1).reshape(-1, 3) * 0.5
+    rows = [(*place, *(place + BIAS + shift)) for place in places for shift in np.linspace(-0.01, 0.01, 5)]
+    text = "\n".join(",".join(f"{value:.4f}" for value in row) for row in rows)
+    (tmp_path / "points.csv").write_text(f"true_x,true_y,true_z,x,y,z\n{text}\n")
+    return tmp_path / "points.csv"
+
+
+def test_points_become_a_map(tmp_path, points, capsys):
+    assert main(["fit", "--static", str(points), "--step", "0.5", "--out", str(tmp_path / "m.npz")]) == 0
+    found = BiasMap.load(tmp_path / "m.npz")
+    assert len(found.at) == 48 and (found.count == 5).all() and found.source == "points.csv" and not found.planar
+    np.testing.assert_allclose(found.bias_at(np.array([[0.8, 0.6, 0.6]])), BIAS[None], atol=1e-6)
+    assert "48 markers 0.5 m apart" in capsys.readouterr().out
+
+
+def test_a_planar_network_needs_no_heights(tmp_path, points):
+    flat = tmp_path / "flat.csv"
+    flat.write_text("".join(",".join(np.array(line.split(","))[[0, 1, 3, 4]]) + "\n" for line in points.read_text().split()))
+    options = ["--planar", "--interpolator", "network", "--step", "0.5", "--out", str(tmp_path / "m.npz")]
+    assert main(["fit", "--static", str(flat), *options]) == 0
+    found = BiasMap.load(tmp_path / "m.npz")
+    assert found.planar and found.interpolator == "network" and (found.count == 15).all()
+    np.testing.assert_allclose(found.bias, np.tile(BIAS[:2], (16, 1)), atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory):
+    """Two bags of flights through the same biases."""
+    folder = tmp_path_factory.mktemp("flights")
+    for name, speed in (("one", 1.0), ("two", 0.8)):
+        config = SimulationConfig(
+            seed=4, duration=40.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True, multipath=False, speed=speed
+        )
+        write_bag(simulate(config), folder / f"{name}.bag")
+    return folder
+
+
+def test_flights_make_a_map_and_are_judged_by_it(tmp_path, flights, capsys):
+    one, two, out = str(flights / "one.bag"), str(flights / "two.bag"), str(tmp_path / "m.npz")
+    fitted = ["fit", one, "--holdout", two, "--out", out, "--json", str(tmp_path / "fit.json"), "--jobs", "1"]
+    assert main(fitted) == 0
+    figures = json.loads((tmp_path / "fit.json").read_text())
+    (row,) = figures["held out"]
+    assert row["after"]["rmse_3d"] < 0.8 * row["before"]["rmse_3d"]
+    assert figures["map"]["markers"] > 30 and figures["map"]["frame"] == "map"
+    assert "held out" in capsys.readouterr().out
+
+    assert main(["judge", out, two, "--json", str(tmp_path / "judge.json")]) == 0
+    assert json.loads((tmp_path / "judge.json").read_text())["runs"] == [row]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["fit", "--out", "m.npz"], "FLIGHT: there is none"),
+        (["fit", "--static", "POINTS", "--step", "0", "--out", "m.npz"], "--step: 0.0"),
+        (["fit", "--static", "nowhere.csv", "--out", "m.npz"], "nowhere.csv: No such file"),
+        (["fit", "--static", "SHORT", "--out", "m.npz"], "has no column true_z"),
+        (["fit", "--static", "TEXT", "--planar", "--out", "m.npz"], "line 3: .* needs a number"),
+        (["fit", "--static", "EMPTY", "--planar", "--out", "m.npz"], "holds no positions"),
+        (["fit", "FLIGHTS/one.bag", "--holdout", "FLIGHTS", "--out", "m.npz"], "one.bag is also a FLIGHT"),
+        (["judge", "POINTS", "FLIGHTS/one.bag"], "is no position bias map"),
+        (["measured", "--data", "FLIGHTS", "--diagnosed", "FLIGHTS", "--out", "o"], "--diagnosed: .*`diagnose_bench"),
+        (["fit"], "required: --out"),
+        ([], "required: COMMAND"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(tmp_path, points, flights, monkeypatch, capsys, arguments, named):
+    monkeypatch.chdir(tmp_path)
+    head = "true_x,true_y,x,y\n"
+    texts = {"SHORT": head + "0,0,0,0\n", "TEXT": head + "0,0,0,0\n1,1,one,1\n", "EMPTY": head}
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    named_paths = {"POINTS": str(points), "FLIGHTS": str(flights)}
+    for name, path in named_paths.items():
+        arguments = [argument.replace(name, path) for argument in arguments]
+    assert main(arguments) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("debias") and "error: " in error
+    assert re.search(named, error)
+    assert not (tmp_path / "m.npz").exists()
+
+
+def test_help_shows_every_command(capsys):
+    assert main(["--help"]) == 0
+    assert "debias set-up --out set_up/" in capsys.readouterr().out
