@@ -36,7 +36,7 @@ def test_a_known_bias_is_found_and_taken_out_elsewhere(planar):
 
 def test_the_network_needs_a_full_grid_and_is_worse_than_the_thin_plate():
     """In the plane, markers everywhere: both help."""
-    parts, fresh = [fly(1, 20000), fly(2, 20000)], fly(3, noise=0.0)
+    parts, fresh = [fly(1, 8000), fly(2, 8000)], fly(3, noise=0.0)
     left = {kind: left_over(fit(parts, 0.5, 10, True, kind), fresh)[:, :2] for kind in INTERPOLATORS}
     rms = {kind: np.sqrt(np.mean(error**2)) for kind, error in left.items()}
     assert rms["thin_plate"] < rms["network"] < 0.6 * np.sqrt(np.mean(field(fresh.true)[:, :2] ** 2))
@@ -46,7 +46,7 @@ def test_the_network_needs_a_full_grid_and_is_worse_than_the_thin_plate():
 def test_covariances_become_honest_but_never_smaller(claimed, honest):
     def drifting(seed):  # a bias of the flight's own, which no map can know
         own = 0.08 * np.random.default_rng(seed).standard_normal(3)
-        return fly(seed, claimed=claimed, bias=lambda true: field(true) + own)
+        return fly(seed, 1500, claimed=claimed, bias=lambda true: field(true) + own)
 
     found = fit([drifting(seed) for seed in range(10)], 0.5, least=10)
     fresh = [drifting(seed) for seed in range(20, 40)]

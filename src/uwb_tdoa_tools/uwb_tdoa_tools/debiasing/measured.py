@@ -12,6 +12,7 @@ from .. import inputs, parallel
 from ..diagnosis.bench.measured import SPLITS
 from .judge import fly, judge
 from .parts import LEAST, part_of
+from .report import about_figures
 
 STEP = 0.35  # m, chosen by leaving out one flight after the other among those to fit
 MAPS = {  # name: (interpolator, step in m, planar)
@@ -35,7 +36,7 @@ def cases():
 
 
 def run(data, diagnosed=None, jobs=None):
-    """[{"case", "fitted", "runs": [{"flight", name of the estimate: {"rmse": m, "rmse_xy": m, "nees": mean}}]}] of all cases.
+    """[{"case", "fitted", "maps", "runs": [{"flight", name of the estimate: {"rmse": m, "rmse_xy": m, "nees": mean}}]}] of all cases.
 
     data : folder of the flights; diagnosed : folder that `diagnose_bench measured` wrote, or None.
     """
@@ -46,18 +47,20 @@ def run(data, diagnosed=None, jobs=None):
 
 
 def _case(task, data, diagnosed):
-    name, split, to_fit, to_judge = task
-    rows = {}
+    case, split, to_fit, to_judge = task
+    rows, about = {}, {}
     for words, effects in _corrections(split, diagnosed).items():
         fitted, judged = ([_fly(data, path, effects) for path in paths] for paths in (to_fit, to_judge))
         parts = [part_of(score, odometry) for _, score, odometry in fitted]
         kinds = MAPS if effects is None else {"thin plate": MAPS["thin plate"]}
-        maps = {kind: fit(parts, step, LEAST, planar, how) for kind, (how, step, planar) in kinds.items()}
+        prefix = f"{words} + " if words else ""
+        maps = {prefix + name: fit(parts, step, LEAST, planar, how) for name, (how, step, planar) in kinds.items()}
         for flown in judged:
             row = rows.setdefault(flown[1].name, {})
             row[words or "before"] = _figures(flown[1])
-            row |= {f"{words}{' + ' * bool(words)}{kind}": _figures(judge(flown, one, effects)) for kind, one in maps.items()}
-    return {"case": name, "fitted": to_fit, "runs": [{"flight": flight, **row} for flight, row in rows.items()]}
+            row |= {name: _figures(judge(flown, one, effects)) for name, one in maps.items()}
+        about |= {name: about_figures(one) for name, one in maps.items()}
+    return {"case": case, "fitted": to_fit, "maps": about, "runs": [{"flight": flight, **row} for flight, row in rows.items()]}
 
 
 def _corrections(split, diagnosed):
