@@ -54,7 +54,9 @@ def test_covariances_become_honest_but_never_smaller(claimed, honest):
     for part in fresh:
         p, covariance, trust = found.correct(part.measured, part.covariance)
         error = (p - part.true)[trust == 1.0]
-        nees.append(np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(covariance[trust == 1.0], error[:, :, None])[:, :, 0])))
+        nees.append(
+            np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(covariance[trust == 1.0], error[:, :, None])[:, :, 0]))
+        )
     if honest:
         assert 2.0 < np.mean(nees) < 5.0  # 20 flights: a third of 3 either way, and more above
         assert np.trace(found.added) > 0.01

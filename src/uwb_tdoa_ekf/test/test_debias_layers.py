@@ -40,7 +40,9 @@ def test_saturation_limits_the_velocity_either_way():
     """Seen through what the velocities predict."""
     p, v = np.zeros((60, 3)), np.zeros((60, 3))
     v[5:] = (50.0, -50.0, 0.0)
-    config = LayerConfig(saturate=True, max_speed=(2.0, 2.0, 2.0), max_acceleration=1000.0, adams_moulton=True, least_weight=0.0)
+    config = LayerConfig(
+        saturate=True, max_speed=(2.0, 2.0, 2.0), max_acceleration=1000.0, adams_moulton=True, least_weight=0.0
+    )
     found = run(config, p, v)
     np.testing.assert_allclose(found[-1], [0.02, -0.02, 0.0], atol=0.005)  # exp(-2) of the estimate is left
 

@@ -138,7 +138,13 @@ def test_layers_act_before_the_map(make_rig, file):
     ],
 )
 def test_bad_parameters_are_refused_in_one_sentence(file, arguments, named):
-    command = [sys.executable, "-m", MODULES["debias_node"], "--ros-args", *(a.replace("MAP", str(file)) for a in arguments)]
+    command = [
+        sys.executable,
+        "-m",
+        MODULES["debias_node"],
+        "--ros-args",
+        *(a.replace("MAP", str(file)) for a in arguments),
+    ]
     result = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert result.returncode == 2
     assert result.stderr.splitlines()[-1].startswith("debias_node: error: ")

@@ -1,7 +1,8 @@
 """debias_node: odometry in, odometry with the bias of its position taken out.
 
 odometry (nav_msgs/Odometry)
-  -> odometry/debiased (nav_msgs/Odometry: one for each, same stamp and frames), /diagnostics (diagnostic_msgs/DiagnosticArray).
+  -> odometry/debiased (nav_msgs/Odometry: one for each, same stamp and frames),
+     /diagnostics (diagnostic_msgs/DiagnosticArray).
 Every parameter is documented in config/debias_node.yaml.
 """
 
@@ -66,7 +67,8 @@ class DebiasNode(Node):
         self._publisher.publish(message)
 
     def _layered(self, message, p):
-        """The position after the layers, which also need the velocity, in the world frame; NaN where one is not known."""
+        """The position after the layers, which also need the velocity, in the world frame; NaN where one is not
+        known."""
         u = message.twist.twist.linear
         state = np.array([*p, u.x, u.y, u.z, *ros.orientation_of(message.pose.pose.orientation)])
         if not np.isfinite(state).all():
@@ -95,7 +97,7 @@ class DebiasNode(Node):
             what = f"odometry is not finite, or not in the map's frame '{self._map.frame}', and is passed on as it is"
             return DiagnosticStatus.ERROR, f"{what}: correct world_frame of ekf_node, or make a map in its frame"
         if recent["outside"] > DOUBT * total:
-            return DiagnosticStatus.WARN, "most positions are outside of the map and not corrected: map more of the room"
+            return DiagnosticStatus.WARN, "most positions are outside of the map, not corrected: map more of the room"
         return DiagnosticStatus.OK, "debiasing"
 
 

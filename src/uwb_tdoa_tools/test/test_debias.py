@@ -32,7 +32,9 @@ def test_points_become_a_map(tmp_path, points, capsys):
 
 def test_a_planar_network_needs_no_heights(tmp_path, points):
     flat = tmp_path / "flat.csv"
-    flat.write_text("".join(",".join(np.array(line.split(","))[[0, 1, 3, 4]]) + "\n" for line in points.read_text().split()))
+    flat.write_text(
+        "".join(",".join(np.array(line.split(","))[[0, 1, 3, 4]]) + "\n" for line in points.read_text().split())
+    )
     options = ["--planar", "--interpolator", "network", "--step", "0.5", "--out", str(tmp_path / "m.npz")]
     assert main(["fit", "--static", str(flat), *options]) == 0
     found = BiasMap.load(tmp_path / "m.npz")

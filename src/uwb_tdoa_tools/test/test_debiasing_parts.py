@@ -7,7 +7,9 @@ from uwb_tdoa_tools.debiasing.parts import part_of, static_parts
 from uwb_tdoa_tools.evaluate import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-CONFIG = SimulationConfig(seed=2, duration=6.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True, place=(0.5, 0.3), height=1.5)
+CONFIG = SimulationConfig(
+    seed=2, duration=6.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True, place=(0.5, 0.3), height=1.5
+)
 
 
 def config(**fields):

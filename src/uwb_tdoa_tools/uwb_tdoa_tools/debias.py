@@ -12,10 +12,11 @@ from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap, fit
 
 from . import cli, inputs, parallel
 from .debiasing import measured, report, set_up
-from .debiasing.judge import fly, judge
+from .debiasing.judge import fly
 from .debiasing.parts import LEAST, part_of, static_parts
 
-DESCRIPTION = """Map the bias of estimated positions over the room, after Grasso et al. (Sensors 2022, 22, 9136), and take it out.
+DESCRIPTION = """Map the bias of estimated positions over the room, after Grasso et al. (Sensors 2022, 22, 9136), and
+take it out.
 
   fit       make a map from flights with ground truth, or from places where a tag stood still
   judge     errors of flights before and after a map
@@ -41,11 +42,13 @@ def main(argv=None):
     fitting.add_argument("flights", nargs="*", metavar="FLIGHT", help=inputs.HELP)
     fitting.add_argument(
         "--static", nargs="+", default=[], metavar="FILE",
-        help="of a tag that stood still: CSV with true_x, true_y, true_z, x, y, z in metres, or recordings with ground truth",
+        help="of a tag that stood still: CSV with true_x, true_y, true_z, x, y, z in metres, or recordings with truth",
     )  # fmt: skip
     fitting.add_argument("--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit")
     fitting.add_argument("--out", metavar="FILE", type=Path, required=True, help="the map to write (.npz)")
-    fitting.add_argument("--step", metavar="M", type=float, default=0.35, help="of the grid of markers, m (default: 0.35)")
+    fitting.add_argument(
+        "--step", metavar="M", type=float, default=0.35, help="of the grid of markers, m (default: 0.35)"
+    )
     fitting.add_argument("--planar", action="store_true", help="map x and y only, whatever the height")
     fitting.add_argument("--interpolator", choices=INTERPOLATORS, default="thin_plate", help="(default: thin_plate)")
     judging = commands.add_parser("judge", help="errors before and after a map")
@@ -61,12 +64,19 @@ def main(argv=None):
     copying = commands.add_parser("set-up", help="simulate the paper's set-up")
     copying.add_argument("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
     flying = commands.add_parser("measured", help="measured flights")
-    flying.add_argument("--data", metavar="DIR", type=Path, required=True, help="the measured flights: flights/, util/, surveys/")
     flying.add_argument(
-        "--diagnosed", metavar="DIR", type=Path, help="what `diagnose_bench measured` wrote: compare with its effects too"
+        "--data", metavar="DIR", type=Path, required=True, help="the measured flights: flights/, util/, surveys/"
+    )
+    flying.add_argument(
+        "--diagnosed",
+        metavar="DIR",
+        type=Path,
+        help="what `diagnose_bench measured` wrote: compare with its effects too",
     )
     for one in (copying, flying):
-        one.add_argument("--out", metavar="DIR", type=Path, required=True, help="where to write tables, figures and pictures")
+        one.add_argument(
+            "--out", metavar="DIR", type=Path, required=True, help="where to write tables, figures and pictures"
+        )
         one.add_argument("--jobs", metavar="N", type=int, help="runs at once (default: as many as there are cores)")
     return cli.run(_debias, parser, argv)
 
@@ -91,7 +101,9 @@ def _fit(args):
     parts += [part_of(score, odometry) for _, score, odometry in fitted]
     frames = {flight.anchors.frame for flight, _, _ in fitted} or {"map"}
     if len(frames) > 1:
-        raise InputError(f"FLIGHT: the flights are in different frames, {', '.join(sorted(frames))}; map them one by one.")
+        raise InputError(
+            f"FLIGHT: the flights are in different frames, {', '.join(sorted(frames))}; map them one by one."
+        )
     source = ", ".join([flight.name for flight, _, _ in fitted] + [Path(path).name for path in args.static])
     least = LEAST if recordings else 1
     found = fit(parts, args.step, least, args.planar, args.interpolator, frames.pop(), source)

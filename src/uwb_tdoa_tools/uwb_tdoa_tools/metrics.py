@@ -32,7 +32,8 @@ def position_errors(odometry, truth):
     first, last = airborne(truth)
     chosen = (odometry.t >= first) & (odometry.t <= last)
     t = odometry.t[chosen]
-    return t, odometry.p[chosen] - position_at(t, truth), getattr(odometry, "covariance", getattr(odometry, "pose_covariance", None))[chosen, :3, :3]
+    covariance = getattr(odometry, "covariance", getattr(odometry, "pose_covariance", None))
+    return t, odometry.p[chosen] - position_at(t, truth), covariance[chosen, :3, :3]
 
 
 def nees(error, covariance):

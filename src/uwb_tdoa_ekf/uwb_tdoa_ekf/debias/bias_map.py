@@ -1,4 +1,5 @@
-"""The map from a measured position to its bias, after Grasso et al. (Sensors 2022, 22, 9136), eqs. 20 and 21; and its file."""
+"""The map from a measured position to its bias, after Grasso et al. (Sensors 2022, 22, 9136), eqs. 20 and 21; and its
+file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +29,12 @@ class BiasMap:
     cell : (n, d) int, place in the grid of `step` m; at : (n, d) m, where the markers are measured, eq. 19
     bias : (n, d) m, b* of eqs. 17 and 18; std : (n, d) m, scatter of the measurements; count : (n,) measurements
     added : (d, d) m^2, to be added to the covariance of a position that is corrected; see `fit`
-    interpolator : "thin_plate" (scipy's RBFInterpolator: passes near all markers, the nearer the more was measured there) or
-        "network" (Grasso et al., appendix A)
+    interpolator : "thin_plate" (scipy's RBFInterpolator: passes near all markers, the nearer the more was measured
+        there) or "network" (Grasso et al., appendix A)
     frame : name of the world frame; source : where it came from, free text
 
-    A position is known inside the convex hull of the markers and no further than one step from the next of them. Beyond, the
-    correction fades to nothing over FADE.
+    A position is known inside the convex hull of the markers and no further than one step from the next of them.
+    Beyond, the correction fades to nothing over FADE.
     """
 
     cell: np.ndarray
@@ -103,8 +104,8 @@ class BiasMap:
         """Positions without their bias (eq. 21) and the covariance of what is left.
 
         p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, trust). With trust w, what is added to the
-        covariance is w^2 `added` for what the map does not know, and (1 - w)^2 of the mean square of all biases, for one that was
-        not taken out.
+        covariance is w^2 `added` for what the map does not know, and (1 - w)^2 of the mean square of all biases, for
+        one that was not taken out.
         """
         trust, d = self.trust(p), self.at.shape[1]
         covariance = covariance.copy()
@@ -115,7 +116,11 @@ class BiasMap:
     def save(self, path):
         """Write what `load` reads: a numpy .npz file that names its format, version and units."""
         about = {"format": FORMAT, "version": VERSION, "units": UNITS, "frame": self.frame, "source": self.source}
-        content = {"step": self.step, "interpolator": self.interpolator, **{name: getattr(self, name) for name in _ARRAYS}}
+        content = {
+            "step": self.step,
+            "interpolator": self.interpolator,
+            **{name: getattr(self, name) for name in _ARRAYS},
+        }
         with open(path, "wb") as file:
             np.savez_compressed(file, **about, **content)
 
@@ -130,5 +135,7 @@ class BiasMap:
                 texts = {name: str(content[name]) for name in ("interpolator", "frame", "source")}
                 step = float(content["step"])
         except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, BadZipFile, zlib.error) as error:
-            raise InputError(f"{path}: is no position bias map of version {VERSION} ({error}); make one with `debias`.") from error
+            raise InputError(
+                f"{path}: is no position bias map of version {VERSION} ({error}); make one with `debias`."
+            ) from error
         return cls(**fields, **texts, step=step)

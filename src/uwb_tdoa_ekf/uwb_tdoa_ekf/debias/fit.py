@@ -16,8 +16,8 @@ LARGEST = 1e4  # times the map's own error that may be added to a covariance
 class Part:
     """What was measured in one go: a flight, or the stay at one point of a grid.
 
-    measured, true : (N, 3) m, world frame; covariance : (N, 3, 3) m^2 of measured, or None where nobody knows it. Pairs that
-    are more than LOST apart, or not finite, are left out.
+    measured, true : (N, 3) m, world frame; covariance : (N, 3, 3) m^2 of measured, or None where nobody knows it. Pairs
+    that are more than LOST apart, or not finite, are left out.
     """
 
     def __init__(self, measured, true, covariance=None):
@@ -33,8 +33,8 @@ def fit(parts, step, least=1, planar=False, interpolator="thin_plate", frame="ma
     """BiasMap of a list of Part. Raises InputError where they hold too little.
 
     step : m, of the grid; least : measurements that make a marker; planar : map x and y only.
-    `added` comes from maps that were fitted without some of the parts and asked about them (without stretches of it, if there is
-    one part only): their mean squared error at markers. If the covariances of the measured positions are
+    `added` comes from maps that were fitted without some of the parts and asked about them (without stretches of it, if
+    there is one part only): their mean squared error at markers. If the covariances of the measured positions are
     known, as much of it is added as makes the normalised squared error of the corrected positions d on average there,
     nothing if they are honest as they are; else all of it.
     """
@@ -68,7 +68,8 @@ def fit(parts, step, least=1, planar=False, interpolator="thin_plate", frame="ma
 
 
 def _needed(error, covariance, added):
-    """The factor of `added` with which the mean of e' (P + factor added)^-1 e is d, the number of dimensions; 0 or more."""
+    """The factor of `added` with which the mean of e' (P + factor added)^-1 e is d, the number of dimensions; 0 or
+    more."""
 
     def excess(factor):
         solved = np.linalg.solve(covariance + factor * added, error[:, :, None])[:, :, 0]
@@ -89,9 +90,13 @@ def _fit(parts, step, least, planar, interpolator, frame, source, added):
 def _markers(parts, step, least, planar):
     parts = [part for part in parts if len(part)]
     if not parts:
-        raise InputError(f"positions: none is within {LOST:g} m of the truth; is it in the same frame, by the same clock?")
+        raise InputError(
+            f"positions: none is within {LOST:g} m of the truth; is it in the same frame, by the same clock?"
+        )
     d = 2 if planar else 3
-    markers = collect(*(np.concatenate([getattr(part, name)[:, :d] for part in parts]) for name in ("measured", "true")), step, least)
+    markers = collect(
+        *(np.concatenate([getattr(part, name)[:, :d] for part in parts]) for name in ("measured", "true")), step, least
+    )
     if len(markers) == 0:
         raise InputError(f"step: no cell of {step:g} m holds {least} positions; give a larger step, or more data.")
     return markers

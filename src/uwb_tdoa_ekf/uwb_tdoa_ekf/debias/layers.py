@@ -1,6 +1,7 @@
 """The filter layers of Grasso et al. (Sensors 2022, 22, 9136), appendix C, which come before the debiasing.
 
-They found no gain in precision from them, nor do we (docs/debiasing.md); they are here for whoever wants to look further.
+They found no gain in precision from them, nor do we (docs/debiasing.md); they are here for whoever wants to look
+further.
 """
 
 from collections import deque
@@ -17,7 +18,8 @@ _ADAMS_MOULTON = np.array([251.0, 646.0, -264.0, 106.0, -19.0]) / 720.0  # newes
 class LayerConfig:
     """Which layers, in the paper's order; all are off by default.
 
-    saturate : limit steps of velocity and position (A19 - A25); max_speed : (3,) m/s along x, y, z; max_acceleration : m/s^2
+    saturate : limit steps of velocity and position (A19 - A25); max_speed : (3,) m/s along x, y, z; max_acceleration :
+        m/s^2
     smooth : share q of the newest position in the weighted mean of the last `history` + 1 (A26); 1 for no smoothing
     adams_moulton : mix in what the velocities predict (A27 - A29); flipping_speed : (3,) m/s at which they begin to
         count; least_weight : alpha_min, that of the estimate itself at high speed
@@ -65,7 +67,8 @@ class Layers:
         self._v = deque(maxlen=len(_ADAMS_MOULTON))
 
     def filter(self, t, p, v):
-        """Position (3,) m of the estimate at stamp t, s, with position p (3,) m and velocity v (3,) m/s, world frame."""
+        """Position (3,) m of the estimate at stamp t, s, with position p (3,) m and velocity v (3,) m/s, world
+        frame."""
         config = self._config
         dt = 0.0 if self._t is None else t - self._t
         if config.saturate and dt > 0.0:
@@ -77,15 +80,16 @@ class Layers:
         out = _smoothed(np.array(self._p), config.smooth) if config.smooth < 1.0 else p
         if config.adams_moulton and len(self._v) == len(_ADAMS_MOULTON):
             predicted = before + dt * (_ADAMS_MOULTON @ np.array(self._v))  # A27
-            # A29: the formula has an acceleration, the text and the caption of figure A5 the speed. The speed makes sense.
-            weight = np.exp(-0.5 * (v / np.array(config.flipping_speed)) ** 2) * (1.0 - config.least_weight) + config.least_weight
+            # A29: the formula has an acceleration; the text, which makes sense, and the caption of figure A5 the speed.
+            slow = np.exp(-0.5 * (v / np.array(config.flipping_speed)) ** 2)
+            weight = slow * (1.0 - config.least_weight) + config.least_weight
             out = weight * out + (1.0 - weight) * predicted  # A28
         return out
 
 
 def _saturated(p, v, last_p, last_v, dt, config):
-    """Position and velocity whose steps are possible (A19 - A25). The paper limits a velocity from above; here also from
-    below."""
+    """Position and velocity whose steps are possible (A19 - A25). The paper limits a velocity from above; here also
+    from below."""
     limit = np.array(config.max_speed)
     change = v - last_v
     v = np.clip(last_v + _scale(dt * config.max_acceleration, change) * change, -limit, limit)  # A21, A22

@@ -12,17 +12,18 @@ CHUNK = 2000  # places at a time
 class AngularNetwork:
     """One Gaussian at every node, whose width depends on the direction in which one looks from there (eqs. A1 - A8).
 
-    A width is chosen so that the Gaussian has fallen to its neighbour's share of the neighbour's value where that neighbour
-    is (A3 - A5), and interpolated over the direction (A6). The value at a node with all its neighbours is then its own, but
-    for the tails of nodes further off.
+    A width is chosen so that the Gaussian has fallen to its neighbour's share of the neighbour's value where that
+    neighbour is (A3 - A5), and interpolated over the direction (A6). The value at a node with all its neighbours is
+    then its own, but for the tails of nodes further off.
 
-    The neighbours are the 8 around a node of a plane, linearly over the angle as published; in space the 26 around it, and
-    over the direction by the inverse of one minus the cosine (Shepard), which takes a neighbour's width in its own direction.
+    The neighbours are the 8 around a node of a plane, linearly over the angle as published; in space the 26 around it,
+    and over the direction by the inverse of one minus the cosine (Shepard), which takes a neighbour's width in its own
+    direction.
 
     Where eq. A5 has no real positive width, it is repaired as little as possible: c2 is not negative (it would be where
-    a neighbour's value exceeds 8 times the node's, 26 times in space, and the "Gaussian" would then grow with distance), and
-    a neighbour of no value counts as SMALLEST_RATIO of the node's. The number of neighbours in eq. A3 stays 8 (26) at
-    the rim, where there are fewer, as published: values there come out too close to the smallest one.
+    a neighbour's value exceeds 8 times the node's, 26 times in space, and the "Gaussian" would then grow with
+    distance), and a neighbour of no value counts as SMALLEST_RATIO of the node's. The number of neighbours in eq. A3
+    stays 8 (26) at the rim, where there are fewer, as published: values there come out too close to the smallest one.
     """
 
     def __init__(self, cell, at, values, step):
@@ -49,7 +50,8 @@ class AngularNetwork:
         self._width_of = _over_angle if d == 2 else _over_direction
 
     def __call__(self, x):
-        """Values at places x (m, d), m: (m, k). Far from every node: the smallest value, or 0 if none is negative (A8)."""
+        """Values at places x (m, d), m: (m, k). Far from every node: the smallest value, or 0 if none is negative
+        (A8)."""
         return np.concatenate([self._at_places(part) for part in np.array_split(x, len(x) // CHUNK + 1)])
 
     def _at_places(self, x):
@@ -77,7 +79,8 @@ def _neighbours(cell, offsets):
 
 
 def _over_angle(away, towards, there, widths):
-    """Widths (P, k) in the directions `away` (P, 2), linear over the angle between the neighbours to the left and right."""
+    """Widths (P, k) in the directions `away` (P, 2), linear over the angle between the neighbours to the left and
+    right."""
     full = 2.0 * np.pi
     angle = np.arctan2(away[:, 1], away[:, 0])[:, None] - np.arctan2(towards[:, :, 1], towards[:, :, 0])
     behind = np.where(there, np.mod(angle, full), np.inf)

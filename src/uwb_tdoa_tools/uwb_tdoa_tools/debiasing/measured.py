@@ -24,24 +24,31 @@ MAPS = {  # name: (interpolator, step in m, planar)
 
 
 def cases():
-    """{name: (split whose effects to compare with or None, flights to fit, flights to judge)}; flights are paths in the data."""
+    """{name: (split whose effects to compare with or None, flights to fit, flights to judge)}; flights are paths in the
+    data."""
     a25, b25 = SPLITS["0425 a"]
     a26, b26 = SPLITS["0426 a"]
     found = {name: (name, *split) for name, split in SPLITS.items() if split[1]}
     found["0425 a, another day"] = ("0425 a", a25, a26 + b26)
     found["0426 a, another day"] = ("0426 a", a26, a25 + b25)
-    found["0425 TDOA2, judged on TDOA3"] = (None, *([path for path in a25 + b25 if kind in path] for kind in ("TDOA2", "TDOA3")))
+    found["0425 TDOA2, judged on TDOA3"] = (
+        None,
+        *([path for path in a25 + b25 if kind in path] for kind in ("TDOA2", "TDOA3")),
+    )
     found["const3, another constellation"] = ("const3", SPLITS["const3"][0], SPLITS["const4 trial 1"][1])
     return found
 
 
 def run(data, diagnosed=None, jobs=None):
-    """[{"case", "fitted", "maps", "runs": [{"flight", name of the estimate: {"rmse": m, "rmse_xy": m, "nees": mean}}]}] of all cases.
+    """[{"case", "fitted", "maps", "runs": [{"flight", name of the estimate: {"rmse": m, "rmse_xy": m, "nees": mean}}]}]
+    of all cases.
 
     data : folder of the flights; diagnosed : folder that `diagnose_bench measured` wrote, or None.
     """
     if diagnosed is not None and not any(_effects_file(diagnosed, name).is_file() for name in SPLITS):
-        raise InputError(f"--diagnosed: {diagnosed} holds no */effects.yaml; run `diagnose_bench measured --out {diagnosed}`.")
+        raise InputError(
+            f"--diagnosed: {diagnosed} holds no */effects.yaml; run `diagnose_bench measured --out {diagnosed}`."
+        )
     tasks = [(name, *case) for name, case in cases().items()]
     return list(parallel.over(partial(_case, data=data, diagnosed=diagnosed), tasks, jobs, unit="case"))
 
@@ -60,7 +67,12 @@ def _case(task, data, diagnosed):
             row[words or "before"] = _figures(flown[1])
             row |= {name: _figures(judge(flown, one, effects)) for name, one in maps.items()}
         about |= {name: about_figures(one) for name, one in maps.items()}
-    return {"case": case, "fitted": to_fit, "maps": about, "runs": [{"flight": flight, **row} for flight, row in rows.items()]}
+    return {
+        "case": case,
+        "fitted": to_fit,
+        "maps": about,
+        "runs": [{"flight": flight, **row} for flight, row in rows.items()],
+    }
 
 
 def _corrections(split, diagnosed):

@@ -31,9 +31,9 @@ def part_of(score, odometry):
 def static_parts(path, survey=None, config=None, effects=None, planar=False):
     """List of Part of a tag that stood still, one for each place.
 
-    path : a CSV file with the columns true_x, true_y, true_z, x, y, z (m; without the z if planar), one row for each measured
-        position; or any recording with ground truth, through which the filter is run, and of which the time at rest counts, but
-        for the first SETTLE s at each place. Raises InputError.
+    path : a CSV file with the columns true_x, true_y, true_z, x, y, z (m; without the z if planar), one row for each
+        measured position; or any recording with ground truth, through which the filter is run, and of which the time at
+        rest counts, but for the first SETTLE s at each place. Raises InputError.
     """
     if not Path(path).is_dir():
         with open(path, "rb") as file:
@@ -66,7 +66,9 @@ def _from_table(path, planar):
             try:
                 values.append([float(row[name]) for name in names])
             except (TypeError, ValueError):
-                raise InputError(f"{path}: line {rows.line_num}: {row} needs a number in each of {', '.join(names)}.") from None
+                raise InputError(
+                    f"{path}: line {rows.line_num}: {row} needs a number in each of {', '.join(names)}."
+                ) from None
     if not values:
         raise InputError(f"{path}: holds no positions; give one row for each.")
     table, d = np.array(values), len(names) // 2

@@ -13,7 +13,8 @@ def about(bias_map):
     figures = about_figures(bias_map)
     added = ", ".join(f"{std:.3f}" for std in figures["added_std"])
     return (
-        f"{figures['markers']} markers {figures['step']:g} m apart, root mean square of the bias {figures['bias_rms']:.3f} m; "
+        f"{figures['markers']} markers {figures['step']:g} m apart, "
+        f"root mean square of the bias {figures['bias_rms']:.3f} m; "
         f"standard deviations added to a corrected position {added} m"
     )
 
@@ -33,8 +34,8 @@ def about_figures(bias_map):
 
 
 def rows(flown, bias_map, effects=None):
-    """[{"flight", "before": figures, "after": figures, "known"}] of what `fly` gave. known : share of the positions that the map
-    knows."""
+    """[{"flight", "before": figures, "after": figures, "known"}] of what `fly` gave. known : share of the positions
+    that the map knows."""
     out = []
     for flight, score, odometry in flown:
         after = judge((flight, score, odometry), bias_map, effects)
@@ -51,7 +52,9 @@ def say_rows(title, found):
         return
     print(f"{title:24s}   before: x       y       z      3D    NEES   after: x       y       z      3D    NEES   known")
     for row in found:
-        print(f"{row['flight']:24s}" + "".join(_side(row[side]) for side in ("before", "after")) + f"{row['known']:8.0%}")
+        print(
+            f"{row['flight']:24s}" + "".join(_side(row[side]) for side in ("before", "after")) + f"{row['known']:8.0%}"
+        )
     before, after = (np.mean([row[side]["rmse_3d"] for row in found]) for side in ("before", "after"))
     print(f"mean 3D RMSE {before:.3f} m before, {after:.3f} m after ({after / before - 1:+.0%})")
 
@@ -76,9 +79,15 @@ def set_up_tables(figures):
     lines += ["", "Square path, RMSE, cm (as Table 2).", ""]
     lines += _head(["edge", *names])
     lines += [_line([edge, *(f"{100 * row[name]:.1f}" for name in names)]) for edge, row in figures["square"].items()]
-    lines += ["", "Layers of appendix C before the map, on the square: RMSE, and change of the error from one position to the next, cm.", ""]
+    lines += [
+        "",
+        "Layers of appendix C before the map, square path: RMSE, and change of the error between positions, cm.",
+        "",
+    ]
     lines += _head(["layers", "RMSE", "change"])
-    lines += [_line([name, f"{100 * row['rmse']:.2f}", f"{100 * row['step']:.3f}"]) for name, row in figures["layers"].items()]
+    lines += [
+        _line([name, f"{100 * row['rmse']:.2f}", f"{100 * row['step']:.3f}"]) for name, row in figures["layers"].items()
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -88,9 +97,13 @@ def measured_tables(figures):
     lines = []
     for title, key in (("3D RMSE, m", "rmse"), ("Horizontal RMSE, m", "rmse_xy"), ("NEES (3 is honest)", "nees")):
         lines += [f"{title}, mean of the runs.", "", *_head(["fitted to", "runs", *names])]
-        lines += [_line([case["case"], len(case["runs"]), *_means(case["runs"], names, key)]) for case in figures] + [""]
+        lines += [_line([case["case"], len(case["runs"]), *_means(case["runs"], names, key)]) for case in figures] + [
+            ""
+        ]
     lines += ["3D RMSE of every run, m.", "", *_head(["fitted to", "flight", *names])]
-    lines += [_line([case["case"], row["flight"], *_means([row], names, "rmse")]) for case in figures for row in case["runs"]]
+    lines += [
+        _line([case["case"], row["flight"], *_means([row], names, "rmse")]) for case in figures for row in case["runs"]
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -113,17 +126,23 @@ def _line(cells):
 def plot_set_up(found, maps, path):
     """Bias before and after the static maps, as arrows from the true place, five times as long."""
     sides = {"before": None, "network": maps["static, network"], "thin plate": maps["static, thin_plate"]}
-    figure, axes = plt.subplots(1, 3, figsize=(13, 5), layout="constrained", sharey=True)
+    figure, axes = plt.subplots(1, 3, figsize=(13, 5.7), layout="constrained", sharey=True)
     for ax, (title, one) in zip(axes, sides.items()):
         for name, colour in (("calibration", "tab:gray"), ("validation", "tab:red")):
             true = np.array([stay.true[0, :2] for stay in found[name]])
             bias = np.array([_mean_error(stay, one) for stay in found[name]])
             ax.quiver(*true.T, *bias.T, angles="xy", scale_units="xy", scale=0.2, color=colour, width=0.004, label=name)
         size = np.mean([np.hypot(*_mean_error(stay, one)) for stay in found["validation"]])
-        ax.set(title=f"{title}: {100 * size:.1f} cm at the validation points", xlabel="x, m", aspect="equal", xlim=(-2.7, 2.9), ylim=(-2.6, 2.6))
+        ax.set(
+            title=f"{title}: {100 * size:.1f} cm at the validation points",
+            xlabel="x, m",
+            aspect="equal",
+            xlim=(-2.7, 2.9),
+            ylim=(-2.6, 3.3),
+        )
         ax.plot([-2, 2, 2, -2], [-2, -2, 2, 2], "k^")
     axes[0].set_ylabel("y, m")
-    axes[0].legend(loc="lower left", fontsize="small")
+    axes[0].legend(loc="upper right", fontsize="small")
     figure.suptitle("Bias of the position, arrows five times as long as the bias")
     figure.savefig(path, dpi=80)
     plt.close(figure)

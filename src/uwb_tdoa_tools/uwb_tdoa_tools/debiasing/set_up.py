@@ -1,5 +1,6 @@
-"""A simulated copy of the set-up of Grasso et al. (Sensors 2022, 22, 9136), sections 4 and 5: 4 x 4 m, four anchors at the
-height of the tag, 0.2 m, a calibration grid of 50 cm, a validation grid of 25 cm beside it, rails, and a square path."""
+"""A simulated copy of the set-up of Grasso et al. (Sensors 2022, 22, 9136), sections 4 and 5: 4 x 4 m, four anchors at
+the height of the tag, 0.2 m, a calibration grid of 50 cm, a validation grid of 25 cm beside it, rails, and a square
+path."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +33,8 @@ FAR = 10.0  # m, of the anchors that hold the height
 
 @dataclass(frozen=True)
 class Measured:
-    """Estimates of one run and the truth at their stamps. t (n,) s; p, v, true (n, 3) m, m/s; covariance (n, 3, 3) m^2."""
+    """Estimates of one run and the truth at their stamps. t (n,) s; p, v, true (n, 3) m, m/s; covariance (n, 3, 3)
+    m^2."""
 
     t: np.ndarray
     p: np.ndarray
@@ -53,8 +55,8 @@ def grid(first, last, step):
 
 
 def measure(task, seed):
-    """Measured of one run. task : (number, fields of SimulationConfig); the anchors' delays are those of the seed, all else
-    random is the run's own."""
+    """Measured of one run. task : (number, fields of SimulationConfig); the anchors' delays are those of the seed, all
+    else random is the run's own."""
     number, fields = task
     config = SimulationConfig(
         seed=1000 * seed + number, constellation="planar", height=HEIGHT, start_in_air=True, imu_rate=100.0,
@@ -65,7 +67,13 @@ def measure(task, seed):
     flight = EFFECTS["anchor_delay"](dict(zip(map(str, flight.anchors.ids.tolist()), delays.tolist()))).inject(flight)
     odometry = run_offline(_held_level(flight)).odometry
     rows = odometry.t > SETTLE
-    columns = (odometry.t, odometry.p, odometry.v, odometry.covariance[:, :3, :3], position_at(odometry.t, flight.truth))
+    columns = (
+        odometry.t,
+        odometry.p,
+        odometry.v,
+        odometry.covariance[:, :3, :3],
+        position_at(odometry.t, flight.truth),
+    )
     return Measured(*(column[rows] for column in columns))
 
 
@@ -125,7 +133,9 @@ def run(seed=0, jobs=None):
 def _errors(measured, maps):
     """{"before" or name of the map: (n, 2) m}."""
     out = {"before": (measured.p - measured.true)[:, :2]}
-    return out | {name: (one.correct(measured.p, measured.covariance)[0] - measured.true)[:, :2] for name, one in maps.items()}
+    return out | {
+        name: (one.correct(measured.p, measured.covariance)[0] - measured.true)[:, :2] for name, one in maps.items()
+    }
 
 
 def _static(stays, maps):

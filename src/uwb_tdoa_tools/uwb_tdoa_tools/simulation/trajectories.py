@@ -88,7 +88,8 @@ def _laps(s, config, corners, ahead):
     dt = 0.01
     s_fine = np.arange(-CORNER_TIME, s[-1] + CORNER_TIME + dt, dt)
     along = np.mod(config.speed * s_fine + ahead, n * edge)
-    sharp = np.column_stack([np.interp(along, edge * np.arange(n + 1), config.radius * x) for x in np.transpose(corners)])
+    path = config.radius * np.transpose(corners)
+    sharp = np.column_stack([np.interp(along, edge * np.arange(n + 1), coordinate) for coordinate in path])
     rounded = CubicSpline(s_fine, _smoothed(sharp, int(CORNER_TIME / dt) | 1))(s)
     return np.column_stack([rounded + config.place, np.full(len(s), config.height)])
 
