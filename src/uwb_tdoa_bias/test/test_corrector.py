@@ -4,7 +4,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.corrector import EFFECTS, NETWORK, PASSED, Corrector
+from uwb_tdoa_bias.corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
@@ -17,12 +17,12 @@ class Height:
 
     name = "height"
 
-    def __init__(self, std=0.05):
-        self.std = std
+    def __init__(self, std=0.05, known=1.0):
+        self.std, self.known = std, known
 
     def predict(self, samples):
         z = samples.p[:, 2]
-        return np.where(z > 2.0, np.nan, z), np.full(len(samples), self.std)
+        return np.where(z > 2.0, np.nan, z), np.full(len(samples), self.std), np.full(len(samples), self.known)
 
 
 def correct(corrector, t):
@@ -125,6 +125,13 @@ def test_where_the_network_cannot_tell_effects_remain():
     assert found.std.tolist() == [0.0, 0.05, 0.0]
 
 
+@pytest.mark.parametrize(("known", "status"), [(1.0, NETWORK), (0.5, NETWORK), (0.49, FADED), (0.0, FADED)])
+def test_says_when_the_network_has_faded(known, status):
+    corrector = climbing(Corrector(ANCHORS, None, Height(known=known), lag=0.0), [1.0])
+    found = correct(corrector, [0.0, 1.0])  # no pose yet: the network says nothing
+    assert found.status.tolist() == [PASSED, status] and found.std.tolist() == [0.0, 0.05]
+
+
 def test_a_network_without_a_finite_deviation_predicts_none():
     corrector = climbing(Corrector(ANCHORS, None, Height(std=np.nan), lag=0.0), [1.0])
     assert correct(corrector, 1.0).std.tolist() == [0.0]
@@ -134,7 +141,22 @@ def test_forgets_old_poses_and_keeps_the_last_ones():
     corrector = climbing(Corrector(ANCHORS, None, Height(), lag=0.0, history=10), np.arange(1000) / 1000)
     found = correct(corrector, np.array([0.001, 0.990, 0.995, 0.999]))
     np.testing.assert_allclose(found.bias, [0.0, 0.990, 0.995, 0.999], atol=1e-12)
-    assert len(corrector._t) == len(corrector._p) == len(corrector._q) <= 20
+    assert len(corrector._poses.t) == len(corrector._poses.p) == len(corrector._poses.q) <= 20
+
+
+@given(st.lists(st.lists(st.integers(0, 60), max_size=12), max_size=6), st.lists(st.integers(0, 60), min_size=1))
+def test_poses_told_together_are_poses_told_one_by_one(batches, asked):
+    correctors = [Corrector(ANCHORS, None, Height(), lag=0.0, history=5) for _ in range(2)]
+    for batch in batches:
+        t = np.array(batch) / 8.0
+        climbing(correctors[0], t)
+        correctors[1].add_pose(t, np.stack([t, t, t], axis=1), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1)))
+    one, other = (corrector._poses for corrector in correctors)
+    np.testing.assert_array_equal(one.t[-5:], other.t[-5:])
+    np.testing.assert_array_equal(one.p[-5:, 2], other.p[-5:, 2])
+    newest = [t for t in np.array(asked) / 8.0 if len(one.t) == 0 or t >= one.t[-5:][0]]
+    found = [correct(corrector, newest) for corrector in correctors]
+    np.testing.assert_array_equal(found[0].bias, found[1].bias)
 
 
 def test_empty_batch():

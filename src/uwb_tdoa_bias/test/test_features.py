@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.anchors import Anchors
 from uwb_tdoa_bias.effects import Samples
-from uwb_tdoa_bias.features import FEATURES, features
+from uwb_tdoa_bias.features import FEATURES, NAMES, PLACE, columns, everything, features
 
 ANGLES = [k for k, name in enumerate(FEATURES) if name.startswith(("azimuth", "elevation"))]
 seeds = st.integers(0, 2**32 - 1)
@@ -25,6 +25,16 @@ def expected(samples):
             out[f"azimuth_{viewer}_{side}"] = np.arctan2(y, x)
             out[f"elevation_{viewer}_{side}"] = np.arcsin(z)
     return np.stack([out[name] for name in FEATURES], axis=1)
+
+
+@given(seeds)
+def test_places(seed):
+    samples = random_samples(seed)
+    body = Rotation.from_quat(samples.q).as_matrix()
+    ends = [np.column_stack([samples.anchors.ids[k], samples.anchors.positions[k]]) for k in (samples.a, samples.b)]
+    expected_place = np.concatenate([samples.p, body[:, :2, 0], body[:, :2, 2], *ends], axis=1)
+    np.testing.assert_allclose(columns(samples, PLACE), expected_place, atol=1e-12)
+    np.testing.assert_array_equal(columns(samples, NAMES[::-1]), everything(samples)[:, ::-1])
 
 
 def test_fourteen_names_in_the_order_of_the_paper():

@@ -45,10 +45,11 @@ def expected(s):
 
 def test_shipped_model_says_the_known_answer():
     s = batch()
-    bias, std = Network(SHIPPED).predict(s)
+    bias, std, known = Network(SHIPPED).predict(s)
     np.testing.assert_allclose(bias, expected(s), atol=1e-6)  # the model computes in float32
     assert np.ptp(bias) > 0.1  # an answer that says something
     np.testing.assert_array_equal(std, 0.0)
+    np.testing.assert_array_equal(known, 1.0)
 
 
 def test_one_sample_gives_what_a_batch_gives():
@@ -82,10 +83,10 @@ def changed(tmp_path, **meta):
     model = known_answer.make()
     for entry in list(model.metadata_props):
         if entry.key in meta:
-            if meta[entry.key] is None:
-                model.metadata_props.remove(entry)
-            else:
-                entry.value = meta[entry.key]
+            model.metadata_props.remove(entry)
+    for key, value in meta.items():
+        if value is not None:
+            model.metadata_props.add(key=key, value=value)
     path = tmp_path / "changed.onnx"
     path.write_bytes(model.SerializeToString())
     return path
@@ -104,6 +105,9 @@ def changed(tmp_path, **meta):
         ({"offset": "[0.0]"}, "1 offsets"),
         ({"scale": "[1.0, 1.0, 1.0]"}, "3 scales"),
         ({"scale": "[0.0, 4.0]"}, "no scale may be 0"),
+        ({"validity": '{"distance": [0, 1, 1]}', "fade_std": "0.3"}, "distance"),
+        ({"validity": '{"x": [0, 1, 0]}', "fade_std": "0.3"}, "margin above 0"),
+        ({"validity": '{"x": [0, 1, 1]}'}, "fade_std"),
     ],
 )
 def test_wrong_metadata_are_refused_by_name(tmp_path, meta, named):
@@ -111,6 +115,20 @@ def test_wrong_metadata_are_refused_by_name(tmp_path, meta, named):
     with pytest.raises(InputError) as error:
         Network(path)
     assert named in str(error.value) and str(path) in str(error.value)
+
+
+def test_fades_beyond_what_it_knows(tmp_path):
+    network = Network(changed(tmp_path, validity='{"z": [0.0, 2.0, 1.0], "up_x": [-0.2, 0.2, 0.5]}', fade_std="0.3"))
+    tilted = [0.0, np.sin(0.25), 0.0, np.cos(0.25)]  # up_x = sin(0.5)
+    s = samples(
+        [[1, 0, 0.0], [1, 0, 2.0], [1, 0, 2.4], [1, 0, -1.0], [1, 0, 9.0], [1, 0, 1.0]],
+        [[0, 0, 0, 1]] * 5 + [tilted], [0] * 6, [1] * 6,
+    )  # fmt: skip
+    plain, (bias, std, known) = Network(SHIPPED).predict(s)[0], network.predict(s)
+    trust = np.array([1.0, 1.0, 0.6, 0.0, 0.0, 1.0 - (np.sin(0.5) - 0.2) / 0.5])
+    np.testing.assert_allclose(known, trust, atol=1e-12)
+    np.testing.assert_allclose(bias, trust * plain, atol=1e-9)
+    np.testing.assert_allclose(std, 0.3 * np.sqrt(1.0 - trust**2), atol=1e-9)
 
 
 def test_missing_file_and_no_model(tmp_path):

@@ -1,15 +1,16 @@
 """From raw TDOAs to corrected ones: the core of bias_node and of the offline engine."""
 
-from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
 
 from .effects import EffectSet, Samples
 from .motion import motion
+from .poses import Poses
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
+FADED_BELOW = 0.5  # share of what can be known that a network's prediction has at least, or it counts as faded
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Corrector:
 
     def reset(self):
         """Forget all poses."""
-        self._t, self._p, self._q = [], [], []
+        self._poses = Poses(self._history)
         self._first = self._last = None  # stamp of the first TDOA; stamp and later anchor of the last one
 
     @property
@@ -51,19 +52,13 @@ class Corrector:
         return not len(self.effects) and self.network is None
 
     def add_pose(self, t, p, q):
-        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world. Stamps must rise; others are ignored."""
-        if self._t and t <= self._t[-1]:
-            return
-        self._t.append(t)
-        self._p.append(p)
-        self._q.append(q)
-        if len(self._t) > 2 * self._history:
-            for kept in (self._t, self._p, self._q):
-                del kept[: self._history]
+        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world; or several: (k,), (k, 3), (k, 4).
+        Stamps must rise; others are ignored."""
+        self._poses.add(t, p, q)
 
     def ready(self, t):
         """True if no pose that is still to come can change the correction of a measurement stamped t."""
-        return self.idle or (bool(self._t) and self._t[-1] > t - self.lag)
+        return self.idle or self._poses.newest > t - self.lag
 
     def correct(self, t, a, b, d):
         """Correct a batch.
@@ -75,24 +70,20 @@ class Corrector:
         zeros = np.zeros(n)
         if self.idle or n == 0:
             return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
-        p, q, places = np.full((n, 3), np.nan), np.full((n, 4), np.nan), []
-        for i in range(n):
-            k = bisect_right(self._t, t[i] - self.lag) - 1
-            places.append(k)
-            if k >= 0:
-                p[i], q[i] = self._p[k], self._q[k]
+        places = np.searchsorted(self._poses.t, t - self.lag, side="right") - 1
+        p, q = self._poses.at(places)
         extra = self._extra(t, b, places) if self.effects.needs_motion else {}
         self._first = t[0] if self._first is None else self._first
         samples = Samples(t, a, b, p, q, self.anchors, self._first, **extra)
         bias = self.effects.bias(samples)
-        std = self.effects.spread(samples)
+        std = spread = self.effects.spread(samples)
         status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
         if self.network is not None:
-            learned, std = self.network.predict(samples)
-            known = np.isfinite(learned)
-            bias = bias + np.where(known, learned, 0.0)
-            std = np.hypot(self.effects.spread(samples), np.where(known & np.isfinite(std), std, 0.0))
-            status[known] = NETWORK
+            learned, std, share = self.network.predict(samples)
+            told = np.isfinite(learned)
+            bias = bias + np.where(told, learned, 0.0)
+            std = np.hypot(spread, np.where(told & np.isfinite(std), std, 0.0))
+            status[told] = np.where(share[told] < FADED_BELOW, FADED, NETWORK)
         return Correction(bias, std, d - bias, status)
 
     def _extra(self, t, b, places):
@@ -101,4 +92,5 @@ class Corrector:
         before = np.concatenate([[t_last], t[:-1]])
         previous = np.concatenate([[b_last], self.anchors.ids[b[:-1]]])
         self._last = (t[-1], self.anchors.ids[b[-1]])
-        return {**motion(self._t, self._p, self._q, places), "interval": t - before, "previous": previous}
+        moved = motion(self._poses.t, self._poses.p, self._poses.q, places.tolist())
+        return {**moved, "interval": t - before, "previous": previous}

@@ -1,4 +1,4 @@
-"""The 14 features of Zhao et al. (RA-L 2021, section III): the relative poses of a tag and two anchors."""
+"""What a network may ask for: the 14 features of Zhao et al. (RA-L 2021, section III), and where everything is."""
 
 import math
 
@@ -15,16 +15,50 @@ FEATURES = (
     "elevation_A_a", "elevation_A_b", "elevation_T_a", "elevation_T_b",
 )  # fmt: skip
 
+# Position of the tag, world, m; horizontal parts of the body's x and z axes; ids
+# and positions, world, m, of both anchors. With these a model knows a place when it is there again.
+PLACE = (
+    "x", "y", "z", "forward_x", "forward_y", "up_x", "up_y",
+    "id_a", "x_a", "y_a", "z_a", "id_b", "x_b", "y_b", "z_b",
+)  # fmt: skip
 
-def features(samples):
-    """The features of a batch, in the order of FEATURES.
 
-    Parameters: samples : Samples. Returns (n, 14) float; NaN where an attitude it needs is unknown.
-    """
-    out = np.empty((len(samples), len(FEATURES)))
+NAMES = FEATURES + PLACE
+
+
+def columns(samples, names):
+    """The named features (of NAMES) of a batch: Samples -> (n, len(names)) float, NaN where unknown."""
+    return everything(samples)[:, [NAMES.index(name) for name in names]]
+
+
+def everything(samples):
+    """All features of a batch, in the order of NAMES: Samples -> (n, 29) float, NaN where a pose it needs is
+    unknown."""
+    out = np.empty((len(samples), len(NAMES)))
     anchors = samples.anchors
     _fill(samples.p, samples.q, samples.a, samples.b, anchors.positions, anchors.orientations, out)
+    _fill_place(samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, out[:, len(FEATURES) :])
     return out
+
+
+def features(samples):
+    """The features of a batch, in the order of FEATURES: Samples -> (n, 14) float; NaN where an attitude it needs is
+    unknown."""
+    return everything(samples)[:, : len(FEATURES)]
+
+
+@compiled
+def _fill_place(p, q, a, b, ids, positions, out):
+    for i in range(len(a)):
+        x, y, z, w = q[i]
+        out[i, 0], out[i, 1], out[i, 2] = p[i]
+        out[i, 3], out[i, 4] = 1 - 2 * (y * y + z * z), 2 * (x * y + z * w)
+        out[i, 5], out[i, 6] = 2 * (x * z + y * w), 2 * (y * z - x * w)
+        for side in range(2):
+            anchor = a[i] if side == 0 else b[i]
+            out[i, 7 + 4 * side] = ids[anchor]
+            for k in range(3):
+                out[i, 8 + 4 * side + k] = positions[anchor, k]
 
 
 @compiled

@@ -51,7 +51,8 @@ class Doubt:
     name = "doubt"
 
     def predict(self, samples):
-        return 0.1 * np.sin(samples.p[:, 0]), 0.05 + 0.02 * np.abs(samples.q[:, 2])
+        std = 0.05 + 0.02 * np.abs(samples.q[:, 2])
+        return 0.1 * np.sin(samples.p[:, 0]), std, np.ones(len(samples))
 
 
 @pytest.mark.parametrize("lag", [0.01, 0.05, 0.2])

@@ -84,8 +84,7 @@ def run_offline(flight, config=None, corrector=None, tape=None):
         rows.append(row[:count])
         covariances.append(covariance[:count])
         if not corrector.idle:
-            for t, p, q in zip(row[:count, 0], row[:count, 1:4], row[:count, 7:11]):
-                corrector.add_pose(t, p, q)
+            corrector.add_pose(row[:count, 0], row[:count, 1:4], row[:count, 7:11])
     odometry = Odometry.from_rows(np.concatenate(rows), np.concatenate(covariances))
     residuals = Residuals(
         tdoa.t, tdoa.a, tdoa.b, outcome[:, 0], outcome[:, 1], outcome[:, 2], outcome[:, 3].astype(np.uint8)
