@@ -20,16 +20,20 @@ MAPS_GAIN, MAPS_SURE = 20.0, 3.0  # held-out log-likelihood, twice, and its t va
 MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
 
 
-def attribute(flights, base=EffectSet(), estimator=None, progress=None, undeclared=True):
+def attribute(flights, base=EffectSet(), estimator=None, progress=None, undeclared=True, kinds=None):
     """Attribution of the residuals of Flights to effects beyond `base`.
 
     estimator(flight, effects) -> Odometry, to do without ground truth; progress() is called now and then;
-    undeclared : scan too.
+    undeclared : scan too; kinds : names of the declared effects to look for, None for all.
     """
     tick = progress or (lambda: None)
     found = _residuals(flights, base, (), estimator)
-    declared = [Candidate(effect.name, tuple((effect.name, key) for key in keys)) for effect, keys in candidates(found)]
-    search = blocked_anchors(flights[0].anchors)
+    declared = [
+        Candidate(effect.name, tuple((effect.name, key) for key in keys))
+        for effect, keys in candidates(found)
+        if kinds is None or effect.name in kinds
+    ]
+    search = blocked_anchors(flights[0].anchors) if kinds is None or "nlos" in kinds else None
     model, inflation = (), None
     for _ in range(ROUNDS):
         now = _residuals(flights, base, model, estimator)

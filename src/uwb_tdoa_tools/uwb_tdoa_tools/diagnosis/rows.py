@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.anchors import Anchors
 from uwb_tdoa_bias.effects import EFFECTS
 
 CELL = 0.5  # s, of TDOAs
@@ -97,12 +98,10 @@ class Cells:
 
 def candidates(found):
     """{(effect, group of keys)} worth a look in these FlightResiduals: list of (effect class, keys)."""
-    anchors = found[0].tdoa.samples.anchors
-    pairs, count = np.unique(
-        np.concatenate([anchors.ids[np.column_stack([f.tdoa.samples.a, f.tdoa.samples.b])] for f in found]),
-        axis=0,
-        return_counts=True,
-    )
+    samples = [f.tdoa.samples for f in found]
+    anchors = _all_anchors([s.anchors for s in samples])
+    heard = np.concatenate([s.anchors.ids[np.column_stack([s.a, s.b])] for s in samples])
+    pairs, count = np.unique(heard, axis=0, return_counts=True)
     pairs = pairs[np.argsort(-count, kind="stable")]
     inertial = any(f.gyro is not None for f in found)
     out = []
@@ -110,6 +109,15 @@ def candidates(found):
         if effect.fitted and ("tdoa" in effect.channels or inertial):
             out += [(effect, keys) for keys in effect.groups(anchors, pairs)]
     return out
+
+
+def _all_anchors(several):
+    """Anchors with every id of several Anchors, each in the first of its places."""
+    ids, positions, orientations = (
+        np.concatenate([getattr(one, name) for one in several]) for name in ("ids", "positions", "orientations")
+    )
+    first = np.unique(ids, return_index=True)[1]
+    return Anchors(ids[first], positions[first], orientations[first], several[0].frame)
 
 
 def build(found, wanted, model=()):
