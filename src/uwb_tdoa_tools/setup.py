@@ -19,8 +19,10 @@ setup(
         "matplotlib>=3.6",
         "numba>=0.57",
         "numpy>=1.26",
+        "onnx>=1.14",
         "PyYAML>=6.0",
         "rosbags>=0.10",
+        "scikit-learn>=1.3",
         "scipy>=1.11",
         "tqdm>=4.64",
         "uwb_tdoa_bias",
@@ -38,6 +40,7 @@ setup(
     entry_points={
         "console_scripts": [
             "bench = uwb_tdoa_tools.bench:main",
+            "compare_models = uwb_tdoa_tools.compare_models:main",
             "convert = uwb_tdoa_tools.convert:main",
             "demo = uwb_tdoa_tools.demo:main",
             "debias = uwb_tdoa_tools.debias:main",
@@ -49,6 +52,8 @@ setup(
             "record = uwb_tdoa_tools.record:main",
             "replay = uwb_tdoa_tools.replay:main",
             "simulate = uwb_tdoa_tools.simulate:main",
+            "spin = uwb_tdoa_tools.spin:main",
+            "train = uwb_tdoa_tools.train:main",
         ]
     },
 )

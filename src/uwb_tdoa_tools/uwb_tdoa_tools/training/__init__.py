@@ -1,0 +1,14 @@
+"""Learning the bias of TDOAs from flights with ground truth.
+
+labels     flights -> what each TDOA was wrong by, at which pose; which flights train and which validate
+models     the kinds of models, all trained by one call
+paper      the network of Zhao et al. (RA-L 2021)
+structured the error of a pair as the difference of two one-anchor errors
+physics    the effects that diagnose can name
+linear     robust Bayesian regression on sparse designs: what structured is fitted with
+export     ONNX files with metadata
+study      what any model could reach at most, and how alike flights are
+simulated  flights of constellations to train on, and of others
+default    makes the model that bias_node ships
+plots      pictures
+"""

@@ -1,0 +1,68 @@
+"""ONNX files: a graph written node by node with plain operators, and the metadata that Network reads."""
+
+import json
+
+import numpy as np
+from onnx import TensorProto, checker, helper, numpy_helper
+
+OPSET, IR_VERSION = 13, 8  # old enough for every onnxruntime that the nodes accept
+
+
+class Graph:
+    """An ONNX graph under construction. Values are the names of its tensors, (n, k) float unless said otherwise."""
+
+    def __init__(self):
+        self._nodes, self._constants = [], []
+        self.input = "features"
+
+    def constant(self, value, kind=np.float32):
+        """A tensor of fixed values."""
+        self._constants.append(numpy_helper.from_array(np.asarray(value, dtype=kind), f"c{len(self._constants)}"))
+        return self._constants[-1].name
+
+    def op(self, kind, *inputs, **attributes):
+        """Append an operator; inputs that are no names become constants. Returns the name of its output."""
+        names = [value if isinstance(value, str) else self.constant(value) for value in inputs]
+        self._nodes.append(helper.make_node(kind, names, [f"v{len(self._nodes)}"], **attributes))
+        return self._nodes[-1].output[0]
+
+    def take(self, value, columns):
+        """Some columns of a tensor."""
+        return self.op("Gather", value, self.constant(list(columns), np.int64), axis=1)
+
+    def twice(self, value):
+        """A tensor below itself: (2n, k)."""
+        return self.op("Concat", value, value, axis=0)
+
+    def halves(self, value):
+        """The upper and the lower half of the rows of a tensor."""
+        outputs = [f"v{len(self._nodes)}a", f"v{len(self._nodes)}b"]
+        self._nodes.append(helper.make_node("Split", [value], outputs, axis=0))
+        return outputs
+
+    def row_sum(self, value):
+        """Sum along each row: (n, 1)."""
+        return self.op("ReduceSum", value, self.constant([1], np.int64), keepdims=1)
+
+    def distance2(self, points, centres):
+        """Squared distances (n, m) from points (n, k) to fixed centres, (m, k) array."""
+        cross = self.op("MatMul", points, -2.0 * centres.T)
+        own = self.row_sum(self.op("Mul", points, points))
+        far = self.op("Add", self.op("Add", cross, own), np.sum(centres**2, axis=1)[None])
+        return self.op("Max", far, [0.0])
+
+    def model(self, width, outputs, meta):
+        """The onnx.ModelProto: `width` input columns, the named (n, 1) tensors beside each other as output,
+        metadata."""
+        self._nodes.append(helper.make_node("Concat", outputs, ["bias"], axis=1))
+        graph = helper.make_graph(
+            self._nodes,
+            "bias",
+            [helper.make_tensor_value_info(self.input, TensorProto.FLOAT, ["n", width])],
+            [helper.make_tensor_value_info("bias", TensorProto.FLOAT, ["n", len(outputs)])],
+            self._constants,
+        )
+        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+        helper.set_model_props(made, {key: json.dumps(value) for key, value in meta.items()})
+        checker.check_model(made)
+        return made

@@ -1,0 +1,166 @@
+"""Labels: what each TDOA of a flight was wrong by, and the pose it was taken at."""
+
+from dataclasses import dataclass, replace
+import hashlib
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet, Samples, samples_at
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.geometry import tdoa
+
+from ..metrics import AIRBORNE, airborne
+
+MARGIN = 0.5  # s after take-off and before landing that are left out: near the floor TDOAs are metres off
+LARGEST = 1.0  # m; a larger error is an outlier, not bias (Zhao et al., section V-B)
+ZERO = 1e-3  # m; if no label is larger, the TDOAs were computed, not measured
+FEWEST = 100  # labels that a flight must give
+MEMORY = 1.0  # s over which the errors of one anchor are alike: so much time counts as one look at it
+SAME_PLACE = 0.1  # m by which an anchor may have moved and still be in its place, one standard deviation
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Labelled TDOAs of one flight.
+
+    name : of the flight; samples : Samples, poses from ground truth; error : (n,) m, measured minus geometric;
+    looks : independent looks that one sample counts as, because errors are alike for a while; has_attitude : the poses
+    have measured attitudes, else the vehicle is taken to be level at yaw 0; digest : hex, of everything above.
+    """
+
+    name: str
+    samples: Samples
+    error: np.ndarray
+    looks: float
+    has_attitude: bool
+    digest: str
+
+    def __len__(self):
+        return len(self.error)
+
+    @property
+    def anchors(self):
+        """Anchors of the flight."""
+        return self.samples.anchors
+
+    def take(self, rows):
+        """Labels of some rows, each counting for more, so that they count for as much together."""
+        part, looks = _rows(self.samples, rows), self.looks * len(self) / max(len(rows), 1)
+        return replace(self, samples=part, error=self.error[rows], looks=looks)
+
+
+def labels(flight, effects=EffectSet()):
+    """Labels of a Flight, its airborne part without outliers; what `effects` explain is taken out. Raises InputError
+    where it cannot teach anything."""
+    if flight.truth is None:
+        raise InputError(f"{flight.name}: it holds no ground truth to learn from.")
+    has_attitude = bool(np.isfinite(flight.truth.q).all())
+    flight = effects.correct_streams(replace(level(flight), imu=None))
+    truth, data, anchors = flight.truth, flight.tdoa, flight.anchors
+    first, last = airborne(truth)
+    first, last = first + MARGIN, last - MARGIN
+    chosen = (data.t > first) & (data.t < last)
+    unknown = np.setdiff1d(np.concatenate([data.a[chosen], data.b[chosen]]), anchors.ids)
+    if len(unknown):
+        raise InputError(f"{flight.name}: anchor {unknown[0]} is heard but not in the survey; add it there.")
+    lost = int(np.sum(~np.isfinite(data.d[chosen])))
+    if lost:
+        raise InputError(f"{flight.name}: {lost} TDOAs are not finite; remove them from the recording.")
+    if not np.isfinite(truth.p).all():
+        raise InputError(f"{flight.name}: the ground truth has positions that are not finite; remove them.")
+    a, b = anchors.index(data.a[chosen]), anchors.index(data.b[chosen])
+    samples = samples_at(data.t[chosen], a, b, truth, anchors, float(data.t[0]), motion=False)
+    error = data.d[chosen] - tdoa(samples.p, samples.position_a, samples.position_b) - effects.bias(samples)
+    kept = (np.abs(error) <= LARGEST) & (samples.p[:, 2] > AIRBORNE) & (a != b)
+    if kept.sum() < FEWEST:
+        raise InputError(
+            f"{flight.name}: only {kept.sum()} TDOAs in the air are right to {LARGEST:g} m; check that survey and "
+            "ground truth are in one frame."
+        )
+    if np.max(np.abs(error[kept])) < ZERO:
+        raise InputError(f"{flight.name}: all labels are zero: its TDOAs were made from the ground truth itself.")
+    looks = min(1.0, len(anchors) * (last - first) / MEMORY / kept.sum())
+    samples = _rows(samples, kept)
+    return Labels(flight.name, samples, error[kept], looks, has_attitude, _digest(samples, error[kept]))
+
+
+def level(flight):
+    """The Flight; if the attitudes of its ground truth are not all measured, they are level, at yaw 0."""
+    truth = flight.truth
+    if np.isfinite(truth.q).all():
+        return flight
+    return replace(flight, truth=replace(truth, q=np.tile(LEVEL, (len(truth), 1))))
+
+
+def split(names, seed, validation=None):
+    """(training, validation) names: whole flights, one in five validates, drawn with `seed`, or those that are
+    named."""
+    if len(set(names)) != len(names):
+        raise InputError(f"flights: {max(names, key=list(names).count)} is there twice.")
+    if len(names) < 2:
+        raise InputError(
+            f"flights: {len(names)} is too few; give at least two, as one must be held out to validate: samples of one "
+            "flight are too alike to validate each other."
+        )
+    if validation is None:
+        count = max(1, round(0.2 * len(names)))
+        validation = np.random.default_rng(seed).choice(sorted(names), count, replace=False).tolist()
+    unknown = set(validation) - set(names)
+    if unknown:
+        raise InputError(f"validation: {sorted(unknown)[0]} is not one of the flights: {', '.join(names)}.")
+    training = [name for name in names if name not in validation]
+    if not training or not validation:
+        raise InputError("validation: leaves no flight to train, or none to validate; hold out some of them.")
+    return training, sorted(validation)
+
+
+def thinned(all_labels, seconds, rng):
+    """Each of a list of Labels with at most one sample per `seconds` on average, drawn at random."""
+    out = []
+    for one in all_labels:
+        duration = one.samples.t[-1] - one.samples.t[0]
+        count = min(len(one), int(duration / seconds) + 1)
+        out.append(one.take(np.sort(rng.choice(len(one), count, replace=False))))
+    return out
+
+
+def white_noise(all_labels):
+    """Standard deviation of what changes from one TDOA of a pair to its next, m: no model of the pose can know it."""
+    steps = []
+    for one in all_labels:
+        pair = one.samples.a * len(one.anchors) + one.samples.b
+        order = np.argsort(pair, kind="stable")  # in time within each pair
+        steps.append(np.diff(one.error[order])[np.diff(pair[order]) == 0])
+    return float(1.4826 * np.median(np.abs(np.concatenate(steps))) / np.sqrt(2.0))
+
+
+def digest(all_labels):
+    """Hex digest of the data of several Labels, in any order."""
+    return hashlib.sha256("".join(sorted(one.digest for one in all_labels)).encode()).hexdigest()[:16]
+
+
+def constellations(some):
+    """The different anchor constellations of flights or labels: list of dicts of id (text) to position, m, to the
+    centimetre."""
+    found = []
+    for one in some:
+        layout = dict(zip(map(str, one.anchors.ids.tolist()), one.anchors.positions.round(2).tolist()))
+        if not any(_alike(layout, known) for known in found):
+            found.append(layout)
+    return found
+
+
+def _alike(one, other):
+    return set(one) == set(other) and all(np.linalg.norm(np.subtract(one[i], other[i])) < SAME_PLACE for i in one)
+
+
+def _rows(s, rows):
+    return Samples(s.t[rows], s.a[rows], s.b[rows], s.p[rows], s.q[rows], s.anchors, s.start)
+
+
+def _digest(samples, error):
+    content = hashlib.sha256()
+    for array in (samples.t, samples.a, samples.b, samples.p, samples.q, error, samples.anchors.positions):
+        content.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+    return content.hexdigest()

@@ -1,0 +1,175 @@
+"""The kinds of models that can be trained, all by one call: `train`."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.features import columns
+
+from . import labels as labelling, linear, paper, physics, structured
+
+KINDS = ("paper", "paper_no_orientation", "structured", "physics", "physics+structured")
+SPACING = 0.01  # s between the samples that are learned from: nearer ones tell the same
+CLIP = 1.0  # m
+MARGINS = {"d": 1.0, "f": 2.0, "u": 0.5}  # trust fades over: positions m, forward (turned round: gone) and up axes
+SLACK = 0.2  # added to the box of attitudes on every side: that much is an estimated attitude off at times
+SMALLEST_STD = 0.01  # m, of what remains
+POINTS = 4  # of a learning curve over flights
+_ATTITUDE = ("forward_x", "forward_y", "up_x", "up_y")
+
+
+@dataclass(frozen=True)
+class Trained:
+    """model : Paper, Structured or None; effects : EffectSet or None; curve : (label, x, training RMS, validation RMS);
+    meta : metadata of the ONNX file; errors : {validation flight: (before, after)}, RMS of its TDOAs, m."""
+
+    model: object
+    effects: EffectSet | None
+    curve: tuple
+    meta: dict
+    errors: dict
+
+    def onnx(self):
+        """The onnx.ModelProto, or None for a kind without a network."""
+        return self.model.onnx(self.meta) if self.model else None
+
+
+def train(kind, training, validation, seed, name, options=structured.Options(), progress=lambda text: None, found=None):
+    """Train a model of `kind` (of KINDS) on lists of Flights. Returns Trained. Raises InputError.
+
+    name : of the model, goes into every corrected message; progress : called with a text now and then; found : Physics
+    of the training and then the validation flights, if somebody has looked for it already. The validation
+    flights decide when the paper's network stops, and tell how far off a model is on flights that it has not seen; then
+    the linear models are fitted anew to them too.
+    """
+    if kind not in KINDS:
+        raise InputError(f"model: {kind!r} is not known; choose {', '.join(KINDS)}.")
+    raw = groups = _labels(training, validation)
+    effects = model = None
+    if kind.startswith("physics"):
+        if found is None:
+            progress("looking for effects")
+            found = physics.find([*training, *validation])
+        free, effects = EffectSet(), found.effects
+        if len(labelling.constellations([*training, *validation])) > 1:
+            free, effects = physics.separate(effects)
+        progress(f"effects: {found.effects.name}")
+        groups = _labels(training, validation, effects)
+    if kind.startswith("paper"):
+        model, curve, left = _paper(kind, *groups, seed, progress)
+    elif kind == "structured":
+        model, _, curve, left = _structured(*groups, seed, options, progress)
+    elif kind == "physics" and not len(free):
+        curve, left = _judge_effects(found, *raw)
+    else:
+        model, free, curve, left = _structured(*groups, seed, options, progress, free, kind == "physics")
+        effects = EffectSet((*free.effects, *effects.effects))
+    everything = [*groups[0], *groups[1]]
+    meta = {
+        "name": name, "kind": kind, "clip": CLIP, "seed": seed, "data": labelling.digest([*raw[0], *raw[1]]),
+        "trained_on": sorted(one.name for one in training), "validated_on": sorted(one.name for one in validation),
+        "constellations": labelling.constellations(everything),
+    }  # fmt: skip
+    if model:
+        learned_from = groups[0] if kind.startswith("paper") else everything
+        meta |= {"validity": _validity(learned_from, model.judged), "fade_std": _rms(one.error for one in groups[1])}
+    errors = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
+    return Trained(model, effects, curve, meta, errors)
+
+
+def _labels(training, validation, effects=EffectSet()):
+    return [[labelling.labels(flight, effects) for flight in group] for group in (training, validation)]
+
+
+def _paper(kind, training, validation, seed, progress):
+    """(Paper, learning curve over epochs, what is left of the errors of each validation flight)."""
+    thin = [labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation)]
+    model, errors = paper.fit(
+        *thin, kind == "paper", seed, lambda epoch, error: progress(f"epoch {epoch}: validation {error:.4f} m")
+    )
+    left = [one.error - model.mean(one.samples) for one in validation]
+    model.std = _deviation(left, 0.0, validation)
+    return model, ("epochs", list(range(1, len(errors[0]) + 1)), *errors), left
+
+
+def _structured(training, validation, seed, options, progress, free=EffectSet(), alone=False):
+    """(Structured, EffectSet, learning curve over numbers of training flights, what is left of the errors of each
+    validation flight by a fit to the training flights). The model itself is then fitted to all flights.
+
+    free : linear effects to fit together with the maps; alone : the maps are only there so that the effects do not take
+    what belongs to a place; no model is returned.
+    """
+    thin = [labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation)]
+
+    def remaining(one):
+        return one.error - fitted.bias(one.samples) - (0.0 if alone else model.mean(one.samples))
+
+    curve = []
+    for some in _growing(len(training), seed):
+        model, fitted = fit_structured([thin[0][k] for k in some], seed, options, free)
+        errors = [_rms(map(remaining, group)) for group in ([thin[0][k] for k in some], thin[1])]
+        curve.append((len(some), *errors))
+        progress("{} of {} flights: training {:.4f} m, validation {:.4f} m".format(len(some), len(training), *errors))
+    left = [remaining(one) for one in validation]
+    explained = np.concatenate([model.variance(one.samples) for one in validation])
+    whole, fitted = fit_structured([*thin[0], *thin[1]], seed, options, free)
+    whole.floor = _deviation(left, explained, validation)
+    return None if alone else whole, fitted, ("training flights", *map(list, zip(*curve))), left
+
+
+def fit_structured(some, seed, options, free=EffectSet()):
+    """(Structured, EffectSet with the values of the linear effects `free`), fitted together to Labels."""
+    model = structured.prepare(some, options, seed)
+    parts = [model.design(one.samples, one.error, one.looks) for one in some]
+    fields = ("phi", "a", "b", "dense", "y", "looks")
+    phi, a, b, dense, y, looks = (np.concatenate([getattr(part, name) for part in parts]) for name in fields)
+    more = np.concatenate([physics.regressors(free, one.samples) for one in some])
+    design = linear.Design(phi, a, b, np.concatenate([dense, more], axis=1), y, looks)
+    posterior = linear.fit(design, len(model.site_ids), options.noise, physics.sizes(free))
+    model.set_posterior(posterior)
+    own = model.link_columns
+    return model, physics.with_values(free, posterior.dense[own:], posterior.dense_covariance[own:, own:])
+
+
+def _judge_effects(found, training, validation):
+    """(Learning curve over numbers of training flights, what is left of the errors of each validation flight) of the
+    effects of a Physics, which counts training flights first."""
+    curve = []
+    for some in _growing(len(training), 0):
+        effects = found.fitted_to(some)
+        judged = ([training[k] for k in some], validation)
+        left = [[one.error - effects.bias(one.samples) for one in group] for group in judged]
+        curve.append((len(some), *map(_rms, left)))
+    return ("training flights", *map(list, zip(*curve))), left[1]
+
+
+def _growing(count, seed):
+    """Growing subsets of `count` flights, in random order, the last one all of them: lists of numbers."""
+    order = np.random.default_rng(seed).permutation(count).tolist()
+    return [order[:n] for n in sorted({int(round(n)) for n in np.geomspace(1, count, min(count, POINTS))})]
+
+
+def _deviation(left, explained, validation):
+    """Standard deviation of what is left of errors, without what maps explain, m^2, and what no model of poses can
+    know."""
+    variance = np.mean(np.concatenate(left) ** 2 - explained) - labelling.white_noise(validation) ** 2
+    return float(np.sqrt(max(variance, SMALLEST_STD**2)))
+
+
+def _rms(parts):
+    parts = list(parts)
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) if parts else float("nan")
+
+
+def _validity(learned_from, judged):
+    """{feature: [lowest, highest, margin]} of Labels."""
+    limits = {}
+    for names, more in ((_ATTITUDE, SLACK), (judged, 0.0)):
+        if not names:
+            continue
+        table = np.concatenate([columns(one.samples, names) for one in learned_from])
+        for name, low, high in zip(names, table.min(axis=0) - more, table.max(axis=0) + more):
+            limits[name] = [round(float(low), 3), round(float(high), 3), MARGINS[name[0]]]
+    return limits

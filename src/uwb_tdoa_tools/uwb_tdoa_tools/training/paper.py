@@ -1,0 +1,91 @@
+"""The network of Zhao et al. (RA-L 2021): three layers of 30 neurons, with or without the orientations of the anchors.
+
+As published (section V-B): scaled inputs, rectified linear units, mini-batch gradient descent on squared errors,
+stopped when the validation error has not fallen for five epochs in a row. Its deviation is that of the validation
+flights."""
+
+import copy
+
+import numpy as np
+from sklearn.neural_network import MLPRegressor
+
+from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.features import FEATURES, columns
+
+from . import export
+
+LAYERS = (30, 30, 30)
+PATIENCE, MOST_EPOCHS = 5, 200
+BATCH, RATE = 64, 0.005
+WITHOUT = tuple(name for name in FEATURES if "_A_" not in name)  # without anchor orientations
+
+
+class Paper:
+    """The network, fitted. `fit` makes one."""
+
+    def __init__(self, names, offset, scale, layers, std):
+        """names : features; offset, scale : (k,); layers : list of (weights (i, o), biases (o,)); std : m."""
+        self.names, self.offset, self.scale, self.layers, self.std = names, offset, scale, layers, std
+        self.judged = tuple(name for name in names if name[0] == "d")
+
+    def mean(self, samples):
+        """Predicted error, (n,) m."""
+        x = (columns(samples, self.names) - self.offset) / self.scale
+        for k, (weights, biases) in enumerate(self.layers):
+            x = x @ weights + biases
+            x = np.maximum(x, 0.0) if k < len(self.layers) - 1 else x
+        return x[:, 0]
+
+    def onnx(self, meta):
+        """The onnx.ModelProto: bias, standard deviation. meta : further metadata."""
+        graph = export.Graph()
+        x = graph.input
+        for k, (weights, biases) in enumerate(self.layers):
+            x = graph.op("Gemm", x, weights, biases)
+            x = graph.op("Relu", x) if k < len(self.layers) - 1 else x
+        std = graph.op("Add", graph.op("Mul", x, [0.0]), [self.std])
+        meta = {**meta, "features": list(self.names), "offset": self.offset.tolist(), "scale": self.scale.tolist()}
+        return graph.model(len(self.names), [x, std], meta)
+
+
+def fit(training, validation, orientations, seed, progress=lambda epoch, error: None):
+    """Paper, and its learning curve: lists of training and validation error per epoch (RMS, m). Raises InputError.
+
+    training, validation : lists of Labels; orientations : use those of the anchors; progress : called after each epoch.
+    """
+    names = FEATURES if orientations else WITHOUT
+    if orientations:
+        for one in (*training, *validation):
+            blind = one.anchors.ids[~np.isfinite(one.anchors.orientations).all(axis=1)]
+            if len(blind):
+                raise InputError(
+                    f"{one.name}: anchor {blind[0]} has no orientation, which this model needs; survey it, or train "
+                    "paper_no_orientation or structured."
+                )
+    (x, y), (x_held, y_held) = (_table(group, names) for group in (training, validation))
+    low, high = x.min(axis=0), x.max(axis=0)
+    offset, scale = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-6)
+    x, x_held = (x - offset) / scale, (x_held - offset) / scale
+    network = MLPRegressor(
+        hidden_layer_sizes=LAYERS, solver="sgd", batch_size=BATCH, learning_rate_init=RATE, random_state=seed
+    )
+    best, since, curve = None, 0, ([], [])
+    for epoch in range(MOST_EPOCHS):
+        network.partial_fit(x, y)
+        for errors, inputs, outputs in zip(curve, (x, x_held), (y, y_held)):
+            errors.append(float(np.sqrt(np.mean((network.predict(inputs) - outputs) ** 2))))
+        progress(epoch, curve[1][-1])
+        if best is None or curve[1][-1] < best[0]:
+            best, since = (curve[1][-1], copy.deepcopy((network.coefs_, network.intercepts_))), 0
+        else:
+            since += 1
+            if since == PATIENCE:
+                break
+    return Paper(names, offset, scale, list(zip(*best[1])), best[0]), curve
+
+
+def _table(group, names):
+    return (
+        np.concatenate([columns(one.samples, names) for one in group]),
+        np.concatenate([one.error for one in group]),
+    )

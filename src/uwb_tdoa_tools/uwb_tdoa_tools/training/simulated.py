@@ -1,0 +1,35 @@
+"""Simulated flights to compare models on: some constellations to train on, others never seen."""
+
+from dataclasses import replace
+
+from ..simulation import SimulationConfig, simulate
+
+TRAINING = ("corners", "wall_middles", "staircase")
+UNSEEN = ("pillars", "low_ceiling", "random-7")
+TRAJECTORIES = ("sines", "sines", "rising_circle", "circle", "square")
+DURATION = 40.0  # s
+
+
+def flights(constellations, count, first_seed, progress=lambda names: names):
+    """{constellation: [Flight, ...]}, `count` each, of varied paths, yaws, protocols and tag specimens.
+
+    The anchors' own delays are calibrated (zero): they are constants of single modules, which no model of poses can
+    know.
+    progress : wraps the list of what is to be flown, e.g. tqdm.
+    """
+    out = {name: [] for name in constellations}
+    for name, k in progress([(name, k) for name in constellations for k in range(count)]):
+        config = SimulationConfig(
+            seed=first_seed + k,
+            constellation=name,
+            trajectory=TRAJECTORIES[k % len(TRAJECTORIES)],
+            duration=DURATION,
+            yaw=("rotating", "along_track", "fixed")[k % 3],
+            yaw_angle=0.7 * k,
+            protocol=("tdoa2", "tdoa3")[k % 2],
+            imu_rate=200.0,
+            tag_unit=k % 5,
+            anchor_delay_std=0.0,
+        )
+        out[name].append(replace(simulate(config), name=f"{name}-{k}"))
+    return out

@@ -1,0 +1,273 @@
+"""The error of a pair as the difference of two one-anchor errors: e_ab = g(b) - g(a).
+
+So it is antisymmetric, and carries over to pairs, protocols and numbers of anchors that were never seen. g of one
+anchor is the sum of
+- a map of this anchor over the position of the tag ("site"): reflections and shadows of the room, and its own delay. It
+  belongs to an anchor at a place; when the anchor is moved, or unknown, it is gone;
+- maps over the distance and the direction of the anchor in the frame of the tag, and over the distance and the
+  direction of the tag in the frame of the anchor if its orientation is known ("links"): the antennas and the received
+  power, the same for all anchors. In the power budget their gains add up, so the two are summed, which carries over to
+  combinations of directions that were never seen.
+All are Gaussian processes, on Nystroem features of some hundred centres (Williams and Seeger, NIPS 2000), so that the
+fit is one linear regression, the standard deviation is its posterior's, and away from the training data the mean goes
+to zero and the deviation to the prior's by itself.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+from scipy.spatial.distance import cdist
+
+from uwb_tdoa_bias.effects import Samples
+from uwb_tdoa_bias.features import columns
+
+from . import export, linear
+from .labels import SAME_PLACE, constellations
+
+COARSE = 4.0  # ratio of the long to the short length of the site map
+LINK_LENGTH = 0.5  # of the link maps, in unit vectors and logarithms of distance
+RANK = 64  # directions of the posterior that the deviation is computed from; the others count as unknown
+SITE_WEIGHTS = 2400  # at most, of all sites together: memory and time of the fit grow with its square and cube
+_DELTA = ("dx", "dy", "dz")
+_PLACE = ("x", "y", "z")
+_END = ("id", "x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Priors of the structured model; the defaults were chosen on the validation flights of docs/bias.md.
+
+    fine, coarse : m, standard deviation of the short and of the long part of a site map, before the data scale both
+    length : (3,) m, over which its short part changes
+    link : m, standard deviation of each link map, before the data scale it
+    noise : m, scale of what no map explains
+    centres, link_centres : Nystroem centres of the site maps and of each link map, at most
+    """
+
+    fine: float = 0.1
+    coarse: float = 0.1
+    length: tuple = (1.0, 1.0, 0.6)
+    link: float = 0.1
+    noise: float = 0.1
+    centres: int = 200
+    link_centres: int = 150
+
+
+@dataclass(frozen=True)
+class Map:
+    """Nystroem features of a kernel: centres (m, k) of scaled inputs; whiten (m, m), kernel values to features;
+    amplitudes and lengths of the exponentials that the kernel is the sum of; squared: Gaussians instead."""
+
+    centres: np.ndarray
+    whiten: np.ndarray
+    amplitudes: tuple
+    lengths: tuple
+    squared: bool
+
+    @property
+    def variance(self):
+        """Of the process at one point, m^2."""
+        return float(sum(a**2 for a in self.amplitudes))
+
+    def scaled(self, factor):
+        """The Map of a process `factor` times as large."""
+        return replace(self, whiten=self.whiten / factor, amplitudes=tuple(factor * a for a in self.amplitudes))
+
+    def kernel(self, x):
+        """Kernel values between scaled inputs (n, k) and the centres: (n, m)."""
+        far = cdist(x, self.centres)
+        parts = (-0.5 * (far / s) ** 2 if self.squared else -far / s for s in self.lengths)
+        return sum(a**2 * np.exp(part) for a, part in zip(self.amplitudes, parts))
+
+    def features(self, x):
+        """(n, m), uncorrelated and of unit variance under the prior."""
+        return self.kernel(x) @ self.whiten
+
+
+def make_map(x, count, amplitudes, lengths, squared, seed):
+    """Map with up to `count` centres spread over the scaled inputs x (n, k)."""
+    rng = np.random.default_rng(seed)
+    some = x[rng.choice(len(x), min(len(x), 5000), replace=False)]
+    centres, _ = kmeans2(some, min(count, len(some)), minit="++", seed=seed)
+    centres = np.unique(centres[np.isfinite(centres).all(axis=1)], axis=0)
+    made = Map(centres, np.eye(len(centres)), tuple(amplitudes), tuple(lengths), squared)
+    value, vector = np.linalg.eigh(made.kernel(centres))
+    kept = value > 1e-6 * value[-1]
+    return replace(made, whiten=vector[:, kept] / np.sqrt(value[kept]))
+
+
+class Structured:
+    """The model; `prepare` makes one without weights, `set_posterior` gives it them."""
+
+    judged = ()  # it fades over positions by itself
+
+    def __init__(self, options, site, site_ids, site_positions):
+        """site : Map over scaled positions; site_ids (s,), site_positions (s, 3) m : the anchors and where they
+        stand."""
+        self.options, self.site, self.site_ids, self.site_positions = options, site, site_ids, site_positions
+        self.links = {}  # "T": Map as the tag sees the anchor, "A": as the anchor sees the tag; empty if not told apart
+        self.floor = 0.0  # m, standard deviation of what remains where everything is known
+
+    def design(self, samples, error=None, looks=1.0):
+        """linear.Design of Samples: the sites of their anchors, one behind the last for those at none, and the link
+        maps as dense part."""
+        phi = self.site.features(samples.p / self.options.length)
+        a, b = (self._site_of(samples.anchors)[rows] for rows in (samples.a, samples.b))
+        dense = [np.zeros((len(samples), 0))]
+        for viewer, link in self.links.items():
+            one, other = (link.features(link_inputs(samples, side, viewer)) for side in "ab")
+            dense.append(other - one)
+        y = np.zeros(len(samples)) if error is None else error
+        return linear.Design(phi, a, b, np.concatenate(dense, axis=1), y, np.broadcast_to(looks, len(samples)))
+
+    def _site_of(self, anchors):
+        far = np.linalg.norm(anchors.positions[:, None] - self.site_positions, axis=2)
+        far[(anchors.ids[:, None] != self.site_ids) | (far > SAME_PLACE)] = np.inf
+        return np.where(np.isfinite(far).any(axis=1), np.argmin(far, axis=1), len(self.site_ids))
+
+    def set_posterior(self, posterior):
+        """Take over weights and the sizes of the priors."""
+        s = posterior.site_std
+        self.site = self.site.scaled(s)
+        self.weights, self.site_covariance = posterior.site / s, posterior.site_covariance / s**2
+        s, first = posterior.dense_std, 0
+        self.link_weights, self.link_covariances = {}, {}
+        for viewer, link in self.links.items():
+            mine = slice(first, first + link.whiten.shape[1])
+            self.links[viewer] = link.scaled(s)
+            self.link_weights[viewer] = posterior.dense[mine] / s
+            self.link_covariances[viewer] = posterior.dense_covariance[mine, mine] / s**2
+            first = mine.stop
+
+    @property
+    def link_columns(self):
+        """How many dense columns of `design` there are."""
+        return sum(link.whiten.shape[1] for link in self.links.values())
+
+    @property
+    def prior(self):
+        """Variance of the error of one arrival where nothing is known, m^2."""
+        return self.site.variance + sum(link.variance for link in self.links.values())
+
+    def mean(self, samples):
+        """Predicted error of Samples, (n,) m."""
+        sites = np.vstack([self.weights, np.zeros(self.weights.shape[1])])
+        links = np.concatenate([np.zeros(0), *(self.link_weights[viewer] for viewer in self.links)])
+        return linear.predict(self.design(samples), sites, links)
+
+    def variance(self, samples):
+        """Of the maps, for Samples: (n,) m^2, without the floor."""
+        phi = self.site.features(samples.p / self.options.length)
+        known, sites = np.einsum("ni,ij,nj->n", phi, self.site_covariance, phi), self._site_of(samples.anchors)
+        at_site = sites < len(self.site_ids)
+        total = sum(np.where(at_site[rows], known, self.site.variance) for rows in (samples.a, samples.b))
+        for viewer, link in self.links.items():
+            for side in "ab":
+                phi = link.features(link_inputs(samples, side, viewer))
+                total += np.einsum("ni,ij,nj->n", phi, self.link_covariances[viewer], phi)
+        return total
+
+    def inputs(self):
+        """Names of the features that the network is fed, in order: the place, then those of either end."""
+        return [*_PLACE, *(f"{name}_{side}" for side in "ab" for name in self._end_inputs())]
+
+    def _end_inputs(self):
+        angles = [f"{angle}_{viewer}" for viewer in self.links for angle in ("azimuth", "elevation")]
+        return [*_END, *(_DELTA if self.links else ()), *angles]
+
+    def onnx(self, meta):
+        """The onnx.ModelProto: bias, standard deviation, share of what can be known. meta : further metadata."""
+        graph, names = export.Graph(), self.inputs()
+        place = graph.op("Div", graph.take(graph.input, [0, 1, 2]), np.array([self.options.length]))
+        values = _kernel_values(graph, self.site, place)
+        seen = _explained(graph, self.site, self.site_covariance, values)
+        n = len(self._end_inputs())
+        ends = [graph.take(graph.input, range(first, first + n)) for first in (len(_PLACE), len(_PLACE) + n)]
+        # both ends go through the graph together, a above b: half as many operators
+        mean, variance = self._end(graph, graph.op("Concat", *ends, axis=0), graph.twice(values), graph.twice(seen))
+        (mean_a, mean_b), (variance_a, variance_b) = graph.halves(mean), graph.halves(variance)
+        bias = graph.op("Sub", mean_b, mean_a)
+        variance = graph.op("Add", graph.op("Add", variance_a, variance_b), [self.floor**2])
+        worst = graph.op("Max", variance_a, variance_b)
+        known = graph.op("Sub", [1.0], graph.op("Div", worst, [self.prior]))
+        meta = {**meta, "features": names, "offset": [0.0] * len(names), "scale": [1.0] * len(names)}
+        return graph.model(len(names), [bias, graph.op("Sqrt", variance), known], meta)
+
+    def _end(self, graph, end, values, seen):
+        """(mean, variance) of g of anchors, each (2n, 1). end : their features; values, seen : of the site map."""
+        names = self._end_inputs()
+        who, where = graph.take(end, [0]), graph.take(end, [1, 2, 3])
+        other = graph.op("Mul", graph.op("Abs", graph.op("Sub", who, self.site_ids[None])), [1e3])  # ids count as far
+        far = graph.op("Add", graph.distance2(where, self.site_positions), other)
+        here = graph.op("Exp", graph.op("Mul", far, [-0.5 / SAME_PLACE**2]))  # (2n, sites)
+        weights = graph.op("MatMul", here, self.weights @ self.site.whiten.T)
+        mean = graph.row_sum(graph.op("Mul", weights, values))
+        at_site = graph.op("Min", graph.row_sum(here), [1.0])
+        variance = graph.op("Max", graph.op("Sub", [self.site.variance], graph.op("Mul", at_site, seen)), [0.0])
+        far = self.links and _distance_graph(graph, graph.take(end, [names.index(name) for name in _DELTA]))
+        for viewer, link in self.links.items():
+            angles = [names.index(f"{angle}_{viewer}") for angle in ("azimuth", "elevation")]
+            told = _kernel_values(graph, link, _link_graph(graph, far, *(graph.take(end, [k]) for k in angles)))
+            mean = graph.op("Add", mean, graph.op("MatMul", told, (link.whiten @ self.link_weights[viewer])[:, None]))
+            seen = _explained(graph, link, self.link_covariances[viewer], told)
+            variance = graph.op("Add", variance, graph.op("Max", graph.op("Sub", [link.variance], seen), [0.0]))
+        return mean, variance
+
+
+def link_inputs(samples, side, viewer):
+    """Inputs of a link map: logarithm of the distance, unit vector to the other end as the viewer sees it. (n, 4).
+
+    side : "a" or "b"; viewer : "T", tag or "A", anchor."""
+    names = [f"{name}_{side}" for name in (*_DELTA, f"azimuth_{viewer}", f"elevation_{viewer}")]
+    dx, dy, dz, azimuth, elevation = columns(samples, names).T
+    far, flat = np.log(np.maximum(np.sqrt(dx**2 + dy**2 + dz**2), 0.1)), np.cos(elevation)
+    return np.stack([far, flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
+
+
+def _distance_graph(graph, delta):
+    far = graph.op("Sqrt", graph.row_sum(graph.op("Mul", delta, delta)))
+    return graph.op("Log", graph.op("Max", far, [0.1]))
+
+
+def _link_graph(graph, far, azimuth, elevation):
+    flat = graph.op("Cos", elevation)
+    seen = [graph.op("Mul", flat, graph.op(turn, azimuth)) for turn in ("Cos", "Sin")]
+    return graph.op("Concat", far, *seen, graph.op("Sin", elevation), axis=1)
+
+
+def _kernel_values(graph, of, x):
+    far = graph.distance2(x, of.centres)
+    far = far if of.squared else graph.op("Sqrt", far)
+    rates = [-0.5 / s**2 if of.squared else -1.0 / s for s in of.lengths]
+    terms = [graph.op("Mul", graph.op("Exp", graph.op("Mul", far, [r])), [a**2]) for a, r in zip(of.amplitudes, rates)]
+    return terms[0] if len(terms) == 1 else graph.op("Add", *terms)
+
+
+def _explained(graph, of, covariance, values):
+    """(n, 1): the part of the prior's variance that the data took away, from kernel values (n, m)."""
+    share, vector = np.linalg.eigh(np.eye(len(covariance)) - covariance)
+    leading = np.argsort(share)[::-1][:RANK]
+    factor = of.whiten @ (vector[:, leading] * np.sqrt(np.maximum(share[leading], 0.0)))
+    part = graph.op("MatMul", values, factor)
+    return graph.row_sum(graph.op("Mul", part, part))
+
+
+def prepare(all_labels, options, seed):
+    """Structured without weights: sites, centres and kernels for a list of Labels."""
+    ids, positions = [], []
+    for one in all_labels:
+        for i, p in zip(one.anchors.ids, one.anchors.positions):
+            if not any(i == k and np.linalg.norm(p - at) < SAME_PLACE for k, at in zip(ids, positions)):
+                ids.append(i)
+                positions.append(p)
+    places = np.concatenate([one.samples.p for one in all_labels]) / options.length
+    centres = min(options.centres, SITE_WEIGHTS // len(ids))
+    site = make_map(places, centres, (options.fine, options.coarse), (1.0, COARSE), False, seed)
+    model = Structured(options, site, np.array(ids, dtype=float), np.array(positions))
+    if len(constellations(all_labels)) > 1:  # in one alone, place and direction are the same thing
+        oriented = all(np.isfinite(one.anchors.orientations).all() for one in all_labels)
+        for viewer in "TA" if oriented else "T":
+            inputs = np.concatenate([link_inputs(one.samples, side, viewer) for one in all_labels for side in "ab"])
+            model.links[viewer] = make_map(inputs, options.link_centres, (options.link,), (LINK_LENGTH,), True, seed)
+    return model
