@@ -7,8 +7,10 @@ Every parameter is documented in config/bias_node.yaml.
 
 from collections import Counter, deque
 import math
+from pathlib import Path
 import sys
 
+from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -24,6 +26,7 @@ from .hold import Hold
 from .network import Network
 from .stamps import StampWatch
 
+SHIPPED = "default"  # as model_file: the model that comes with the package
 EARLY = 2000  # TDOAs kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
@@ -36,7 +39,11 @@ class BiasNode(Node):
     def __init__(self):
         super().__init__(self.NAME)
         effects_file = ros.parameter(self, "effects_file", "", "effects.yaml to correct with; empty for none")
-        model_file = ros.parameter(self, "model_file", "", "ONNX model to correct with; empty for none")
+        model_file = ros.parameter(
+            self, "model_file", SHIPPED, "ONNX model to correct with; default for the one shipped, empty for none"
+        )
+        if model_file == SHIPPED:
+            model_file = Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "default.onnx"
         self._lag = ros.parameter(self, "pose_lag", 0.05, "a TDOA is corrected at the newest pose this much older, s")
         self._limit = ros.parameter(self, "hold", 0.225, "longest wait of a TDOA for its pose, s of stamps")
         for name, value in (("pose_lag", self._lag), ("hold", self._limit)):

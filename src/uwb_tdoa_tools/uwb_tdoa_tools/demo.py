@@ -76,7 +76,7 @@ def demo(args):
     try:
         live = run_live(
             bag, args.out, args.rate,
-            {name: str(Path(path).resolve()) for name, path in paths.items() if path},
+            {name: str(Path(path).resolve()) if path else "" for name, path in paths.items()},
             {"use_imu": flight.imu is not None},
             lambda text: print(f"nodes      {text}", flush=True),
         )  # fmt: skip

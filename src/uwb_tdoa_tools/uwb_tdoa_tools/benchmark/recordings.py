@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
+import numpy as np
 
 from uwb_tdoa_bias.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
@@ -17,6 +18,7 @@ from .flights import make_flight
 SECONDS = 45.0
 TARGET = 0.5  # s for such a flight
 ANCHORS = (4, 16, 32, 64)
+BATCHES = (1, 4, 16)  # TDOAs that arrive together
 
 
 def measure(progress, quick=False, model=None):
@@ -27,7 +29,7 @@ def measure(progress, quick=False, model=None):
     progress("recording, first call")
     name = "first call: compiled, or compiled code read from numba's cache"
     yield Figure.of(section, name, "s", _seconds(run_offline, flight))
-    network = Network(model or Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "known_answer.onnx")
+    network = Network(model or Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "default.onnx")
     effects = EffectSet((
         AnchorDelay(flight.meta["parameters"]["anchor_delays"]), TagLeverArm({"x": 0.01, "y": 0.0, "z": 0.05}),
     ))  # fmt: skip
@@ -45,12 +47,31 @@ def measure(progress, quick=False, model=None):
         yield Figure.of(section, name, "s", taken, None if function is smooth else TARGET)
         if corrector is None and function is run_offline:
             yield Figure.of(section, "the same per second of flight", "ms/s", [1e3 * s / SECONDS for s in taken])
+    for batch in BATCHES:
+        name = f"correction of a TDOA by the network ({network.name}), {batch} at a time"
+        corrector = Corrector(flight.anchors, network=network)
+        yield Figure.of(section, name, "us", _per_tdoa(flight, corrector, batch, repeats))
     for anchors in () if quick else ANCHORS:
         progress(f"recording, {anchors} anchors")
         flight = make_flight(SECONDS, anchors)
         yield Figure.of(
             section, f"no correction, {anchors} anchors", "s", [_seconds(run_offline, flight) for _ in range(repeats)]
         )
+
+
+def _per_tdoa(flight, corrector, batch, repeats):
+    """us per TDOA of a Flight, corrected in batches of `batch`: (repeats,)."""
+    truth, tdoa = flight.truth, flight.tdoa
+    corrector.add_pose(truth.t, truth.p, truth.q)
+    a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
+    parts = [slice(k, k + batch) for k in range(0, 400 * batch, batch) if k + batch <= len(tdoa)]
+
+    def correct():
+        for part in parts:
+            corrector.correct(tdoa.t[part], a[part], b[part], tdoa.d[part])
+
+    correct()
+    return np.array([_seconds(correct) for _ in range(repeats)]) * 1e6 / (len(parts) * batch)
 
 
 def _seconds(function, *arguments):
