@@ -14,6 +14,7 @@ def small(monkeypatch):
     monkeypatch.setattr(simulated, "UNSEEN", ("low_ceiling",))
 
 
+@pytest.mark.slow
 def test_compares_on_constellations_never_seen(tmp_path, capsys):
     arguments = ["--simulated", "2", "--models", "structured", "physics", "--bound", "--out", str(tmp_path)]
     assert compare_models.main(arguments) == 0
