@@ -1,3 +1,4 @@
+from dataclasses import replace
 import json
 from pathlib import Path
 import pickle
@@ -108,6 +109,7 @@ def changed(tmp_path, **meta):
         ({"validity": '{"distance": [0, 1, 1]}', "fade_std": "0.3"}, "distance"),
         ({"validity": '{"x": [0, 1, 0]}', "fade_std": "0.3"}, "margin above 0"),
         ({"validity": '{"x": [0, 1, 1]}'}, "fade_std"),
+        ({"largest_yaw_std": '"wide"'}, "wide"),
     ],
 )
 def test_wrong_metadata_are_refused_by_name(tmp_path, meta, named):
@@ -115,6 +117,15 @@ def test_wrong_metadata_are_refused_by_name(tmp_path, meta, named):
     with pytest.raises(InputError) as error:
         Network(path)
     assert named in str(error.value) and str(path) in str(error.value)
+
+
+def test_says_nothing_before_the_yaw_is_known(tmp_path):
+    network, s = Network(changed(tmp_path, largest_yaw_std="1.0")), batch(3)
+    plain = network.predict(s)[0]
+    assert np.isfinite(plain).all()
+    bias, std, _ = network.predict(replace(s, yaw_std=np.array([0.0, 1.0, 1.1])))
+    np.testing.assert_array_equal(bias, [*plain[:2], np.nan])
+    np.testing.assert_array_equal(np.isnan(std), [False, False, True])
 
 
 def test_fades_beyond_what_it_knows(tmp_path):

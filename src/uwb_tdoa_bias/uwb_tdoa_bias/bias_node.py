@@ -27,6 +27,7 @@ from .network import Network
 from .stamps import StampWatch
 
 SHIPPED = "default"  # as model_file: the model that comes with the package
+YAW = 35  # place of the yaw's variance in the covariance of a pose
 EARLY = 2000  # TDOAs kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
@@ -98,7 +99,7 @@ class BiasNode(Node):
                 "taken as the same frame",
                 once=True,
             )
-        self._take_pose(self._epoch.seconds(message.header.stamp), message.pose.pose)
+        self._take_pose(self._epoch.seconds(message.header.stamp), message.pose)
         self._release()
 
     def _take_pose(self, t, pose):
@@ -109,8 +110,9 @@ class BiasNode(Node):
             for _, message in held:
                 self._take(message)
         for t, pose in believed:
-            position = pose.position
-            self._corrector.add_pose(t, (position.x, position.y, position.z), ros.orientation_of(pose.orientation))
+            position, yaw_variance = pose.pose.position, pose.covariance[YAW]
+            at, orientation = (position.x, position.y, position.z), ros.orientation_of(pose.pose.orientation)
+            self._corrector.add_pose(t, at, orientation, math.sqrt(max(yaw_variance, 0.0)))
 
     def _on_tdoa(self, message):
         self._counts["received"] += 1

@@ -51,10 +51,10 @@ class Corrector:
         """True if there is nothing to correct with."""
         return not len(self.effects) and self.network is None
 
-    def add_pose(self, t, p, q):
-        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world; or several: (k,), (k, 3), (k, 4).
-        Stamps must rise; others are ignored."""
-        self._poses.add(t, p, q)
+    def add_pose(self, t, p, q, yaw_std=0.0):
+        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, yaw_std rad: deviation of its rotation about
+        the vertical; or several: (k,), (k, 3), (k, 4), (k,). Stamps must rise; others are ignored."""
+        self._poses.add(t, p, q, np.broadcast_to(yaw_std, np.shape(t)))
 
     def ready(self, t):
         """True if no pose that is still to come can change the correction of a measurement stamped t."""
@@ -71,10 +71,10 @@ class Corrector:
         if self.idle or n == 0:
             return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
         places = np.searchsorted(self._poses.t, t - self.lag, side="right") - 1
-        p, q = self._poses.at(places)
+        p, q, yaw_std = self._poses.at(places)
         extra = self._extra(t, b, places) if self.effects.needs_motion else {}
         self._first = t[0] if self._first is None else self._first
-        samples = Samples(t, a, b, p, q, self.anchors, self._first, **extra)
+        samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std, **extra)
         bias = self.effects.bias(samples)
         std = spread = self.effects.spread(samples)
         status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)

@@ -8,6 +8,7 @@ Metadata of the model (all values JSON text):
     validity  optional: {feature: [lowest, highest, margin]}, in the units of the features. Inside, the network is
               believed; beyond by `margin` or more, not at all; linearly in between, the worst feature counting.
     fade_std  number, metres, with validity: standard deviation of the bias where the network is not believed
+    largest_yaw_std  optional: number, radians; where the yaw is less certain, the network says nothing
 Input: one float tensor (n, number of features), of any name. Output: one float tensor (n, 1), bias in metres; (n, 2),
 bias and its standard deviation in metres; or (n, 3), with the share 0 ... 1 of what can be known that the network knows
 there: it has already faded bias and deviation itself.
@@ -68,6 +69,7 @@ class Network:
         self.name = str(json.loads(meta["name"]))
         limits = json.loads(meta.get("validity", "{}"))
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
+        self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
         self._inputs, self._judged = ([_COLUMN[name] for name in some] for some in (names, limits))
         self._lower, self._upper, self._margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
         if not ((self._margin > 0.0) & (self._upper >= self._lower)).all():
@@ -75,7 +77,7 @@ class Network:
 
     def predict(self, samples):
         """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
-        (n,) arrays. The first two are NaN where a feature that is needed is unknown."""
+        (n,) arrays. The first two are NaN where a feature that is needed, or the yaw, is unknown."""
         table = everything(samples)
         x = (table[:, self._inputs] - self._offset) / self._scale
         out = self._session.run(None, {self._input: x.astype(np.float32)})[0].astype(float)
@@ -88,4 +90,7 @@ class Network:
             trust = 1.0 - np.clip(beyond.max(axis=1), 0.0, 1.0)
             bias, known = trust * bias, trust * known
             std = np.sqrt((trust * std) ** 2 + (1.0 - trust**2) * self._fade_std**2)
+        if samples.yaw_std is not None:
+            undecided = samples.yaw_std > self._largest_yaw_std
+            bias[undecided] = std[undecided] = np.nan
         return bias, std, known

@@ -8,53 +8,54 @@ class Poses:
 
     def __init__(self, history):
         self._history, self._count = history, 0
-        self._t, self._p, self._q = (np.empty((2 * history, *shape)) for shape in ((), (3,), (4,)))
+        self._columns = [np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), ())]
 
     @property
     def t(self):
         """Stamps, (m,) s."""
-        return self._t[: self._count]
+        return self._columns[0][: self._count]
 
     @property
     def p(self):
         """Positions, (m, 3) m."""
-        return self._p[: self._count]
+        return self._columns[1][: self._count]
 
     @property
     def q(self):
         """Attitudes, (m, 4) x y z w, body to world."""
-        return self._q[: self._count]
+        return self._columns[2][: self._count]
 
     @property
     def newest(self):
         """Stamp of the last pose, s; -inf if there is none."""
-        return self._t[self._count - 1] if self._count else -np.inf
+        return self.t[-1] if self._count else -np.inf
 
-    def add(self, t, p, q):
-        """Append one pose, or several: t (k,), p (k, 3), q (k, 4). Those not later than all before them are ignored."""
-        t, p, q = np.reshape(t, -1), np.reshape(p, (-1, 3)), np.reshape(q, (-1, 4))
-        rising = t > np.maximum.accumulate(np.concatenate([[self.newest], t]))[:-1]
+    def add(self, t, p, q, yaw_std):
+        """Append one pose, or several: t (k,), p (k, 3), q (k, 4), yaw_std (k,) rad. Those not later than all before them
+        are ignored."""
+        new = [np.reshape(part, (-1, *column.shape[1:])) for part, column in zip((t, p, q, yaw_std), self._columns)]
+        rising = new[0] > np.maximum.accumulate(np.concatenate([[self.newest], new[0]]))[:-1]
         if not rising.all():
-            t, p, q = t[rising], p[rising], q[rising]
-        for first in range(0, len(t), self._history):
-            self._append(*(part[first : first + self._history] for part in (t, p, q)))
+            new = [part[rising] for part in new]
+        for first in range(0, len(new[0]), self._history):
+            self._append([part[first : first + self._history] for part in new])
 
     def at(self, places):
-        """(p (n, 3), q (n, 4)) of the poses with these numbers (n,); NaN for -1."""
+        """(p (n, 3), q (n, 4), yaw_std (n,)) of the poses with these numbers (n,); NaN for -1."""
         known = places >= 0
-        if known.all():
-            return self._p[places], self._q[places]
-        p, q = np.full((len(places), 3), np.nan), np.full((len(places), 4), np.nan)
-        p[known], q[known] = self._p[places[known]], self._q[places[known]]
-        return p, q
+        parts = [column[places] for column in self._columns[1:]]
+        if not known.all():
+            for part in parts:
+                part[~known] = np.nan
+        return parts
 
-    def _append(self, *new):
+    def _append(self, new):
         end = self._count + len(new[0])
         if end > 2 * self._history:  # make room
             kept = self._count - self._history
-            for column in (self._t, self._p, self._q):
+            for column in self._columns:
                 column[: self._history] = column[kept : self._count].copy()
             self._count, end = self._history, self._history + len(new[0])
-        for column, values in zip((self._t, self._p, self._q), new):
+        for column, values in zip(self._columns, new):
             column[self._count : end] = values
         self._count = end

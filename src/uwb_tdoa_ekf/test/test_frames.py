@@ -1,6 +1,6 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
-from uwb_tdoa_ekf.frames import to_odometry
+from uwb_tdoa_ekf.frames import to_odometry, yaw_std
 
 
 def state(seed=0):
@@ -25,6 +25,12 @@ def test_covariance_is_that_of_what_an_odometry_holds():
     np.testing.assert_allclose(u[0], Rotation.from_quat(q).inv().apply(v), atol=1e-12)
     for part in (slice(0, 6), slice(6, 9)):  # pose and twist
         np.testing.assert_allclose(converted[0][part, part], sampled[part, part], atol=0.02 * sampled[part, part].max())
+
+
+def test_yaw_std_is_that_of_the_odometry():
+    q, v, covariance = (np.stack(rows) for rows in zip(*map(state, range(5))))
+    converted = to_odometry(q, v, covariance)[1]
+    np.testing.assert_allclose(yaw_std(q, covariance), np.sqrt(converted[:, 5, 5]), rtol=1e-12)
 
 
 def test_many_rows_are_independent():

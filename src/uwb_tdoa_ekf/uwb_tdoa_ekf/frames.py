@@ -24,3 +24,10 @@ def to_odometry(q, v, covariance):
     jacobian[:, 6:, 3:6] = to_body
     jacobian[:, [6, 6, 7, 7, 8, 8], [7, 8, 6, 8, 6, 7]] = u[:, [2, 1, 2, 0, 1, 0]] * (-1, 1, 1, -1, -1, 1)  # [u]x
     return u, jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+
+
+def yaw_std(q, covariance):
+    """Standard deviation of the rotation about the world's z, (n,) rad: that of to_odometry. Arguments as there, without v."""
+    x, y, z, w = q.T
+    vertical = np.stack([2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)], axis=1)  # in the body
+    return np.sqrt(np.einsum("ni,nij,nj->n", vertical, covariance[:, 6:, 6:], vertical))

@@ -9,6 +9,7 @@ from uwb_tdoa_bias.corrector import Corrector
 from .config import FilterConfig
 from .engine import INVALID, run
 from .estimator import VERDICTS, Odometry, Residuals
+from .frames import yaw_std
 from .hypotheses import quarter
 from .memory import BEST, RECOVERIES, TAPED, new_memory
 from .tape import new_tape
@@ -84,7 +85,8 @@ def run_offline(flight, config=None, corrector=None, tape=None):
         rows.append(row[:count])
         covariances.append(covariance[:count])
         if not corrector.idle:
-            corrector.add_pose(row[:count, 0], row[:count, 1:4], row[:count, 7:11])
+            q = row[:count, 7:11]
+            corrector.add_pose(row[:count, 0], row[:count, 1:4], q, yaw_std(q, covariance[:count]))
     odometry = Odometry.from_rows(np.concatenate(rows), np.concatenate(covariances))
     residuals = Residuals(
         tdoa.t, tdoa.a, tdoa.b, outcome[:, 0], outcome[:, 1], outcome[:, 2], outcome[:, 3].astype(np.uint8)

@@ -20,6 +20,7 @@ class Samples:
     interval : (n,) s since the TDOA before; previous : (n,) id of the later anchor of that; vibration : (n,) m/s^2,
     root of the power of the high-passed accelerometer; None if unknown.
     extra : {name: (n,)}, anything else that a recording holds; None if nobody asked.
+    yaw_std : (n,) rad, standard deviation of the yaw in q; None for a known one.
     """
 
     t: np.ndarray
@@ -36,6 +37,7 @@ class Samples:
     previous: np.ndarray | None = None
     vibration: np.ndarray | None = None
     extra: dict | None = None
+    yaw_std: np.ndarray | None = None
 
     def __len__(self):
         return len(self.t)

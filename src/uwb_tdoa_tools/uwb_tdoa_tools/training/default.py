@@ -63,7 +63,7 @@ def learn(count, options=OPTIONS):
     meta = {
         "name": "default", "kind": "structured", "clip": models.CLIP, "seed": SEED, "data": labelling.digest(known),
         "trained_on": [f"{count} simulated flights in {place}" for place in PLACES],
-        "constellations": labelling.constellations(known),
+        "constellations": labelling.constellations(known), "largest_yaw_std": models.LARGEST_YAW_STD,
     }  # fmt: skip
     return models.fit_structured(thin, 0, options)[0], meta
 

@@ -23,6 +23,8 @@ WITHOUT = tuple(name for name in FEATURES if "_A_" not in name)  # without ancho
 class Paper:
     """The network, fitted. `fit` makes one."""
 
+    sees_attitude = True
+
     def __init__(self, names, offset, scale, layers, std):
         """names : features; offset, scale : (k,); layers : list of (weights (i, o), biases (o,)); std : m."""
         self.names, self.offset, self.scale, self.layers, self.std = names, offset, scale, layers, std

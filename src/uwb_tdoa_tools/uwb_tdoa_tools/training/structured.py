@@ -141,6 +141,11 @@ class Structured:
             first = mine.stop
 
     @property
+    def sees_attitude(self):
+        """Whether the mean depends on how the tag is turned."""
+        return bool(self.links)
+
+    @property
     def link_columns(self):
         """How many dense columns of `design` there are."""
         return sum(link.whiten.shape[1] for link in self.links.values())
