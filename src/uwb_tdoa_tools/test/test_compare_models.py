@@ -2,6 +2,7 @@ import json
 
 import pytest
 
+from uwb_tdoa_bias.network import Network
 from uwb_tdoa_tools import compare_models
 from uwb_tdoa_tools.training import simulated, structured
 
@@ -25,6 +26,7 @@ def test_compares_on_constellations_never_seen(tmp_path, capsys):
     assert report["tdoa_rms"]["structured"] < report["tdoa_rms"]["none"]
     assert 0.3 < report["normalised_variance"]["structured"] < 3.0
     assert (tmp_path / "structured" / "model.onnx").exists() and (tmp_path / "physics" / "effects.yaml").exists()
+    assert Network(tmp_path / "structured" / "model.onnx").meta["largest_yaw_std"] == "1.0"
     assert {"table.md", "histograms.png", "rmse.png"} <= {path.name for path in tmp_path.iterdir()}
     printed = capsys.readouterr().out
     assert "**mean**" in printed and "repeat" not in printed.lower() and (tmp_path / "table.md").read_text() in printed
