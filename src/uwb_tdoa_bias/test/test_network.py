@@ -119,13 +119,14 @@ def test_wrong_metadata_are_refused_by_name(tmp_path, meta, named):
     assert named in str(error.value) and str(path) in str(error.value)
 
 
-def test_says_nothing_before_the_yaw_is_known(tmp_path):
+def test_takes_nothing_out_before_the_yaw_is_known(tmp_path):
     network, s = Network(changed(tmp_path, largest_yaw_std="1.0")), batch(3)
     plain = network.predict(s)[0]
-    assert np.isfinite(plain).all()
-    bias, std, _ = network.predict(replace(s, yaw_std=np.array([0.0, 1.0, 1.1])))
-    np.testing.assert_array_equal(bias, [*plain[:2], np.nan])
-    np.testing.assert_array_equal(np.isnan(std), [False, False, True])
+    assert (plain != 0.0).all()
+    bias, std, known = network.predict(replace(s, yaw_std=np.array([0.0, 1.0, 1.1])))
+    np.testing.assert_array_equal(bias, [*plain[:2], 0.0])
+    np.testing.assert_array_equal(std, [0.0, 0.0, abs(plain[2])])
+    np.testing.assert_array_equal(known, [1.0, 1.0, 0.0])
 
 
 def test_fades_beyond_what_it_knows(tmp_path):

@@ -8,7 +8,8 @@ Metadata of the model (all values JSON text):
     validity  optional: {feature: [lowest, highest, margin]}, in the units of the features. Inside, the network is
               believed; beyond by `margin` or more, not at all; linearly in between, the worst feature counting.
     fade_std  number, metres, with validity: standard deviation of the bias where the network is not believed
-    largest_yaw_std  optional: number, radians; where the yaw is less certain, the network says nothing
+    largest_yaw_std  optional: number, radians; where the yaw is less certain, the bias is not taken out, but counts as
+              uncertainty
 Input: one float tensor (n, number of features), of any name. Output: one float tensor (n, 1), bias in metres; (n, 2),
 bias and its standard deviation in metres; or (n, 3), with the share 0 ... 1 of what can be known that the network knows
 there: it has already faded bias and deviation itself.
@@ -77,7 +78,7 @@ class Network:
 
     def predict(self, samples):
         """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
-        (n,) arrays. The first two are NaN where a feature that is needed, or the yaw, is unknown."""
+        (n,) arrays. The first two are NaN where a feature that is needed is unknown."""
         table = everything(samples)
         x = (table[:, self._inputs] - self._offset) / self._scale
         out = self._session.run(None, {self._input: x.astype(np.float32)})[0].astype(float)
@@ -92,5 +93,6 @@ class Network:
             std = np.sqrt((trust * std) ** 2 + (1.0 - trust**2) * self._fade_std**2)
         if samples.yaw_std is not None:
             undecided = samples.yaw_std > self._largest_yaw_std
-            bias[undecided] = std[undecided] = np.nan
+            std[undecided] = np.hypot(std[undecided], bias[undecided])
+            bias[undecided] = known[undecided] = 0.0
         return bias, std, known

@@ -47,7 +47,7 @@ def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_
     (layout,) = meta["constellations"]
     assert set(layout) == {str(i) for i in range(8)} and len(meta["data"]) == 16
     assert set(meta["validity"]) >= {"forward_x", "up_x"} and meta["fade_std"] > 0.0
-    assert meta["features"][:3] == ["x", "y", "z"] and "largest_yaw_std" not in meta  # of one constellation: maps of places
+    assert meta["features"][:3] == ["x", "y", "z"] and "largest_yaw_std" not in meta  # maps of places alone
     assert len(meta["offset"]) == len(meta["scale"]) == len(meta["features"])
 
     told = json.loads((out / "training.json").read_text())

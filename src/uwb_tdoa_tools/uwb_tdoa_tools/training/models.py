@@ -17,7 +17,8 @@ MARGINS = {"d": 1.0, "f": 2.0, "u": 0.5}  # trust fades over: positions m, forwa
 SLACK = 0.2  # added to the box of attitudes on every side: that much is an estimated attitude off at times
 SMALLEST_STD = 0.01  # m, of what remains
 POINTS = 4  # of a learning curve over flights
-LARGEST_YAW_STD = 1.0  # rad; a model that has seen attitudes is of no use before the filter has found the yaw
+LARGEST_YAW_STD = 1.0  # rad; a model that tells headings apart is of no use before the filter has found the yaw
+HEADINGS = 1.0  # range of the forward axis in training from which on a model tells headings apart
 _ATTITUDE = ("forward_x", "forward_y", "up_x", "up_y")
 
 
@@ -76,7 +77,8 @@ def train(kind, training, validation, seed, name, options=structured.Options(), 
     if model:
         learned_from = groups[0] if kind.startswith("paper") else everything
         meta |= {"validity": _validity(learned_from, model.judged), "fade_std": _rms(one.error for one in groups[1])}
-        if model.sees_attitude and any(one.has_attitude for one in learned_from):
+        heads = [meta["validity"][name] for name in ("forward_x", "forward_y")]
+        if model.sees_attitude and any(high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads):
             meta["largest_yaw_std"] = LARGEST_YAW_STD
     errors = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
     return Trained(model, effects, curve, meta, errors)
