@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.anchors import Anchors
 from uwb_tdoa_bias.corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.poses import told_yaw_std, turned
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
 DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))
@@ -157,6 +158,32 @@ def test_poses_told_together_are_poses_told_one_by_one(batches, asked):
     newest = [t for t in np.array(asked) / 8.0 if len(one.t) == 0 or t >= one.t[-5:][0]]
     found = [correct(corrector, newest) for corrector in correctors]
     np.testing.assert_array_equal(found[0].bias, found[1].bias)
+
+
+def test_effects_are_those_of_the_mean_heading_while_the_yaw_is_unknown():
+    arm = EffectSet((TagLeverArm({"x": 0.3, "z": 0.2}),))
+    told = {}
+    for yaw_std in (0.1, 2.0):
+        corrector = Corrector(ANCHORS, arm, lag=0.0)
+        corrector.add_pose(0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), yaw_std)
+        told[yaw_std] = correct(corrector, [0.0])
+    upright = Corrector(ANCHORS, EffectSet((TagLeverArm({"z": 0.2}),)), lag=0.0)
+    upright.add_pose(0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(told[2.0].bias, correct(upright, [0.0]).bias, atol=0.01)  # what is across averages out
+    assert abs(told[0.1].bias[0] - told[2.0].bias[0]) > 0.03
+    assert told[0.1].std[0] == 0.0 and told[2.0].std[0] > 0.03
+
+
+def test_without_an_estimated_attitude_the_yaw_is_what_everybody_assumes():
+    std = np.array([[0.1, 0.1, 2.0], [1.2, 1.2, 2.5], [0.1, 0.1, 0.3]])
+    np.testing.assert_array_equal(told_yaw_std(std), [2.0, 0.0, 0.3])
+
+
+@given(st.integers(-4, 4), st.integers(0, 1000))
+def test_turned_turns_about_the_vertical(quarters, seed):
+    q = Rotation.random(3, random_state=seed)
+    expected = Rotation.from_euler("z", quarters * np.pi / 2) * q
+    assert np.abs((Rotation.from_quat(turned(q.as_quat(), quarters)) * expected.inv()).magnitude()).max() < 1e-9
 
 
 def test_empty_batch():

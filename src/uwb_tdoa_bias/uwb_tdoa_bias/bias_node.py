@@ -24,10 +24,11 @@ from .effects import EffectSet
 from .errors import InputError
 from .hold import Hold
 from .network import Network
+from .poses import told_yaw_std
 from .stamps import StampWatch
 
 SHIPPED = "default"  # as model_file: the model that comes with the package
-YAW = 35  # place of the yaw's variance in the covariance of a pose
+ROTATIONS = [21, 28, 35]  # places of the variances about the axes in the covariance of a pose
 EARLY = 2000  # TDOAs kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
@@ -110,9 +111,9 @@ class BiasNode(Node):
             for _, message in held:
                 self._take(message)
         for t, pose in believed:
-            position, yaw_variance = pose.pose.position, pose.covariance[YAW]
+            position, turns = pose.pose.position, np.sqrt(np.maximum(pose.covariance[ROTATIONS], 0.0))
             at, orientation = (position.x, position.y, position.z), ros.orientation_of(pose.pose.orientation)
-            self._corrector.add_pose(t, at, orientation, math.sqrt(max(yaw_variance, 0.0)))
+            self._corrector.add_pose(t, at, orientation, told_yaw_std(turns[None])[0])
 
     def _on_tdoa(self, message):
         self._counts["received"] += 1

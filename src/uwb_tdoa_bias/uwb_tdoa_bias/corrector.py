@@ -1,15 +1,16 @@
 """From raw TDOAs to corrected ones: the core of bias_node and of the offline engine."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .effects import EffectSet, Samples
 from .motion import motion
-from .poses import Poses
+from .poses import Poses, turned
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
+LARGEST_YAW_STD = 1.0  # rad; a yaw that is less certain is unknown: the filter follows four, 90 degrees apart
 FADED_BELOW = 0.5  # share of what can be known that a network's prediction has at least, or it counts as faded
 
 
@@ -75,8 +76,8 @@ class Corrector:
         extra = self._extra(t, b, places) if self.effects.needs_motion else {}
         self._first = t[0] if self._first is None else self._first
         samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std, **extra)
-        bias = self.effects.bias(samples)
-        std = spread = self.effects.spread(samples)
+        bias, spread = self._effects_at(samples)
+        std = spread
         status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
         if self.network is not None:
             learned, std, share = self.network.predict(samples)
@@ -85,6 +86,16 @@ class Corrector:
             std = np.hypot(spread, np.where(told & np.isfinite(std), std, 0.0))
             status[told] = np.where(share[told] < FADED_BELOW, FADED, NETWORK)
         return Correction(bias, std, d - bias, status)
+
+    def _effects_at(self, samples):
+        """(bias, spread) of the effects; while the yaw is unknown their mean over four headings, and its scatter."""
+        bias, spread = self.effects.bias(samples), self.effects.spread(samples)
+        unknown = samples.yaw_std > LARGEST_YAW_STD
+        if unknown.any() and len(self.effects):
+            each = np.stack([self.effects.bias(replace(samples, q=turned(samples.q, k))) for k in range(4)])
+            bias = np.where(unknown, each.mean(axis=0), bias)
+            spread = np.where(unknown, np.hypot(spread, each.std(axis=0)), spread)
+        return bias, spread
 
     def _extra(self, t, b, places):
         """Motion of the tag at the poses numbered `places`, and what was heard before each TDOA: for Samples."""

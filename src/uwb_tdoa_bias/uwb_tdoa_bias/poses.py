@@ -2,6 +2,8 @@
 
 import numpy as np
 
+TILT = 0.5  # rad; a filter that does not know the tilt better estimates no attitude
+
 
 class Poses:
     """Poses in the order of their stamps, of which at least the last `history` are kept."""
@@ -59,3 +61,18 @@ class Poses:
         for column, values in zip(self._columns, new):
             column[self._count : end] = values
         self._count = end
+
+
+def told_yaw_std(std):
+    """Standard deviation of the yaw, (n,) rad, of attitudes with deviations std (n, 3) rad about the axes of the world.
+
+    It is 0 where the tilt is not known either: then no attitude is estimated, and level at yaw 0 is what is meant.
+    """
+    return np.where(std[:, :2].max(axis=1) < TILT, std[:, 2], 0.0)
+
+
+def turned(q, quarters):
+    """Attitudes q (n, 4) x y z w, turned about the vertical by some quarters of a turn."""
+    s, c = np.sin(0.25 * np.pi * quarters), np.cos(0.25 * np.pi * quarters)
+    x, y, z, w = q.T
+    return np.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], axis=1)

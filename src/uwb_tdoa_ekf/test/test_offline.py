@@ -10,9 +10,11 @@ from scipy.stats import chi2
 from uwb_tdoa_bias.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_bias.flight import Flight, Imu, Tdoas
+from uwb_tdoa_bias.poses import told_yaw_std
 from uwb_tdoa_ekf.config import FilterConfig
 from uwb_tdoa_ekf.engine import INVALID, STARTUP, USED
 from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.frames import to_odometry
 from uwb_tdoa_ekf.offline import run_offline
 
 IDS = corners().ids.tolist()
@@ -26,8 +28,10 @@ def live(flight, corrector, config=None):
 
     def advance():
         odometry, residuals = estimator.advance()
-        for t, p, q in zip(odometry.t, odometry.p, odometry.q):
-            corrector.add_pose(t, p, q)
+        told = to_odometry(odometry.q, odometry.v, odometry.covariance)[1] if len(odometry) else np.empty((0, 9, 9))
+        yaw_std = told_yaw_std(np.sqrt(told[:, [3, 4, 5], [3, 4, 5]]))
+        for pose in zip(odometry.t, odometry.p, odometry.q, yaw_std):
+            corrector.add_pose(*pose)
         parts.append((odometry, residuals))
 
     for t, stream, i in messages(flight):

@@ -26,8 +26,8 @@ def to_odometry(q, v, covariance):
     return u, jacobian @ covariance @ jacobian.transpose(0, 2, 1)
 
 
-def yaw_std(q, covariance):
-    """Standard deviation of the rotation about the world's z, (n,) rad: that of to_odometry. Arguments as there, without v."""
-    x, y, z, w = q.T
-    vertical = np.stack([2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)], axis=1)  # in the body
-    return np.sqrt(np.einsum("ni,nij,nj->n", vertical, covariance[:, 6:, 6:], vertical))
+def rotation_std(q, covariance):
+    """Standard deviations of the rotation about the world's axes, (n, 3) rad: those of to_odometry. Arguments as there, without
+    v."""
+    rotation = Rotation.from_quat(q).as_matrix()
+    return np.sqrt(np.einsum("nki,nij,nkj->nk", rotation, covariance[:, 6:, 6:], rotation))

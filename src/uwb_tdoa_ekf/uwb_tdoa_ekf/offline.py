@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwb_tdoa_bias.corrector import Corrector
+from uwb_tdoa_bias.poses import told_yaw_std
 
 from .config import FilterConfig
 from .engine import INVALID, run
 from .estimator import VERDICTS, Odometry, Residuals
-from .frames import yaw_std
+from .frames import rotation_std
 from .hypotheses import quarter
 from .memory import BEST, RECOVERIES, TAPED, new_memory
 from .tape import new_tape
@@ -84,9 +85,10 @@ def run_offline(flight, config=None, corrector=None, tape=None):
         outcome[batch] = result
         rows.append(row[:count])
         covariances.append(covariance[:count])
-        if not corrector.idle:
+        if not corrector.idle and count:
             q = row[:count, 7:11]
-            corrector.add_pose(row[:count, 0], row[:count, 1:4], q, yaw_std(q, covariance[:count]))
+            certain = told_yaw_std(rotation_std(q, covariance[:count]))
+            corrector.add_pose(row[:count, 0], row[:count, 1:4], q, certain)
     odometry = Odometry.from_rows(np.concatenate(rows), np.concatenate(covariances))
     residuals = Residuals(
         tdoa.t, tdoa.a, tdoa.b, outcome[:, 0], outcome[:, 1], outcome[:, 2], outcome[:, 3].astype(np.uint8)
