@@ -55,7 +55,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what):
     }[what]
     config, told = FilterConfig(), ["--params-file", f"{SOURCES}/uwb_tdoa_ekf/config/ekf_node.yaml"]
     if what == "shipped":  # takes nothing out before the yaw is known
-        config, told = FilterConfig(initial_yaw_std=0.1), [*told, "-p", "initial_yaw_std:=0.1"]
+        config, told = FilterConfig(initial_yaw_std=0.1), ["-p", "initial_yaw_std:=0.1"]
     rig = make_rig()
     rig.start("bias_node", "ekf_node", bias_node=parameters, ekf_node=told)
     rig.send_anchors(flight.anchors)
