@@ -1,10 +1,12 @@
+from dataclasses import fields
+
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
+from uwb_tdoa_bias.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_bias.poses import told_yaw_std, turned
 
@@ -26,10 +28,13 @@ class Height:
         return np.where(z > 2.0, np.nan, z), np.full(len(samples), self.std), np.full(len(samples), self.known)
 
 
-def correct(corrector, t):
+def correct(corrector, t, dense=False):
+    """Correct measurements of 1 m at stamps t; `dense`: each is preceded by one with its own stamp."""
     t = np.atleast_1d(np.asarray(t, dtype=float))
-    rows = np.arange(len(t))
-    return corrector.correct(t, rows % 4, (rows + 1) % 4, np.ones(len(t)))
+    each = 2 if dense else 1
+    rows = np.repeat(np.arange(len(t)), each)
+    found = corrector.correct(np.repeat(t, each), rows % 4, (rows + 1) % 4, np.ones(len(rows)))
+    return Correction(*(getattr(found, field.name)[each - 1 :: each] for field in fields(Correction)))
 
 
 def climbing(corrector, stamps):
@@ -78,13 +83,14 @@ def test_effects_see_the_pose():
     st.lists(st.integers(0, 120), min_size=1, max_size=10),
     st.integers(0, 20),
 )
-def test_uses_the_newest_pose_not_younger_than_the_lag(poses, asked, lag):
+def test_uses_the_newest_pose_a_lag_before_the_preceding_measurement(poses, asked, lag):
     # eighths of a second are exact: "no later than" is tested at equality too
     corrector = climbing(Corrector(ANCHORS, None, Height(), lag=lag / 8), np.array(poses) / 8)
     told = [t for k, t in enumerate(poses) if t > max(poses[:k], default=-1)]  # stamps must rise, others are ignored
     found = correct(corrector, np.array(asked) / 8)
-    for t, bias, status in zip(asked, found.bias, found.status):
-        known = [pose for pose in told if pose <= t - lag]
+    for k, (t, bias, status) in enumerate(zip(asked, found.bias, found.status)):
+        preceding = min(t, max(asked[:k], default=t))
+        known = [pose for pose in told if pose <= preceding - lag]
         height = max(known) / 8 if known else 3.0
         assert bias == (height if height <= 2.0 else 0.0)
         assert status == (NETWORK if height <= 2.0 else PASSED)
@@ -112,6 +118,7 @@ def test_a_batch_is_the_same_as_one_by_one():
     t = np.random.default_rng(0).uniform(-0.1, 3.1, 200)
     a = np.arange(200) % 4
     together = corrector.correct(t, a, (a + 1) % 4, t)
+    corrector = climbing(Corrector(ANCHORS, ARM, Height()), np.arange(0.0, 3.0, 0.01))
     for i in range(200):
         alone = corrector.correct(t[i : i + 1], a[i : i + 1], (a[i : i + 1] + 1) % 4, t[i : i + 1])
         for name in ("bias", "std", "corrected", "status"):
@@ -120,7 +127,7 @@ def test_a_batch_is_the_same_as_one_by_one():
 
 def test_where_the_network_cannot_tell_effects_remain():
     corrector = climbing(Corrector(ANCHORS, DELAYS, Height(), lag=0.0), [1.0, 2.5])
-    found = correct(corrector, [0.0, 1.0, 2.5])  # no pose yet; a pose it knows; one it does not
+    found = correct(corrector, [0.0, 1.0, 2.5], dense=True)  # no pose yet; a pose it knows; one it does not
     np.testing.assert_allclose(found.bias, [-0.1, -0.2 + 1.0, 0.2])
     assert found.status.tolist() == [EFFECTS, NETWORK, EFFECTS]
     assert found.std.tolist() == [0.0, 0.05, 0.0]
@@ -129,7 +136,7 @@ def test_where_the_network_cannot_tell_effects_remain():
 @pytest.mark.parametrize(("known", "status"), [(1.0, NETWORK), (0.5, NETWORK), (0.49, FADED), (0.0, FADED)])
 def test_says_when_the_network_has_faded(known, status):
     corrector = climbing(Corrector(ANCHORS, None, Height(known=known), lag=0.0), [1.0])
-    found = correct(corrector, [0.0, 1.0])  # no pose yet: the network says nothing
+    found = correct(corrector, [0.0, 1.0], dense=True)  # no pose yet: the network says nothing
     assert found.status.tolist() == [PASSED, status] and found.std.tolist() == [0.0, 0.05]
 
 
@@ -140,7 +147,7 @@ def test_a_network_without_a_finite_deviation_predicts_none():
 
 def test_forgets_old_poses_and_keeps_the_last_ones():
     corrector = climbing(Corrector(ANCHORS, None, Height(), lag=0.0, history=10), np.arange(1000) / 1000)
-    found = correct(corrector, np.array([0.001, 0.990, 0.995, 0.999]))
+    found = correct(corrector, [0.001, 0.990, 0.995, 0.999], dense=True)
     np.testing.assert_allclose(found.bias, [0.0, 0.990, 0.995, 0.999], atol=1e-12)
     assert len(corrector._poses.t) == len(corrector._poses.p) == len(corrector._poses.q) <= 20
 

@@ -7,9 +7,18 @@ def test_leaves_when_ready_in_order_of_arrival():
     hold = Hold(limit=1.0)
     for t, item in ((0.3, "a"), (0.1, "b"), (0.4, "c")):
         hold.add(t, item)
-    assert hold.take(lambda t: t < 0.2) == []  # b is ready but waits behind a
-    assert hold.take(lambda t: t < 0.35) == [(0.3, "a", True), (0.1, "b", True)]
-    assert len(hold) == 1
+    assert hold.take(lambda before: before < 0.2) == []  # b is ready but waits behind a
+    assert hold.take(lambda before: before < 0.3) == []
+    assert hold.take(lambda before: before <= 0.3) == [(0.3, "a", True), (0.1, "b", True), (0.4, "c", True)]
+
+
+def test_after_a_gap_what_counts_is_the_item_before_it():
+    hold = Hold(limit=10.0)
+    hold.add(1.0, "a")
+    hold.add(5.0, "b")
+    assert hold.take(lambda before: before < 2.0) == [(1.0, "a", True), (5.0, "b", True)]
+    hold.add(5.1, "c")  # b has left, and still counts
+    assert hold.take(lambda before: before < 5.0) == []
 
 
 def test_leaves_unready_when_a_newer_one_is_too_far_ahead():
@@ -23,12 +32,13 @@ def test_leaves_unready_when_a_newer_one_is_too_far_ahead():
 
 @given(st.lists(st.tuples(st.floats(0, 2), st.floats(0, 2)), max_size=40))
 def test_every_item_leaves_once_in_order_and_not_before_its_time(steps):
-    hold, out, newest = Hold(limit=0.2), [], 0.0
+    hold, out, before = Hold(limit=0.2), [], []
     for number, (t, progress) in enumerate(steps):
         hold.add(t, number)
-        newest = max(newest, t)
-        for stamp, item, ready in hold.take(lambda stamp: stamp <= progress):
-            assert ready == (stamp <= progress)
+        newest = max([t, *before])
+        before.append(t)
+        for stamp, item, ready in hold.take(lambda before: before <= progress):
+            assert ready == (min(stamp, max(before[:item], default=stamp)) <= progress)
             assert ready or newest - stamp > 0.2
             out.append(item)
         assert out == list(range(len(out)))

@@ -46,7 +46,7 @@ class BiasNode(Node):
         )
         if model_file == SHIPPED:
             model_file = Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "default.onnx"
-        self._lag = ros.parameter(self, "pose_lag", 0.05, "a TDOA is corrected at the newest pose this much older, s")
+        self._lag = ros.parameter(self, "pose_lag", 0.05, "the pose used is this much older than the TDOA before, s")
         self._limit = ros.parameter(self, "hold", 0.225, "longest wait of a TDOA for its pose, s of stamps")
         for name, value in (("pose_lag", self._lag), ("hold", self._limit)):
             if not 0.0 < value < math.inf:
@@ -161,8 +161,8 @@ class BiasNode(Node):
                 message.header.stamp = self._epoch.stamp(at)
             self._publish(message, *values)
 
-    def _is_ready(self, t):
-        return self._poses.newest == -math.inf or self._corrector.ready(t)
+    def _is_ready(self, before):
+        return self._poses.newest == -math.inf or self._corrector.ready(before)
 
     def _publish(self, message, bias, std, status):
         out = self._message

@@ -27,8 +27,9 @@ class Correction:
 class Corrector:
     """Predicts the systematic error of each TDOA at the pose the tag had a little earlier, and removes it.
 
-    The pose used for a measurement stamped t is the newest one stamped no later than t - lag. It depends on stamps alone,
-    so that a recording gives the same result at any speed, and leaves the filter `lag` seconds to report that pose.
+    The pose used for a measurement is the newest one stamped no later than `lag` before the measurement that preceded it.
+    It depends on stamps alone, so that a recording gives the same result at any speed; it leaves the filter `lag` seconds to
+    report that pose; and the filter can: it needs nothing later than the preceding measurement, after a gap neither.
     """
 
     def __init__(self, anchors, effects=None, network=None, lag=0.05, history=4096):
@@ -45,6 +46,7 @@ class Corrector:
     def reset(self):
         """Forget all poses."""
         self._poses = Poses(self._history)
+        self._newest = None  # latest stamp of a TDOA
         self._first = self._last = None  # stamp of the first TDOA; stamp and later anchor of the last one
 
     @property
@@ -57,9 +59,9 @@ class Corrector:
         the vertical; or several: (k,), (k, 3), (k, 4), (k,). Stamps must rise; others are ignored."""
         self._poses.add(t, p, q, np.broadcast_to(yaw_std, np.shape(t)))
 
-    def ready(self, t):
-        """True if no pose that is still to come can change the correction of a measurement stamped t."""
-        return self.idle or self._poses.newest > t - self.lag
+    def ready(self, before):
+        """True if no pose that is still to come can change the correction of a measurement that follows one stamped so."""
+        return self.idle or self._poses.newest > before - self.lag
 
     def correct(self, t, a, b, d):
         """Correct a batch.
@@ -71,7 +73,9 @@ class Corrector:
         zeros = np.zeros(n)
         if self.idle or n == 0:
             return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
-        places = np.searchsorted(self._poses.t, t - self.lag, side="right") - 1
+        newest = np.maximum.accumulate(np.concatenate([t[:1] if self._newest is None else [self._newest], t]))
+        self._newest = newest[-1]
+        places = np.searchsorted(self._poses.t, np.minimum(newest[:-1], t) - self.lag, side="right") - 1
         p, q, yaw_std = self._poses.at(places)
         extra = self._extra(t, b, places) if self.effects.needs_motion else {}
         self._first = t[0] if self._first is None else self._first

@@ -59,16 +59,17 @@ def test_a_measurement_waits_for_its_pose(make_rig, delays):
 
     rig.send_pose(0.5)
     rig.counts("bias_node", poses=1)
-    for t in (0.54, 0.58, 0.62):
+    for t in (0.56, 0.6, 0.64, 0.68):
         rig.send_tdoa(t, 14, 10, 1.0)
-    counts = rig.counts("bias_node", received=4)
-    assert (counts["published"], counts["waiting"]) == (2, 2)  # only 0.54 is less than 50 ms after the pose
-    rig.send_pose(0.56)
-    rig.wait(lambda: len(rig.corrected) == 3, "0.58")
-    rig.send_pose(0.575)
-    rig.wait(lambda: len(rig.corrected) == 4, "0.62")
-    assert [round(seconds_of(m.header.stamp), 2) for m in rig.corrected] == [0.1, 0.54, 0.58, 0.62]
-    assert rig.counts("bias_node", published=4)["released before their pose"] == 0
+    counts = rig.counts("bias_node", received=5)
+    # The filter can have no later pose than that of 0.1 before it gets 0.56. What precedes 0.6 is 60 ms after the pose.
+    assert (counts["published"], counts["waiting"]) == (2, 3)
+    rig.send_pose(0.57)
+    rig.wait(lambda: len(rig.corrected) == 4, "0.6 and 0.64, which follow 0.56 and 0.6")
+    rig.send_pose(0.6)
+    rig.wait(lambda: len(rig.corrected) == 5, "0.68, which follows 0.64")
+    assert [round(seconds_of(m.header.stamp), 2) for m in rig.corrected] == [0.1, 0.56, 0.6, 0.64, 0.68]
+    assert rig.counts("bias_node", published=5)["released before their pose"] == 0
 
 
 def test_late_stamps_are_moved(make_rig, tmp_path):
