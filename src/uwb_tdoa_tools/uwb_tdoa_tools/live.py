@@ -64,7 +64,7 @@ def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, s
         say("starting the nodes; the very first start compiles the filter, which takes a minute")
         wait(READY_LIMIT, "the nodes to find each other", processes, node, lambda: _is_ready(node, diagnostics))
         say(f"replaying {bag} at rate {rate:g}")
-        options = ("--rate", rate, "--wait-matched", MATCH_LIMIT, "--wait-topics", *inputs)
+        options = ("--rate", rate, "--follow", "odometry", "--wait-matched", MATCH_LIMIT, "--wait-topics", *inputs)
         replay = processes.start("uwb_tdoa_tools", "replay", bag, *options, may_end=True)
         wait(None, None, processes, node, lambda: replay.poll() is not None)
         diagnostics.forget()

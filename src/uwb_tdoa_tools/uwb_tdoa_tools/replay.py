@@ -17,6 +17,7 @@ from uwb_tdoa_bias.errors import InputError
 
 from . import cli
 from .bag_files import messages, open_bag
+from .follow import Follower, is_stamped, stamp_of
 from .read_ahead import read_ahead
 from .ros_session import message_class, own_arguments, publisher_qos, session
 
@@ -25,7 +26,8 @@ DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 ba
 
 Every topic is published with the durability it was recorded with, and always reliably, which serves best-effort
 subscriptions too: a reliable subscription gets every message at any rate (the replay waits for it when it must), a
-best-effort one gets what it keeps up with. Ends when every reliable subscription has everything, and tells what was
+best-effort one gets what it keeps up with. With --follow, nothing is played more than 2 s ahead of what comes of it: a
+slow computer then takes longer, and gets the same. Ends when every reliable subscription has everything, and tells what was
 published and how late. Topics can be moved with ROS arguments, as in the last example.
 """
 SETTLE = 0.2  # s from the last match to the first message: a subscription learns of a match a little later than we do
@@ -41,6 +43,7 @@ def main(argv=None):
         DESCRIPTION,
         "replay flight.bag",
         "replay flight.bag --rate 4 --clock",
+        "replay flight.bag --rate 10 --follow odometry",
         "replay flight.bag --wait-matched 30 --wait-topics imu/data uwb/tdoa",
         "replay flight.bag --ros-args -r /uwb/tdoa:=/tag1/uwb/tdoa -r /imu/data:=/tag1/imu/data",
     )
@@ -63,6 +66,7 @@ def main(argv=None):
         "--wait-topics", nargs="+", default=[], metavar="TOPIC",
         help="wait for these topics only, and fail if nobody subscribes to one of them in time",
     )  # fmt: skip
+    parser.add_argument("--follow", metavar="TOPIC", help="wait whenever the stamps on this topic fall 2 s behind")
     return cli.run(lambda args: replay(args, arguments), parser, own_arguments("replay", arguments))
 
 
@@ -71,12 +75,13 @@ class Played:
     """What was published.
 
     counts : messages by topic; behind : s, the latest that a message was; stretched : s, by how much the time of the
-    replay was stretched, so that a stall was not followed by a burst that nobody can take.
+    replay was stretched, so that a stall was not followed by a burst that nobody can take; waited : s, for --follow.
     """
 
     counts: Counter = field(default_factory=Counter)
     behind: float = 0.0
     stretched: float = 0.0
+    waited: float = 0.0
 
 
 def replay(args, ros_arguments):
@@ -89,13 +94,14 @@ def replay(args, ros_arguments):
             raise InputError(f"{args.bag}: has no message to replay.")
         clock = node.create_publisher(Clock, "/clock", QoSProfile(depth=10)) if args.clock else None
         _wait_matched(publishers, args.wait_matched, args.wait_topics, stop)
+        follower = Follower(node, args.follow) if args.follow else None
         length = (reader.end_time - reader.start_time) / 1e9
         _say(f"playing {count} messages, {length:.1f} s at rate {args.rate:g}")
         played = Played()
         began = time.perf_counter()
         while not stop:
             with closing(read_ahead(messages(args.bag, reader, connections))) as recorded:
-                _play(recorded, publishers, args.rate, clock, args.clock, played, stop)
+                _play(recorded, publishers, args.rate, clock, args.clock, follower, played, stop)
             if not args.loop:
                 break
         took = time.perf_counter() - began
@@ -105,6 +111,7 @@ def replay(args, ros_arguments):
     print(
         f"{sum(played.counts.values())} messages in {took:.2f} s, at most {1e3 * played.behind:.1f} ms late, "
         f"stretched by {1e3 * played.stretched:.1f} ms"
+        + (f", waited {played.waited:.2f} s for {args.follow}" if follower else "")
     )
     if stop:
         _say("stopped")
@@ -155,9 +162,10 @@ def _wait_matched(publishers, limit, topics, stop):
     time.sleep(SETTLE)
 
 
-def _play(recorded, publishers, rate, clock, clock_rate, played, stop):
+def _play(recorded, publishers, rate, clock, clock_rate, follower, played, stop):
     """Publish (connection, stamp ns, bytes) in the time between their stamps, divided by the rate."""
     start = began = next_tick = None
+    stamped = {topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)} if follower else set()
     for connection, stamp, data in recorded:
         if start is None:
             start, began = stamp, time.perf_counter()
@@ -179,6 +187,10 @@ def _play(recorded, publishers, rate, clock, clock_rate, played, stop):
         if behind > LARGEST_CATCH_UP:
             began += behind - LARGEST_CATCH_UP
             played.stretched += behind - LARGEST_CATCH_UP
+        if connection.topic in stamped:
+            waited = follower.wait(stamp_of(data), stop)
+            played.waited += waited
+            began += waited
         if _publish(publishers[connection.topic], data, stop):
             played.counts[connection.topic] += 1
 

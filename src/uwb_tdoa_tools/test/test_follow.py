@@ -1,0 +1,97 @@
+"""What is played keeps in step with what comes of it."""
+
+import threading
+import time
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from rclpy.serialization import serialize_message  # noqa: E402
+from sensor_msgs.msg import Imu, TimeReference  # noqa: E402
+from std_msgs.msg import Float64  # noqa: E402
+from uwb_tdoa_bias.errors import InputError  # noqa: E402
+from uwb_tdoa_tools import follow  # noqa: E402
+from uwb_tdoa_tools.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
+
+SECOND = 10**9
+
+
+@pytest.fixture
+def node():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    yield rclpy.create_node("player", context=context, enable_rosout=False, start_parameter_services=False)
+    rclpy.shutdown(context=context)
+
+
+class Speaker:
+    """Publishes stamps on a topic and waits until somebody has subscribed."""
+
+    def __init__(self, node, topic):
+        self._publisher = node.create_publisher(Imu, topic, 10)
+
+    def say(self, seconds):
+        message = Imu()
+        message.header.stamp.sec = seconds
+        self._publisher.publish(message)
+
+    def matched(self):
+        until = time.monotonic() + 60.0
+        while not self._publisher.get_subscription_count():
+            assert time.monotonic() < until
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def speaker(node):
+    return Speaker(node, "imu/late")
+
+
+@pytest.fixture
+def follower(node, speaker):
+    follower = Follower(node, "imu/late")
+    speaker.matched()
+    return follower
+
+
+def test_waits_until_the_topic_is_less_than_the_lead_behind(follower, speaker):
+    assert follower.wait(100 * SECOND, False) == 0.0
+    assert follower.wait(100 * SECOND + LEAD, False) < 1.0
+    later = threading.Timer(0.3, speaker.say, [101])
+    later.start()
+    assert follower.wait(101 * SECOND + LEAD, False) > 0.2  # 100.0 was the beginning, 101.0 comes in 0.3 s
+    later.join()
+    assert follower.wait(101 * SECOND + LEAD, False) == 0.0
+
+
+def test_a_topic_that_has_gone_silent_is_not_waited_for(follower, speaker, monkeypatch):
+    monkeypatch.setattr(follow, "SILENCE", 0.2)
+    follower.wait(0, False)
+    assert follower.wait(5 * SECOND, False) > 0.2
+    assert follower.wait(10 * SECOND, False) < 0.2
+    speaker.say(9)
+    until = time.monotonic() + 60.0
+    while follower.wait(12 * SECOND, False) < 0.2:  # it is waited for again, once that has come
+        assert time.monotonic() < until
+
+
+def test_a_signal_ends_the_wait(follower):
+    follower.wait(0, False)
+    assert follower.wait(9 * SECOND, True) < 1.0
+
+
+def test_what_cannot_be_followed_is_named(node):
+    with pytest.raises(InputError, match="nobody publishes /odometry"):
+        Follower(node, "odometry")
+    node.create_publisher(Float64, "number", 1)
+    with pytest.raises(InputError, match="std_msgs/msg/Float64: not installed, or without a header"):
+        Follower(node, "/number")
+
+
+def test_stamps_are_read_from_the_bytes():
+    assert is_stamped(Imu) and is_stamped(TimeReference) and not is_stamped(Float64) and not is_stamped(None)
+    message = Imu()
+    message.header.stamp.sec, message.header.stamp.nanosec = -3, 999_999_999
+    message.header.frame_id = "somewhere"
+    assert stamp_of(serialize_message(message)) == -3 * SECOND + 999_999_999
