@@ -1,3 +1,4 @@
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -106,6 +107,20 @@ def test_other_ids_at_the_same_places_are_other_anchors(one_place):
     s = labels(flight(5, **CIRCLE)).samples
     renamed = Anchors(s.anchors.ids + 20, s.anchors.positions, s.anchors.orientations)
     np.testing.assert_allclose(network.predict(replace(s, anchors=renamed))[0], 0.0, atol=1e-5)
+
+
+def test_what_holds_for_all_anchors_can_be_kept_alone(two_places, tmp_path):
+    model, network = two_places
+    found = labels(flight(7, "wall_middles"))  # none of its anchors has a site
+    general = copy.deepcopy(model)
+    general.forget_sites()
+    assert len(general.inputs()) < len(model.inputs())
+    path = tmp_path / "general.onnx"
+    path.write_bytes(general.onnx({"clip": 1.0, "name": "general"}).SerializeToString())
+    for expected, told in zip(network.predict(found.samples), Network(path).predict(found.samples)):
+        np.testing.assert_allclose(told, expected, atol=1e-5)
+    np.testing.assert_allclose(general.mean(found.samples), model.mean(found.samples), atol=1e-12)
+    np.testing.assert_allclose(general.variance(found.samples), model.variance(found.samples), rtol=1e-9)
 
 
 def test_flights_with_and_without_attitude_together(tmp_path):

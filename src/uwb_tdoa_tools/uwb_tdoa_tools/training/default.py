@@ -26,7 +26,7 @@ from ..readers import read_flight
 from . import labels as labelling, models, simulated, structured
 
 FLIGHTS, SEED, SPACING = 20, 100, 0.02  # in each constellation; first seed; s between samples
-OPTIONS = structured.Options(centres=10, link_centres=100)  # places are of no use elsewhere
+OPTIONS = structured.Options(centres=10, link_centres=100)
 PLACES = simulated.TRAINING + simulated.UNSEEN
 
 
@@ -56,7 +56,7 @@ def main(argv=None):
 
 
 def learn(count, options=OPTIONS):
-    """(Structured, metadata) from `count` simulated flights in each of PLACES."""
+    """(Structured, metadata) from `count` simulated flights in each of PLACES, of which it forgets the places."""
     flights = simulated.flights(PLACES, count, SEED, tqdm)
     known = [labelling.labels(flight) for some in flights.values() for flight in some]
     thin = labelling.thinned(known, SPACING, np.random.default_rng(0))
@@ -65,7 +65,9 @@ def learn(count, options=OPTIONS):
         "trained_on": [f"{count} simulated flights in {place}" for place in PLACES],
         "constellations": labelling.constellations(known), "largest_yaw_std": models.LARGEST_YAW_STD,
     }  # fmt: skip
-    return models.fit_structured(thin, 0, options)[0], meta
+    model = models.fit_structured(thin, 0, options)[0]
+    model.forget_sites()
+    return model, meta
 
 
 def scaled(model, measured):
@@ -74,7 +76,6 @@ def scaled(model, measured):
     told = np.concatenate([model.mean(one.samples) for one in measured])
     share = float(np.clip(np.sum(told * error) / np.sum(told**2), 0.0, 1.0))
     out = copy.deepcopy(model)
-    out.weights *= share
     for weights in out.link_weights.values():
         weights *= share
     out.floor = float(np.sqrt(np.mean((error - share * told) ** 2) - labelling.white_noise(measured) ** 2))

@@ -30,15 +30,13 @@ class Graph:
         """Some columns of a tensor."""
         return self.op("Gather", value, self.constant(list(columns), np.int64), axis=1)
 
-    def twice(self, value):
-        """A tensor below itself: (2n, k)."""
-        return self.op("Concat", value, value, axis=0)
+    def rows(self, value, width):
+        """A tensor with rows of another width, in the same order of numbers."""
+        return self.op("Reshape", value, self.constant([-1, width], np.int64))
 
-    def halves(self, value):
-        """The upper and the lower half of the rows of a tensor."""
-        outputs = [f"v{len(self._nodes)}a", f"v{len(self._nodes)}b"]
-        self._nodes.append(helper.make_node("Split", [value], outputs, axis=0))
-        return outputs
+    def total(self, values):
+        """Sum of tensors of one shape."""
+        return values[0] if len(values) == 1 else self.op("Sum", *values)
 
     def row_sum(self, value):
         """Sum along each row: (n, 1)."""

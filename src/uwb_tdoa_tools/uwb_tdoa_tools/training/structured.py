@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
+from scipy.linalg import block_diag
 from scipy.spatial.distance import cdist
 
 from uwb_tdoa_bias.effects import Samples
@@ -26,6 +27,7 @@ from . import export, linear
 from .labels import SAME_PLACE, constellations
 
 COARSE = 4.0  # ratio of the long to the short length of the site map
+NEAREST = 0.1  # m; all that is nearer counts as at this distance, which has a logarithm
 LINK_LENGTH = 0.5  # of the link maps, in unit vectors and logarithms of distance
 RANK = 64  # directions of the posterior that the deviation is computed from; the others count as unknown
 SITE_WEIGHTS = 2400  # at most, of all sites together: memory and time of the fit grow with its square and cube
@@ -123,8 +125,8 @@ class Structured:
 
     def _site_of(self, anchors):
         far = np.linalg.norm(anchors.positions[:, None] - self.site_positions, axis=2)
-        far[(anchors.ids[:, None] != self.site_ids) | (far > SAME_PLACE)] = np.inf
-        return np.where(np.isfinite(far).any(axis=1), np.argmin(far, axis=1), len(self.site_ids))
+        far[anchors.ids[:, None] != self.site_ids] = np.inf
+        return np.argmin(np.column_stack([far, np.full(len(far), SAME_PLACE)]), axis=1)  # the last: none is so near
 
     def set_posterior(self, posterior):
         """Take over weights and the sizes of the priors."""
@@ -139,6 +141,10 @@ class Structured:
             self.link_weights[viewer] = posterior.dense[mine] / s
             self.link_covariances[viewer] = posterior.dense_covariance[mine, mine] / s**2
             first = mine.stop
+
+    def forget_sites(self):
+        """Keep what holds for all anchors; each is then at a site of which nothing is known."""
+        self.site_ids, self.site_positions, self.weights = self.site_ids[:0], self.site_positions[:0], self.weights[:0]
 
     @property
     def sees_attitude(self):
@@ -173,51 +179,75 @@ class Structured:
                 total += np.einsum("ni,ij,nj->n", phi, self.link_covariances[viewer], phi)
         return total
 
-    def inputs(self):
-        """Names of the features that the network is fed, in order: the place, then those of either end."""
-        return [*_PLACE, *(f"{name}_{side}" for side in "ab" for name in self._end_inputs())]
+    def _end_inputs(self, side="a"):
+        sites = (*_PLACE, *(f"{name}_{side}" for name in _END)) if len(self.site_ids) else ()
+        angles = [f"{angle}_{viewer}_{side}" for angle in ("azimuth", "elevation") for viewer in self.links]
+        return [*sites, *(f"{name}_{side}" for name in _DELTA if self.links), *angles]
 
-    def _end_inputs(self):
-        angles = [f"{angle}_{viewer}" for viewer in self.links for angle in ("azimuth", "elevation")]
-        return [*_END, *(_DELTA if self.links else ()), *angles]
+    def inputs(self):
+        """Names of the features that the network is fed, in order: those of one end, then those of the other."""
+        return [name for side in "ab" for name in self._end_inputs(side)]
 
     def onnx(self, meta):
         """The onnx.ModelProto: bias, standard deviation, share of what can be known. meta : further metadata."""
         graph, names = export.Graph(), self.inputs()
-        place = graph.op("Div", graph.take(graph.input, [0, 1, 2]), np.array([self.options.length]))
-        values = _kernel_values(graph, self.site, place)
-        seen = _explained(graph, self.site, self.site_covariance, values)
-        n = len(self._end_inputs())
-        ends = [graph.take(graph.input, range(first, first + n)) for first in (len(_PLACE), len(_PLACE) + n)]
-        # both ends go through the graph together, a above b: half as many operators
-        mean, variance = self._end(graph, graph.op("Concat", *ends, axis=0), graph.twice(values), graph.twice(seen))
-        (mean_a, mean_b), (variance_a, variance_b) = graph.halves(mean), graph.halves(variance)
-        bias = graph.op("Sub", mean_b, mean_a)
-        variance = graph.op("Add", graph.op("Add", variance_a, variance_b), [self.floor**2])
-        worst = graph.op("Max", variance_a, variance_b)
-        known = graph.op("Sub", [1.0], graph.op("Div", worst, [self.prior]))
+        end = graph.rows(graph.input, len(names) // 2)  # (2n, ...): what follows is said of one end
+        maps = [self._site_graph(graph, end)] if len(self.site_ids) else []
+        maps += [self._link_graph(graph, end)] if self.links else []
+        means, explained = zip(*maps)
+        variance = graph.op("Max", graph.op("Sub", [self.prior], graph.total(explained)), [0.0])
+        means, variances = graph.rows(graph.total(means), 2), graph.rows(variance, 2)  # (n, 2): a, b
+        bias = graph.op("MatMul", means, [[-1.0], [1.0]])
+        std = graph.op("Sqrt", graph.op("Add", graph.row_sum(variances), [self.floor**2]))
+        worst = graph.op("ReduceMax", variances, axes=[1])
+        known = graph.op("Sub", [1.0], graph.op("Mul", worst, [1.0 / self.prior]))
         meta = {**meta, "features": names, "offset": [0.0] * len(names), "scale": [1.0] * len(names)}
-        return graph.model(len(names), [bias, graph.op("Sqrt", variance), known], meta)
+        return graph.model(len(names), [bias, std, known], meta)
 
-    def _end(self, graph, end, values, seen):
-        """(mean, variance) of g of anchors, each (2n, 1). end : their features; values, seen : of the site map."""
-        names = self._end_inputs()
-        who, where = graph.take(end, [0]), graph.take(end, [1, 2, 3])
+    def _site_graph(self, graph, end):
+        """(mean, variance explained) by the site maps, each (2n, 1). end : features of one end."""
+        place, who, where = (graph.take(end, some) for some in ([0, 1, 2], [3], [4, 5, 6]))
+        place = graph.op("Div", place, [self.options.length])
+        far = graph.distance2(place, self.site.centres)
+        far = far if self.site.squared else graph.op("Sqrt", far)
+        rates = [-0.5 / s**2 if self.site.squared else -1.0 / s for s in self.site.lengths]
+        parts = [graph.op("Exp", graph.op("Mul", far, [rate])) for rate in rates]
+        values = graph.total([graph.op("Mul", part, [a**2]) for part, a in zip(parts, self.site.amplitudes)])
         other = graph.op("Mul", graph.op("Abs", graph.op("Sub", who, self.site_ids[None])), [1e3])  # ids count as far
         far = graph.op("Add", graph.distance2(where, self.site_positions), other)
         here = graph.op("Exp", graph.op("Mul", far, [-0.5 / SAME_PLACE**2]))  # (2n, sites)
         weights = graph.op("MatMul", here, self.weights @ self.site.whiten.T)
-        mean = graph.row_sum(graph.op("Mul", weights, values))
         at_site = graph.op("Min", graph.row_sum(here), [1.0])
-        variance = graph.op("Max", graph.op("Sub", [self.site.variance], graph.op("Mul", at_site, seen)), [0.0])
-        far = self.links and _distance_graph(graph, graph.take(end, [names.index(name) for name in _DELTA]))
-        for viewer, link in self.links.items():
-            angles = [names.index(f"{angle}_{viewer}") for angle in ("azimuth", "elevation")]
-            told = _kernel_values(graph, link, _link_graph(graph, far, *(graph.take(end, [k]) for k in angles)))
-            mean = graph.op("Add", mean, graph.op("MatMul", told, (link.whiten @ self.link_weights[viewer])[:, None]))
-            seen = _explained(graph, link, self.link_covariances[viewer], told)
-            variance = graph.op("Add", variance, graph.op("Max", graph.op("Sub", [link.variance], seen), [0.0]))
-        return mean, variance
+        known = _power(graph, values, _known_directions(self.site, self.site_covariance))
+        return graph.row_sum(graph.op("Mul", weights, values)), graph.op("Mul", at_site, known)
+
+    def _link_graph(self, graph, end):
+        """(mean, variance explained) by the link maps together, each (2n, 1).
+
+        A Gaussian of the distance of x = (log distance, unit vector) from a centre c is an exponential of what is linear
+        in x and |x|^2 = (log distance)^2 + 1, so that one matrix product serves all centres.
+        """
+        n = len(self.links)
+        first = len(self._end_inputs()) - 2 * n - 3  # the columns: 3 of the distance, n azimuths, n elevations
+        delta = graph.take(end, range(first, first + 3))
+        far = graph.op("Max", graph.row_sum(graph.op("Mul", delta, delta)), [NEAREST**2])
+        far = graph.op("Mul", graph.op("Log", far), [0.5])
+        azimuth, elevation = (graph.take(end, range(k, k + n)) for k in (first + 3, first + 3 + n))
+        flat = graph.op("Cos", elevation)
+        seen = [graph.op("Mul", flat, graph.op(turn, azimuth)) for turn in ("Cos", "Sin")]
+        x = graph.op("Concat", far, graph.op("Mul", far, far), *seen, graph.op("Sin", elevation), axis=1)
+        slopes, levels, weights, factors = [], [], [], []
+        for k, (viewer, link) in enumerate(self.links.items()):
+            ((amplitude,), (length,)), c = (link.amplitudes, link.lengths), link.centres
+            slope = np.zeros((2 + 3 * n, len(c)))
+            slope[[0, *range(2 + k, 2 + 3 * n, n)]], slope[1] = c.T, -0.5
+            slopes.append(slope / length**2)
+            levels.append(np.log(amplitude**2) - 0.5 * (1.0 + np.sum(c**2, axis=1)) / length**2)
+            weights.append(link.whiten @ self.link_weights[viewer])
+            factors.append(_known_directions(link, self.link_covariances[viewer]))
+        values = graph.op("Exp", graph.op("Gemm", x, np.hstack(slopes), np.concatenate(levels)))
+        mean = graph.op("MatMul", values, np.concatenate(weights)[:, None])
+        return mean, _power(graph, values, block_diag(*factors))
 
 
 def link_inputs(samples, side, viewer):
@@ -226,35 +256,21 @@ def link_inputs(samples, side, viewer):
     side : "a" or "b"; viewer : "T", tag or "A", anchor."""
     names = [f"{name}_{side}" for name in (*_DELTA, f"azimuth_{viewer}", f"elevation_{viewer}")]
     dx, dy, dz, azimuth, elevation = columns(samples, names).T
-    far, flat = np.log(np.maximum(np.sqrt(dx**2 + dy**2 + dz**2), 0.1)), np.cos(elevation)
+    far, flat = np.log(np.maximum(np.sqrt(dx**2 + dy**2 + dz**2), NEAREST)), np.cos(elevation)
     return np.stack([far, flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
-def _distance_graph(graph, delta):
-    far = graph.op("Sqrt", graph.row_sum(graph.op("Mul", delta, delta)))
-    return graph.op("Log", graph.op("Max", far, [0.1]))
-
-
-def _link_graph(graph, far, azimuth, elevation):
-    flat = graph.op("Cos", elevation)
-    seen = [graph.op("Mul", flat, graph.op(turn, azimuth)) for turn in ("Cos", "Sin")]
-    return graph.op("Concat", far, *seen, graph.op("Sin", elevation), axis=1)
-
-
-def _kernel_values(graph, of, x):
-    far = graph.distance2(x, of.centres)
-    far = far if of.squared else graph.op("Sqrt", far)
-    rates = [-0.5 / s**2 if of.squared else -1.0 / s for s in of.lengths]
-    terms = [graph.op("Mul", graph.op("Exp", graph.op("Mul", far, [r])), [a**2]) for a, r in zip(of.amplitudes, rates)]
-    return terms[0] if len(terms) == 1 else graph.op("Add", *terms)
-
-
-def _explained(graph, of, covariance, values):
-    """(n, 1): the part of the prior's variance that the data took away, from kernel values (n, m)."""
+def _known_directions(of, covariance):
+    """Of the kernel values of a Map (m,), the RANK directions that the data told most of, as large as what they told:
+    (m, RANK)."""
     share, vector = np.linalg.eigh(np.eye(len(covariance)) - covariance)
     leading = np.argsort(share)[::-1][:RANK]
-    factor = of.whiten @ (vector[:, leading] * np.sqrt(np.maximum(share[leading], 0.0)))
-    part = graph.op("MatMul", values, factor)
+    return of.whiten @ (vector[:, leading] * np.sqrt(np.maximum(share[leading], 0.0)))
+
+
+def _power(graph, values, directions):
+    """Sum of the squares of values (n, m) along directions (m, k): (n, 1)."""
+    part = graph.op("MatMul", values, directions)
     return graph.row_sum(graph.op("Mul", part, part))
 
 
