@@ -75,8 +75,7 @@ class Corrector:
             return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
         newest = np.maximum.accumulate(np.concatenate([t[:1] if self._newest is None else [self._newest], t]))
         self._newest = newest[-1]
-        places = np.searchsorted(self._poses.t, np.minimum(newest[:-1], t) - self.lag, side="right") - 1
-        p, q, yaw_std = self._poses.at(places)
+        places, p, q, yaw_std = self._poses.before(np.minimum(newest[:-1], t) - self.lag)
         extra = self._extra(t, b, places) if self.effects.needs_motion else {}
         self._first = t[0] if self._first is None else self._first
         samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std, **extra)
@@ -93,9 +92,11 @@ class Corrector:
 
     def _effects_at(self, samples):
         """(bias, spread) of the effects; while the yaw is unknown their mean over four headings, and its scatter."""
+        if not len(self.effects):
+            return np.zeros(len(samples)), np.zeros(len(samples))
         bias, spread = self.effects.bias(samples), self.effects.spread(samples)
         unknown = samples.yaw_std > LARGEST_YAW_STD
-        if unknown.any() and len(self.effects):
+        if unknown.any():
             each = np.stack([self.effects.bias(replace(samples, q=turned(samples.q, k))) for k in range(4)])
             bias = np.where(unknown, each.mean(axis=0), bias)
             spread = np.where(unknown, np.hypot(spread, each.std(axis=0)), spread)

@@ -71,7 +71,7 @@ class Network:
         limits = json.loads(meta.get("validity", "{}"))
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
-        self._inputs, self._judged = ([_COLUMN[name] for name in some] for some in (names, limits))
+        self._inputs, self._judged = (np.array([_COLUMN[name] for name in some], dtype=int) for some in (names, limits))
         self._lower, self._upper, self._margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
         if not ((self._margin > 0.0) & (self._upper >= self._lower)).all():
             raise ValueError("validity: every feature needs [lowest, highest, margin above 0]")
@@ -80,12 +80,12 @@ class Network:
         """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
         (n,) arrays. The first two are NaN where a feature that is needed is unknown."""
         table = everything(samples)
-        x = (table[:, self._inputs] - self._offset) / self._scale
+        x = (table.take(self._inputs, axis=1) - self._offset) / self._scale
         out = self._session.run(None, {self._input: x.astype(np.float32)})[0].astype(float)
         bias = np.clip(out[:, 0], -self.clip, self.clip)
         std = out[:, 1] if out.shape[1] > 1 else np.zeros(len(out))
         known = out[:, 2] if out.shape[1] > 2 else np.ones(len(out))
-        if self._judged:
+        if len(self._judged):
             value = table[:, self._judged]
             beyond = np.maximum(self._lower - value, value - self._upper) / self._margin
             trust = 1.0 - np.clip(beyond.max(axis=1), 0.0, 1.0)
@@ -93,6 +93,7 @@ class Network:
             std = np.sqrt((trust * std) ** 2 + (1.0 - trust**2) * self._fade_std**2)
         if samples.yaw_std is not None:
             undecided = samples.yaw_std > self._largest_yaw_std
-            std[undecided] = np.hypot(std[undecided], bias[undecided])
-            bias[undecided] = known[undecided] = 0.0
+            if undecided.any():
+                std[undecided] = np.hypot(std[undecided], bias[undecided])
+                bias[undecided] = known[undecided] = 0.0
         return bias, std, known

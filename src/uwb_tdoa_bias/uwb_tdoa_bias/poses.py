@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from .compiled import compiled
+
 TILT = 0.5  # rad; a filter that does not know the tilt better estimates no attitude
 
 
@@ -42,14 +44,13 @@ class Poses:
         for first in range(0, len(new[0]), self._history):
             self._append([part[first : first + self._history] for part in new])
 
-    def at(self, places):
-        """(p (n, 3), q (n, 4), yaw_std (n,)) of the poses with these numbers (n,); NaN for -1."""
-        known = places >= 0
-        parts = [column[places] for column in self._columns[1:]]
-        if not known.all():
-            for part in parts:
-                part[~known] = np.nan
-        return parts
+    def before(self, t):
+        """Of the newest poses stamped no later than t (n,) s: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN
+        where there is none."""
+        n = len(t)
+        out = np.empty(n, dtype=np.int64), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)
+        _look_up(t, self._count, *self._columns, *out)
+        return out
 
     def _append(self, new):
         end = self._count + len(new[0])
@@ -61,6 +62,17 @@ class Poses:
         for column, values in zip(self._columns, new):
             column[self._count : end] = values
         self._count = end
+
+
+@compiled
+def _look_up(t, count, stamps, p, q, yaw_std, places, p_out, q_out, yaw_std_out):
+    for i in range(len(t)):
+        place = np.searchsorted(stamps[:count], t[i], side="right") - 1
+        places[i] = place
+        if place >= 0:
+            p_out[i], q_out[i], yaw_std_out[i] = p[place], q[place], yaw_std[place]
+        else:
+            p_out[i], q_out[i], yaw_std_out[i] = np.nan, np.nan, np.nan
 
 
 def told_yaw_std(std):
