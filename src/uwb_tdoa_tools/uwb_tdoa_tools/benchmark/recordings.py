@@ -40,9 +40,9 @@ def measure(progress, quick=False, model=None):
         f"effects and network ({network.name})": (run_offline, Corrector(flight.anchors, effects, network)),
         "no correction, smoothed": (smooth, None),
     }
-    smooth(flight)  # its own compiled code
     for name, (function, corrector) in ways.items():
         progress(f"recording, {name}")
+        function(flight, None, corrector)  # compiles, or loads, what the ways before it did not need
         taken = [_seconds(function, flight, None, corrector) for _ in range(repeats)]
         yield Figure.of(section, name, "s", taken, None if function is smooth else TARGET)
         if corrector is None and function is run_offline:
