@@ -61,6 +61,7 @@ def test_index_finds_every_known_id_and_no_other(ids, asked):
     asked = asked + ids[:3]
     expected = [ids.index(i) if i in ids else -1 for i in asked]
     assert anchors.index(asked).tolist() == expected
+    assert [anchors.row(i) for i in asked] == expected
 
 
 def test_index_keeps_the_shape():

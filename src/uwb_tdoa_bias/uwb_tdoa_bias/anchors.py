@@ -52,9 +52,14 @@ class Anchors:
         for name, value in (("ids", ids), ("positions", positions), ("orientations", orientations)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "_rows", {i: row for row, i in enumerate(ids.tolist())})
 
     def __len__(self):
         return len(self.ids)
+
+    def row(self, anchor):
+        """Row of one id, -1 if it is unknown."""
+        return self._rows.get(anchor, -1)
 
     def index(self, ids):
         """Rows of the given ids: int array of the shape of `ids`, -1 where an id is unknown."""

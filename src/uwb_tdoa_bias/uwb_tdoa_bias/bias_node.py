@@ -147,8 +147,8 @@ class BiasNode(Node):
         if not released:
             return
         t = np.array([t for t, _, _ in released])
-        pairs = [(message.anchor_a, message.anchor_b) for _, message, _ in released]
-        a, b = self._corrector.anchors.index(pairs).T
+        row = self._corrector.anchors.row
+        a, b = np.array([(row(message.anchor_a), row(message.anchor_b)) for _, message, _ in released]).T
         d = np.array([message.distance_difference for _, message, _ in released])
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
         correction = self._corrector.correct(t[valid], a[valid], b[valid], d[valid])

