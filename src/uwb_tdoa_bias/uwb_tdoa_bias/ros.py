@@ -19,6 +19,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 from uwb_tdoa_msgs.msg import Anchor, AnchorArray
@@ -38,6 +39,7 @@ ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 TF_QOS = QoSProfile(depth=100)  # what tf2 listens with
+LONGEST_WAIT = 0.2  # s, until a node that receives nothing sees a signal
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 
 
@@ -200,15 +202,15 @@ def run(node_class, description, argv=None):
     parser = argparse.ArgumentParser(
         prog=name, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    interruptible, signals = True, []
+    interruptible, stop = True, Future()
 
-    def on_signal(number, _):  # rclpy also ends its context; an exception then would come at any instruction
-        signals.append(number)
+    def on_signal(number, _):  # rclpy's own handler would end the context while a callback still publishes
         if interruptible:
             raise KeyboardInterrupt
+        stop.set_result(number)
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)  # before rclpy, which calls what it finds
+        signal.signal(number, on_signal)
     node = executor = None
     try:
         _init(parser, arguments)
@@ -218,18 +220,15 @@ def run(node_class, description, argv=None):
         gc.collect()
         gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
         interruptible = False
-        while rclpy.ok():  # not spin(): in the wheels' EventsExecutor it never wakes up
-            executor.spin_until_future_complete(Future(), timeout_sec=1.0)
-    except SystemExit as stop:  # argparse has said it already
-        return stop.code or 0
+        while not stop.done() and rclpy.ok():  # a signal is seen after a callback, or after the time
+            executor.spin_until_future_complete(stop, timeout_sec=LONGEST_WAIT)
+    except SystemExit as ended:  # argparse has said it already
+        return ended.code or 0
     except InputError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return 2
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except Exception:
-        if not signals:
-            raise  # else rclpy was ended under our feet
     finally:
         interruptible = False
         if executor is not None:
@@ -244,6 +243,6 @@ def run(node_class, description, argv=None):
 def _init(parser, arguments):
     try:
         parser.parse_args(remove_ros_args(arguments)[1:])
-        rclpy.init(args=arguments)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except (implementation.RCLError, implementation.RCLInvalidROSArgsError, implementation.UnknownROSArgsError) as error:
         raise InputError(f"--ros-args: {error}.") from error
