@@ -7,7 +7,7 @@ from ament_index_python.packages import get_package_share_directory
 import numpy as np
 
 from uwb_tdoa_bias.corrector import Corrector
-from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm, samples_at
 from uwb_tdoa_bias.network import Network
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
@@ -18,6 +18,7 @@ from .flights import make_flight
 SECONDS = 45.0
 TARGET = 0.5  # s for such a flight
 ANCHORS = (4, 16, 32, 64)
+PREDICTION_TARGET = 30.0  # us
 BATCHES = (1, 4, 16)  # TDOAs that arrive together
 
 
@@ -47,6 +48,9 @@ def measure(progress, quick=False, model=None):
         yield Figure.of(section, name, "s", taken, None if function is smooth else TARGET)
         if corrector is None and function is run_offline:
             yield Figure.of(section, "the same per second of flight", "ms/s", [1e3 * s / SECONDS for s in taken])
+    progress("single TDOAs")
+    name = f"prediction by the network ({network.name}), 1 at a time"
+    yield Figure.of(section, name, "us", _per_prediction(flight, network, repeats), PREDICTION_TARGET)
     for batch in BATCHES:
         name = f"correction of a TDOA by the network ({network.name}), {batch} at a time"
         corrector = Corrector(flight.anchors, network=network)
@@ -57,6 +61,21 @@ def measure(progress, quick=False, model=None):
         yield Figure.of(
             section, f"no correction, {anchors} anchors", "s", [_seconds(run_offline, flight) for _ in range(repeats)]
         )
+
+
+def _per_prediction(flight, network, repeats):
+    """us per TDOA of a Flight that the network alone takes, one at a time: (repeats,)."""
+    truth, tdoa = flight.truth, flight.tdoa
+    a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
+    rows = [slice(k, k + 1) for k in range(400)]
+    alone = [samples_at(tdoa.t[k], a[k], b[k], truth, flight.anchors, motion=False) for k in rows]
+
+    def predict():
+        for samples in alone:
+            network.predict(samples)
+
+    predict()
+    return np.array([_seconds(predict) for _ in range(repeats)]) * 1e6 / len(alone)
 
 
 def _per_tdoa(flight, corrector, batch, repeats):
