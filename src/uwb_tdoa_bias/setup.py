@@ -25,9 +25,8 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", glob("config/*.yaml")),
-        (f"share/{NAME}/launch", glob("launch/*.py")),
-        (f"share/{NAME}/models", glob("models/*.onnx")),
     ],
+    package_data={NAME: ["models/*.onnx"]},
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [

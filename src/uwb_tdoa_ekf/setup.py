@@ -25,7 +25,6 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", glob("config/*.yaml")),
         (f"share/{NAME}/launch", glob("launch/*.py")),
-        (f"share/{NAME}/models", glob("models/*.onnx")),
     ],
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={

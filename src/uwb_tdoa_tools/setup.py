@@ -1,5 +1,3 @@
-from glob import glob
-
 from setuptools import find_packages, setup
 
 NAME = "uwb_tdoa_tools"
@@ -32,9 +30,6 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/config", glob("config/*.yaml")),
-        (f"share/{NAME}/launch", glob("launch/*.py")),
-        (f"share/{NAME}/models", glob("models/*.onnx")),
     ],
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={

@@ -1,6 +1,5 @@
 from dataclasses import replace
 import json
-from pathlib import Path
 import pickle
 
 import numpy as np
@@ -9,9 +8,9 @@ from uwb_tdoa_bias import known_answer
 from uwb_tdoa_bias.anchors import Anchors
 from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.network import Network
+from uwb_tdoa_bias.network import MODELS, SHIPPED, Network, load_network
 
-SHIPPED = Path(__file__).resolve().parents[1] / "models" / "known_answer.onnx"
+KNOWN = MODELS / "known_answer.onnx"
 ANCHORS = Anchors.from_positions([[5, 0, 1], [-3, 2, 3], [0, -400, 2]])
 
 
@@ -46,7 +45,7 @@ def expected(s):
 
 def test_shipped_model_says_the_known_answer():
     s = batch()
-    bias, std, known = Network(SHIPPED).predict(s)
+    bias, std, known = Network(KNOWN).predict(s)
     np.testing.assert_allclose(bias, expected(s), atol=1e-6)  # the model computes in float32
     assert np.ptp(bias) > 0.1  # an answer that says something
     np.testing.assert_array_equal(std, 0.0)
@@ -54,26 +53,26 @@ def test_shipped_model_says_the_known_answer():
 
 
 def test_one_sample_gives_what_a_batch_gives():
-    network, s = Network(SHIPPED), batch()
+    network, s = Network(KNOWN), batch()
     one = samples(s.p[7:8], s.q[7:8], s.a[7:8], s.b[7:8])
     np.testing.assert_allclose(network.predict(one)[0], network.predict(s)[0][7:8], atol=1e-7)
 
 
 def test_output_is_clipped():
     far = samples([[-80.0, 0, 0], [80.0, 0, 0]], [[0, 0, 0, 1]] * 2, [0, 0], [1, 1])
-    np.testing.assert_array_equal(Network(SHIPPED).predict(far)[0], [1.0, -1.0])
+    np.testing.assert_array_equal(Network(KNOWN).predict(far)[0], [1.0, -1.0])
 
 
 def test_unknown_attitude_gives_nan():
     s = samples([[0, 0, 1]] * 2, [[np.nan] * 4, [0, 0, 0, 1]], [0, 0], [1, 1])
-    np.testing.assert_array_equal(np.isnan(Network(SHIPPED).predict(s)[0]), [True, False])
+    np.testing.assert_array_equal(np.isnan(Network(KNOWN).predict(s)[0]), [True, False])
 
 
 def test_shipped_model_is_what_the_maker_makes(tmp_path):
     pytest.importorskip("onnx")
     path = tmp_path / "made.onnx"
     path.write_bytes(known_answer.make().SerializeToString())
-    made, shipped, s = Network(path), Network(SHIPPED), batch()
+    made, shipped, s = Network(path), Network(KNOWN), batch()
     np.testing.assert_array_equal(made.predict(s)[0], shipped.predict(s)[0])
     assert made.name == shipped.name == "known_answer"
 
@@ -136,7 +135,7 @@ def test_fades_beyond_what_it_knows(tmp_path):
         [[1, 0, 0.0], [1, 0, 2.0], [1, 0, 2.4], [1, 0, -1.0], [1, 0, 9.0], [1, 0, 1.0]],
         [[0, 0, 0, 1]] * 5 + [tilted], [0] * 6, [1] * 6,
     )  # fmt: skip
-    plain, (bias, std, known) = Network(SHIPPED).predict(s)[0], network.predict(s)
+    plain, (bias, std, known) = Network(KNOWN).predict(s)[0], network.predict(s)
     trust = np.array([1.0, 1.0, 0.6, 0.0, 0.0, 1.0 - (np.sin(0.5) - 0.2) / 0.5])
     np.testing.assert_allclose(known, trust, atol=1e-12)
     np.testing.assert_allclose(bias, trust * plain, atol=1e-9)
@@ -153,7 +152,15 @@ def test_missing_file_and_no_model(tmp_path):
 
 
 def test_a_pickled_network_says_the_same():
-    network = Network(SHIPPED)
+    network = Network(KNOWN)
     again = pickle.loads(pickle.dumps(network))
     for one, other in zip(network.predict(batch()), again.predict(batch())):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_model_is_named_by_its_file_or_as_the_one_shipped():
+    assert load_network("") is None and load_network(None) is None
+    assert load_network(str(KNOWN)).name == "known_answer"
+    assert load_network(SHIPPED).name == "default"
+    with pytest.raises(InputError, match="other.onnx does not exist"):
+        load_network("other.onnx")

@@ -7,10 +7,8 @@ Every parameter is documented in config/bias_node.yaml.
 
 from collections import Counter, deque
 import math
-from pathlib import Path
 import sys
 
-from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -23,11 +21,10 @@ from .corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
 from .effects import EffectSet
 from .errors import InputError
 from .hold import Hold
-from .network import Network
+from .network import SHIPPED, load_network
 from .poses import told_yaw_std
 from .stamps import StampWatch
 
-SHIPPED = "default"  # as model_file: the model that comes with the package
 ROTATIONS = [21, 28, 35]  # places of the variances about the axes in the covariance of a pose
 EARLY = 2000  # TDOAs kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
@@ -44,15 +41,13 @@ class BiasNode(Node):
         model_file = ros.parameter(
             self, "model_file", SHIPPED, "ONNX model to correct with; default for the one shipped, empty for none"
         )
-        if model_file == SHIPPED:
-            model_file = Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "default.onnx"
         self._lag = ros.parameter(self, "pose_lag", 0.05, "the pose used is this much older than the TDOA before, s")
         self._limit = ros.parameter(self, "hold", 0.225, "longest wait of a TDOA for its pose, s of stamps")
         for name, value in (("pose_lag", self._lag), ("hold", self._limit)):
             if not 0.0 < value < math.inf:
                 raise InputError(f"{name}: {value!r} must be a number of seconds above 0.")
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
-        self._network = Network(model_file) if model_file else None
+        self._network = load_network(model_file)
         self._model = self._warm_up()
         self._idle = self._model[NETWORK] == "none"
         self._corrector = None

@@ -2,7 +2,7 @@
 
     bias = 0.05 m + 0.02 dx_a + 0.01 m elevation_T_b,  limited to +-1 m
 
-Re-make it, with the onnx package installed:  python -m uwb_tdoa_bias.known_answer models/known_answer.onnx
+Re-make it, with the onnx package installed:  python -m uwb_tdoa_bias.known_answer known_answer.onnx
 """
 
 import json

@@ -24,7 +24,16 @@ import onnxruntime
 from .errors import InputError
 from .features import NAMES, everything
 
+MODELS = Path(__file__).parent / "models"
+SHIPPED = "default"  # instead of a path: the model that comes with the package
 _COLUMN = {name: column for column, name in enumerate(NAMES)}
+
+
+def load_network(name):
+    """The Network of a file; for "default" the one shipped; None for an empty name. Raises InputError."""
+    if not name:
+        return None
+    return Network(MODELS / "default.onnx" if str(name) == SHIPPED else name)
 
 
 class Network:

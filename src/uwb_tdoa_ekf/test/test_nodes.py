@@ -25,7 +25,7 @@ from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
 SOURCES = Path(__file__).resolve().parents[2]
-MODEL = SOURCES / "uwb_tdoa_bias" / "models" / "known_answer.onnx"
+MODEL = SOURCES / "uwb_tdoa_bias" / "uwb_tdoa_bias" / "models" / "known_answer.onnx"
 EFFECTS = "effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, tag_lever_arm: {values: {x: 0.05, z: 0.1}}}"
 
 

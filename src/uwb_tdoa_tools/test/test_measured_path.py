@@ -1,13 +1,10 @@
 """The main job on a measured flight: nodes over topics, at two speeds, against the offline engine and ground truth."""
 
-from pathlib import Path
-
 import pytest
 
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
 
-from ament_index_python.packages import get_package_share_directory  # noqa: E402
-from uwb_tdoa_bias.network import Network  # noqa: E402
+from uwb_tdoa_bias.network import SHIPPED, load_network  # noqa: E402
 from uwb_tdoa_tools.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.evaluate import evaluate  # noqa: E402
 from uwb_tdoa_tools.live import run_live  # noqa: E402
@@ -23,8 +20,7 @@ def test_measured_flight_through_the_nodes_at_any_rate_is_the_offline_run(shared
     bag = tmp_path / "flight.bag"
     write_bag(read_flight(log, survey), bag)
     flight = read_bag(bag)
-    shipped = Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "default.onnx"  # what bias_node takes unasked
-    offline, _ = evaluate(flight, network=Network(shipped))
+    offline, _ = evaluate(flight, network=load_network(SHIPPED))  # what bias_node takes unasked
     expected = offline.row()["rmse_3d"]
     assert expected < 0.35
     for rate in (1.0, 4.0):

@@ -9,7 +9,7 @@ import numpy as np
 from uwb_tdoa_bias.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.network import Network
+from uwb_tdoa_bias.network import SHIPPED, load_network
 from uwb_tdoa_ekf.offline import run_offline
 
 from . import cli, inputs
@@ -24,7 +24,7 @@ compare the estimate with ground truth.
 
 Without --flight it is a simulated one whose anchors have delays of 0.1 m (standard deviation); the nodes correct for
 them with an effects.yaml that holds their true values, as a calibration would find them. A measured flight is corrected
-with what --effects and --model give. "raw" is the same filter without any correction, run without ROS.
+with what --effects and --model give, or else with the model that bias_node ships. "raw" is the same filter without any correction, run without ROS.
 """
 SIMULATED = SimulationConfig(anchor_delay_std=0.1, duration=40.0, seed=1)
 FIGURES = {"rmse_x": "x", "rmse_y": "y", "rmse_z": "z", "rmse_3d": "3D", "median_3d": "median", "max_3d": "max"}
@@ -45,7 +45,7 @@ def main(argv=None):
     add("--rate", metavar="R", type=float, default=1.0, help="replay R times as fast as flown (default 1)")
     add("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="for all files (default out/demo)")
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
-    add("--model", metavar="FILE", help="ONNX bias network to correct with")
+    add("--model", metavar="FILE", help="ONNX bias network to correct with; default: the one shipped")
     return cli.run(demo, parser, argv)
 
 
@@ -61,22 +61,21 @@ def demo(args):
     started = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
 
-    flight, effects_file = _flight(args)
+    flight, effects_file, model = _flight(args)
     effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
-    network = Network(args.model) if args.model else None
+    network = load_network(model)
     correction = Corrector(flight.anchors, effects, network)
     length = flight.truth.t[-1] - flight.truth.t[0]
     print(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
-    given = ", ".join(str(path) for path in (effects_file, args.model) if path)
-    print(f"correction {correction.model} ({given or '--effects and --model give one'})")
+    given = ", ".join(str(path) for path in (effects_file, model) if path)
+    print(f"correction {correction.model} ({given})")
 
     bag = args.out / "flight.bag"
     write_bag(flight, bag, force=True)
-    paths = {"effects_file": effects_file, "model_file": args.model}
     try:
         live = run_live(
             bag, args.out, args.rate,
-            {name: str(Path(path).resolve()) if path else "" for name, path in paths.items()},
+            {"effects_file": _absolute(effects_file), "model_file": SHIPPED if model == SHIPPED else _absolute(model)},
             {"use_imu": flight.imu is not None},
             lambda text: print(f"nodes      {text}", flush=True),
         )  # fmt: skip
@@ -97,22 +96,27 @@ def demo(args):
 
 
 def _flight(args):
-    """(Flight, path of effects.yaml or None)."""
+    """(Flight, path of effects.yaml or None, model or None)."""
     if args.flight:
         flight = read_flight(args.flight, inputs.survey_for(args.flight, args.survey))
         if flight.truth is None:
             raise InputError(f"{args.flight}: holds no ground truth to compare with; take a flight that has it.")
         airborne(flight.truth)
-        return flight, args.effects
+        return flight, args.effects, args.model or (None if args.effects else SHIPPED)
     if args.survey:
         raise InputError("--survey: needs --flight; a simulated flight has its own anchors.")
     flight = simulate(SIMULATED)
     if args.effects or args.model:
-        return flight, args.effects
+        return flight, args.effects, args.model
     true_delays = AnchorDelay(flight.meta["parameters"]["anchor_delays"], source="the simulation's own values")
     effects_file = args.out / "effects.yaml"
     EffectSet((true_delays,)).to_yaml(effects_file)
-    return flight, effects_file
+    return flight, effects_file, None
+
+
+def _absolute(path):
+    """For a node, which runs elsewhere; "" for none."""
+    return str(Path(path).resolve()) if path else ""
 
 
 def _print_accounts(flight, became):

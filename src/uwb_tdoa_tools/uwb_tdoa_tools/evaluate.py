@@ -13,7 +13,7 @@ import yaml
 from uwb_tdoa_bias.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.network import Network
+from uwb_tdoa_bias.network import load_network
 from uwb_tdoa_ekf.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
@@ -61,7 +61,7 @@ def main(argv=None):
     parser.add_argument("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
     parser.add_argument("--effects", metavar="FILE", help="effects.yaml: systematic effects to correct for")
-    parser.add_argument("--model", metavar="FILE", help="ONNX bias network to correct with")
+    parser.add_argument("--model", metavar="FILE", help="ONNX bias network to correct with; default: the one shipped")
     parser.add_argument("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
     parser.add_argument("--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)")
     parser.add_argument(
@@ -85,7 +85,7 @@ def _evaluate(args):
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
     config = replace(config, **dict(map(_parameter, args.parameters)))
     effects = EffectSet.from_yaml(args.effects) if args.effects and not args.no_bias else None
-    network = Network(args.model) if args.model and not args.no_bias else None
+    network = None if args.no_bias else load_network(args.model)
     found = inputs.find_flights(args.flights, args.survey, absolute=bool(args.dask))
     for option in ("odometry", "plot"):
         if getattr(args, option) and len(found) != 1:

@@ -1,14 +1,12 @@
 """s that a whole recording takes without ROS: filter, correction, smoother."""
 
 import time
-from pathlib import Path
 
-from ament_index_python.packages import get_package_share_directory
 import numpy as np
 
 from uwb_tdoa_bias.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm, samples_at
-from uwb_tdoa_bias.network import Network
+from uwb_tdoa_bias.network import SHIPPED, load_network
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
@@ -30,7 +28,7 @@ def measure(progress, quick=False, model=None):
     progress("recording, first call")
     name = "first call: compiled, or compiled code read from numba's cache"
     yield Figure.of(section, name, "s", _seconds(run_offline, flight))
-    network = Network(model or Path(get_package_share_directory("uwb_tdoa_bias")) / "models" / "default.onnx")
+    network = load_network(model or SHIPPED)
     effects = EffectSet((
         AnchorDelay(flight.meta["parameters"]["anchor_delays"]), TagLeverArm({"x": 0.01, "y": 0.0, "z": 0.05}),
     ))  # fmt: skip

@@ -4,7 +4,7 @@ The structured model, trained on simulated flights: antennas and received power 
 How much of its prediction measured flights bear out, and how much remains that it does not know, is then taken from
 those: its mean is scaled by the one, its standard deviation is the other. Re-make it:
 
-    python -m uwb_tdoa_tools.training.default DATA/flights --survey DATA/surveys --out models/default.onnx
+    python -m uwb_tdoa_tools.training.default DATA/flights --survey DATA/surveys --out default.onnx
 
 It prints what the model does on each day's flights when that day took no part.
 """
