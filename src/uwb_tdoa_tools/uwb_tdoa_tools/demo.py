@@ -67,8 +67,8 @@ def demo(args):
     correction = Corrector(flight.anchors, effects, network)
     length = flight.truth.t[-1] - flight.truth.t[0]
     print(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
-    given = ", ".join(str(path) for path in (effects_file, model) if path)
-    print(f"correction {correction.model} ({given})")
+    sources = ["shipped with bias_node" if path == SHIPPED else str(path) for path in (effects_file, model) if path]
+    print(f"correction {correction.model} ({', '.join(sources)})")
 
     bag = args.out / "flight.bag"
     write_bag(flight, bag, force=True)
