@@ -76,9 +76,21 @@ def test_rates_and_age(clock):
     assert values == {
         "state": "running",
         "age of last odometry": "1.000 s",
+        "odometry behind the clock": "unknown",
         "IMU rate": "500.0 Hz",
         "TDOA rate": "20.0 Hz",
     }
+
+
+@pytest.mark.parametrize("behind, level", [(-0.5, OK), (0.9, OK), (1.1, WARN), (59.0, WARN), (3600.0, OK)])
+def test_odometry_that_falls_behind_the_clock_is_a_warning(clock, behind, level):
+    judge = health.Health(FilterConfig(), lag=0.25)
+    judge.behind = behind
+    said, text, values = second(clock, judge, RUNNING, used=400)
+    assert said == level and ("too slow" in text) == (level == WARN)
+    assert values["odometry behind the clock"] == f"{behind:.3f} s"
+    judge.behind = 2.0
+    assert "invalid" in second(clock, judge, RUNNING, used=400, invalid=400)[1]  # what matters more is said
 
 
 def test_a_tag_outside_of_the_flyable_volume_is_a_warning(clock):

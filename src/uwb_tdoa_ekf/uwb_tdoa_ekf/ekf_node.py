@@ -16,6 +16,7 @@ from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.node import Node
+from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias import ros
@@ -186,6 +187,12 @@ class EkfNode(Node):
         self._health.last_odometry = time.monotonic()
         self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
 
+    def _behind(self):
+        """s from the stamp of the newest odometry to now, by the clock of the node; None without odometry."""
+        if not self._health.odometry:
+            return None
+        return 1e-9 * (self.get_clock().now().nanoseconds - Time.from_msg(self._odometry.header.stamp).nanoseconds)
+
     def _report(self):
         counts, estimator = Counter(self._past), self._estimator
         imu_waiting = sum(take == self._take_imu for take, _ in self._early)
@@ -193,6 +200,7 @@ class EkfNode(Node):
         if estimator is not None:
             counts.update(estimator.counts, recoveries=estimator.recoveries)
             imu_waiting, tdoa_waiting = estimator.waiting
+        self._health.behind = self._behind()
         level, text, values = self._health.report(self._anchors.refused, estimator, counts)
         alarms = self._monitor.alarms if estimator is not None else []
         if alarms and level == OK:

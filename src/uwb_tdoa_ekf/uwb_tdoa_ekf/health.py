@@ -8,6 +8,7 @@ from uwb_tdoa_bias.ros import Rate
 from .place import Place
 
 PATIENCE = 5.0  # s of data without a start position before it becomes a warning
+BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is a recording
 DOUBT = 0.5  # share of TDOAs that are not used that becomes a warning
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -21,6 +22,7 @@ class Health:
         self.imu = self.tdoa = self.odometry = 0  # messages received, and published
         self.last_odometry = None  # time.monotonic(), s
         self.last_position = None  # (3,) m and its covariance (3, 3) m^2
+        self.behind = None  # s from the stamp of the newest odometry to the present time of ROS
         self._use_imu, self._lag = config.use_imu, lag
         self._place = Place(volume)
         self._imu_rate, self._tdoa_rate = Rate(), Rate()
@@ -59,8 +61,12 @@ class Health:
             trouble, there = self._place.judge(estimator.anchors, *self.last_position)
             if trouble and judgement[0] == OK:
                 judgement = WARN, trouble
+        if running and self.behind is not None and BEHIND[0] < self.behind < BEHIND[1] and judgement[0] == OK:
+            reason = "this machine is too slow for all it receives, or clocks differ"
+            judgement = WARN, f"the odometry is {self.behind:.1f} s behind: {reason}"
         age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
         values = {"state": "running" if running else "starting", "age of last odometry": age}
+        values |= {"odometry behind the clock": "unknown" if self.behind is None else f"{self.behind:.3f} s"}
         values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
         return *judgement, values | there
 
