@@ -41,12 +41,6 @@ def everything(samples):
     return out
 
 
-def features(samples):
-    """The features of a batch, in the order of FEATURES: Samples -> (n, 14) float; NaN where an attitude it needs is
-    unknown."""
-    return everything(samples)[:, : len(FEATURES)]
-
-
 @compiled
 def _fill_place(p, q, a, b, ids, positions, out):
     for i in range(len(a)):

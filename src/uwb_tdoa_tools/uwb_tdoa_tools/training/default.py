@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.network import Network
 
 from .. import inputs
@@ -63,7 +64,7 @@ def learn(count, options=OPTIONS):
     meta = {
         "name": "default", "kind": "structured", "clip": models.CLIP, "seed": SEED, "data": labelling.digest(known),
         "trained_on": [f"{count} simulated flights in {place}" for place in PLACES],
-        "constellations": labelling.constellations(known), "largest_yaw_std": models.LARGEST_YAW_STD,
+        "constellations": labelling.constellations(known), "largest_yaw_std": LARGEST_YAW_STD,
     }  # fmt: skip
     model = models.fit_structured(thin, 0, options)[0]
     model.forget_sites()

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwb_tdoa_bias.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.errors import InputError
 from uwb_tdoa_bias.features import columns
@@ -17,7 +18,6 @@ MARGINS = {"d": 1.0, "f": 2.0, "u": 0.5}  # trust fades over: positions m, forwa
 SLACK = 0.2  # added to the box of attitudes on every side: that much is an estimated attitude off at times
 SMALLEST_STD = 0.01  # m, of what remains
 POINTS = 4  # of a learning curve over flights
-LARGEST_YAW_STD = 1.0  # rad; a model that tells headings apart is of no use before the filter has found the yaw
 HEADINGS = 1.0  # range of the forward axis in training from which on a model tells headings apart
 _ATTITUDE = ("forward_x", "forward_y", "up_x", "up_y")
 
@@ -79,7 +79,7 @@ def train(kind, training, validation, seed, name, options=structured.Options(), 
         meta |= {"validity": _validity(learned_from, model.judged), "fade_std": _rms(one.error for one in groups[1])}
         heads = [meta["validity"][name] for name in ("forward_x", "forward_y")]
         if model.sees_attitude and any(high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads):
-            meta["largest_yaw_std"] = LARGEST_YAW_STD
+            meta["largest_yaw_std"] = LARGEST_YAW_STD  # before the yaw is known, it cannot tell
     errors = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
     return Trained(model, effects, curve, meta, errors)
 

@@ -208,10 +208,8 @@ class Structured:
         """(mean, variance explained) by the site maps, each (2n, 1). end : features of one end."""
         place, who, where = (graph.take(end, some) for some in ([0, 1, 2], [3], [4, 5, 6]))
         place = graph.op("Div", place, [self.options.length])
-        far = graph.distance2(place, self.site.centres)
-        far = far if self.site.squared else graph.op("Sqrt", far)
-        rates = [-0.5 / s**2 if self.site.squared else -1.0 / s for s in self.site.lengths]
-        parts = [graph.op("Exp", graph.op("Mul", far, [rate])) for rate in rates]
+        far = graph.op("Sqrt", graph.distance2(place, self.site.centres))
+        parts = [graph.op("Exp", graph.op("Mul", far, [-1.0 / s])) for s in self.site.lengths]
         values = graph.total([graph.op("Mul", part, [a**2]) for part, a in zip(parts, self.site.amplitudes)])
         other = graph.op("Mul", graph.op("Abs", graph.op("Sub", who, self.site_ids[None])), [1e3])  # ids count as far
         far = graph.op("Add", graph.distance2(where, self.site_positions), other)
