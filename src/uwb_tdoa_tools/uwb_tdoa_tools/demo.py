@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.offline import run_offline
 
 from . import cli, inputs
 from .bag import read_odometry, write_bag
-from .metrics import Score, airborne
+from .metrics import Score, airborne, position_at
 from .plots import plt
 from .readers import read_flight
 from .simulation import SimulationConfig, simulate
@@ -45,7 +45,7 @@ def main(argv=None):
     add("--rate", metavar="R", type=float, default=1.0, help="replay R times as fast as flown (default 1)")
     add("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="for all files (default out/demo)")
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
-    add("--model", metavar="FILE", help="ONNX bias network to correct with; default: the one shipped")
+    add("--model", metavar="FILE", help='ONNX bias network to correct with; "default" is the one shipped')
     return cli.run(demo, parser, argv)
 
 
@@ -144,8 +144,7 @@ def _plot(scores, flight, path):
     for score in scores:
         name = f"{score.name}: RMSE {score.row()['rmse_3d']:.3f} m"
         over_time.plot(score.t - score.first, np.linalg.norm(score.error, axis=1), lw=0.8, label=name)
-        truth = np.stack([np.interp(score.t, flight.truth.t, flight.truth.p[:, k]) for k in (0, 1)], axis=1)
-        above.plot(*(truth + score.error[:, :2]).T, lw=0.8, label=score.name)
+        above.plot(*(position_at(score.t, flight.truth) + score.error)[:, :2].T, lw=0.8, label=score.name)
     over_time.set(xlabel="time in the air [s]", ylabel="3D position error [m]", ylim=(0, None))
     above.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     for axes in (over_time, above):

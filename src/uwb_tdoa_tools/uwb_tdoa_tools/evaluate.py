@@ -61,7 +61,7 @@ def main(argv=None):
     parser.add_argument("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
     parser.add_argument("--effects", metavar="FILE", help="effects.yaml: systematic effects to correct for")
-    parser.add_argument("--model", metavar="FILE", help="ONNX bias network to correct with; default: the one shipped")
+    parser.add_argument("--model", metavar="FILE", help='ONNX bias network to correct with; "default" is the one shipped')
     parser.add_argument("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
     parser.add_argument("--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)")
     parser.add_argument(

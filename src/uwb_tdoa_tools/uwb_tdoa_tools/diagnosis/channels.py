@@ -12,7 +12,7 @@ from uwb_tdoa_bias.errors import InputError
 from uwb_tdoa_bias.flight import Truth
 from uwb_tdoa_bias.geometry import tdoa, tdoa_jacobian
 
-from ..metrics import airborne
+from ..metrics import airborne, position_at
 
 IMU_CELL = 0.25  # s; both sides of an inertial residual are averaged over it (accelerometer: a triangle twice as wide)
 MARGIN = 0.5  # s left out at both ends of the airborne part
@@ -142,7 +142,7 @@ def _imu(flight, truth, effects, first, last):
     t, accel = imu.t[flown], imu.accel[flown]
     world = Rotation.from_quat(_poses(flight, truth, t, False).q).apply(accel)
     turn = Rotation.from_quat(at.q).inv()
-    p = np.stack([np.interp(edges, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
+    p = position_at(edges, truth)
     acceleration = (p[2:] - 2.0 * p[1:-1] + p[:-2]) / IMU_CELL**2
     true = turn.apply(acceleration + [0.0, 0.0, GRAVITY])
     felt = turn.apply(_triangle(t, world, edges))

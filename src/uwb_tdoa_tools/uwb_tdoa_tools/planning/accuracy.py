@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..evaluate import evaluate
+from ..metrics import position_at
 from .precision import bound, information
 
 FEW = 20  # estimates in a cell below which it tells nothing
@@ -24,9 +25,7 @@ class Samples:
 def fly(flight):
     """Samples of a Flight with ground truth, static or moving. Raises InputError."""
     score, _ = evaluate(flight)
-    truth = flight.truth
-    place = np.stack([np.interp(score.t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
-    return Samples(score.t, place, score.error, score.covariance)
+    return Samples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
 
 
 def together(samples):

@@ -9,7 +9,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.geometry import tdoa
 from uwb_tdoa_ekf.offline import run_offline
 
-from ..metrics import Score, airborne
+from ..metrics import Score, airborne, position_at
 from .labels import LARGEST
 
 CELL = 0.3  # m, size of the cells in which residuals of two flights are compared
@@ -27,7 +27,7 @@ def oracle(flight, window):
     """
     data, anchors, truth = flight.tdoa, flight.anchors, flight.truth
     a, b = anchors.index(data.a), anchors.index(data.b)
-    p = np.stack([np.interp(data.t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
+    p = position_at(data.t, truth)
     error = data.d - tdoa(p, anchors.positions[a], anchors.positions[b])
     first, last = airborne(truth)
     bias, sane = np.zeros(len(data)), (np.abs(error) <= LARGEST) & (data.t >= first) & (data.t <= last)
