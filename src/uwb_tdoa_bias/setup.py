@@ -26,7 +26,7 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", glob("config/*.yaml")),
     ],
-    package_data={NAME: ["models/*.onnx"]},
+    package_data={NAME: ["correction/models/*.onnx"]},
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [

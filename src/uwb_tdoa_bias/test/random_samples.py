@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import Samples
 
 

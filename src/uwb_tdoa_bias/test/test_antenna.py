@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.antenna import DWM1000_AZIMUTH, DWM1000_ELEVATION_1, DWM1000_ELEVATION_2, Antenna
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.antenna import DWM1000_AZIMUTH, DWM1000_ELEVATION_1, DWM1000_ELEVATION_2, Antenna
+from uwb_tdoa_bias.foundation.errors import InputError
 
 angles = st.floats(-np.pi, np.pi)
 

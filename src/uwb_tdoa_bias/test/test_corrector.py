@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
-from uwb_tdoa_bias.poses import told_yaw_std, turned
+from uwb_tdoa_bias.correction.poses import told_yaw_std, turned
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
 DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))

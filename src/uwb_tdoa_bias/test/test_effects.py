@@ -7,10 +7,10 @@ import pytest
 from random_samples import random_samples
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, ImuCorrector, Samples, SmoothTerm, TagLeverArm
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.geometry import tdoa
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.geometry import tdoa
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -217,7 +217,7 @@ def test_inertial_samples_are_corrected_the_same_at_once_and_one_by_one():
 
 
 def test_stamps_and_spread():
-    from uwb_tdoa_bias.flight import Flight, Tdoas
+    from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
 
     samples = random_samples(4)
     ids = samples.anchors.ids

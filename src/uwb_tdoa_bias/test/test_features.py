@@ -3,9 +3,9 @@ import numpy as np
 from random_samples import random_rotation, random_samples
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import Samples
-from uwb_tdoa_bias.features import FEATURES, NAMES, PLACE, columns, everything
+from uwb_tdoa_bias.correction.features import FEATURES, NAMES, PLACE, columns, everything
 
 ANGLES = [k for k, name in enumerate(FEATURES) if name.startswith(("azimuth", "elevation"))]
 seeds = st.integers(0, 2**32 - 1)

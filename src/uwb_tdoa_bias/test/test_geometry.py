@@ -3,7 +3,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 from random_samples import random_rotation
 
-from uwb_tdoa_bias.geometry import rotate, tdoa, tdoa_jacobian
+from uwb_tdoa_bias.foundation.geometry import rotate, tdoa, tdoa_jacobian
 
 seeds = st.integers(0, 2**32 - 1)
 

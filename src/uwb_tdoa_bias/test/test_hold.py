@@ -1,6 +1,6 @@
 from hypothesis import given
 from hypothesis import strategies as st
-from uwb_tdoa_bias.hold import Hold
+from uwb_tdoa_bias.correction.hold import Hold
 
 
 def test_leaves_when_ready_in_order_of_arrival():

@@ -4,11 +4,11 @@ import pickle
 
 import numpy as np
 import pytest
-from uwb_tdoa_bias import known_answer
-from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.correction import known_answer
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import Samples
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.network import MODELS, SHIPPED, Network, load_network
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.correction.network import MODELS, SHIPPED, Network, load_network
 
 KNOWN = MODELS / "known_answer.onnx"
 ANCHORS = Anchors.from_positions([[5, 0, 1], [-3, 2, 3], [0, -400, 2]])

@@ -4,15 +4,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from geometry_msgs.msg import Quaternion  # noqa: E402
 from rclpy.qos import QoSCompatibility, QoSPresetProfiles, QoSProfile, qos_check_compatible  # noqa: E402
-from uwb_tdoa_bias import ros  # noqa: E402
+from uwb_tdoa_bias.foundation import ros  # noqa: E402
 
 NANOSECONDS = st.integers(0, 10**9 - 1)
 MONTH = 30 * 86400

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.stamps import AHEAD, BACK, StampWatch
+from uwb_tdoa_bias.foundation.stamps import AHEAD, BACK, StampWatch
 
 
 def through(stamps):

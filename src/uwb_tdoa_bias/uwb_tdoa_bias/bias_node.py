@@ -15,15 +15,15 @@ import numpy as np
 from rclpy.node import Node
 from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
-from . import ros
-from .anchors import Anchors
-from .corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
+from .foundation import ros
+from .foundation.anchors import Anchors
+from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
 from .effects import EffectSet
-from .errors import InputError
-from .hold import Hold
-from .network import SHIPPED, load_network
-from .poses import told_yaw_std
-from .stamps import StampWatch
+from .foundation.errors import InputError
+from .correction.hold import Hold
+from .correction.network import SHIPPED, load_network
+from .correction.poses import told_yaw_std
+from .foundation.stamps import StampWatch
 
 ROTATIONS = [21, 28, 35]  # places of the variances about the axes in the covariance of a pose
 EARLY = 2000  # TDOAs kept while there are no anchors

@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.geometry import tdoa
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.geometry import tdoa
 
 GRAVITY = 9.81
 

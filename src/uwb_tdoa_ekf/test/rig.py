@@ -19,7 +19,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 from tf2_msgs.msg import TFMessage
-from uwb_tdoa_bias import ros
+from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
 EPOCH = 1_700_000_000  # s; stamps of today's size

@@ -2,8 +2,8 @@ from dataclasses import fields
 
 import pytest
 
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_ekf.config import LOSSES, ROBUST, FilterConfig, Tuning
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.config import LOSSES, ROBUST, FilterConfig, Tuning
 
 SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover")
 OTHERS = ("robust", "loss", "initial_yaw", *SWITCHES)

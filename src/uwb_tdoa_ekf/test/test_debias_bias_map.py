@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from uwb_tdoa_ekf.debias import BiasMap
 from uwb_tdoa_ekf.debias.bias_map import FADE, INTERPOLATORS

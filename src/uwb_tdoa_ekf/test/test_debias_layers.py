@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from uwb_tdoa_ekf.debias import LayerConfig, Layers
 

@@ -14,9 +14,9 @@ from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from flights import corners  # noqa: E402
 from rig import MODULES, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from sensor_msgs.msg import Imu  # noqa: E402
-from uwb_tdoa_bias import ros  # noqa: E402
-from uwb_tdoa_bias.anchors import Anchors  # noqa: E402
-from uwb_tdoa_bias.flyable import FlyableVolume  # noqa: E402
+from uwb_tdoa_bias.foundation import ros  # noqa: E402
+from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
 ANCHORS = corners()  # ids 10 ... 17

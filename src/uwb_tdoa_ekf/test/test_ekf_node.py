@@ -8,8 +8,8 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from flights import fly  # noqa: E402
-from uwb_tdoa_ekf import engine, validity  # noqa: E402
-from uwb_tdoa_ekf.config import FilterConfig  # noqa: E402
+from uwb_tdoa_ekf.core import engine, validity  # noqa: E402
+from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
 from uwb_tdoa_ekf.estimator import Estimator  # noqa: E402
 

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.flight import Imu, Tdoas
-from uwb_tdoa_bias.geometry import tdoa
-from uwb_tdoa_ekf import engine
-from uwb_tdoa_ekf.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.engine import REJECTED, STARTUP, USED, run
-from uwb_tdoa_ekf.hypotheses import YAW_STD
-from uwb_tdoa_ekf.memory import BEST, RECOVERIES, RUNNING, Memory, new_memory
-from uwb_tdoa_ekf.tape import new_tape
+from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
+from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_ekf.core import engine
+from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
+from uwb_tdoa_ekf.core.engine import REJECTED, STARTUP, USED, run
+from uwb_tdoa_ekf.core.memory import BEST, RECOVERIES, RUNNING, Memory, new_memory
+from uwb_tdoa_ekf.core.tape import new_tape
 
 MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaResidual.msg"
 

@@ -6,11 +6,11 @@ from live import IMU, TDOA, arriving, assert_same, feed, joined, messages
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.flight import Tdoas
-from uwb_tdoa_bias.stamps import BACK
-from uwb_tdoa_ekf.config import FilterConfig
-from uwb_tdoa_ekf.engine import INVALID, LATE, STARTUP, USED
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.stamps import BACK
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.engine import INVALID, LATE, STARTUP, USED
 from uwb_tdoa_ekf.estimator import VERDICTS, Estimator
 from uwb_tdoa_ekf.offline import run_offline
 

@@ -3,15 +3,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.flyable import FlyableVolume
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from uwb_tdoa_ekf import health  # noqa: E402
-from uwb_tdoa_ekf.config import FilterConfig  # noqa: E402
-from uwb_tdoa_ekf.health import ERROR, OK, WARN  # noqa: E402
+from uwb_tdoa_ekf.monitoring import health  # noqa: E402
+from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
+from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402
 
 STARTING, RUNNING = SimpleNamespace(running=False), SimpleNamespace(running=True)
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_ekf.config import FilterConfig
-from uwb_tdoa_ekf.hypotheses import HOPELESS, YAW_STD, add_doubt, blame, choose, quarter
-from uwb_tdoa_ekf.memory import BEST, HYPOTHESES, new_memory
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.hypotheses import HOPELESS, YAW_STD, add_doubt, blame, choose, quarter
+from uwb_tdoa_ekf.core.memory import BEST, HYPOTHESES, new_memory
 from uwb_tdoa_ekf.offline import run_offline
 
 NOISE = dict(accel_noise=0.01, gyro_noise=0.001)  # a common sensor that does not vibrate

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_ekf.inertial import quiet, observe, trust
-from uwb_tdoa_ekf.memory import LAST_IMU, FORCE, GYRO, MEAN_FORCE, new_memory
-from uwb_tdoa_ekf.state import GRAVITY
+from uwb_tdoa_ekf.core.inertial import quiet, observe, trust
+from uwb_tdoa_ekf.core.memory import LAST_IMU, FORCE, GYRO, MEAN_FORCE, new_memory
+from uwb_tdoa_ekf.core.state import GRAVITY
 
 UP = np.array([0.0, 0.0, GRAVITY])
 

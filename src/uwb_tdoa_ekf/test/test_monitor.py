@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_ekf.engine import INVALID, USED
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.core.engine import INVALID, USED
 from uwb_tdoa_ekf.estimator import Odometry, Residuals
-from uwb_tdoa_ekf.monitor import Monitor
+from uwb_tdoa_ekf.monitoring.monitor import Monitor
 
 ANCHORS = Anchors.from_positions(np.random.default_rng(0).uniform(-4, 4, (6, 3)), ids=[3, 5, 7, 9, 11, 13])
 IDS = ANCHORS.ids

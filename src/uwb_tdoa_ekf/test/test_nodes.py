@@ -15,17 +15,17 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
 from rig import EPOCH, make_rig, recording, seconds_of  # noqa: E402, F401
-from uwb_tdoa_bias.corrector import Corrector  # noqa: E402
+from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
-from uwb_tdoa_bias.flight import Tdoas
-from uwb_tdoa_bias.network import Network  # noqa: E402
-from uwb_tdoa_ekf.config import FilterConfig  # noqa: E402
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.correction.network import Network  # noqa: E402
+from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
 SOURCES = Path(__file__).resolve().parents[2]
-MODEL = SOURCES / "uwb_tdoa_bias" / "uwb_tdoa_bias" / "models" / "known_answer.onnx"
+MODEL = SOURCES / "uwb_tdoa_bias" / "uwb_tdoa_bias" / "correction" / "models" / "known_answer.onnx"
 EFFECTS = "effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, tag_lever_arm: {values: {x: 0.05, z: 0.1}}}"
 
 

@@ -4,9 +4,9 @@ import pytest
 
 from flights import corners, fly
 from dataclasses import replace
-from uwb_tdoa_ekf.config import FilterConfig
-from uwb_tdoa_ekf.memory import new_memory
-from uwb_tdoa_ekf.noise import excess_variance, learn
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.memory import new_memory
+from uwb_tdoa_ekf.core.noise import excess_variance, learn
 from uwb_tdoa_ekf.offline import run_offline
 
 

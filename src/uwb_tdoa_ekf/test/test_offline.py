@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from uwb_tdoa_bias.corrector import Corrector
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
-from uwb_tdoa_bias.flight import Flight, Imu, Tdoas
-from uwb_tdoa_bias.poses import told_yaw_std
-from uwb_tdoa_ekf.config import FilterConfig
-from uwb_tdoa_ekf.engine import INVALID, STARTUP, USED
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
+from uwb_tdoa_bias.correction.poses import told_yaw_std
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.engine import INVALID, STARTUP, USED
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import to_odometry
 from uwb_tdoa_ekf.offline import run_offline

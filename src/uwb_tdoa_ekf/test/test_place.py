@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.flyable import FlyableVolume
-from uwb_tdoa_ekf.place import Place
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flyable import FlyableVolume
+from uwb_tdoa_ekf.monitoring.place import Place
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 3]])
 COVARIANCE = np.diag([0.01, 0.03, 0.12])

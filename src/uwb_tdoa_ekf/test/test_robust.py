@@ -4,20 +4,12 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.geometry import tdoa, tdoa_jacobian
-from uwb_tdoa_ekf.robust import (
-    CAUCHY,
-    GEMAN_MCCLURE,
-    HUBER,
-    NEGLIGIBLE,
-    gain_terms,
-    predicted,
-    update_gate,
-    update_innovation,
-    update_m_estimation,
-    weight,
-)
-from uwb_tdoa_ekf.state import inject
+from uwb_tdoa_bias.foundation.geometry import tdoa, tdoa_jacobian
+from uwb_tdoa_ekf.core.robust import (
+    CAUCHY, GEMAN_MCCLURE, HUBER, NEGLIGIBLE, gain_terms, predicted, update_gate, update_innovation,
+    update_m_estimation, weight,
+)  # fmt: skip
+from uwb_tdoa_ekf.core.state import inject
 
 seeds = st.integers(0, 2**32 - 1)
 losses = st.sampled_from([GEMAN_MCCLURE, HUBER, CAUCHY])

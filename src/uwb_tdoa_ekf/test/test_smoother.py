@@ -6,8 +6,8 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.flight import Tdoas
-from uwb_tdoa_ekf.config import ROBUST, FilterConfig
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 

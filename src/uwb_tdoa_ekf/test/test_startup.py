@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.geometry import tdoa
-from uwb_tdoa_ekf.startup import INLIER, ROOM, believable, level, locate, reach, share_of_inliers
+from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_ekf.core.startup import INLIER, ROOM, believable, level, locate, reach, share_of_inliers
 
 SIZE = np.array([7.0, 8.0, 3.0])
 STD = 0.25  # m, what locate is told of one TDOA

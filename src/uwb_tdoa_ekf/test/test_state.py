@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_ekf.state import GRAVITY, coast, inject, predict, rotation, turn
+from uwb_tdoa_ekf.core.state import GRAVITY, coast, inject, predict, rotation, turn
 
 seeds = st.integers(0, 2**32 - 1)
 DOWN = np.array([0.0, 0.0, -GRAVITY])

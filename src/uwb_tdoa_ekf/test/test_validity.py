@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_ekf.validity import MARGIN, usable, usable_all
+from uwb_tdoa_ekf.core.validity import MARGIN, usable, usable_all
 
 POSITIONS = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])
 CASES = [

@@ -15,8 +15,8 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
-from uwb_tdoa_bias import ros
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .debias import BiasMap, LayerConfig, Layers
 

@@ -19,19 +19,19 @@ from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from tf2_msgs.msg import TFMessage
-from uwb_tdoa_bias import ros
-from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import EffectSet, ImuCorrector
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.flyable import FlyableVolume
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
 
-from .config import FilterConfig
-from .engine import INVALID
+from .core.config import FilterConfig
+from .core.engine import INVALID
 from .estimator import VERDICTS, Estimator
 from .frames import to_odometry
-from .health import OK, WARN, Health
-from .monitor import Monitor
+from .monitoring.health import OK, WARN, Health
+from .monitoring.monitor import Monitor
 
 EARLY = 5000  # messages kept while there are no anchors
 UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.stamps import StampWatch
+from uwb_tdoa_bias.foundation.stamps import StampWatch
 
-from .config import FilterConfig
-from .engine import INVALID, LATE, REJECTED, STARTUP, USED, run
-from .memory import RECOVERIES, RUNNING, new_memory
-from .tape import new_tape
-from .validity import MAX_FORCE, MAX_RATE, usable
+from .core.config import FilterConfig
+from .core.engine import INVALID, LATE, REJECTED, STARTUP, USED, run
+from .core.memory import RECOVERIES, RUNNING, new_memory
+from .core.tape import new_tape
+from .core.validity import MAX_FORCE, MAX_RATE, usable
 
 VERDICTS = {USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup"}
 IMU, TDOA = range(2)  # the streams

@@ -4,17 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_bias.corrector import Corrector
-from uwb_tdoa_bias.poses import told_yaw_std
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.poses import told_yaw_std
 
-from .config import FilterConfig
-from .engine import INVALID, run
+from .core.config import FilterConfig
+from .core.engine import INVALID, run
 from .estimator import VERDICTS, Odometry, Residuals
 from .frames import rotation_std
-from .hypotheses import quarter
-from .memory import BEST, RECOVERIES, TAPED, new_memory
-from .tape import new_tape
-from .validity import usable_all, usable_imu
+from .core.hypotheses import quarter
+from .core.memory import BEST, RECOVERIES, TAPED, new_memory
+from .core.tape import new_tape
+from .core.validity import usable_all, usable_imu
 
 
 @dataclass(frozen=True)

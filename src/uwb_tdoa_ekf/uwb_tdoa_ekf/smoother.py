@@ -9,15 +9,15 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import compiled
 
-from .config import FilterConfig
-from .engine import REST_PERIOD
+from .core.config import FilterConfig
+from .core.engine import REST_PERIOD
 from .estimator import Odometry
-from .hypotheses import YAW_STD
+from .core.hypotheses import YAW_STD
 from .offline import run_offline
-from .state import inject
-from .tape import REPLACED, new_tape
+from .core.state import inject
+from .core.tape import REPLACED, new_tape
 
 
 def smooth(flight, config=None, corrector=None):

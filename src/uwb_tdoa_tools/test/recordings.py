@@ -4,8 +4,8 @@ import struct
 import zlib
 
 import numpy as np
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 
 ANCHORS = Anchors(
     [0, 1, 5],

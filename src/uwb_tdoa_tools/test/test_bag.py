@@ -12,12 +12,12 @@ from recordings import ANCHORS, differences, small_flight
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader, Writer
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_tools.bag import read_bag, read_fields, read_odometry, write_bag
-from uwb_tdoa_tools.bag_messages import tdoa_messages
-from uwb_tdoa_tools.message_types import typestore
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_bag
+from uwb_tdoa_tools.bags.messages import tdoa_messages
+from uwb_tdoa_tools.bags.message_types import typestore
 
 BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 

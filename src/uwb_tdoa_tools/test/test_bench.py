@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from uwb_tdoa_tools import bench
+from uwb_tdoa_tools.commands import bench
 from uwb_tdoa_tools.benchmark import usage
 from uwb_tdoa_tools.benchmark.figures import Figure, as_json, table
 from uwb_tdoa_tools.benchmark.flights import TDOA_RATE, make_flight

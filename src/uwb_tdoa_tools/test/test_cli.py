@@ -2,7 +2,7 @@ import subprocess
 import sys
 
 import pytest
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools import cli
 
 

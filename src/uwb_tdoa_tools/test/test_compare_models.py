@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from uwb_tdoa_bias.network import Network
-from uwb_tdoa_tools import compare_models
+from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_tools.commands import compare_models
 from uwb_tdoa_tools.training import simulated, structured
 
 

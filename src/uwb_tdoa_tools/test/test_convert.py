@@ -2,7 +2,7 @@ import json
 
 import pytest
 from recordings import SURVEY, csv_text, differences, log_bytes
-from uwb_tdoa_tools.convert import main
+from uwb_tdoa_tools.commands.convert import main
 from uwb_tdoa_tools.readers import read_flight
 
 

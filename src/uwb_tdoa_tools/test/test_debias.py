@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from uwb_tdoa_ekf.debias import BiasMap
 
-from uwb_tdoa_tools.bag import write_bag
-from uwb_tdoa_tools.debias import main
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands.debias import main
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 BIAS = np.array([0.1, -0.2, 0.05])

@@ -1,8 +1,8 @@
 import pytest
 
-from uwb_tdoa_tools.debiasing import measured
+from uwb_tdoa_tools.studies.debiasing import measured
 from uwb_tdoa_tools.debiasing.report import measured_tables
-from uwb_tdoa_tools.diagnosis.bench.measured import SPLITS
+from uwb_tdoa_tools.studies.diagnosis.measured import SPLITS
 
 
 def test_no_flight_is_fitted_to_and_judged():

@@ -1,6 +1,6 @@
 import numpy as np
 
-from uwb_tdoa_tools.debiasing import set_up
+from uwb_tdoa_tools.studies.debiasing import set_up
 from uwb_tdoa_tools.debiasing.report import set_up_tables
 from uwb_tdoa_tools.simulation import SimulationConfig
 

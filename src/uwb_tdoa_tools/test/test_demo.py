@@ -1,7 +1,7 @@
 import pytest
 
 pytest.importorskip("rclpy")
-from uwb_tdoa_tools import demo  # noqa: E402
+from uwb_tdoa_tools.commands import demo  # noqa: E402
 
 
 @pytest.mark.parametrize(

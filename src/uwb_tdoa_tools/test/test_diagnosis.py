@@ -5,12 +5,12 @@ import pytest
 
 import undeclared
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_tools.bag import write_bag
-from uwb_tdoa_tools.diagnose import main
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands.diagnose import main
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.attribute import attribute
-from uwb_tdoa_tools.diagnosis.bench.bank import SIZES, clean_flight, effect_of, names_found
+from uwb_tdoa_tools.studies.diagnosis.bank import SIZES, clean_flight, effect_of, names_found
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.fit import fit
 from uwb_tdoa_tools.diagnosis.rows import build, candidates
@@ -99,7 +99,7 @@ def test_an_undeclared_effect_is_found_by_its_covariate(flight):
 def test_anchors_of_two_installations_are_refused(flight):
     from dataclasses import replace
 
-    from uwb_tdoa_bias.anchors import Anchors
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
     other = replace(
         flight,

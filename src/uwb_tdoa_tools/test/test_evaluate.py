@@ -6,13 +6,14 @@ import pytest
 from scipy.stats import chi2
 
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_ekf.config import FilterConfig
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_tools.bag import write_bag
-from uwb_tdoa_tools.bag_files import new_bag
-from uwb_tdoa_tools.evaluate import evaluate, main
-from uwb_tdoa_tools.message_types import typestore
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.bags.files import new_bag
+from uwb_tdoa_tools.commands.evaluate import main
+from uwb_tdoa_tools.scoring.evaluation import evaluate
+from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 
 CLEAN = dict(duration=14.0, floor_time=1.0, imu_rate=200.0, bias=False, multipath=False, outlier_probability=0.0)

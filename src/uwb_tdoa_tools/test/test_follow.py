@@ -10,9 +10,9 @@ rclpy = pytest.importorskip("rclpy")
 from rclpy.serialization import serialize_message  # noqa: E402
 from sensor_msgs.msg import Imu, TimeReference  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
-from uwb_tdoa_bias.errors import InputError  # noqa: E402
-from uwb_tdoa_tools import follow  # noqa: E402
-from uwb_tdoa_tools.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
+from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_tools.live import follow  # noqa: E402
+from uwb_tdoa_tools.live.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
 
 SECOND = 10**9
 

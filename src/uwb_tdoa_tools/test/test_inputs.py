@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from recordings import ANCHORS, SURVEY, log_bytes
 
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_tools.inputs import find_flights, load_flights, survey_for
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.readers.inputs import find_flights, load_flights, survey_for
 
 
 def make(folder, *names):

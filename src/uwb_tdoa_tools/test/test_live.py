@@ -3,7 +3,7 @@
 import pytest
 
 pytest.importorskip("rclpy")
-from uwb_tdoa_tools import live  # noqa: E402
+from uwb_tdoa_tools.live import run as live  # noqa: E402
 
 
 def test_parameters_are_yaml_whatever_they_hold():

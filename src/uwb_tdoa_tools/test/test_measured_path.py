@@ -4,11 +4,11 @@ import pytest
 
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
 
-from uwb_tdoa_bias.network import SHIPPED, load_network  # noqa: E402
-from uwb_tdoa_tools.bag import read_bag, read_odometry, write_bag  # noqa: E402
-from uwb_tdoa_tools.evaluate import evaluate  # noqa: E402
-from uwb_tdoa_tools.live import run_live  # noqa: E402
-from uwb_tdoa_tools.metrics import Score  # noqa: E402
+from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
+from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
+from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
+from uwb_tdoa_tools.live.run import run_live  # noqa: E402
+from uwb_tdoa_tools.scoring.metrics import Score  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 
 VERDICTS = ("used", "rejected", "late", "invalid", "startup", "waiting")

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.flight import Imu, Tdoas
-from uwb_tdoa_ekf.config import FilterConfig
-from uwb_tdoa_ekf.engine import run
-from uwb_tdoa_ekf.memory import new_memory
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.engine import run
+from uwb_tdoa_ekf.core.memory import new_memory
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.tape import new_tape
-from uwb_tdoa_tools.inputs import load_flights
-from uwb_tdoa_tools.metrics import airborne
+from uwb_tdoa_ekf.core.tape import new_tape
+from uwb_tdoa_tools.readers.inputs import load_flights
+from uwb_tdoa_tools.scoring.metrics import airborne
 
 FLIGHTS = (
     "0422-log00", "0425-traj13", "0425-traj2", "0426-traj1", "0426-traj15", "0426-traj9", "tdoa2-obs-log1",

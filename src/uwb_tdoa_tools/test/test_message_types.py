@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 from rosbags.typesys import Stores, get_typestore
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_tools.message_types import OUR_TYPES, add_type, typestore
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.bags.message_types import OUR_TYPES, add_type, typestore
 
 PREFIXES = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
 BUILT = [prefix / "share" / "uwb_tdoa_msgs" / "msg" for prefix in PREFIXES]

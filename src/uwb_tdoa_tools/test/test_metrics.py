@@ -3,10 +3,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.flight import Truth
-from uwb_tdoa_ekf.engine import INVALID, LATE, REJECTED, STARTUP, USED
-from uwb_tdoa_tools.metrics import Score, airborne, coverage, nees, nis, pooled, position_errors, summary
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_ekf.core.engine import INVALID, LATE, REJECTED, STARTUP, USED
+from uwb_tdoa_tools.scoring.metrics import Score, airborne, coverage, nees, nis, pooled, position_errors, summary
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 

@@ -8,8 +8,9 @@ import time
 from pathlib import Path
 
 import pytest
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_tools import cli, parallel
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools import cli
+from uwb_tdoa_tools import parallel
 
 
 def times_ten(number):

@@ -6,10 +6,10 @@ import sys
 
 import numpy as np
 import pytest
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.flyable import FlyableVolume
-from uwb_tdoa_tools import plan
-from uwb_tdoa_tools.bag import write_bag
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flyable import FlyableVolume
+from uwb_tdoa_tools.commands import plan
+from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners
 
@@ -164,7 +164,7 @@ def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
     command = [
         sys.executable,
         "-m",
-        "uwb_tdoa_tools.plan",
+        "uwb_tdoa_tools.commands.plan",
         anchors,
         *COARSE,
         "--out",

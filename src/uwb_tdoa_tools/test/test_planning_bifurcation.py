@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.bifurcation import CLEAR, MOST_SUBSETS, Subsets
 from uwb_tdoa_tools.planning.check import brute_force
 from uwb_tdoa_tools.planning.installation import Installation

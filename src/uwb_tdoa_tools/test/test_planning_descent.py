@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.descent import descend, errors_and_slopes, failing_and_slopes
 from uwb_tdoa_tools.planning.goal import UNUSABLE, Goal

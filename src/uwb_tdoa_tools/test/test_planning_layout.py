@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.layout import one_more, optimise

@@ -2,7 +2,7 @@ import time
 
 import numpy as np
 import pytest
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import MOST_CELLS, Grid, chart

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from uwb_tdoa_tools.bag_files import deserialize, open_bag
+from uwb_tdoa_tools.bags.files import deserialize, open_bag
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid, chart
 from uwb_tdoa_tools.planning.messages import TOPICS, messages, write

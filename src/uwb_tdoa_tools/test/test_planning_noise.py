@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise, antenna_from_yaml, variance_gradient
-from uwb_tdoa_bias.antenna import DWM1000_AZIMUTH, Antenna
+from uwb_tdoa_bias.foundation.antenna import DWM1000_AZIMUTH, Antenna
 from uwb_tdoa_tools.simulation.constellations import corners, facing
 
 ONE = Anchors.from_positions([[0.0, 0.0, 0.0]])  # no orientation: omnidirectional

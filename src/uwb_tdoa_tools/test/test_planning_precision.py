@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import median_filter
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.geometry import tdoa
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.noise import RadioNoise

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue  # noqa: E402
-from uwb_tdoa_tools import processes  # noqa: E402
+from uwb_tdoa_tools.live import processes  # noqa: E402
 
 
 @pytest.fixture

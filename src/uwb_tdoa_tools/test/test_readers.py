@@ -3,8 +3,8 @@ import gzip
 import numpy as np
 import pytest
 from recordings import ANCHORS, SURVEY, csv_text, log_bytes, small_flight
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_tools.bag import write_bag
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.readers import read_flight
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from recordings import differences, small_flight
-from uwb_tdoa_tools.bag import read_bag, read_fields, write_bag
+from uwb_tdoa_tools.bags.bag import read_bag, read_fields, write_bag
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="uwb_tdoa_msgs is not built and sourced")
@@ -22,7 +22,7 @@ from rosbags.rosbag2 import Reader  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
-from uwb_tdoa_tools import record, replay  # noqa: E402
+from uwb_tdoa_tools.commands import record, replay  # noqa: E402
 
 LIMIT = 60.0  # s: a step that takes longer has failed
 STREAMS = ["imu/data", "uwb/tdoa", "ground_truth/pose"]
@@ -33,7 +33,7 @@ class Process:
     """A tool of ours that runs, and what it says on stderr, line by line."""
 
     def __init__(self, name, *arguments):
-        command = [sys.executable, "-m", f"uwb_tdoa_tools.{name}", *map(str, arguments)]
+        command = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *map(str, arguments)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         self.said = []
         self._lines = queue.Queue()

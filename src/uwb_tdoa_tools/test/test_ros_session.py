@@ -4,7 +4,7 @@ rclpy = pytest.importorskip("rclpy")
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability  # noqa: E402
-from uwb_tdoa_tools.ros_session import message_class, publisher_qos, recorded_qos, subscription_qos  # noqa: E402
+from uwb_tdoa_tools.live.session import message_class, publisher_qos, recorded_qos, subscription_qos  # noqa: E402
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 LATCHED, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from uwb_tdoa_tools import simulate
+from uwb_tdoa_tools.commands import simulate
 from uwb_tdoa_tools.simulation import SimulationConfig
 
 SHORT = ["--duration", "20", "--trajectory", "circle"]

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import YAW_PROFILES
 from uwb_tdoa_tools.simulation.constellations import CONSTELLATIONS

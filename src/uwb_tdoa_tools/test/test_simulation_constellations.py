@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.simulation.constellations import CONSTELLATIONS, constellation, facing
 from uwb_tdoa_tools.simulation.room import room_of
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.antenna import Antenna
-from uwb_tdoa_bias.radio import RadioLink, arrival_bias, into_frame, power_bias, received_power_dbm
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.antenna import Antenna
+from uwb_tdoa_bias.foundation.radio import RadioLink, arrival_bias, into_frame, power_bias, received_power_dbm
 from uwb_tdoa_tools.simulation.constellations import pair
 from uwb_tdoa_tools.simulation.ranging import tag_link
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.geometry import tdoa
+from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_bias.radio import arrival_bias
+from uwb_tdoa_bias.foundation.radio import arrival_bias
 from uwb_tdoa_tools.simulation.ranging import floor_multipath, outliers, tdoa_noise
 from uwb_tdoa_tools.simulation.schedule import make_schedule
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.simulation import SimulationConfig
 from uwb_tdoa_tools.simulation.trajectories import GRAVITY, TRAJECTORIES, Trajectory
 

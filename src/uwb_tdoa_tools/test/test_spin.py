@@ -1,6 +1,6 @@
 import numpy as np
 
-from uwb_tdoa_tools import spin
+from uwb_tdoa_tools.commands import spin
 
 
 def test_orientation_matters_and_the_specimen_hardly(tmp_path, capsys):

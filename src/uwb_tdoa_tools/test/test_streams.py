@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from uwb_tdoa_bias.flight import Tdoas
+from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.readers.streams import protocol
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from recordings import ANCHORS, SURVEY
 from scipy.spatial.transform import Rotation
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.readers import read_survey
 from uwb_tdoa_tools.readers.survey import ARM_TIPS, orientation_from_tips
 

@@ -5,9 +5,9 @@ import pytest
 from training_flights import flight, without_attitude
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.network import Network
-from uwb_tdoa_tools import train
-from uwb_tdoa_tools.bag import write_bag
+from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_tools.commands import train
+from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.training import structured
 from uwb_tdoa_tools.training.labels import labels
 

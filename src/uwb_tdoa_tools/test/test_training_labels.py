@@ -5,8 +5,8 @@ import pytest
 from training_flights import flight, without_attitude
 
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.geometry import tdoa
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.training.labels import constellations, digest, labels, split, thinned, white_noise
 
 PERFECT = {"noise_std": 0.0, "bias": False, "outlier_probability": 0.0}

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from recordings import ANCHORS, EVENTS, ROWS, log_bytes
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.readers import read_usd_log
 
 

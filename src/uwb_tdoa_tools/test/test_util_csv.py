@@ -3,7 +3,7 @@ import gzip
 import numpy as np
 import pytest
 from recordings import ANCHORS, FULL_HEADER, FULL_ROWS, csv_text
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.readers import read_util_csv
 
 SUBSET = "t_tdoa,idA,idB,tdoa_meas,t_pose,pose_x,pose_y,pose_z"

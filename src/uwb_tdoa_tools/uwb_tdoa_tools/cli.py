@@ -10,7 +10,7 @@ import argparse
 import os
 import sys
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 
 def parser(name, description, *examples):

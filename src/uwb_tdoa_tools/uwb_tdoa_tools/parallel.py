@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from joblib import Parallel, cpu_count, delayed, parallel_config
 from tqdm import tqdm
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
 

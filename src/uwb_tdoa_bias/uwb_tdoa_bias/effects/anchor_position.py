@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ..errors import InputError
-from ..geometry import tdoa
+from ..foundation.errors import InputError
+from ..foundation.geometry import tdoa
 from .base import Effect, check_anchor, known_anchors, once_per_anchors
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ..antenna import Antenna
-from ..radio import FLAT_MOUNT, into_frame
+from ..foundation.antenna import Antenna
+from ..foundation.radio import FLAT_MOUNT, into_frame
 from .base import ArrivalEffect, tile
 
 UNIT = Antenna(delay_span=1.0)
@@ -20,7 +20,7 @@ class AntennaPattern(ArrivalEffect):
     example = "tag"
     physics = "off its best direction an antenna radiates over longer ways: the group delay grows towards its nulls"
     confounded_with = ("received_power_bias", "tag_lever_arm")
-    reference = "Qorvo support: 10 - 15 cm over direction for a module; the shape is that of uwb_tdoa_bias.antenna"
+    reference = "Qorvo support: 10 - 15 cm over direction for a module; the shape is that of uwb_tdoa_bias.foundation.antenna"
 
     @classmethod
     def groups(cls, anchors, pairs):

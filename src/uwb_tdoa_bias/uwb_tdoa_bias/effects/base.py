@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..errors import InputError
+from ..foundation.errors import InputError
 from .samples import Samples, true_samples
 
 __all__ = ["ArrivalEffect", "Effect", "Samples"]

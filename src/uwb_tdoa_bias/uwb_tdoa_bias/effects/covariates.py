@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from ..compiled import compiled
-from ..radio import into_frame
+from ..foundation.compiled import compiled
+from ..foundation.radio import into_frame
 from .base import tile
 
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from ..errors import InputError
+from ..foundation.errors import InputError
 from .catalogue import EFFECTS
 from .covariates import OF_MOTION
 from .imu_corrector import ImuCorrector

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..errors import InputError
+from ..foundation.errors import InputError
 from .base import ArrivalEffect, check_anchor, tile
 
 PARTS = ("delay", "start", "end", "x", "y", "z", "radius")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..errors import InputError
+from ..foundation.errors import InputError
 from .base import Effect
 
 

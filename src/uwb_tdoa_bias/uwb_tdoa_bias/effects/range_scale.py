@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..geometry import tdoa
+from ..foundation.geometry import tdoa
 from .base import Effect
 
 

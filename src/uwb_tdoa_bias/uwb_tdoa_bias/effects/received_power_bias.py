@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..radio import NOMINAL_GAIN, RadioLink, power_bias, received_power_dbm
+from ..foundation.radio import NOMINAL_GAIN, RadioLink, power_bias, received_power_dbm
 from .base import ArrivalEffect, tile
 
 LINK = RadioLink()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..anchors import Anchors
+from ..foundation.anchors import Anchors
 
 MOTION_TIME = 0.1  # s over which velocity, acceleration and turning rate are taken
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.interpolate import BSpline
 
-from ..errors import InputError
+from ..foundation.errors import InputError
 from .base import Effect, known_anchors, once_per_anchors, tile
 from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_TDOA
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..geometry import tdoa, tdoa_jacobian
+from ..foundation.geometry import tdoa, tdoa_jacobian
 from .base import Effect
 
 

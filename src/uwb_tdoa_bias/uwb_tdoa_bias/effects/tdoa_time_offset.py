@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..geometry import tdoa_jacobian
+from ..foundation.geometry import tdoa_jacobian
 from .base import Effect
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..geometry import tdoa
+from ..foundation.geometry import tdoa
 from .base import Effect
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import brentq
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .bias_map import BiasMap
 from .markers import collect, corrected_bias, measured_places

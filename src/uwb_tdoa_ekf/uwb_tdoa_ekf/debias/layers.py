@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 _ADAMS_MOULTON = np.array([251.0, 646.0, -264.0, 106.0, -19.0]) / 720.0  # newest first, eq. A27
 

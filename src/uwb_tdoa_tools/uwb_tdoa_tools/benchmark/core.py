@@ -4,10 +4,10 @@ import time
 
 import numpy as np
 
-from uwb_tdoa_ekf.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.engine import run
-from uwb_tdoa_ekf.memory import HYPOTHESES, RUNNING, Memory, new_memory
-from uwb_tdoa_ekf.tape import new_tape
+from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
+from uwb_tdoa_ekf.core.engine import run
+from uwb_tdoa_ekf.core.memory import HYPOTHESES, RUNNING, Memory, new_memory
+from uwb_tdoa_ekf.core.tape import new_tape
 
 from .figures import Figure
 from .flights import make_flight

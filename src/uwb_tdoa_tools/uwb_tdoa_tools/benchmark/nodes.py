@@ -9,9 +9,9 @@ from functools import partial
 
 import numpy as np
 
-from ..live import accounts
-from ..processes import Diagnostics, Processes, own_domain, variables, wait
-from ..ros_session import session
+from ..live.run import accounts
+from ..live.processes import Diagnostics, Processes, own_domain, variables, wait
+from ..live.session import session
 from .figures import Figure
 from .flights import make_flight
 from .source import Source, latencies

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ..bag import read_odometry, write_bag
-from ..bag_files import messages, open_bag
-from ..live import accounts, run_live
+from ..bags.bag import read_odometry, write_bag
+from ..bags.files import messages, open_bag
+from ..live.run import accounts, run_live
 from .figures import Figure
 from .flights import make_flight
 

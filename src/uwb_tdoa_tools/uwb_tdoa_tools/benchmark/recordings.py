@@ -4,9 +4,9 @@ import time
 
 import numpy as np
 
-from uwb_tdoa_bias.corrector import Corrector
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm, samples_at
-from uwb_tdoa_bias.network import SHIPPED, load_network
+from uwb_tdoa_bias.correction.network import SHIPPED, load_network
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 

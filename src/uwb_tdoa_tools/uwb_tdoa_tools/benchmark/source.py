@@ -8,7 +8,7 @@ from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
-from uwb_tdoa_bias import ros
+from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa
 
 HEADER_STAMP = struct.Struct("<iI")  # of a little-endian CDR message that begins with a header, after 4 bytes

@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from ..evaluate import evaluate, judging_truth
-from ..metrics import Score
+from ..scoring.evaluation import evaluate, judging_truth
+from ..scoring.metrics import Score
 from ..readers import read_flight
 
 

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_tdoa_bias.corrector import Corrector
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import Part
 from uwb_tdoa_ekf.offline import run_offline
 
-from .. import inputs
-from ..evaluate import judging_truth
-from ..metrics import position_at
+from ..readers import inputs
+from ..scoring.evaluation import judging_truth
+from ..scoring.metrics import position_at
 from ..readers import read_flight
 
 LEAST = 10  # positions of flights, 5 ms apart, that make a marker

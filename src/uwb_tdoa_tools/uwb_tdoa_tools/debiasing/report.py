@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..plots import plt
+from ..scoring.plots import plt
 from .judge import judge
 
 _RUN = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean")

@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.effects import EffectSet, Samples, samples_at
 from uwb_tdoa_bias.effects.catalogue import ImuGravity
 from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.flight import Truth
-from uwb_tdoa_bias.geometry import tdoa, tdoa_jacobian
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_bias.foundation.geometry import tdoa, tdoa_jacobian
 
-from ..metrics import airborne, position_at
+from ..scoring.metrics import airborne, position_at
 
 IMU_CELL = 0.25  # s; both sides of an inertial residual are averaged over it (accelerometer: a triangle twice as wide)
 MARGIN = 0.5  # s left out at both ends of the airborne part

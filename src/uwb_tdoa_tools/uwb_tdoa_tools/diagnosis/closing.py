@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwb_tdoa_bias.corrector import Corrector
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.flight import Truth
-from uwb_tdoa_ekf.engine import USED
+from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_ekf.core.engine import USED
 from uwb_tdoa_ekf.offline import run_offline
 
-from ..evaluate import as_json, evaluate
-from ..metrics import Score, airborne, pooled
+from ..scoring.evaluation import evaluate
+from ..scoring.metrics import Score, airborne, as_json, pooled
 from .attribute import effects_of, label_of
 from .fit import refit
 from .select import columns_of

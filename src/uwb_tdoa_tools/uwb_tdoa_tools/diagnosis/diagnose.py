@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_bias.corrector import Corrector
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 
-from ..metrics import Score
+from ..scoring.metrics import Score
 from . import closing, confounding, report
 from .attribute import attribute, restricted
 from .findings import Attribution

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwb_tdoa_ekf.engine import REJECTED, USED
+from uwb_tdoa_ekf.core.engine import REJECTED, USED
 
 LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s
 

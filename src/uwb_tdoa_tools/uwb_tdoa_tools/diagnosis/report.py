@@ -224,7 +224,7 @@ def _health(health):
 
 
 def _picture(draw, result):
-    from ..plots import plt
+    from ..scoring.plots import plt
 
     figure = draw(result, plt)
     if figure is None:

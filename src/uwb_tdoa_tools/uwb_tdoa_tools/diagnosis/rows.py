@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.anchors import Anchors
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import EFFECTS
 
 CELL = 0.5  # s, of TDOAs

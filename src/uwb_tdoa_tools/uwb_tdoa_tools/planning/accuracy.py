@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..evaluate import evaluate
-from ..metrics import position_at
+from ..scoring.evaluation import evaluate
+from ..scoring.metrics import position_at
 from .precision import bound, information
 
 FEW = 20  # estimates in a cell below which it tells nothing

@@ -17,7 +17,7 @@ from itertools import combinations
 
 import numpy as np
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .installation import principal_extents
 from .precision import weigh

@@ -5,8 +5,8 @@ from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 from scipy.special import expit
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .bifurcation import Subsets
 from .goal import UNUSABLE

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .noise import RadioNoise
 from .pairing import Pairing, ring

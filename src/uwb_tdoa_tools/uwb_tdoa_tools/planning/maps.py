@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.flyable import FlyableVolume
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 
 from .bifurcation import CLEAR, Subsets
 from .precision import bound, dilution, information, position_error

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from ..bag import _LATCHED_QOS
-from ..bag_files import new_bag
-from ..bag_messages import anchors_message
-from ..message_types import typestore
+from ..bags.bag import _LATCHED_QOS
+from ..bags.files import new_bag
+from ..bags.messages import anchors_message
+from ..bags.message_types import typestore
 
 TOPICS = {
     "plan/flyable": "nav_msgs/msg/OccupancyGrid",
@@ -52,9 +52,9 @@ def publish(found):
     import rclpy
     from rclpy.serialization import deserialize_message
 
-    from uwb_tdoa_bias.ros import ANCHORS_QOS
+    from uwb_tdoa_bias.foundation.ros import ANCHORS_QOS
 
-    from ..ros_session import message_class, session
+    from ..live.session import message_class, session
 
     store = typestore()
     with session("plan", []) as (node, stop):

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from uwb_tdoa_bias.antenna import Antenna
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.radio import SPEED_OF_LIGHT, RadioLink, received_power_dbm
+from uwb_tdoa_bias.foundation.antenna import Antenna
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.radio import SPEED_OF_LIGHT, RadioLink, received_power_dbm
 
 BOLTZMANN = 1.380649e-23  # J/K
 ZERO_CELSIUS = 273.15  # K
@@ -120,7 +120,7 @@ def variance_gradient(noise, points, anchors, variance, dimensions):
 
 
 def antenna_from_yaml(path):
-    """Antenna of a YAML file with the fields of `uwb_tdoa_bias.antenna.Antenna`: azimuth, elevation_1, elevation_2 (dBi,
+    """Antenna of a YAML file with the fields of `uwb_tdoa_bias.foundation.antenna.Antenna`: azimuth, elevation_1, elevation_2 (dBi,
     around the full circle), and optionally gain_offset. Raises InputError."""
     try:
         content = yaml.safe_load(Path(path).read_text())

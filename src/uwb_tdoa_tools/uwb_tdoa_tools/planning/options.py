@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_tdoa_bias.antenna import Antenna
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.antenna import Antenna
+from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli, inputs, parallel
+from .. import cli
+from ..readers import inputs
+from .. import parallel
 from ..simulation.room import Room, room_of
 from .installation import Installation
 from .goal import OBJECTIVES, Goal

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 
 class Places:

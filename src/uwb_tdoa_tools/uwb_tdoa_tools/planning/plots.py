@@ -5,7 +5,7 @@ from matplotlib.collections import EllipseCollection
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from ..plots import plt
+from ..scoring.plots import plt
 from .bifurcation import Subsets
 from .precision import NORMAL_99, ellipses
 

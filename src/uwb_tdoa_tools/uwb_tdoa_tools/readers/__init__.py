@@ -3,7 +3,7 @@
 import zlib
 from pathlib import Path
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .streams import read_bytes
 from .survey import read_survey
@@ -22,7 +22,7 @@ def read_flight(path, survey=None, namespace=""):
     namespace : of the tag's topics in a bag, see `read_bag`.
     Raises InputError.
     """
-    from ..bag import is_bag, read_bag  # here, because bags need the rosbags library and the others do not
+    from ..bags.bag import is_bag, read_bag  # here, because bags need the rosbags library and the others do not
 
     path = Path(path)
     if not path.exists():

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 

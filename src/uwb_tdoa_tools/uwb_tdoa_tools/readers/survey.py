@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 
 # The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z), arm 3 forward (x).
 # Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this makes a right-handed frame

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .streams import make_flight, read_bytes
 

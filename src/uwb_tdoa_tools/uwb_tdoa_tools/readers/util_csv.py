@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .streams import make_flight, read_bytes
 

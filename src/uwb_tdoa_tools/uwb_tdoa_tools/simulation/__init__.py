@@ -6,7 +6,7 @@
 
 import numpy as np
 
-from uwb_tdoa_bias.flight import Flight, Truth
+from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
 from . import imu, ranging
 from .config import SimulationConfig

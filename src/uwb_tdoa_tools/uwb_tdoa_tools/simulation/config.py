@@ -4,8 +4,8 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .constellations import constellation
 from .imu import ImuErrors

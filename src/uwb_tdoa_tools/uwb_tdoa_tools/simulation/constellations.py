@@ -5,8 +5,8 @@ import re
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.anchors import Anchors
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 
 LOW = 0.18  # m, height of an anchor on its stand on the floor
 

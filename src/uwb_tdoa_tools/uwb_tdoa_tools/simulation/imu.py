@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.flight import Imu
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Imu
 
 
 @dataclass(frozen=True)

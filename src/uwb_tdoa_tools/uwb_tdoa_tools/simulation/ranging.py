@@ -4,10 +4,10 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.antenna import Antenna
-from uwb_tdoa_bias.flight import Tdoas
-from uwb_tdoa_bias.geometry import tdoa
-from uwb_tdoa_bias.radio import FLAT_MOUNT, RadioLink, arrival_bias
+from uwb_tdoa_bias.foundation.antenna import Antenna
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.foundation.radio import FLAT_MOUNT, RadioLink, arrival_bias
 
 from .schedule import make_schedule
 

@@ -11,7 +11,7 @@ from numpy.polynomial import Polynomial
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.errors import InputError
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .room import REST_HEIGHT
 

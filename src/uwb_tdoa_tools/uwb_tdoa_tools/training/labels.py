@@ -6,10 +6,10 @@ import hashlib
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet, Samples, samples_at
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.geometry import tdoa
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.geometry import tdoa
 
-from ..metrics import AIRBORNE, airborne
+from ..scoring.metrics import AIRBORNE, airborne
 
 MARGIN = 0.5  # s after take-off and before landing that are left out: near the floor TDOAs are metres off
 LARGEST = 1.0  # m; a larger error is an outlier, not bias (Zhao et al., section V-B)

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_bias.corrector import LARGEST_YAW_STD
+from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.features import columns
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.correction.features import columns
 
 from . import labels as labelling, linear, paper, physics, structured
 
@@ -178,3 +178,17 @@ def _validity(learned_from, judged):
         for name, low, high in zip(names, table.min(axis=0) - more, table.max(axis=0) + more):
             limits[name] = [round(float(low), 3), round(float(high), 3), MARGINS[name[0]]]
     return limits
+
+
+def save(result, folder):
+    """Write model.onnx and effects.yaml of a Trained, as far as it has them. Returns their paths, None for none."""
+    model, effects = folder / "model.onnx", folder / "effects.yaml"
+    made = result.onnx()
+    for path, content in ((model, made), (effects, result.effects)):
+        if content is None:
+            path.unlink(missing_ok=True)  # or an earlier training's would be taken for ours
+    if made is not None:
+        model.write_bytes(made.SerializeToString(deterministic=True))
+    if result.effects is not None:
+        result.effects.to_yaml(effects)
+    return (model if made is not None else None), (effects if result.effects is not None else None)

@@ -9,8 +9,8 @@ import copy
 import numpy as np
 from sklearn.neural_network import MLPRegressor
 
-from uwb_tdoa_bias.errors import InputError
-from uwb_tdoa_bias.features import FEATURES, columns
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.correction.features import FEATURES, columns
 
 from . import export
 

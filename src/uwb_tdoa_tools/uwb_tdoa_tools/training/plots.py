@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import norm
 
-from ..plots import plt
+from ..scoring.plots import plt
 
 COLOURS = {
     "none": "0.6", "paper_no_orientation": "tab:red", "paper": "tab:cyan", "physics": "tab:orange",

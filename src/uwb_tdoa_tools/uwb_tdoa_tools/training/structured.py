@@ -20,8 +20,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.linalg import block_diag
 from scipy.spatial.distance import cdist
 
-from uwb_tdoa_bias.effects import Samples
-from uwb_tdoa_bias.features import columns
+from uwb_tdoa_bias.correction.features import columns
 
 from . import export, linear
 from .labels import SAME_PLACE, constellations

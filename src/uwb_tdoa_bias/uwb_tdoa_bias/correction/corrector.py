@@ -1,0 +1,112 @@
+"""From raw TDOAs to corrected ones: the core of bias_node and of the offline engine."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..effects import EffectSet, Samples
+from .motion import motion
+from .poses import Poses, turned
+
+# status of one correction; the values of TdoaCorrected.STATUS_*
+PASSED, EFFECTS, NETWORK, FADED = range(4)
+LARGEST_YAW_STD = 1.0  # rad; a yaw that is less certain is unknown: the filter follows four, 90 degrees apart
+FADED_BELOW = 0.5  # share of what can be known that a network's prediction has at least, or it counts as faded
+
+
+@dataclass(frozen=True)
+class Correction:
+    """bias, std : (n,) m; corrected = d - bias, (n,) m; status : (n,) one of PASSED, EFFECTS, NETWORK, FADED."""
+
+    bias: np.ndarray
+    std: np.ndarray
+    corrected: np.ndarray
+    status: np.ndarray
+
+
+class Corrector:
+    """Predicts the systematic error of each TDOA at the pose the tag had a little earlier, and removes it.
+
+    The pose used for a measurement is the newest one stamped no later than `lag` before the measurement that preceded it.
+    It depends on stamps alone, so that a recording gives the same result at any speed; it leaves the filter `lag` seconds to
+    report that pose; and the filter can: it needs nothing later than the preceding measurement, after a gap neither.
+    """
+
+    def __init__(self, anchors, effects=None, network=None, lag=0.05, history=4096):
+        """anchors : Anchors; effects : EffectSet or None; network : Network or None; lag : s; history : poses kept."""
+        self.anchors = anchors
+        self.effects = effects or EffectSet()
+        self.network = network
+        self.lag = lag
+        parts = [self.effects.name] if len(self.effects) else []
+        self.model = "+".join(parts + ([network.name] if network else [])) or "none"
+        self._history = history
+        self.reset()
+
+    def reset(self):
+        """Forget all poses."""
+        self._poses = Poses(self._history)
+        self._newest = None  # latest stamp of a TDOA
+        self._first = self._last = None  # stamp of the first TDOA; stamp and later anchor of the last one
+
+    @property
+    def idle(self):
+        """True if there is nothing to correct with."""
+        return not len(self.effects) and self.network is None
+
+    def add_pose(self, t, p, q, yaw_std=0.0):
+        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, yaw_std rad: deviation of its rotation about
+        the vertical; or several: (k,), (k, 3), (k, 4), (k,). Stamps must rise; others are ignored."""
+        self._poses.add(t, p, q, np.broadcast_to(yaw_std, np.shape(t)))
+
+    def ready(self, before):
+        """True if no pose that is still to come can change the correction of a measurement that follows one stamped so."""
+        return self.idle or self._poses.newest > before - self.lag
+
+    def correct(self, t, a, b, d):
+        """Correct a batch.
+
+        t : (n,) s; a, b : (n,) anchor rows (of `anchors`); d : (n,) raw d_ab, m. Returns a Correction. Where no pose is
+        known yet, only effects that need none contribute.
+        """
+        n = len(t)
+        zeros = np.zeros(n)
+        if self.idle or n == 0:
+            return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
+        newest = np.maximum.accumulate(np.concatenate([t[:1] if self._newest is None else [self._newest], t]))
+        self._newest = newest[-1]
+        places, p, q, yaw_std = self._poses.before(np.minimum(newest[:-1], t) - self.lag)
+        extra = self._extra(t, b, places) if self.effects.needs_motion else {}
+        self._first = t[0] if self._first is None else self._first
+        samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std, **extra)
+        bias, spread = self._effects_at(samples)
+        std = spread
+        status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
+        if self.network is not None:
+            learned, std, share = self.network.predict(samples)
+            told = np.isfinite(learned)
+            bias = bias + np.where(told, learned, 0.0)
+            std = np.hypot(spread, np.where(told & np.isfinite(std), std, 0.0))
+            status[told] = np.where(share[told] < FADED_BELOW, FADED, NETWORK)
+        return Correction(bias, std, d - bias, status)
+
+    def _effects_at(self, samples):
+        """(bias, spread) of the effects; while the yaw is unknown their mean over four headings, and its scatter."""
+        if not len(self.effects):
+            return np.zeros(len(samples)), np.zeros(len(samples))
+        bias, spread = self.effects.bias(samples), self.effects.spread(samples)
+        unknown = samples.yaw_std > LARGEST_YAW_STD
+        if unknown.any():
+            each = np.stack([self.effects.bias(replace(samples, q=turned(samples.q, k))) for k in range(4)])
+            bias = np.where(unknown, each.mean(axis=0), bias)
+            spread = np.where(unknown, np.hypot(spread, each.std(axis=0)), spread)
+        return bias, spread
+
+    def _extra(self, t, b, places):
+        """Motion of the tag at the poses numbered `places`, and what was heard before each TDOA: for Samples."""
+        t_last, b_last = self._last or (t[0], -1)
+        before = np.concatenate([[t_last], t[:-1]])
+        previous = np.concatenate([[b_last], self.anchors.ids[b[:-1]]])
+        self._last = (t[-1], self.anchors.ids[b[-1]])
+        moved = motion(self._poses.t, self._poses.p, self._poses.q, places.tolist())
+        return {**moved, "interval": t - before, "previous": previous}

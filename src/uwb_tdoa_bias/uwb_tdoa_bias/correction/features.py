@@ -1,0 +1,83 @@
+"""What a network may ask for: the 14 features of Zhao et al. (RA-L 2021, section III), and where everything is."""
+
+import math
+
+import numpy as np
+
+from ..foundation.compiled import compiled
+from ..foundation.geometry import rotate
+
+# Azimuth (about z, from x) and elevation (above the x-y plane) of the tag seen from the antenna frame of each anchor (A),
+# and of each anchor seen from the tag's body frame (T), rad; positions of the anchors relative to the tag, world axes, m.
+FEATURES = (
+    "dx_a", "dy_a", "dz_a", "dx_b", "dy_b", "dz_b",
+    "azimuth_A_a", "azimuth_A_b", "azimuth_T_a", "azimuth_T_b",
+    "elevation_A_a", "elevation_A_b", "elevation_T_a", "elevation_T_b",
+)  # fmt: skip
+
+# Position of the tag, world, m; horizontal parts of the body's x and z axes; ids
+# and positions, world, m, of both anchors. With these a model knows a place when it is there again.
+PLACE = (
+    "x", "y", "z", "forward_x", "forward_y", "up_x", "up_y",
+    "id_a", "x_a", "y_a", "z_a", "id_b", "x_b", "y_b", "z_b",
+)  # fmt: skip
+
+
+NAMES = FEATURES + PLACE
+
+
+def columns(samples, names):
+    """The named features (of NAMES) of a batch: Samples -> (n, len(names)) float, NaN where unknown."""
+    return everything(samples)[:, [NAMES.index(name) for name in names]]
+
+
+def everything(samples):
+    """All features of a batch, in the order of NAMES: Samples -> (n, 29) float, NaN where a pose it needs is
+    unknown."""
+    out = np.empty((len(samples), len(NAMES)))
+    anchors = samples.anchors
+    _fill(samples.p, samples.q, samples.a, samples.b, anchors.positions, anchors.orientations, out)
+    _fill_place(samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, out[:, len(FEATURES) :])
+    return out
+
+
+@compiled
+def _fill_place(p, q, a, b, ids, positions, out):
+    for i in range(len(a)):
+        x, y, z, w = q[i]
+        out[i, 0], out[i, 1], out[i, 2] = p[i]
+        out[i, 3], out[i, 4] = 1 - 2 * (y * y + z * z), 2 * (x * y + z * w)
+        out[i, 5], out[i, 6] = 2 * (x * z + y * w), 2 * (y * z - x * w)
+        for side in range(2):
+            anchor = a[i] if side == 0 else b[i]
+            out[i, 7 + 4 * side] = ids[anchor]
+            for k in range(3):
+                out[i, 8 + 4 * side + k] = positions[anchor, k]
+
+
+@compiled
+def _fill(p, q, a, b, positions, orientations, out):
+    delta = np.empty(3)
+    inverse = np.empty(4)
+    seen = np.empty(3)
+    for i in range(len(a)):
+        for side in range(2):
+            anchor = a[i] if side == 0 else b[i]
+            for k in range(3):
+                delta[k] = positions[anchor, k] - p[i, k]
+                out[i, 3 * side + k] = delta[k]
+            _conjugate(q[i], inverse)
+            rotate(inverse, delta, seen)
+            out[i, 8 + side] = math.atan2(seen[1], seen[0])
+            out[i, 12 + side] = math.atan2(seen[2], math.hypot(seen[0], seen[1]))
+            for k in range(3):
+                delta[k] = -delta[k]
+            _conjugate(orientations[anchor], inverse)
+            rotate(inverse, delta, seen)
+            out[i, 6 + side] = math.atan2(seen[1], seen[0])
+            out[i, 10 + side] = math.atan2(seen[2], math.hypot(seen[0], seen[1]))
+
+
+@compiled
+def _conjugate(q, out):
+    out[0], out[1], out[2], out[3] = -q[0], -q[1], -q[2], q[3]

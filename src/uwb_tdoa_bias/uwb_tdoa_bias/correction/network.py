@@ -1,0 +1,108 @@
+"""A bias network in an ONNX file that says itself what it wants and how far it can be trusted.
+
+Metadata of the model (all values JSON text):
+    features  list of names out of features.FEATURES and features.PLACE: the input columns
+    offset, scale  lists as long as features: the network is fed (feature - offset) / scale
+    clip      number, metres: the output is limited to +-clip
+    name      short name, goes into every message
+    validity  optional: {feature: [lowest, highest, margin]}, in the units of the features. Inside, the network is
+              believed; beyond by `margin` or more, not at all; linearly in between, the worst feature counting.
+    fade_std  number, metres, with validity: standard deviation of the bias where the network is not believed
+    largest_yaw_std  optional: number, radians; where the yaw is less certain, the bias is not taken out, but counts as
+              uncertainty
+Input: one float tensor (n, number of features), of any name. Output: one float tensor (n, 1), bias in metres; (n, 2),
+bias and its standard deviation in metres; or (n, 3), with the share 0 ... 1 of what can be known that the network knows
+there: it has already faded bias and deviation itself.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from ..foundation.errors import InputError
+from .features import NAMES, everything
+
+MODELS = Path(__file__).parent / "models"
+SHIPPED = "default"  # instead of a path: the model that comes with the package
+_COLUMN = {name: column for column, name in enumerate(NAMES)}
+
+
+def load_network(name):
+    """The Network of a file; for "default" the one shipped; None for an empty name. Raises InputError."""
+    if not name:
+        return None
+    return Network(MODELS / "default.onnx" if str(name) == SHIPPED else name)
+
+
+class Network:
+    """An ONNX bias model, run on one thread. meta : all its metadata, dict of str."""
+
+    def __init__(self, path):
+        """Load `path`; raises InputError if it is no model or its metadata do not fit."""
+        self._path = Path(path).absolute()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        if not Path(path).is_file():
+            raise InputError(f"model: {path} does not exist; give an .onnx file or leave the model empty.")
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime raises its own family of exceptions, with no common public base
+            raise InputError(f"model: {path} cannot be loaded as ONNX ({str(error).splitlines()[0]}).") from error
+        self.meta = self._session.get_modelmeta().custom_metadata_map
+        try:
+            self._read(self.meta)
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(
+                f"model: {path}: its metadata must hold features (names out of {', '.join(NAMES)}), offset, scale, "
+                f"clip and name, and may hold validity with fade_std, as JSON; the problem is {error!r}."
+            ) from error
+        (entry,) = self._session.get_inputs()
+        width, n = entry.shape[-1], len(self._inputs)
+        if not (n == len(self._offset) == len(self._scale) == width) or (self._scale == 0).any():
+            raise InputError(
+                f"model: {path}: input {entry.name!r} has {width} columns, the metadata name {n} features, "
+                f"{len(self._offset)} offsets and {len(self._scale)} scales; they must agree, and no scale may be 0."
+            )
+        self._input = entry.name
+
+    def __reduce__(self):
+        """Pickled as the path of its file: a session cannot be."""
+        return Network, (self._path,)
+
+    def _read(self, meta):
+        names, self._offset, self._scale = (json.loads(meta[key]) for key in ("features", "offset", "scale"))
+        self._offset, self._scale = np.array(self._offset, dtype=float), np.array(self._scale, dtype=float)
+        self.clip = float(json.loads(meta["clip"]))
+        self.name = str(json.loads(meta["name"]))
+        limits = json.loads(meta.get("validity", "{}"))
+        self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
+        self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
+        self._inputs, self._judged = (np.array([_COLUMN[name] for name in some], dtype=int) for some in (names, limits))
+        self._lower, self._upper, self._margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
+        if not ((self._margin > 0.0) & (self._upper >= self._lower)).all():
+            raise ValueError("validity: every feature needs [lowest, highest, margin above 0]")
+
+    def predict(self, samples):
+        """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
+        (n,) arrays. The first two are NaN where a feature that is needed is unknown."""
+        table = everything(samples)
+        x = (table.take(self._inputs, axis=1) - self._offset) / self._scale
+        out = self._session.run(None, {self._input: x.astype(np.float32)})[0].astype(float)
+        bias = np.minimum(np.maximum(out[:, 0], -self.clip), self.clip)  # a fifth of what np.clip takes
+        std = out[:, 1] if out.shape[1] > 1 else np.zeros(len(out))
+        known = out[:, 2] if out.shape[1] > 2 else np.ones(len(out))
+        if len(self._judged):
+            value = table[:, self._judged]
+            beyond = np.maximum(self._lower - value, value - self._upper) / self._margin
+            trust = 1.0 - np.clip(beyond.max(axis=1), 0.0, 1.0)
+            bias, known = trust * bias, trust * known
+            std = np.sqrt((trust * std) ** 2 + (1.0 - trust**2) * self._fade_std**2)
+        if samples.yaw_std is not None:
+            undecided = samples.yaw_std > self._largest_yaw_std
+            if undecided.any():
+                std[undecided] = np.hypot(std[undecided], bias[undecided])
+                bias[undecided] = known[undecided] = 0.0
+        return bias, std, known

@@ -1,0 +1,90 @@
+"""The poses of the last seconds."""
+
+import numpy as np
+
+from ..foundation.compiled import compiled
+
+TILT = 0.5  # rad; a filter that does not know the tilt better estimates no attitude
+
+
+class Poses:
+    """Poses in the order of their stamps, of which at least the last `history` are kept."""
+
+    def __init__(self, history):
+        self._history, self._count = history, 0
+        self._columns = [np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), ())]
+
+    @property
+    def t(self):
+        """Stamps, (m,) s."""
+        return self._columns[0][: self._count]
+
+    @property
+    def p(self):
+        """Positions, (m, 3) m."""
+        return self._columns[1][: self._count]
+
+    @property
+    def q(self):
+        """Attitudes, (m, 4) x y z w, body to world."""
+        return self._columns[2][: self._count]
+
+    @property
+    def newest(self):
+        """Stamp of the last pose, s; -inf if there is none."""
+        return self.t[-1] if self._count else -np.inf
+
+    def add(self, t, p, q, yaw_std):
+        """Append one pose, or several: t (k,), p (k, 3), q (k, 4), yaw_std (k,) rad. Those not later than all before them
+        are ignored."""
+        new = [np.reshape(part, (-1, *column.shape[1:])) for part, column in zip((t, p, q, yaw_std), self._columns)]
+        rising = new[0] > np.maximum.accumulate(np.concatenate([[self.newest], new[0]]))[:-1]
+        if not rising.all():
+            new = [part[rising] for part in new]
+        for first in range(0, len(new[0]), self._history):
+            self._append([part[first : first + self._history] for part in new])
+
+    def before(self, t):
+        """Of the newest poses stamped no later than t (n,) s: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN
+        where there is none."""
+        n = len(t)
+        out = np.empty(n, dtype=np.int64), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)
+        _look_up(t, self._count, *self._columns, *out)
+        return out
+
+    def _append(self, new):
+        end = self._count + len(new[0])
+        if end > 2 * self._history:  # make room
+            kept = self._count - self._history
+            for column in self._columns:
+                column[: self._history] = column[kept : self._count].copy()
+            self._count, end = self._history, self._history + len(new[0])
+        for column, values in zip(self._columns, new):
+            column[self._count : end] = values
+        self._count = end
+
+
+@compiled
+def _look_up(t, count, stamps, p, q, yaw_std, places, p_out, q_out, yaw_std_out):
+    for i in range(len(t)):
+        place = np.searchsorted(stamps[:count], t[i], side="right") - 1
+        places[i] = place
+        if place >= 0:
+            p_out[i], q_out[i], yaw_std_out[i] = p[place], q[place], yaw_std[place]
+        else:
+            p_out[i], q_out[i], yaw_std_out[i] = np.nan, np.nan, np.nan
+
+
+def told_yaw_std(std):
+    """Standard deviation of the yaw, (n,) rad, of attitudes with deviations std (n, 3) rad about the axes of the world.
+
+    It is 0 where the tilt is not known either: then no attitude is estimated, and level at yaw 0 is what is meant.
+    """
+    return np.where(std[:, :2].max(axis=1) < TILT, std[:, 2], 0.0)
+
+
+def turned(q, quarters):
+    """Attitudes q (n, 4) x y z w, turned about the vertical by some quarters of a turn."""
+    s, c = np.sin(0.25 * np.pi * quarters), np.cos(0.25 * np.pi * quarters)
+    x, y, z, w = q.T
+    return np.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], axis=1)

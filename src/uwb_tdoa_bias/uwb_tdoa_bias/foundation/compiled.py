@@ -1,0 +1,43 @@
+"""numba's njit with an on-disk cache that never runs yesterday's code.
+
+numba's own cache notices a change in the file of a compiled function, but not in the files of the functions it calls.
+Here every state of the sources has a cache folder of its own.
+"""
+
+from functools import lru_cache
+import hashlib
+import os
+from pathlib import Path
+
+from numba import config, njit
+
+
+def compiled(function):
+    """Decorator: compile `function` (which may call other compiled ones below its folder and of the foundation) and cache it."""
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(_base() / _digest(Path(function.__code__.co_filename).parent))
+    try:
+        return njit(error_model="numpy", cache=True)(function)
+    finally:
+        config.CACHE_DIR = before
+
+
+def inlined(function):
+    """Decorator for a small function that only compiled ones call: it is pasted into them, because handing over a filter's
+    whole memory costs more than what such a function does."""
+    return njit(error_model="numpy", inline="always")(function)
+
+
+def _base():
+    """NUMBA_CACHE_DIR if set, else the user's cache folder."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home) / "uwb_tdoa")
+
+
+@lru_cache(maxsize=None)
+def _digest(folder):
+    """Name of the present state of the sources below `folder` and beside this file."""
+    digest = hashlib.sha256()
+    for source in sorted({*folder.rglob("*.py"), *Path(__file__).parent.glob("*.py")}):
+        digest.update(source.name.encode() + b"\0" + source.read_bytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,1 @@
+"""The filter itself, compiled: states, prediction, robust updates, hypotheses, start. No ROS, no files."""

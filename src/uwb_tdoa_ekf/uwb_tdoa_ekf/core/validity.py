@@ -1,0 +1,38 @@
+"""Which TDOAs cannot be measurements at all."""
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+MAX_RATE, MAX_FORCE = 100.0, 1000.0  # rad/s, m/s^2: beyond what any inertial sensor reads
+MARGIN = 1.0  # m by which |d_ab| may exceed the distance between a and b: its largest believable error
+
+
+@compiled
+def usable(a, b, d, bias_std, positions):
+    """False for an unknown anchor (row -1), a pair of one anchor, a value that is not finite or longer than the baseline.
+
+    a, b : anchor rows; d, bias_std : m; positions : (N, 3) m.
+    """
+    if a < 0 or b < 0 or a == b or not (math.isfinite(d) and math.isfinite(bias_std)):
+        return False
+    baseline = 0.0
+    for k in range(3):
+        baseline += (positions[a, k] - positions[b, k]) ** 2
+    return abs(d) <= math.sqrt(baseline) + MARGIN
+
+
+@compiled
+def usable_all(a, b, d, bias_std, positions):
+    """`usable` for (n,) arrays: (n,) bool."""
+    out = np.empty(len(d), np.bool_)
+    for i in range(len(d)):
+        out[i] = usable(a[i], b[i], d[i], bias_std[i], positions)
+    return out
+
+
+def usable_imu(gyro, force):
+    """(n,) bool: finite and within the range of any sensor. gyro (n, 3) rad/s, force (n, 3) m/s^2."""
+    return (np.abs(gyro) < MAX_RATE).all(axis=-1) & (np.abs(force) < MAX_FORCE).all(axis=-1)

@@ -1,0 +1,1 @@
+"""What ekf_node says about itself and about what it receives."""

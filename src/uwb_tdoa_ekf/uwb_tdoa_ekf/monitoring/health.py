@@ -1,0 +1,85 @@
+"""What ekf_node says about itself on /diagnostics, and what to do about it."""
+
+import time
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from uwb_tdoa_bias.foundation.ros import Rate
+
+from .place import Place
+
+PATIENCE = 5.0  # s of data without a start position before it becomes a warning
+BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is a recording
+DOUBT = 0.5  # share of TDOAs that are not used that becomes a warning
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+class Health:
+    """Judges once a second, by the wall clock."""
+
+    def __init__(self, config, lag, volume=None):
+        """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
+        self.imu = self.tdoa = self.odometry = 0  # messages received, and published
+        self.last_odometry = None  # time.monotonic(), s
+        self.last_position = None  # (3,) m and its covariance (3, 3) m^2
+        self.behind = None  # s from the stamp of the newest odometry to the present time of ROS
+        self._use_imu, self._lag = config.use_imu, lag
+        self._place = Place(volume)
+        self._imu_rate, self._tdoa_rate = Rate(), Rate()
+        self._starting = None
+        self._judged = {}
+
+    def report(self, refused, estimator, counts):
+        """Returns (level, text, values).
+
+        refused : what was wrong with the last anchors, or None; estimator : Estimator or None;
+        counts : totals by verdict.
+        """
+        now = time.monotonic()
+        imu_rate, tdoa_rate = self._imu_rate.of(self.imu), self._tdoa_rate.of(self.tdoa)
+        running = estimator is not None and estimator.running
+        if running or not tdoa_rate:
+            self._starting = None
+        elif self._starting is None:
+            self._starting = now
+        if refused:
+            judgement = ERROR, refused
+        elif estimator is None:
+            judgement = ERROR, "no anchors yet: publish them on uwb/anchors, reliable and transient local"
+        elif not tdoa_rate:
+            judgement = ERROR, "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the tag's driver"
+        elif self._use_imu and not imu_rate:
+            judgement = ERROR, "no samples on imu/data: check the IMU's driver, or set use_imu to false"
+        elif running:
+            judgement = self._judge_use(counts)
+        elif now - self._starting > PATIENCE:
+            judgement = WARN, "no start position found: check ids and positions of the anchors, and that four are heard"
+        else:
+            judgement = OK, "looking for the start position"
+        there = {}
+        if running and self.last_position is not None:
+            trouble, there = self._place.judge(estimator.anchors, *self.last_position)
+            if trouble and judgement[0] == OK:
+                judgement = WARN, trouble
+        if running and self.behind is not None and BEHIND[0] < self.behind < BEHIND[1] and judgement[0] == OK:
+            reason = "this machine is too slow for all it receives, or clocks differ"
+            judgement = WARN, f"the odometry is {self.behind:.1f} s behind: {reason}"
+        age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
+        values = {"state": "running" if running else "starting", "age of last odometry": age}
+        values |= {"odometry behind the clock": "unknown" if self.behind is None else f"{self.behind:.3f} s"}
+        values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
+        return *judgement, values | there
+
+    def _judge_use(self, counts):
+        """What became of the TDOAs since the last time."""
+        reasons = {
+            "late": f"are late: check the load of this machine, or raise lag (now {self._lag} s)",
+            "invalid": "are invalid: check that uwb/anchors lists the anchors that the tag hears, in metres",
+            "rejected": "contradict the filter: check the anchors' positions, and tdoa_std",
+        }
+        recent = {name: counts[name] - self._judged.get(name, 0) for name in ("used", *reasons)}
+        self._judged = dict(counts)
+        for name, reason in reasons.items():
+            if recent[name] > DOUBT * sum(recent.values()):
+                return WARN, f"more than half of the TDOAs {reason}"
+        return OK, "running"

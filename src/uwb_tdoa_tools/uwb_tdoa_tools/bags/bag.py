@@ -1,0 +1,250 @@
+"""Flights to and from ROS 2 bags (mcap or sqlite3), with the topics that the nodes use.
+
+Topic (in a bag always absolute)   type                              what
+/imu/data                          sensor_msgs/msg/Imu               Flight.imu, frame base_link
+/uwb/tdoa                          uwb_tdoa_msgs/msg/Tdoa            Flight.tdoa
+/uwb/anchors                       uwb_tdoa_msgs/msg/AnchorArray     Flight.anchors, once, transient local
+/ground_truth/pose                 geometry_msgs/msg/PoseStamped     Flight.truth
+/tf_static                         tf2_msgs/msg/TFMessage            frames anchor_<id>, once, transient local
+
+The time of a message is its header stamp. `Flight.extra` has no message type and stays behind.
+"""
+
+import heapq
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Flight
+
+from . import messages as bag_messages
+from .files import check_output, check_type, deserialize, is_bag, messages, new_bag, open_bag
+from .message_types import typestore
+
+__all__ = ["RecordedOdometry", "check_output", "is_bag", "read_bag", "read_fields", "read_odometry", "write_bag"]
+
+_FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
+
+
+def _qos(durability, depth):
+    """Reliable, because a reliable publisher serves reliable and best-effort subscriptions, and loses nothing."""
+    endless = QosTime(9223372036, 854775807)
+    return Qos(
+        QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, endless, endless,
+        QosLiveliness.AUTOMATIC, endless, False,
+    )  # fmt: skip
+
+
+_STREAM_QOS = _qos(QosDurability.VOLATILE, 1000)
+_LATCHED_QOS = _qos(QosDurability.TRANSIENT_LOCAL, 1)
+
+
+@dataclass(frozen=True)
+class RecordedOdometry:
+    """Recorded estimates. World frame of the filter and body frame as in nav_msgs/Odometry.
+
+    t : (n,) s, header stamps; p : (n, 3) m and v : (n, 3) m/s in the world frame; q : (n, 4) x y z w, body to world;
+    covariance : (n, 6, 6) of position (world) and rotation, m^2 and rad^2;
+    twist_covariance : (n, 6, 6) of linear and angular velocity in the body frame, as recorded.
+    """
+
+    t: np.ndarray
+    p: np.ndarray
+    v: np.ndarray
+    q: np.ndarray
+    covariance: np.ndarray
+    twist_covariance: np.ndarray
+
+    def __len__(self):
+        return len(self.t)
+
+
+def write_bag(flight, out, storage="mcap", force=False):
+    """Write a Flight as a ROS 2 bag. Returns {topic: number of messages}.
+
+    out : path of the new bag, a directory. It appears only when it is complete. An existing path is refused; with force
+        an existing bag (nothing else) is replaced.
+    storage : "mcap" or "sqlite3".
+    Raises InputError; also for stamps that a ROS message cannot hold.
+    """
+    store = typestore()
+    present = [(name, getattr(flight, name)) for name in ("tdoa", "imu", "truth")]
+    starts = [bag_messages.nanoseconds(name, s.t[:1])[0] for name, s in present if s is not None and len(s)]
+    if not starts:
+        raise InputError(f"{flight.name}: holds no message; there is nothing to write.")
+    first = int(min(starts))
+    topics = {  # at equal stamps this order holds: anchors before what needs them
+        "/uwb/anchors": (
+            "uwb_tdoa_msgs/msg/AnchorArray",
+            _LATCHED_QOS,
+            [bag_messages.anchors_message(flight.anchors, first, store)],
+        ),
+        "/tf_static": (
+            "tf2_msgs/msg/TFMessage",
+            _LATCHED_QOS,
+            [bag_messages.transforms_message(flight.anchors, first, store)],
+        ),
+    }
+    if flight.imu is not None:
+        topics["/imu/data"] = "sensor_msgs/msg/Imu", _STREAM_QOS, bag_messages.imu_messages(flight.imu, store)
+    topics["/uwb/tdoa"] = "uwb_tdoa_msgs/msg/Tdoa", _STREAM_QOS, bag_messages.tdoa_messages(flight.tdoa, store)
+    if flight.truth is not None:
+        poses = bag_messages.pose_messages(flight.truth, flight.anchors.frame, store)
+        topics["/ground_truth/pose"] = "geometry_msgs/msg/PoseStamped", _STREAM_QOS, poses
+
+    counts = dict.fromkeys(topics, 0)
+    with new_bag(out, storage, force) as writer:
+        writer.set_custom_data(_FLIGHT_KEY, json.dumps({"name": flight.name, "meta": flight.meta}, default=str))
+        streams = []
+        for topic, (msgtype, qos, outgoing) in topics.items():
+            connection = writer.add_connection(topic, msgtype, typestore=store, offered_qos_profiles=[qos])
+            streams.append(_serialized(connection, outgoing, store))
+        for stamp, connection, data in heapq.merge(*streams, key=lambda message: message[0]):
+            writer.write(connection, stamp, data)
+            counts[connection.topic] += 1
+    return counts
+
+
+def _serialized(connection, outgoing, store):
+    for stamp, message in outgoing:
+        yield stamp, connection, store.serialize_cdr(message, connection.msgtype)
+
+
+def read_bag(path, namespace="", anchors=None):
+    """Flight of a bag that was written here, by `ros2 bag record` or by our `record`; other topics are ignored.
+
+    namespace : where the tag's topics are in the bag, e.g. "tag1" for /tag1/uwb/tdoa.
+    anchors : Anchors to use instead of the recorded uwb/anchors.
+    Stamps are header stamps; messages that were recorded out of their order are sorted (`meta["reordered"]`).
+    Raises InputError for a bag that is damaged, has no uwb/tdoa, or neither anchors nor uwb/anchors.
+    """
+    with open_bag(path) as reader:
+        connections = _connections(reader)
+        about = _about(path)
+        meta = {**about.get("meta", {}), "bag": str(path)}
+
+        def stream(topic, msgtype, row, make):
+            found = _find(path, connections, namespace, topic, msgtype)
+            stamps, rows, falls = _table(path, reader, found, row)
+            if falls:
+                meta.setdefault("reordered", {})[topic] = falls
+            return make(stamps, rows) if len(stamps) else None
+
+        tdoa = stream("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of)
+        if tdoa is None:
+            raise InputError(
+                f"{path}: has no message on {_absolute(namespace, 'uwb/tdoa')}; {_others(connections, namespace)}."
+            )
+        if anchors is None:
+            anchors = _read_anchors(path, reader, connections, namespace)
+        imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
+        pose = "geometry_msgs/msg/PoseStamped"
+        truth = stream("ground_truth/pose", pose, bag_messages.pose_row, bag_messages.truth_of)
+    return Flight(about.get("name", Path(path).stem), anchors, tdoa, imu, truth, {}, meta)
+
+
+def read_odometry(path, topic="odometry", namespace=""):
+    """RecordedOdometry of a nav_msgs/Odometry topic, in order of header stamps; raises InputError.
+
+    nav_msgs/Odometry has the velocity in the child frame; it is turned into the world frame here.
+    """
+    with open_bag(path) as reader:
+        found = _find(path, _connections(reader), namespace, topic, "nav_msgs/msg/Odometry")
+        t, rows, _ = _table(path, reader, found, bag_messages.odometry_row)
+    if not len(t):
+        raise InputError(f"{path}: has no message on {_absolute(namespace, topic)}; record the output of the filter.")
+    p, v, q = rows[:, 0:3], rows[:, 3:6], rows[:, 6:10]
+    v = Rotation.from_quat(q).apply(v)
+    return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6))
+
+
+def read_fields(path, topic, namespace=""):
+    """Columns of a recorded topic whose messages have a header, e.g. uwb/residual or uwb/tdoa_corrected.
+
+    Returns {"t": (n,) s, field: (n,) array, ...} for every field that is one number or one string, in order of header
+    stamps; raises InputError.
+    """
+    with open_bag(path) as reader:
+        found = _find(path, _connections(reader), namespace, topic)
+        if not found:
+            raise InputError(f"{path}: has no topic {_absolute(namespace, topic)}; record it.")
+        recorded = [deserialize(path, c, data) for c, _, data in messages(path, reader, found)]
+    stamps = np.array([bag_messages.stamp_of(message.header) for message in recorded], dtype=np.int64)
+    order = np.argsort(stamps, kind="stable")
+    columns = {"t": stamps[order] / 1e9}
+    _, fields = typestore().fielddefs[found[0].msgtype]
+    for name, _ in fields if recorded else ():
+        values = [getattr(message, name) for message in recorded]
+        if isinstance(values[0], (bool, int, float, str)):
+            columns[name] = np.array(values)[order]
+    return columns
+
+
+def _connections(reader):
+    return {connection.topic: connection for connection in reader.connections}
+
+
+def _about(path):
+    """Name and meta of the flight, as `write_bag` left them in the bag's custom data; {} in bags of others."""
+    file = Path(path) / "metadata.yaml"
+    if not file.is_file():
+        return {}
+    information = yaml.safe_load(file.read_text())["rosbag2_bagfile_information"]
+    return json.loads((information.get("custom_data") or {}).get(_FLIGHT_KEY, "{}"))
+
+
+def _absolute(namespace, topic):
+    parts = [part.strip("/") for part in (namespace, topic)]
+    return "/" + "/".join(part for part in parts if part)
+
+
+def _find(path, connections, namespace, topic, msgtype=None):
+    """The connection of a topic as a list, empty if it is not there; raises InputError if its type is another."""
+    connection = connections.get(_absolute(namespace, topic))
+    if connection is None:
+        return []
+    if msgtype is not None and connection.msgtype != msgtype:
+        raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {msgtype} is needed there.")
+    check_type(path, connection)
+    return [connection]
+
+
+def _table(path, reader, connections, row):
+    """Stamps (n,) s, the other columns (n, k) of row(message) in order of stamps, and how often the stamps fell."""
+    rows = [row(deserialize(path, c, data)) for c, _, data in messages(path, reader, connections)]
+    if not rows:
+        return np.empty(0), np.empty((0, 0)), 0
+    stamps = np.array([values[0] for values in rows], dtype=np.int64)
+    table = np.array([values[1:] for values in rows], dtype=float)
+    falls = int((np.diff(stamps) < 0).sum())
+    if falls:
+        order = np.argsort(stamps, kind="stable")
+        stamps, table = stamps[order], table[order]
+    return stamps / 1e9, table, falls
+
+
+def _read_anchors(path, reader, connections, namespace):
+    found = _find(path, connections, namespace, "uwb/anchors", "uwb_tdoa_msgs/msg/AnchorArray")
+    last = None
+    for connection, _, data in messages(path, reader, found):
+        last = deserialize(path, connection, data)
+    if last is None:
+        raise InputError(
+            f"{path}: has no message on {_absolute(namespace, 'uwb/anchors')}; give a survey file (--survey FILE)."
+        )
+    return bag_messages.anchors_of(last)
+
+
+def _others(connections, namespace):
+    """Where the bag has such a topic instead, for an error message."""
+    places = sorted(topic.removesuffix("/uwb/tdoa") for topic in connections if topic.endswith("/uwb/tdoa"))
+    places = [place for place in places if place.strip("/") != namespace.strip("/")]
+    if places:
+        return f"give the namespace it was recorded in: {', '.join(place or '/' for place in places)}"
+    return "it is no recording of this suite"

@@ -1,0 +1,49 @@
+"""ROS 2 message types for reading and writing bags without a ROS installation."""
+
+import os
+from functools import lru_cache
+from pathlib import Path
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+OUR_PACKAGE = "uwb_tdoa_msgs"
+OUR_TYPES = ("Tdoa", "TdoaCorrected", "TdoaResidual", "Anchor", "AnchorArray")
+_SOURCE_TREE = Path(__file__).resolve().parents[3]  # where our packages lie side by side
+
+
+@lru_cache(maxsize=1)
+def typestore():
+    """The types of ROS 2 Jazzy and of uwb_tdoa_msgs; `add_type` adds others."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name in OUR_TYPES:
+        add_type(store, f"{OUR_PACKAGE}/msg/{name}")
+    return store
+
+
+def add_type(store, msgtype):
+    """Make a type like "pkg/msg/Name" known to a store, with the types it is made of, from installed .msg files."""
+    if msgtype in store.fielddefs:
+        return
+    types = get_types_from_msg(_definition(msgtype), msgtype)
+    store.register(types)
+    for _, fields in types.values():
+        for _, field in fields:
+            while field[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                field = field[1][0]
+            if field[0] == Nodetype.NAME:
+                add_type(store, field[1])
+
+
+def _definition(msgtype):
+    package, _, name = msgtype.split("/")
+    prefixes = [
+        Path(prefix) / "share" for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix
+    ]
+    for share in [*prefixes, _SOURCE_TREE]:
+        file = share / package / "msg" / f"{name}.msg"
+        if file.is_file():
+            return file.read_text(encoding="utf-8")
+    raise InputError(f"{msgtype}: its definition is not installed; build and source the workspace that has {package}.")

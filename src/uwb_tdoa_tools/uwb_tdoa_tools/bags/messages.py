@@ -1,0 +1,153 @@
+"""The arrays of a Flight as ROS messages (of a rosbags typestore), and back.
+
+What was not measured is marked as the messages say: an orientation of (0, 0, 0, 0), an orientation_covariance[0] of -1,
+covariances of 0 for unknown.
+"""
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Imu, Tdoas, Truth
+
+BODY_FRAME = "base_link"
+
+
+def nanoseconds(name, t):
+    """(n,) int stamps of (n,) s; raises InputError, with the name of the stream, for what a ROS stamp cannot hold."""
+    bad = np.flatnonzero(~((t >= 0) & (t < 2**31)))
+    if len(bad):
+        raise InputError(f"{name}: stamp {bad[0]} is {t[bad[0]]} s; ROS stamps are 0 s to 2^31 s: shift the clock.")
+    return np.rint(np.asarray(t, dtype=float) * 1e9).astype(np.int64)
+
+
+def stamp_of(header):
+    """Nanoseconds of a header's stamp. (Dividing them by 1e9 gives back the very float that was written.)"""
+    return header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+def imu_messages(imu, store):
+    """Yield (stamp ns, sensor_msgs/Imu)."""
+    Message, Vector3 = store.types["sensor_msgs/msg/Imu"], store.types["geometry_msgs/msg/Vector3"]
+    no_orientation = store.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 0.0)
+    unknown, none = np.zeros(9), np.zeros(9)
+    none[0] = -1.0
+    for stamp, rate, force in zip(nanoseconds("imu", imu.t).tolist(), imu.gyro.tolist(), imu.accel.tolist()):
+        header = _header(store, stamp, BODY_FRAME)
+        yield stamp, Message(header, no_orientation, none, Vector3(*rate), unknown, Vector3(*force), unknown)
+
+
+def imu_row(message):
+    rate, force = message.angular_velocity, message.linear_acceleration
+    return stamp_of(message.header), rate.x, rate.y, rate.z, force.x, force.y, force.z
+
+
+def imu_of(stamps, rows):
+    return Imu(stamps, rows[:, 0:3], rows[:, 3:6])
+
+
+def tdoa_messages(tdoa, store):
+    """Yield (stamp ns, uwb_tdoa_msgs/Tdoa)."""
+    Message = store.types["uwb_tdoa_msgs/msg/Tdoa"]
+    columns = (nanoseconds("tdoa", tdoa.t), tdoa.a, tdoa.b, tdoa.d)
+    for stamp, a, b, d in zip(*(column.tolist() for column in columns)):
+        yield stamp, Message(_header(store, stamp, BODY_FRAME), a, b, d)
+
+
+def tdoa_row(message):
+    return stamp_of(message.header), message.anchor_a, message.anchor_b, message.distance_difference
+
+
+def tdoas_of(stamps, rows):
+    return Tdoas(stamps, rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2])
+
+
+def pose_messages(truth, frame, store):
+    """Yield (stamp ns, geometry_msgs/PoseStamped)."""
+    Message = store.types["geometry_msgs/msg/PoseStamped"]
+    q_or_zero = np.where(np.isfinite(truth.q), truth.q, 0.0)
+    for stamp, p, q in zip(nanoseconds("truth", truth.t).tolist(), truth.p.tolist(), q_or_zero.tolist()):
+        yield stamp, Message(_header(store, stamp, frame), _pose(store, p, q))
+
+
+def pose_row(message):
+    return stamp_of(message.header), *_point(message.pose.position), *_quaternion(message.pose.orientation)
+
+
+def truth_of(stamps, rows):
+    q = rows[:, 3:7]
+    return Truth(stamps, rows[:, 0:3], np.where((q == 0).all(axis=1, keepdims=True), np.nan, q))
+
+
+def anchors_message(anchors, stamp, store):
+    """(stamp ns, uwb_tdoa_msgs/AnchorArray)."""
+    Anchor = store.types["uwb_tdoa_msgs/msg/Anchor"]
+    q_or_zero = np.where(np.isfinite(anchors.orientations), anchors.orientations, 0.0)
+    array = [
+        Anchor(number, _pose(store, p, q))
+        for number, p, q in zip(anchors.ids.tolist(), anchors.positions.tolist(), q_or_zero.tolist())
+    ]
+    return stamp, store.types["uwb_tdoa_msgs/msg/AnchorArray"](_header(store, stamp, anchors.frame), array)
+
+
+def anchors_of(message):
+    """Anchors of an AnchorArray."""
+    poses = [anchor.pose for anchor in message.anchors]
+    return Anchors(
+        [anchor.id for anchor in message.anchors],
+        np.array([_point(pose.position) for pose in poses]).reshape(-1, 3),
+        np.array([_quaternion(pose.orientation) for pose in poses]).reshape(-1, 4),
+        message.header.frame_id,
+    )
+
+
+def transforms_message(anchors, stamp, store):
+    """(stamp ns, tf2_msgs/TFMessage) with the anchors as frames anchor_<id>.
+
+    An unknown orientation is the identity here: tf has no word for "not known".
+    """
+    types = store.types
+    q_or_identity = np.where(np.isfinite(anchors.orientations), anchors.orientations, [0.0, 0.0, 0.0, 1.0])
+    transforms = [
+        types["geometry_msgs/msg/TransformStamped"](
+            _header(store, stamp, anchors.frame),
+            f"anchor_{number}",
+            types["geometry_msgs/msg/Transform"](
+                types["geometry_msgs/msg/Vector3"](*p), types["geometry_msgs/msg/Quaternion"](*q)
+            ),
+        )
+        for number, p, q in zip(anchors.ids.tolist(), anchors.positions.tolist(), q_or_identity.tolist())
+    ]
+    return stamp, types["tf2_msgs/msg/TFMessage"](transforms)
+
+
+def odometry_row(message):
+    """Stamp, position, velocity in the child frame, quaternion, pose covariance (36), twist covariance (36)."""
+    return (
+        stamp_of(message.header),
+        *_point(message.pose.pose.position),
+        *_point(message.twist.twist.linear),
+        *_quaternion(message.pose.pose.orientation),
+        *message.pose.covariance.tolist(),
+        *message.twist.covariance.tolist(),
+    )
+
+
+def _header(store, stamp, frame):
+    time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+    return store.types["std_msgs/msg/Header"](time, frame)
+
+
+def _pose(store, p, q):
+    types = store.types
+    return types["geometry_msgs/msg/Pose"](
+        types["geometry_msgs/msg/Point"](*p), types["geometry_msgs/msg/Quaternion"](*q)
+    )
+
+
+def _point(v):
+    return v.x, v.y, v.z
+
+
+def _quaternion(q):
+    return q.x, q.y, q.z, q.w

@@ -1,0 +1,1 @@
+"""The executables, one file each: options, one call, what is printed. Nothing imports them."""

@@ -1,0 +1,158 @@
+"""diagnose_bench: make the figures of docs/diagnosis.md anew."""
+
+import importlib.util
+import json
+from pathlib import Path
+import sys
+import time
+
+import numpy as np
+from tqdm import tqdm
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from .. import cli
+from ..diagnosis import diagnose
+from ..diagnosis.attribute import attribute
+from ..studies.diagnosis import bank, measured, undeclared
+
+PARTS = ("bank", "no-truth", "undeclared", "injected", "measured", "speed")
+
+
+def main(argv=None):
+    """The executable."""
+    parser = cli.parser(
+        "diagnose_bench",
+        "Make the figures of docs/diagnosis.md anew. Every part prints its figures and writes them, with all\n"
+        "cases, to PART.json in the output folder; the bank also draws its confusion matrix.",
+        "diagnose_bench bank --out bench/",
+        "diagnose_bench undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
+        "diagnose_bench measured --data DATA --out bench/",
+    )
+    parser.add_argument("part", choices=PARTS, help="what to run")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="where to write")
+    parser.add_argument(
+        "--seeds", metavar="N", type=int, default=5, help="flights for each effect and size (default: 5)"
+    )
+    parser.add_argument("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
+    parser.add_argument("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
+    return cli.run(_bench, parser, argv)
+
+
+def _bench(args):
+    args.out.mkdir(parents=True, exist_ok=True)
+    for option in {"undeclared": ("cases",), "injected": ("data",), "measured": ("data",)}.get(args.part, ()):
+        if getattr(args, option) is None:
+            raise InputError(f"--{option}: {args.part} needs it.")
+    started = time.monotonic()
+    result = {
+        "bank": _bank,
+        "no-truth": _no_truth,
+        "undeclared": _undeclared,
+        "injected": _injected,
+        "measured": _measured,
+        "speed": _speed,
+    }[args.part](args)
+    result["seconds"] = round(time.monotonic() - started, 1)
+    (args.out / f"{args.part}.json").write_text(json.dumps(result, indent=1, default=float))
+    print(json.dumps(result["figures"], indent=1, default=float))
+
+
+def _each(cases, function):
+    out = []
+    for case in tqdm(cases, unit="case", disable=None):
+        out.append(function(*case))
+    return out
+
+
+def _bank(args):
+    results = _each(
+        bank.cases(args.seeds), lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed)}
+    )
+    _confusion(results, args.out / "confusion.png")
+    return {"figures": bank.figures(results), "cases": results}
+
+
+def _no_truth(args):
+    cases = [case for case in bank.cases(min(args.seeds, 2)) if case[0] == "large"]
+    results = _each(cases, lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed, truth=False)})
+    seen = [r for r in results if r["put_in"][0] not in bank.INVISIBLE]
+    hidden = [r for r in results if r["put_in"][0] in bank.INVISIBLE]
+    figures = {
+        "observable": len(seen),
+        "right first": bank.share(r["found"][:1] == r["put_in"] for r in seen),
+        "not observable": len(hidden),
+        "named as such, and nothing found": bank.share(
+            r["put_in"][0] in r["unobservable"] and not r["found"] for r in hidden
+        ),
+    }
+    return {"figures": figures, "cases": results}
+
+
+def _undeclared(args):
+    spec = importlib.util.spec_from_file_location("undeclared_cases", args.cases)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    results = _each(
+        [(name, case, seed) for name, case in module.CASES.items() for seed in range(400, 400 + args.seeds)],
+        undeclared.run,
+    )
+    return {"figures": undeclared.figures(results), "cases": results}
+
+
+def _injected(args):
+    results = measured.injected(args.data, lambda cases, function: _each(cases, function))
+    figures = {
+        "cases": len(results),
+        "found on top": bank.share(r["hit"] for r in results),
+        "found, or named as an alternative": bank.share(r["hit"] or r["put_in"] in r["ambiguous"] for r in results),
+    }
+    return {"figures": figures, "cases": results}
+
+
+def _measured(args):
+    results = _each([(name,) for name in measured.SPLITS], lambda name: measured.run(args.data, name, args.out))
+    return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
+
+
+def _speed(args):
+    flight = bank.effect_of("anchor_delay", True, 1).inject(bank.clean_flight(500, 126.0))
+    attribute([bank.clean_flight(501, 30.0)])  # compile
+    started = time.monotonic()
+    result = diagnose([flight])
+    return {"figures": {"seconds for 120 s of flight": round(time.monotonic() - started, 1)}, "cases": result.as_text()}
+
+
+def _confusion(results, path):
+    """Rows: what was put in; columns: the first thing found; small and large together."""
+    from ..scoring.plots import plt
+
+    names = list(bank.SIZES)
+    columns = [*names, "something without a name", "nothing"]
+    count = np.zeros((len(names) + 1, len(columns)))
+    for r in results:
+        if r["kind"] == "pair":
+            continue
+        row = names.index(r["put_in"][0]) if r["put_in"] else len(names)
+        first = (r["found"] or ["nothing"])[0]
+        count[row, columns.index(first) if first in columns else len(names)] += 1
+    figure, ax = plt.subplots(figsize=(11, 10), layout="constrained")
+    share = count / np.maximum(count.sum(axis=1, keepdims=True), 1)
+    ax.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    for row, column in zip(*np.nonzero(count)):
+        ax.text(
+            column,
+            row,
+            int(count[row, column]),
+            ha="center",
+            va="center",
+            color="w" if share[row, column] > 0.5 else "k",
+        )
+    ax.set(xticks=range(len(columns)), yticks=range(len(names) + 1), xlabel="found first", ylabel="put in")
+    ax.set_xticklabels(columns, rotation=90)
+    ax.set_yticklabels([*names, "nothing"])
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,63 @@
+"""train: learn the systematic error of TDOAs from flights with ground truth."""
+
+import json
+from pathlib import Path
+import sys
+
+
+from .. import cli
+from ..readers import inputs
+from ..training import labels as labelling, models
+from ..training.plots import plot_curve
+
+
+def main(argv=None):
+    """The executable. Returns the exit code."""
+    parser = cli.parser(
+        "train",
+        "Learn the systematic error of TDOAs from flights with ground truth. Writes to --out: model.onnx, for\n"
+        "bias_node and evaluate --model (not for physics); effects.yaml, for both nodes and evaluate --effects (for\n"
+        "both physics); training.png, the learning curve; training.json, all figures. Without measured attitude a\n"
+        "flight counts as level, at yaw 0. What differs between days or vehicles is best trained apart.\n\n"
+        "models:\n"
+        "  paper                 the network of Zhao et al. (RA-L 2021), with the orientations of the anchors\n"
+        "  paper_no_orientation  the same without them\n"
+        "  structured            the difference of two one-anchor errors, robust, with an honest standard deviation\n"
+        "  physics               the effects that diagnose can name; of several constellations, those that carry over\n"
+        "  physics+structured    these, and the structured model on what they leave",
+        "train flights/0425 --survey surveys/ --model physics+structured --out model/",
+        "train flights/ util/ --survey surveys/ --model structured --out model/ --seed 1",
+        "train a.bag b.bag c.bag --validation c --model paper --out model/",
+    )
+    parser.add_argument("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
+    parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    parser.add_argument("--model", choices=models.KINDS, required=True, help="what to train")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="where to write")
+    parser.add_argument("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
+    parser.add_argument("--name", help="of the model, goes into every corrected message (default: the kind)")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
+    return cli.run(_train, parser, argv)
+
+
+def _train(args):
+    flights = {flight.name: flight for flight in inputs.read_flights(args.flights, args.survey)}
+    names = labelling.split(list(flights), args.seed, args.validation)
+    for what, some in zip(("training on", "validating on"), names):
+        print(f"{what:13s} {', '.join(some)}")
+    training, validation = ([flights[name] for name in some] for some in names)
+    result = models.train(args.model, training, validation, args.seed, args.name or args.model, progress=print)
+    args.out.mkdir(parents=True, exist_ok=True)
+    models.save(result, args.out)
+    label, x, *errors = result.curve
+    plot_curve(label, x, *errors, args.out / "training.png")
+    for name, (before, after) in result.errors.items():
+        print(f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m (root mean square)")
+    curve = {label: x, "training": errors[0], "validation": errors[1]}
+    content = {**result.meta, "curve": curve, "validation": result.errors}
+    (args.out / "training.json").write_text(json.dumps(content, indent=1) + "\n")
+    print(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

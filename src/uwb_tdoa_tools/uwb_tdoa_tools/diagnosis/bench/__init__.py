@@ -1,1 +1,0 @@
-"""Benchmarks of diagnose: the figures of docs/diagnosis.md."""

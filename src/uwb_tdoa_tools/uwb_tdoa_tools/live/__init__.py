@@ -1,0 +1,1 @@
+"""Running nodes as processes, playing to them, and listening to them."""

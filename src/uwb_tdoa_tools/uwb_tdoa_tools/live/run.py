@@ -1,0 +1,101 @@
+"""Run a bag through both nodes, as processes, over ROS topics, and record what they say."""
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from uwb_tdoa_ekf.estimator import VERDICTS
+
+from ..bags.files import open_bag
+from .processes import Diagnostics, Processes, own_domain, wait
+from .session import session
+
+INPUTS = ("/uwb/anchors", "/uwb/tdoa", "/imu/data")
+# Who must have found whom before the first message: topic -> (publishers, subscriptions)
+MATCHED = {
+    "/imu/data": (0, 1),
+    "/uwb/tdoa": (0, 1),
+    "/uwb/anchors": (0, 2),
+    "/uwb/tdoa_corrected": (1, 1),
+    "/odometry": (1, 2),
+}
+# A replay can wait, a robot cannot: here no link may lose a message, and a stream that falls behind is waited for.
+PATIENCE = {"bias_node": {"hold": 9.975}, "ekf_node": {"lag": 10.0}}  # s of stamps; hold: see config/bias_node.yaml
+RELIABLE = {
+    "bias_node": ("/uwb/tdoa.subscription", "/odometry.subscription", "/uwb/tdoa_corrected.publisher"),
+    "ekf_node": ("/imu/data.subscription", "/uwb/tdoa_corrected.subscription", "/odometry.publisher"),
+}
+DEPTH = 1_000_000  # messages that may wait in a subscription
+READY_LIMIT = 180.0  # s: the very first start compiles the filter
+MATCH_LIMIT = 60.0  # s
+SETTLE_LIMIT = 600.0  # s: on a slow machine a replay at a high rate leaves a lot to catch up with
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """recorded : path of a bag with `odometry`; bias, ekf : {key: text}, the last diagnostics of each node."""
+
+    recorded: Path
+    bias: dict
+    ekf: dict
+
+
+def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, say=print):
+    """Start bias_node, ekf_node and record, wait until they have found each other, replay the bag, stop them.
+
+    bag : path of a bag; folder : where the recorded bag (`recorded.bag`) and the output of the processes (`*.log`) go;
+    rate : times as fast as recorded; bias_parameters, ekf_parameters : {name: value} for the nodes; say(text) : tells
+    what happens now.
+    In a ROS domain of its own, on this machine only. Returns a LiveRun. Raises LiveError, and KeyboardInterrupt after a
+    signal.
+    """
+    with open_bag(bag) as reader:
+        present = {connection.topic for connection in reader.connections}
+    inputs = [topic for topic in INPUTS if topic in present]
+    recorded = Path(folder) / "recorded.bag"
+    if recorded.exists():
+        shutil.rmtree(recorded)
+    with own_domain(), session("demo", []) as (node, stop), Processes(folder, stop) as processes:
+        diagnostics = Diagnostics(node)
+        processes.start("uwb_tdoa_bias", "bias_node", *_parameters("bias_node", bias_parameters))
+        processes.start("uwb_tdoa_ekf", "ekf_node", *_parameters("ekf_node", ekf_parameters))
+        processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
+        say("starting the nodes; the very first start compiles the filter, which takes a minute")
+        wait(READY_LIMIT, "the nodes to find each other", processes, node, lambda: _is_ready(node, diagnostics))
+        say(f"replaying {bag} at rate {rate:g}")
+        options = ("--rate", rate, "--follow", "odometry", "--wait-matched", MATCH_LIMIT, "--wait-topics", *inputs)
+        replay = processes.start("uwb_tdoa_tools", "replay", bag, *options, may_end=True)
+        wait(None, None, processes, node, lambda: replay.poll() is not None)
+        diagnostics.forget()
+        wait(SETTLE_LIMIT, "the nodes to finish", processes, node, diagnostics.is_settled)
+        for name in ("record", "ekf_node", "bias_node"):
+            processes.stop(name)
+    return LiveRun(recorded, diagnostics.newest("bias_node"), diagnostics.newest("ekf_node"))
+
+
+def accounts(ekf, flight):
+    """What became of the messages of a Flight that was played, by the last diagnostics of ekf_node.
+
+    {verdict: TDOAs, "waiting", "lost": TDOAs, "imu_late", "imu_lost": samples}.
+    """
+    counts = {name: int(ekf[name]) for name in (*VERDICTS.values(), "waiting")}
+    counts["lost"] = len(flight.tdoa) - sum(counts.values())
+    samples = 0 if flight.imu is None else len(flight.imu)
+    return counts | {"imu_late": int(ekf["imu_late"]), "imu_lost": samples - int(ekf["IMU samples received"])}
+
+
+def _parameters(name, values):
+    """Command-line arguments for a node's parameters; JSON is also YAML."""
+    values = PATIENCE[name] | (values or {})
+    for end in RELIABLE[name]:
+        values |= {f"qos_overrides.{end}.reliability": "reliable", f"qos_overrides.{end}.depth": DEPTH}
+    return ["--ros-args", *(part for key, value in values.items() for part in ("-p", f"{key}:={json.dumps(value)}"))]
+
+
+def _is_ready(node, diagnostics):
+    found = diagnostics.newest("ekf_node").get("publishers of uwb/tdoa_corrected", "0") != "0"
+    return found and diagnostics.newest("bias_node") and all(
+        node.count_publishers(topic) >= publishers and node.count_subscribers(topic) >= subscriptions
+        for topic, (publishers, subscriptions) in MATCHED.items()
+    )  # fmt: skip

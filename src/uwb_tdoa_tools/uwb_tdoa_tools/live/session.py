@@ -1,0 +1,119 @@
+"""What replay and record share: their life as a ROS node, message classes by name, QoS to and from bags."""
+
+import signal
+from contextlib import contextmanager
+from importlib import import_module
+
+import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+READER_DEPTH = 10_000  # messages that a subscription holds until they are taken: 10 s of a 1 kHz stream
+
+
+class Stop:
+    """True once the process was asked to end, with the number of the signal that asked."""
+
+    def __init__(self):
+        self.signal = None
+
+    def __bool__(self):
+        return self.signal is not None
+
+
+@contextmanager
+def session(name, arguments):
+    """(node, Stop) while the block lasts. SIGINT and SIGTERM only set Stop: the block ends in its own order.
+
+    arguments : command line with the --ros-args that rclpy shall see. Raises InputError for what rclpy refuses.
+    """
+    stop = Stop()
+
+    def asked(number, _):
+        stop.signal = number
+
+    # Set here even where SIGINT was ignored, as it is in a job that a shell script put in the background.
+    previous = {number: signal.signal(number, asked) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        try:
+            rclpy.init(args=[name, *arguments], signal_handler_options=SignalHandlerOptions.NO)
+        except (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError) as error:
+            raise InputError(f"ROS arguments: {error}") from error
+        try:
+            # No parameters and no /rosout of its own: a recording of everything shall hold the others.
+            node = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
+            yield node, stop
+        finally:
+            rclpy.try_shutdown()
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def own_arguments(name, arguments):
+    """The command line without what is for ROS (--ros-args ...)."""
+    try:
+        return remove_ros_args([name, *arguments])[1:]
+    except rclpy_implementation.UnknownROSArgsError:  # `session` will say it
+        return arguments[: arguments.index("--ros-args")]
+
+
+def message_class(msgtype):
+    """Class of a type like "pkg/msg/Name", or None if its package is not installed."""
+    package, kind, name = msgtype.split("/")
+    try:
+        return getattr(import_module(f"{package}.{kind}"), name, None)
+    except ImportError:
+        return None
+
+
+def publisher_qos(recorded, messages):
+    """QoSProfile to replay a topic with. recorded : rosbags Qos of each recorded publisher; messages : how many.
+
+    Durability as recorded. Always reliable: that serves reliable and best-effort subscriptions alike. A stream keeps
+    all that is not acknowledged, so that a reliable subscription that lags holds the replay up and loses nothing. On a
+    transient-local topic, a late subscription gets as many messages as the recorded publishers kept.
+    """
+    if any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in recorded):
+        kept = sum(qos.depth for qos in recorded)  # discovery does not tell the depth: then 0 was recorded
+        return QoSProfile(
+            depth=kept or max(1, min(messages, READER_DEPTH)),
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+    return QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def subscription_qos(offered):
+    """QoSProfile that gets the most of all publishers of a topic. offered : their QoSProfiles."""
+    reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
+    latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
+    return QoSProfile(
+        depth=READER_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def recorded_qos(qos):
+    """The rosbags Qos of a publisher's QoSProfile. (Both number the policies as rmw does.)"""
+
+    def time(duration):
+        return QosTime(*divmod(duration.nanoseconds, 10**9))
+
+    return Qos(
+        QosHistory(int(qos.history)),
+        qos.depth,
+        QosReliability(int(qos.reliability)),
+        QosDurability(int(qos.durability)),
+        time(qos.deadline),
+        time(qos.lifespan),
+        QosLiveliness(int(qos.liveliness)),
+        time(qos.liveliness_lease_duration),
+        qos.avoid_ros_namespace_conventions,
+    )

@@ -1,0 +1,1 @@
+"""Estimates against ground truth: figures, pictures, files for others."""

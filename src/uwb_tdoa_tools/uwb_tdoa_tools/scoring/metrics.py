@@ -1,0 +1,126 @@
+"""How far an estimate is from ground truth, and whether its covariance is honest."""
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.engine import REJECTED, USED
+
+AIRBORNE = 0.3  # m; errors count from the first to the last instant above this height
+LOST = 1.0  # m; a larger error is no estimate
+LOST_SHARE = 0.25  # of the airborne time; more is a diverged run
+START_GRACE = 1.0  # s into the airborne part by which the first estimate must have come
+
+
+def airborne(truth):
+    """(first, last) stamp of the truth, s, with z above 0.3 m. Raises InputError if it never is."""
+    above = np.flatnonzero(truth.p[:, 2] > AIRBORNE)
+    if len(above) == 0:
+        raise InputError(f"truth: z never exceeds {AIRBORNE} m, so that no part of this flight counts; is it a flight?")
+    return truth.t[above[0]], truth.t[above[-1]]
+
+
+def position_at(t, truth):
+    """True positions at stamps t (n,), s: (n, 3) m, linear in between."""
+    return np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
+
+
+def position_errors(odometry, truth):
+    """Errors over the airborne part, the truth interpolated to the stamps of the estimate.
+
+    Returns (t (n,) s, error (n, 3) m, covariance (n, 3, 3) m^2 of the position).
+    """
+    first, last = airborne(truth)
+    chosen = (odometry.t >= first) & (odometry.t <= last)
+    t = odometry.t[chosen]
+    covariance = getattr(odometry, "covariance", getattr(odometry, "pose_covariance", None))
+    return t, odometry.p[chosen] - position_at(t, truth), covariance[chosen, :3, :3]
+
+
+def nees(error, covariance):
+    """Normalised estimation error squared, e' P^-1 e: (n,), expected 3 for an honest 3D covariance (Bar-Shalom et al.,
+    Estimation with Applications to Tracking and Navigation, sec. 5.4)."""
+    out = np.full(len(error), np.nan)
+    usable = np.linalg.det(covariance) > 0.0
+    solved = np.linalg.solve(covariance[usable], error[usable, :, None])[:, :, 0]
+    out[usable] = np.einsum("ni,ni->n", error[usable], solved)
+    return out
+
+
+def nis(residuals):
+    """Normalised innovation squared of every TDOA that reached the filter: (n,), expected 1."""
+    reached = (residuals.verdict == USED) | (residuals.verdict == REJECTED)
+    return residuals.innovation[reached] ** 2 / residuals.variance[reached]
+
+
+def summary(errors, normalised, innovations):
+    """The figures of one run, or of several pooled: errors (n, 3) m, NEES (n,), NIS (k,). A dict of floats."""
+    distance = np.linalg.norm(errors, axis=1)
+    finite = np.isfinite(distance)
+    out = {f"rmse_{axis}": _rms(errors[:, k]) for k, axis in enumerate("xyz")}
+    out["rmse_3d"] = _rms(distance)
+    out["median_3d"], out["max_3d"] = _or_nan(np.median, distance), _or_nan(np.max, distance)
+    out["frac_gt_1m"] = float(np.mean(~(distance <= LOST))) if len(distance) else 1.0
+    out["diverged"] = bool(out["frac_gt_1m"] > LOST_SHARE or not finite.all())
+    out["nees_mean"], out["nees_median"] = _or_nan(np.mean, normalised), _or_nan(np.median, normalised)
+    out["nis_mean"], out["nis_median"] = _or_nan(np.mean, innovations), _or_nan(np.median, innovations)
+    return out
+
+
+def coverage(error, covariance, sigmas=3.0):
+    """Share of errors within `sigmas` predicted standard deviations, per axis: (3,); honest and Gaussian: 0.997."""
+    std = np.sqrt(np.einsum("nii->ni", covariance))
+    return np.mean(np.abs(error) <= sigmas * std, axis=0) if len(error) else np.full(3, np.nan)
+
+
+class Score:
+    """Errors of one run against its ground truth."""
+
+    def __init__(self, name, odometry, truth, residuals=None):
+        """name : of the flight; odometry : Odometry; truth : Truth; residuals : Residuals or None."""
+        self.name = name
+        self.t, self.error, self.covariance = position_errors(odometry, truth)
+        self.first, self.last = airborne(truth)
+        self.nees = nees(self.error, self.covariance)
+        self.nis = nis(residuals) if residuals is not None else np.empty(0)
+
+    def row(self):
+        """The figures of this run: a dict."""
+        out = {"flight": self.name, **summary(self.error, self.nees, self.nis)}
+        late = not len(self.t) or self.t[0] > self.first + START_GRACE
+        gone = len(self.t) and self.t[-1] < self.last - START_GRACE
+        out["diverged"] = bool(out["diverged"] or late or gone)
+        out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else float("inf")
+        return {**out, **_named(coverage(self.error, self.covariance))}
+
+
+def pooled(scores):
+    """The figures of all samples of several runs together, and mean and largest of the runs' 3D RMSE: a dict."""
+    rows = [score.row() for score in scores]
+    error = np.concatenate([score.error for score in scores])
+    covariance = np.concatenate([score.covariance for score in scores])
+    parts = (np.concatenate([getattr(score, name) for score in scores]) for name in ("nees", "nis"))
+    out = {"flight": f"{len(scores)} pooled", **summary(error, *parts), **_named(coverage(error, covariance))}
+    out["start_delay"] = max(row["start_delay"] for row in rows)
+    out["diverged"] = sum(row["diverged"] for row in rows)
+    out["rmse_3d_mean_of_runs"] = float(np.mean([row["rmse_3d"] for row in rows]))
+    out["rmse_3d_max_of_runs"] = float(np.max([row["rmse_3d"] for row in rows]))
+    return out
+
+
+def as_json(row):
+    """JSON has no NaN and no infinity: null."""
+    return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}
+
+
+def _named(shares):
+    return {f"coverage_3sigma_{axis}": float(share) for axis, share in zip("xyz", shares)}
+
+
+def _rms(values):
+    return _or_nan(lambda v: np.sqrt(np.mean(v**2)), values)
+
+
+def _or_nan(function, values):
+    return float(function(values)) if len(values) else float("nan")

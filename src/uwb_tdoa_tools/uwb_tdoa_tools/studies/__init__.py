@@ -1,0 +1,1 @@
+"""What re-makes the figures of the documentation; users do not need it."""

@@ -1,0 +1,1 @@
+"""Figures of docs/debiasing.md."""

@@ -1,0 +1,198 @@
+"""The bank of simulated flights with known effects."""
+
+import numpy as np
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_ekf.offline import run_offline
+
+from ...scoring.evaluation import evaluate
+from ...simulation import ImuErrors, SimulationConfig, simulate
+from ...diagnosis.attribute import attribute
+from ...diagnosis.confounding import unobservable
+
+PATHS = ("sines", "rising_circle", "square", "sines", "rising_circle")
+# Without effects: white noise, outliers within the nominal 2 %, an inertial sensor without bias.
+CLEAN = {"bias": False, "multipath": False, "imu_errors": ImuErrors(gyro_bias=0.0, accel_bias=0.0)}
+
+# {effect: (small, large)}: parameters; N is the number of some anchor, P of some pair.
+SIZES = {
+    "anchor_delay": ({"N": 0.05}, {"N": 0.3}),
+    "pair_offset": ({"P": 0.05}, {"P": 0.3}),
+    "anchor_position": ({"N.x": 0.08}, {"N.x": 0.3, "N.y": -0.2, "N.z": 0.2}),
+    "tag_lever_arm": ({"z": 0.05}, {"x": 0.1, "y": -0.1, "z": 0.2}),
+    "tdoa_time_offset": ({"offset": 0.01}, {"offset": 0.05}),
+    "truth_time_offset": ({"offset": 0.01}, {"offset": 0.05}),
+    "truth_frame": ({"z": 0.04}, {"x": 0.1, "y": 0.1, "z": 0.1, "roll": 0.02, "pitch": 0.02, "yaw": 0.05}),
+    "range_scale": ({"scale": 0.01}, {"scale": 0.05}),
+    "range_bias": ({"quadratic": 0.002}, {"quadratic": 0.01}),
+    "received_power_bias": ({"scale": 0.5}, {"scale": 2.0}),
+    "antenna_pattern": ({"tag": 0.08}, {"tag": 0.3, "anchor": 0.3}),
+    "anchor_clock_drift": ({"N": 0.0015}, {"N": 0.01}),
+    "nlos": ({"N.delay": 0.15, "N.start": 20.0, "N.end": 32.0}, {"N.delay": 0.6, "N.start": 20.0, "N.end": 32.0}),
+    "floor_multipath": ({"size": 0.3}, {"size": 2.0}),
+    "gyro_bias": ({"z": 0.005}, {"x": 0.03, "y": -0.03, "z": 0.05}),
+    "gyro_scale": ({"z": 0.03}, {"z": 0.1}),
+    "accel_bias": ({"x": 0.08}, {"x": 0.3, "y": -0.3, "z": 0.2}),
+    "accel_scale": ({"z": 0.01}, {"z": 0.05}),
+    "imu_misalignment": ({"x": 0.01}, {"x": 0.05, "y": -0.05, "z": 0.05}),
+    "imu_gravity": ({"excess": 0.06}, {"excess": 0.3}),
+    "noise_level": ({"P": 0.1}, {"P": 0.3}),
+    "noise_correlation": ({"std": 0.08, "time": 0.5}, {"std": 0.2, "time": 0.5}),
+    "outlier_rate": ({"share": 0.05}, {"share": 0.15}),
+}
+PAIRS = (
+    ("anchor_delay", "tag_lever_arm"),
+    ("anchor_delay", "gyro_bias"),
+    ("pair_offset", "range_scale"),
+    ("anchor_position", "tdoa_time_offset"),
+    ("anchor_clock_drift", "accel_bias"),
+    ("nlos", "anchor_delay"),
+    ("received_power_bias", "anchor_delay"),
+    ("truth_frame", "imu_misalignment"),
+)
+# Without ground truth an error of the position explains these as well, or nothing else is measured on their channel.
+INVISIBLE = (
+    "tag_lever_arm",
+    "tdoa_time_offset",
+    "truth_time_offset",
+    "truth_frame",
+    "gyro_scale",
+    "accel_bias",
+    "accel_scale",
+    "imu_misalignment",
+    "imu_gravity",
+)
+
+
+def clean_flight(seed, duration=50.0):
+    """A simulated flight without any effect."""
+    return simulate(
+        SimulationConfig(
+            seed=seed,
+            duration=duration,
+            trajectory=PATHS[seed % 5],
+            yaw=("along_track", "rotating")[seed % 2],
+            protocol=("tdoa2", "tdoa3")[seed // 2 % 2],
+            **CLEAN,
+        )
+    )
+
+
+def effect_of(name, large, seed):
+    """The effect at a size, on an anchor or pair that the seed chooses."""
+    rng = np.random.default_rng([seed, len(name)])
+    anchor = int(rng.integers(8))
+    pair = f"{anchor}-{(anchor + 1) % 8}"  # is heard in both protocols
+    values = SIZES[name][int(large)]
+    return EFFECTS[name]({key.replace("N", str(anchor)).replace("P", pair): value for key, value in values.items()})
+
+
+def names_found(attribution):
+    """Names of effects, the most certain first, smooth terms as channel/covariate."""
+    ranked = sorted(
+        attribution.findings, key=lambda f: -f.evidence.get("held_out_gain", f.evidence.get("standard_errors", 0.0))
+    )
+    return [f.effect.name for f in ranked] + [f"{f.effect.channel}/{f.effect.covariate}" for f in attribution.terms]
+
+
+def diagnose_case(effects, seed, truth=True):
+    """dict of one case: what was put in, found, how near the parameters, and the errors of the filter on a second
+    flight with the same effects: before, corrected as found, corrected as it is."""
+    rng = np.random.default_rng([seed, 77])
+
+    def flown(number):
+        flight = clean_flight(number)
+        for effect in effects:
+            flight = effect.inject(flight, rng)
+        return flight
+
+    def estimator(flight, model):
+        return run_offline(flight, None, Corrector(flight.anchors, model)).odometry
+
+    attribution = attribute([flown(seed)], estimator=None if truth else estimator)
+    found = names_found(attribution)
+    ambiguous = {c.effect for f in attribution.findings for _, c in f.rivals}
+    case = {
+        "put_in": [effect.name for effect in effects],
+        "seed": seed,
+        "found": found,
+        "ambiguous": sorted(ambiguous),
+        "parameters_right": _right(effects, attribution),
+    }
+    if not truth:
+        case["unobservable"] = sorted({item["effect"] for item in unobservable(attribution)})
+        return case
+    other = flown(seed + 5000)
+    usable = EffectSet(tuple(e for e in attribution.effects if getattr(e, "usable", True)))
+    for name, model in (("before", EffectSet()), ("found_rmse", usable), ("told_rmse", EffectSet(tuple(effects)))):
+        case[name] = evaluate(other, effects=model)[0].row()["rmse_3d"]
+    return case
+
+
+def _right(effects, attribution):
+    """Whether every injected parameter was found within 10 % or 3 standard errors; limits of time and place are not
+    judged."""
+    found = {f.effect.name: f.effect for f in attribution.findings}
+    for effect in effects:
+        other = found.get(effect.name)
+        if other is None:
+            return False
+        for key, value in effect.values.items():
+            if effect.name == "outlier_rate":
+                value = value + (1.0 - value) * SimulationConfig.outlier_probability  # on top of what is nominal
+            if effect.name == "nlos" and not key.endswith(".delay"):
+                continue
+            error = abs(other.values.get(key, 0.0) - value)
+            if error > max(0.1 * abs(value), 3.0 * other.std.get(key, 0.0)):
+                return False
+    return True
+
+
+def cases(seeds):
+    """[(kind, effects, seed)] of the whole bank: small, large, pair, clean."""
+    out = []
+    for name in SIZES:
+        out += [
+            ("small" if not large else "large", (effect_of(name, large, s),), 100 + s)
+            for large in (False, True)
+            for s in range(seeds)
+        ]
+    out += [
+        ("pair", (effect_of(a, True, s), effect_of(b, True, s + 1)), 200 + s)
+        for a, b in PAIRS
+        for s in range(min(seeds, 2))
+    ]
+    out += [("clean", (), 300 + s) for s in range(8 * seeds)]
+    return out
+
+
+def figures(results):
+    """{kind: figures} of the cases."""
+    out = {}
+    for kind in ("small", "large", "pair"):
+        mine = [r for r in results if r["kind"] == kind]
+        exact = [sorted(r["found"]) == sorted(r["put_in"]) for r in mine]
+        among = [set(r["put_in"]) <= set(r["found"]) for r in mine]
+        first = [
+            r["found"][:1] == r["put_in"][:1]
+            or (kind == "pair" and set(r["found"][:1]) <= set(r["put_in"]) and r["found"])
+            for r in mine
+        ]
+        near = [r["found_rmse"] <= 1.1 * r["told_rmse"] + 0.002 for r in mine if "found_rmse" in r]
+        out[kind] = {
+            "cases": len(mine),
+            "exactly": share(exact),
+            "found": share(among),
+            "first": share(bool(x) for x in first),
+            "parameters_right": share(r["parameters_right"] for r in mine),
+            "rmse_as_if_told": share(near),
+        }
+    clean = [r for r in results if r["kind"] == "clean"]
+    out["clean"] = {"cases": len(clean), "false_alarms": share(bool(r["found"]) for r in clean)}
+    return out
+
+
+def share(values):
+    """Mean of truth values; None of none."""
+    values = list(values)
+    return round(float(np.mean(values)), 3) if values else None

@@ -1,0 +1,123 @@
+"""The measured flights: as they are, and with effects put in on top."""
+
+import json
+import time
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet
+
+from ...readers import inputs
+from ...diagnosis.attribute import attribute
+from ...diagnosis.diagnose import diagnose
+from .bank import SIZES, effect_of
+
+_T2, _T3 = "flights/0425/TDOA2/0425-traj", "flights/0425/TDOA3/0425-traj"
+# {name: (to fit, to judge)}; a swap of both judges the others.
+SPLITS = {
+    "0425 a": (
+        [_T2 + "1", _T2 + "2", _T2 + "6", _T3 + "13", _T3 + "17"],
+        [_T2 + "3", _T2 + "7", _T2 + "10", _T3 + "14", _T3 + "21"],
+    ),
+    "0425 b": (
+        [_T2 + "3", _T2 + "7", _T2 + "10", _T3 + "14", _T3 + "21"],
+        [_T2 + "1", _T2 + "2", _T2 + "6", _T3 + "13", _T3 + "17"],
+    ),
+    "0426 a": (
+        [f"flights/0426/0426-traj{k}" for k in (1, 3, 5, 9)],
+        [f"flights/0426/0426-traj{k}" for k in (2, 7, 11, 13, 15)],
+    ),
+    "0426 b": (
+        [f"flights/0426/0426-traj{k}" for k in (2, 7, 11, 13, 15)],
+        [f"flights/0426/0426-traj{k}" for k in (1, 3, 5, 9)],
+    ),
+    "0422 a": (["flights/0422/0422-log00"], ["flights/0422/0422-log02"]),
+    "0422 b": (["flights/0422/0422-log02"], ["flights/0422/0422-log00"]),
+    "0607": (["flights/0607/tdoa2-obs-log1"], []),
+    "const1": (
+        ["util/const1-trial1-tdoa2.csv.gz"],
+        [f"util/const1-trial{k}.csv.gz" for k in ("1-tdoa3", "2-tdoa2", "3-tdoa2")],
+    ),
+    "const3": (
+        [f"util/const3-trial{k}-tdoa2.csv.gz" for k in (1, 2)],
+        [f"util/const3-trial{k}-tdoa2.csv.gz" for k in (3, 4)],
+    ),
+    "const4 trial 1": (
+        ["util/const4-trial1-tdoa2-traj1.csv.gz"],
+        [f"util/const4-trial1-tdoa2-traj{k}.csv.gz" for k in (2, 3)],
+    ),
+    "const4 trial 3": (
+        ["util/const4-trial3-tdoa2-traj1.csv.gz"],
+        [f"util/const4-trial3-tdoa2-traj{k}.csv.gz" for k in (2, 3)],
+    ),
+}
+INTO = (
+    "flights/0425/TDOA2/0425-traj2",
+    "flights/0425/TDOA3/0425-traj17",
+    "flights/0426/0426-traj3",
+    "flights/0426/0426-traj5",
+)
+PRESENT = (
+    "outlier_rate",
+    "noise_correlation",
+    "floor_multipath",
+)  # in every measured flight, and cannot be taken out first
+
+
+def _load(data, paths):
+    return list(inputs.load_flights([data / path for path in paths], data / "surveys"))
+
+
+def run(data, name, out):
+    """Diagnose one split; writes its report and effects.yaml. Returns dict of the summary and all findings."""
+    fit, judge = SPLITS[name]
+    started = time.monotonic()
+    result = diagnose(_load(data, fit), _load(data, judge))
+    folder = out / name.replace(" ", "-")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "report.html").write_text(result.as_html())
+    result.effects.to_yaml(folder / "effects.yaml")
+    content = result.as_json()
+    (folder / "diagnosis.json").write_text(json.dumps(content, indent=1, allow_nan=False))
+    sides = {side: [row["rmse_3d"] for row in content[side]["runs"]] for side in ("before", "after")}
+    summary = {
+        "mean 3D before": round(float(np.mean(sides["before"])), 3),
+        "after": round(float(np.mean(sides["after"])), 3),
+        "gain 95 %": content["after"]["pooled"].get("rmse_3d_gain_ci"),
+        "diverged": sum(row["diverged"] for row in content["after"]["runs"]),
+        "found": [f["effect"] for f in content["findings"]],
+        "without a name": [f"{t['channel']}/{t['covariate']}/{t['form']}" for t in content["unattributed"]],
+    }
+    runs = [
+        [row["flight"], row["rmse_3d"], other["rmse_3d"]]
+        for row, other in zip(content["before"]["runs"], content["after"]["runs"])
+    ]
+    return {
+        "split": name,
+        "summary": summary,
+        "runs": runs,
+        "judged_on": content["judged_on"],
+        "seconds": time.monotonic() - started,
+    }
+
+
+def injected(data, each):
+    """Put large effects into measured flights whose own effects were diagnosed before: [dict], with "hit"."""
+    cases = [(path, name) for path in INTO for name in SIZES if name not in PRESENT]
+    known = {}
+
+    def one(path, name):
+        if path not in known:
+            flight = _load(data, [path])[0]
+            own = attribute([flight])
+            known[path] = flight, EffectSet(tuple(e for e in own.effects if getattr(e, "usable", True)))
+        flight, base = known[path]
+        effect = effect_of(name, True, len(path) + len(name))
+        found = attribute([effect.inject(flight, np.random.default_rng(1))], base, undeclared=False)
+        names = [f.effect.name for f in found.findings]
+        same = next((f.effect for f in found.findings if f.effect.name == name), None)
+        hit = same is not None and bool(set(same.values) & set(effect.values))
+        rivals = sorted({candidate.effect for f in found.findings for _, candidate in f.rivals})
+        return {"flight": flight.name, "put_in": name, "found": names, "ambiguous": rivals, "hit": hit}
+
+    return each(cases, one)

@@ -1,0 +1,1 @@
+"""Figures of docs/bias.md, and the model that is shipped."""
