@@ -22,4 +22,4 @@ def random_samples(seed, n=20, n_anchors=5):
     b = (a + rng.integers(1, n_anchors, n)) % n_anchors
     q = Rotation.from_quat(rng.standard_normal((n, 4))).as_quat() if n else np.empty((0, 4))
     p, v = rng.uniform(-5, 5, (n, 3)), rng.standard_normal((n, 3))
-    return Samples(np.arange(n) / 100.0, a, b, p, q, anchors, v=v)
+    return Samples(np.arange(n) / 100.0, a, b, p, q, anchors, velocity=v)

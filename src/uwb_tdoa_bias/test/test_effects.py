@@ -226,5 +226,5 @@ def test_stamps_and_spread():
     np.testing.assert_allclose(EffectSet((noisy,)).spread(samples), 0.3 * hit)
     late = EffectSet((EFFECTS["tdoa_time_offset"]({"offset": 0.03}),))
     flight = Flight("f", samples.anchors, Tdoas(samples.t, ids[samples.a], ids[samples.b], samples.t))
-    assert late.tdoa_offset == 0.03
+    assert late.stamp_offset("tdoa") == 0.03 and late.stamp_offset("imu") == 0.0
     np.testing.assert_allclose(late.correct_streams(flight).tdoa.t, samples.t - 0.03)

@@ -47,6 +47,7 @@ class BiasNode(Node):
             if not 0.0 < value < math.inf:
                 raise InputError(f"{name}: {value!r} must be a number of seconds above 0.")
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
+        self._late = self._effects.stamp_offset("tdoa")  # s
         self._network = load_network(model_file)
         self._model = self._warm_up()
         self._idle = self._model[NETWORK] == "none"
@@ -123,7 +124,7 @@ class BiasNode(Node):
             self._take(message)
 
     def _take(self, message):
-        t = self._epoch.seconds(message.header.stamp) - self._effects.tdoa_offset
+        t = self._epoch.seconds(message.header.stamp) - self._late
         believed, strays, fell_back = self._tdoas.take(t, message)
         for _, stray in strays:  # ekf_node says of it that its stamp is wrong
             self._publish(stray, 0.0, 0.0, PASSED)
@@ -152,7 +153,7 @@ class BiasNode(Node):
         self._counts["invalid"] += len(t) - int(valid.sum())
         for (at, message, ready), *values in zip(released, bias.tolist(), std.tolist(), status.tolist()):
             self._counts["unready"] += not ready
-            if self._effects.tdoa_offset:
+            if self._late:
                 message.header.stamp = self._epoch.stamp(at)
             self._publish(message, *values)
 

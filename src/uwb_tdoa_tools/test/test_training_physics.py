@@ -40,7 +40,7 @@ def test_of_several_constellations_only_what_carries_over(one_place):
     flights = [*one_place[:2], *injected(elsewhere, DELAY, PUSHED)]
     flights = [*injected(flights[:2], MOVED), *flights[2:]]
     names = {effect.name for effect in physics.find(flights).effects.effects}
-    assert "anchor_delay" in names and names <= {*physics.CARRIED, "noise_level", "noise_correlation"}
+    assert "anchor_delay" in names and names <= {*physics.PORTABLE, "noise_level", "noise_correlation"}
 
 
 def test_does_without_attitude():

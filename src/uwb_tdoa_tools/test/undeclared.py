@@ -36,7 +36,7 @@ def _since(flight):
 
 def drag_on_cable(flight):
     """TDOAs grow with the square of the speed."""
-    return _tdoa(flight, lambda s: 0.1 * np.sum(s.v**2, axis=1))
+    return _tdoa(flight, lambda s: 0.1 * np.sum(s.velocity**2, axis=1))
 
 
 def warming_tag(flight):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..effects import EffectSet, Samples
-from .motion import motion
+from ..effects.motion import POSE_LAG, motion_at, preceding
 from .poses import Poses, turned
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
@@ -32,7 +32,7 @@ class Corrector:
     report that pose; and the filter can: it needs nothing later than the preceding measurement, after a gap neither.
     """
 
-    def __init__(self, anchors, effects=None, network=None, lag=0.05, history=4096):
+    def __init__(self, anchors, effects=None, network=None, lag=POSE_LAG, history=4096):
         """anchors : Anchors; effects : EffectSet or None; network : Network or None; lag : s; history : poses kept."""
         self.anchors = anchors
         self.effects = effects or EffectSet()
@@ -73,13 +73,8 @@ class Corrector:
         zeros = np.zeros(n)
         if self.idle or n == 0:
             return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
-        newest = np.maximum.accumulate(np.concatenate([t[:1] if self._newest is None else [self._newest], t]))
-        self._newest = newest[-1]
-        places, p, q, yaw_std = self._poses.before(np.minimum(newest[:-1], t) - self.lag)
-        extra = self._extra(t, b, places) if self.effects.needs_motion else {}
-        self._first = t[0] if self._first is None else self._first
-        samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std, **extra)
-        bias, spread = self._effects_at(samples)
+        samples = self.samples(t, a, b)
+        bias, spread = self.contribution(samples)
         std = spread
         status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
         if self.network is not None:
@@ -90,8 +85,9 @@ class Corrector:
             status[told] = np.where(share[told] < FADED_BELOW, FADED, NETWORK)
         return Correction(bias, std, d - bias, status)
 
-    def _effects_at(self, samples):
-        """(bias, spread) of the effects; while the yaw is unknown their mean over four headings, and its scatter."""
+    def contribution(self, samples):
+        """(bias, spread) of the effects in Samples, (n,) m; while the yaw is unknown their mean over four headings, and its
+        scatter."""
         if not len(self.effects):
             return np.zeros(len(samples)), np.zeros(len(samples))
         bias, spread = self.effects.bias(samples), self.effects.spread(samples)
@@ -102,11 +98,20 @@ class Corrector:
             spread = np.where(unknown, np.hypot(spread, each.std(axis=0)), spread)
         return bias, spread
 
-    def _extra(self, t, b, places):
-        """Motion of the tag at the poses numbered `places`, and what was heard before each TDOA: for Samples."""
-        t_last, b_last = self._last or (t[0], -1)
-        before = np.concatenate([[t_last], t[:-1]])
-        previous = np.concatenate([[b_last], self.anchors.ids[b[:-1]]])
+    def samples(self, t, a, b):
+        """Samples of a batch at the poses that are known by now."""
+        before = preceding(t, self._newest)
+        self._newest = t.max() if self._newest is None else max(self._newest, t.max())
+        self._first = t[0] if self._first is None else self._first
+        places, p, q, yaw_std = self._poses.before(before - self.lag)
+        samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std)
+        if not self.effects.needs_motion:
+            return samples
+        last_t, last_b = self._last or (t[0], -1)
         self._last = (t[-1], self.anchors.ids[b[-1]])
-        moved = motion(self._poses.t, self._poses.p, self._poses.q, places.tolist())
-        return {**moved, "interval": t - before, "previous": previous}
+        return replace(
+            samples,
+            motion=motion_at(self._poses.t, self._poses.p, self._poses.q, places),
+            interval=t - np.concatenate([[last_t], t[:-1]]),
+            previous=np.concatenate([[last_b], self.anchors.ids[b[:-1]]]),
+        )

@@ -22,11 +22,11 @@ from .base import ArrivalEffect, Effect
 from .catalogue import EFFECTS
 from .effect_set import EffectSet
 from .imu_corrector import ImuCorrector
-from .samples import Samples, samples_at, true_samples
+from .samples import ImuSamples, Samples, Track, samples_at, true_samples
 from .smooth_term import SmoothTerm
 from .tag_lever_arm import TagLeverArm
 
 __all__ = [
-    "EFFECTS", "AnchorDelay", "ArrivalEffect", "Effect", "EffectSet", "ImuCorrector", "Samples", "SmoothTerm",
-    "TagLeverArm", "samples_at", "true_samples",
+    "EFFECTS", "AnchorDelay", "ArrivalEffect", "Effect", "EffectSet", "ImuCorrector", "ImuSamples", "Samples",
+    "SmoothTerm", "TagLeverArm", "Track", "samples_at", "true_samples",
 ]  # fmt: skip

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from .imu_error import Affine, ImuEffect
+from .affine import Affine
+from .imu_error import ImuEffect
 
 
 class AccelScale(ImuEffect):
@@ -16,6 +17,9 @@ class AccelScale(ImuEffect):
     example = "z"
     physics = "sensitivity error of a MEMS accelerometer"
     confounded_with = ("accel_bias", "imu_gravity")
+    told_apart = {
+        "accel_bias": "hard manoeuvres: a scale grows with them, a bias does not",
+    }
     reference = "BMI088 data sheet: sensitivity tolerance 0.7 %"
     channels = ("accel",)
 

@@ -16,7 +16,12 @@ class AnchorClockDrift(Effect):
     example = "0"
     physics = "the correction of an anchor's clock lags behind its crystal, which warms up: its delay grows with time"
     confounded_with = ("anchor_delay", "nlos")
+    told_apart = {
+        "nlos": "a longer flight: a drift goes on, an obstacle ends",
+        "anchor_delay": "a longer flight",
+    }
     reference = "Sidorenko et al., Sensors 2019, 19, 2942; DW1000 user manual: 2.15 mm per degree"
+    portable = False
 
     @classmethod
     def check_key(cls, key):

@@ -19,6 +19,10 @@ class AnchorDelay(Effect):
     example = "0"
     physics = "the antenna delay of an anchor is not calibrated: it always seems farther away by the same distance"
     confounded_with = ("anchor_position", "pair_offset")
+    told_apart = {
+        "pair_offset": "TDoA3, where each anchor is heard in many pairs",
+        "anchor_position": "a flight that passes the anchor on several sides, near and far",
+    }
     reference = "DW1000 user manual, antenna delay calibration: 10 - 50 cm from module to module"
 
     @classmethod

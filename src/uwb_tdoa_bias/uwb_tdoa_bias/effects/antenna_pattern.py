@@ -20,6 +20,9 @@ class AntennaPattern(ArrivalEffect):
     example = "tag"
     physics = "off its best direction an antenna radiates over longer ways: the group delay grows towards its nulls"
     confounded_with = ("received_power_bias", "tag_lever_arm")
+    told_apart = {
+        "received_power_bias": "one place at many headings, then one heading at many ranges",
+    }
     reference = "Qorvo support: 10 - 15 cm over direction for a module; the shape is that of uwb_tdoa_bias.foundation.antenna"
 
     @classmethod

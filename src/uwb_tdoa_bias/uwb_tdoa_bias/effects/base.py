@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..foundation.errors import InputError
+from .affine import IDENTITY
 from .samples import Samples, true_samples
 
 __all__ = ["ArrivalEffect", "Effect", "Samples"]
@@ -18,7 +19,9 @@ class Effect:
 
     values : {parameter name: value in `unit`}; std : the same keys, standard errors, empty if unknown;
     source : where the values came from, free text.
-    An effect acts on the TDOAs (`bias`, `spread`), or on whole streams (`correct_streams`: stamps, inertial samples).
+    An effect says what it does to measurements, and by that how it is undone, the same way in a node, off line and in a
+    recording: `bias` and `spread` of TDOAs, `stamp_offset` of streams, `sensor_model` and `sensor_bias` of inertial
+    samples. For `diagnose` it gives `regressors` on the channels where it shows.
     """
 
     values: dict = field(default_factory=dict)
@@ -35,7 +38,13 @@ class Effect:
     confounded_with: ClassVar[tuple] = ()
     reference: ClassVar[str]
     channels: ClassVar[tuple] = ("tdoa",)  # where it shows: tdoa, gyro, accel
-    fitted: ClassVar[bool] = True  # False: found by a search of its own, not by linear regression
+    fitted: ClassVar[bool] = True  # False: found by a detector of its own, not by linear regression
+    portable: ClassVar[bool] = True  # goes with the tag, the vehicle and the anchors' modules to another installation
+    settings: ClassVar[tuple] = ()  # further entries in effects.yaml, constructor arguments
+    price: ClassVar[float] = 0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
+    told_apart: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
+    usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
+    needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
 
     def __post_init__(self):
         for group in ("values", "std"):
@@ -80,12 +89,28 @@ class Effect:
         """
         raise NotImplementedError
 
+    @property
+    def label(self):
+        """What reports call it."""
+        return self.name
+
+    @property
+    def identity(self):
+        """Hashable: equal for effects whose parameters of one name are the same quantity, which can hence be merged."""
+        return (self.name, *(getattr(self, name) for name in self.settings))
+
+    @classmethod
+    def plausible(cls, values):
+        """Whether {parameter: value} could be: within bounds."""
+        return all(abs(value) <= cls.bound_of(key) for key, value in values.items())
+
     def bias(self, samples):
         """Contribution to the measured d_ab, (n,) metres; NaN where it cannot be told (unknown pose)."""
         return np.zeros(len(samples))
 
     def regressors(self, samples, keys):
-        """Derivative of `bias` with respect to the parameters named in `keys`, (n, len(keys)), metres per `unit`."""
+        """Derivative of what `samples.channel` measures by the parameters `keys`: of Samples (n, len(keys)), metres per
+        `unit`; of ImuSamples (n, 3, len(keys)), body axes. Asked for the channels in `channels` only."""
         return np.zeros((len(samples), len(keys)))
 
     def spread(self, samples):
@@ -104,9 +129,21 @@ class Effect:
         d[rows] += bias
         return replace(flight, tdoa=replace(flight.tdoa, d=d))
 
-    def correct_streams(self, flight):
-        """The Flight without this effect's part in stamps and inertial samples. TDOA biases are the Corrector's."""
-        return flight
+    def stamp_offset(self, stream):
+        """Seconds by which the stamps of the stream "tdoa", "imu" or "truth" are late."""
+        return 0.0
+
+    def sensor_model(self, channel):
+        """Affine from the true to the measured values of "gyro" (rad/s) or "accel" (m/s^2), body axes."""
+        return IDENTITY
+
+    def sensor_bias(self, channel, features):
+        """What it adds to "gyro" or "accel" besides, (n, 3), given their features (n, len(OF_IMU)); None for nothing."""
+        return None
+
+    def uncorrected(self, samples):
+        """What taking it out of a stream leaves of it in ImuSamples, (n, 3), because nodes know less than those."""
+        return 0.0
 
 
 class ArrivalEffect(Effect):

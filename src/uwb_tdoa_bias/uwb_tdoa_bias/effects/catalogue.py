@@ -1,4 +1,4 @@
-"""All declared effects, by name."""
+"""All declared effects, by name. The file of each is named after it."""
 
 from .accel_bias import AccelBias
 from .accel_scale import AccelScale

@@ -14,7 +14,7 @@ VIBRATION_CORNER, VIBRATION_TIME = 0.05, 0.3  # s: faster is vibration; its powe
 
 
 def _norm(v):
-    return None if v is None else np.linalg.norm(v, axis=1)
+    return np.linalg.norm(v, axis=1)
 
 
 # One value per TDOA, of Samples: (n,), or None if the samples do not hold it.
@@ -23,10 +23,10 @@ OF_TDOA = {
     "x": lambda s: s.p[:, 0],
     "y": lambda s: s.p[:, 1],
     "height": lambda s: s.p[:, 2],
-    "speed": lambda s: _norm(s.v),
-    "climb_rate": lambda s: None if s.v is None else s.v[:, 2],
-    "acceleration": lambda s: _norm(s.acceleration),
-    "turning_rate": lambda s: _norm(s.rate),
+    "speed": lambda s: None if s.motion is None else _norm(s.motion.velocity),
+    "climb_rate": lambda s: None if s.motion is None else s.motion.velocity[:, 2],
+    "acceleration": lambda s: None if s.motion is None else _norm(s.motion.acceleration),
+    "turning_rate": lambda s: None if s.motion is None else _norm(s.motion.rate),
     "interval": lambda s: s.interval,
     "previous_anchor": lambda s: s.previous,
     "vibration": lambda s: s.vibration,
@@ -60,6 +60,13 @@ OF_ARRIVAL = {
 OF_IMU = (
     "time", "vibration", "turning_rate", "rate_x", "rate_y", "rate_z", "force", "force_x", "force_y", "force_z",
 )  # fmt: skip
+
+
+def imu_covariate(name, samples):
+    """Covariate `name`, of OF_IMU or of a pose in OF_TDOA, of ImuSamples: (n,)."""
+    if samples.channel == "accel" and name.startswith("force"):  # the measured one shares its noise with the residual
+        return _norm(samples.reading) if name == "force" else samples.reading[:, "xyz".index(name[-1])]
+    return samples.features[:, OF_IMU.index(name)] if name in OF_IMU else OF_TDOA[name](samples)
 
 
 class ImuFeatures:

@@ -8,12 +8,12 @@ import yaml
 
 from ..foundation.errors import InputError
 from .catalogue import EFFECTS
-from .covariates import OF_MOTION
 from .imu_corrector import ImuCorrector
 from .smooth_term import SmoothTerm
-from .tdoa_time_offset import TdoaTimeOffset
+from .stamp_error import shifted
 
 ENTRY = ("values", "std", "source")
+STREAMS = ("tdoa", "imu", "truth")
 
 
 @dataclass(frozen=True)
@@ -45,17 +45,16 @@ class EffectSet:
     @property
     def needs_motion(self):
         """True if an effect looks at more than poses."""
-        return any(isinstance(effect, SmoothTerm) and effect.covariate in OF_MOTION for effect in self.effects)
+        return any(effect.needs_motion for effect in self.effects)
 
-    @property
-    def tdoa_offset(self):
-        """Seconds by which the stamps of TDOAs are late."""
-        return sum(effect.offset for effect in self.effects if isinstance(effect, TdoaTimeOffset))
+    def stamp_offset(self, stream):
+        """Seconds by which the stamps of the stream "tdoa", "imu" or "truth" are late."""
+        return sum(effect.stamp_offset(stream) for effect in self.effects)
 
     def correct_streams(self, flight):
         """The Flight without the effects' part in stamps and inertial samples. TDOA biases are the Corrector's."""
-        for effect in self.effects:
-            flight = effect.correct_streams(flight)
+        for stream in STREAMS:
+            flight = shifted(flight, stream, -self.stamp_offset(stream))
         corrector = ImuCorrector(self.effects)
         if flight.imu is None or corrector.idle:
             return flight
@@ -79,7 +78,7 @@ class EffectSet:
             if kind is None:
                 known = ", ".join([*EFFECTS, "smooth_term_1, ..."])
                 raise InputError(f"{path}: effect {name!r} is not known; known are {known}.")
-            allowed = (*ENTRY, *getattr(kind, "settings", ()))
+            allowed = (*ENTRY, *kind.settings)
             entry = entry or {}
             unknown = set(entry) - set(allowed) if isinstance(entry, dict) else {"(not a mapping)"}
             if unknown:
@@ -92,17 +91,18 @@ class EffectSet:
 
     def to_yaml(self, path):
         """Write what `from_yaml` reads."""
-        entries, terms = {}, 0
+        entries = {}
         for effect in self.effects:
+            entry = {name: _plain(getattr(effect, name)) for name in (*effect.settings, *ENTRY)}
             name = effect.name
-            entry = {"values": dict(effect.values), "std": dict(effect.std), "source": effect.source}
-            if isinstance(effect, SmoothTerm):
-                terms += 1
-                name = f"{name}_{terms}"
-                entry = {**{key: getattr(effect, key) for key in effect.settings}, **entry}
-                entry["knots"] = list(effect.knots)
+            if effect.settings:  # there may be several
+                name = f"{name}_{1 + sum(known.startswith(f'{name}_') for known in entries)}"
             entries[name] = {key: value for key, value in entry.items() if value}
         Path(path).write_text(yaml.safe_dump({"effects": entries}, sort_keys=False))
+
+
+def _plain(value):
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _kind(name):

@@ -22,6 +22,7 @@ class FloorMultipath(ArrivalEffect):
     )
     confounded_with = ("tag_lever_arm", "truth_frame", "nlos")
     reference = "two-ray model; TDOAs on the floor are wrong by metres in the measured flights"
+    portable = False
     fitted = False
 
     @classmethod

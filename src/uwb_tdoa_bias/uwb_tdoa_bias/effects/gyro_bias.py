@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from .imu_error import Affine, ImuEffect
+from .affine import Affine
+from .imu_error import ImuEffect
 
 
 class GyroBias(ImuEffect):

@@ -2,32 +2,38 @@
 
 import numpy as np
 
+from .affine import IDENTITY
 from .covariates import OF_IMU, ImuFeatures
-from .imu_error import IDENTITY, ImuEffect
-from .smooth_term import SmoothTerm
+
+SENSORS = ("gyro", "accel")
 
 
 class ImuCorrector:
-    """Undoes the effects of a set in the order in which they are listed; smooth terms come last."""
+    """Undoes the effects of a set in the order in which they are listed; what depends on features comes last."""
 
     def __init__(self, effects):
         """effects : iterable of Effect; those that do not act on inertial samples are passed over."""
-        self._gyro = self._accel = IDENTITY
-        for effect in effects:
-            if isinstance(effect, ImuEffect):
-                self._gyro = effect.gyro().inverse().after(self._gyro)
-                self._accel = effect.accel().inverse().after(self._accel)
-        self._terms = [e for e in effects if isinstance(e, SmoothTerm) and e.channel != "tdoa" and e.usable]
+        self._undo = []
+        for channel in SENSORS:
+            undo = IDENTITY
+            for effect in effects:
+                undo = effect.sensor_model(channel).inverse().after(undo)
+            self._undo.append(undo)
+        still = np.zeros((1, len(OF_IMU)))
+        self._additive = [e for e in effects if any(e.sensor_bias(channel, still) is not None for channel in SENSORS)]
         self._features = ImuFeatures()
-        self.idle = not self._terms and not any(isinstance(effect, ImuEffect) for effect in effects)
+        self.idle = not self._additive and all(
+            effect.sensor_model(channel) is IDENTITY for effect in effects for channel in SENSORS
+        )
 
     def correct(self, t, gyro, accel):
         """t (n,) s; gyro (n, 3) rad/s; accel (n, 3) m/s^2. Returns corrected (gyro, accel)."""
-        gyro, accel = self._gyro(gyro), self._accel(accel)
-        if self._terms:
-            features = self._features(t, gyro, accel)
-            for term in self._terms:
-                sensor, axis = term.channel.split(".")
-                part = term.curve(features[:, OF_IMU.index(term.covariate)])
-                (gyro if sensor == "gyro" else accel)[:, "xyz".index(axis)] -= np.where(np.isfinite(part), part, 0.0)
-        return gyro, accel
+        sensed = [undo(samples) for undo, samples in zip(self._undo, (gyro, accel))]
+        if self._additive:
+            features = self._features(t, *sensed)
+            for effect in self._additive:
+                for channel, samples in zip(SENSORS, sensed):
+                    part = effect.sensor_bias(channel, features)
+                    if part is not None:
+                        samples -= np.where(np.isfinite(part), part, 0.0)
+        return tuple(sensed)

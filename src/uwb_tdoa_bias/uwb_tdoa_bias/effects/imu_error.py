@@ -1,34 +1,12 @@
 """What the inertial effects share: measured = (I + E) true + b, for gyroscope and accelerometer."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ..foundation.errors import InputError
+from .affine import IDENTITY
 from .base import Effect
-
-
-@dataclass(frozen=True)
-class Affine:
-    """x -> matrix x + offset, for (n, 3) rows."""
-
-    matrix: np.ndarray
-    offset: np.ndarray
-
-    def __call__(self, x):
-        return x @ self.matrix.T + self.offset
-
-    def after(self, first):
-        """The map that applies `first`, then this one."""
-        return Affine(self.matrix @ first.matrix, self.matrix @ first.offset + self.offset)
-
-    def inverse(self):
-        """The map that undoes this one."""
-        back = np.linalg.inv(self.matrix)
-        return Affine(back, -back @ self.offset)
-
-
-IDENTITY = Affine(np.eye(3), np.zeros(3))
 
 
 class ImuEffect(Effect):
@@ -50,13 +28,18 @@ class ImuEffect(Effect):
         """(3,) values of x, y, z."""
         return np.array([self.values.get(key, 0.0) for key in "xyz"])
 
-    def imu_regressors(self, channel, true, keys):
-        """Derivative of what `channel` ("gyro" or "accel") measures by the parameters `keys`, at the true values
-        (n, 3): (n, 3, len(keys))."""
-        step, out = 1e-6, np.empty((*true.shape, len(keys)))
+    def sensor_model(self, channel):
+        return {"gyro": self.gyro, "accel": self.accel}[channel]()
+
+    def regressors(self, samples, keys):
+        """Derivative of what the sensor of ImuSamples reads by the parameters `keys`: (n, 3, len(keys)); numerical."""
+        step, out = 1e-6, np.empty((len(samples), 3, len(keys)))
         for column, key in enumerate(keys):
             here = self.values.get(key, 0.0)
-            ends = [getattr(type(self)({**self.values, key: here + s}), channel)()(true) for s in (-step, step)]
+            ends = [
+                type(self)({**self.values, key: here + s}).sensor_model(samples.channel)(samples.reading)
+                for s in (-step, step)
+            ]
             out[:, :, column] = (ends[1] - ends[0]) / (2.0 * step)
         return out
 

@@ -6,8 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .base import need_truth
-from .imu_error import Affine, ImuEffect, need_imu
-from .samples import samples_at
+from .affine import Affine
+from .imu_error import ImuEffect, need_imu
+from .samples import Track
 
 
 class ImuGravity(ImuEffect):
@@ -22,6 +23,10 @@ class ImuGravity(ImuEffect):
     example = "excess"
     physics = "local gravity, or the factor from g to m/s^2, differs from the 9.81 m/s^2 of the filter"
     confounded_with = ("accel_bias", "accel_scale")
+    told_apart = {
+        "accel_bias": "a flight that tilts, or the vehicle at rest on its sides",
+        "accel_scale": "hard manoeuvres up and down: a scale grows with them, gravity does not",
+    }
     reference = "gravity is 9.780 to 9.832 m/s^2 between equator and pole"
     channels = ("accel",)
 
@@ -34,6 +39,12 @@ class ImuGravity(ImuEffect):
         """m/s^2"""
         return self.values.get("excess", 0.0)
 
+    def regressors(self, samples, keys):
+        return np.repeat(samples.up[:, :, None], len(keys), axis=2)  # the true vertical, not the body's z
+
+    def uncorrected(self, samples):
+        return self.excess * (samples.up - [0.0, 0.0, 1.0])
+
     def accel(self):
         return Affine(np.eye(3), np.array([0.0, 0.0, self.excess]))
 
@@ -41,8 +52,7 @@ class ImuGravity(ImuEffect):
         need_truth(self, flight)
         need_imu(self, flight)
         imu = flight.imu
-        none = np.zeros(len(imu), dtype=int)
-        q = samples_at(imu.t, none, none, flight.truth, flight.anchors, motion=False).q
+        q = Track(flight.truth).attitudes(imu.t)
         up = (
             Rotation.from_quat(q).inv().apply([0.0, 0.0, self.excess])
             if np.isfinite(q).all()

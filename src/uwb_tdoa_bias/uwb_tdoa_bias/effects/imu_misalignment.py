@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .imu_error import Affine, ImuEffect
+from .affine import Affine
+from .imu_error import ImuEffect
 
 
 class ImuMisalignment(ImuEffect):
@@ -18,6 +19,9 @@ class ImuMisalignment(ImuEffect):
     example = "x"
     physics = "the sensor, or the frame of the ground truth, is turned against the body's axes"
     confounded_with = ("accel_bias", "gyro_scale")
+    told_apart = {
+        "accel_bias": "quick turns: a misalignment also shows on the gyroscope",
+    }
     reference = "strapdown navigation: mounting misalignment"
     channels = ("gyro", "accel")
 

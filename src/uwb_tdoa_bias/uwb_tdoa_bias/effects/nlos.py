@@ -20,7 +20,11 @@ class Nlos(ArrivalEffect):
     example = "0.delay"
     physics = "something between tag and anchor: the direct path is slowed or lost, and a later one is taken for it"
     confounded_with = ("anchor_delay", "anchor_clock_drift", "anchor_position")
+    told_apart = {
+        "anchor_delay": "the same path again without the obstacle, or from another side",
+    }
     reference = "UTIL identification data: metal 0.2 - 0.6 m, wood 0.03 - 0.24 m, people up to 2 m"
+    portable = False
     fitted = False
 
     @classmethod
@@ -37,6 +41,14 @@ class Nlos(ArrivalEffect):
     @classmethod
     def groups(cls, anchors, pairs):
         return [()]
+
+    @property
+    def identity(self):
+        return (self.name, *sorted((key, value) for key, value in self.values.items() if not key.endswith(".delay")))
+
+    @classmethod
+    def plausible(cls, values):
+        return super().plausible(values) and all(values[key] >= 0.0 for key in values if key.endswith(".delay"))
 
     def _blocked(self, samples, rows, anchor):
         """(k * n,) bool"""

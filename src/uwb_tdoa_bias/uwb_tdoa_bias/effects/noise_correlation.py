@@ -20,6 +20,7 @@ class NoiseCorrelation(Effect):
     physics = "multipath and attitude change slowly: errors of successive arrivals of an anchor are alike"
     confounded_with = ("noise_level",)
     reference = "third-party analysis of the UTIL identification data: noise correlated in time"
+    portable = False
     fitted = False
 
     @classmethod

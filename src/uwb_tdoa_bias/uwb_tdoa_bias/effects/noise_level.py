@@ -20,6 +20,7 @@ class NoiseLevel(Effect):
     physics = "a weak or disturbed link: its arrivals scatter more"
     confounded_with = ("outlier_rate", "noise_correlation")
     reference = "DW1000 user manual: ranging precision over received power"
+    portable = False
     fitted = False
 
     check_key = PairOffset.check_key

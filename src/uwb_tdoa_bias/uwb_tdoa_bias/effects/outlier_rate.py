@@ -20,7 +20,9 @@ class OutlierRate(Effect):
     physics = "lost or mixed-up packets and reflections: single measurements that have nothing to do with the geometry"
     confounded_with = ("noise_level",)
     reference = "crazyflie-firmware issues 277, 305, 375"
+    portable = False
     fitted = False
+    usable = False  # the filter's weights are the remedy
 
     @classmethod
     def groups(cls, anchors, pairs):

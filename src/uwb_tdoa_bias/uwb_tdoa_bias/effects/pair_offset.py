@@ -21,6 +21,7 @@ class PairOffset(Effect):
     )
     confounded_with = ("anchor_delay", "anchor_position")
     reference = "Bitcraze documentation of TDoA2: anchor-to-anchor time of flight"
+    portable = False
 
     @classmethod
     def check_key(cls, key):

@@ -16,6 +16,10 @@ class RangeBias(ArrivalEffect):
     example = "quadratic"
     physics = "the detector fires later on weak, far signals: a range error that bends over range"
     confounded_with = ("received_power_bias", "range_scale")
+    told_apart = {
+        "received_power_bias": "one range at many headings: power changes with the antennas, range does not",
+        "range_scale": "a flight near to and far from the anchors",
+    }
     reference = "Decawave APS011: the range error is a bent function of received power, hence of range"
 
     @classmethod

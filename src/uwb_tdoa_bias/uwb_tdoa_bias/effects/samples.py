@@ -1,13 +1,15 @@
 """A batch of TDOAs with the motion of the tag, as effects see it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..foundation.anchors import Anchors
+from .motion import POSE_LAG, Motion, motion_at, preceding
 
-MOTION_TIME = 0.1  # s over which velocity, acceleration and turning rate are taken
+STEP = 0.1  # s over which the velocity at an instant is taken
 
 
 @dataclass(frozen=True)
@@ -16,7 +18,8 @@ class Samples:
 
     t : (n,) s; a, b : (n,) rows of `anchors`; p : (n, 3) m, world; q : (n, 4) x y z w, body to world, NaN if unknown.
     start : s, stamp of the first TDOA of the recording, from which slow changes count.
-    v, acceleration : (n, 3) m/s and m/s^2, world, of the body; rate : (n, 3) rad/s, body; each None if nobody asked.
+    velocity : (n, 3) m/s, world, of the body at that very instant, where the truth tells; motion : Motion up to the pose that
+    a node corrects at; each None if nobody asked.
     interval : (n,) s since the TDOA before; previous : (n,) id of the later anchor of that; vibration : (n,) m/s^2,
     root of the power of the high-passed accelerometer; None if unknown.
     extra : {name: (n,)}, anything else that a recording holds; None if nobody asked.
@@ -30,14 +33,15 @@ class Samples:
     q: np.ndarray
     anchors: Anchors
     start: float = 0.0
-    v: np.ndarray | None = None
-    acceleration: np.ndarray | None = None
-    rate: np.ndarray | None = None
+    velocity: np.ndarray | None = None
+    motion: Motion | None = None
     interval: np.ndarray | None = None
     previous: np.ndarray | None = None
     vibration: np.ndarray | None = None
     extra: dict | None = None
     yaw_std: np.ndarray | None = None
+
+    channel: ClassVar[str] = "tdoa"
 
     def __len__(self):
         return len(self.t)
@@ -53,39 +57,71 @@ class Samples:
         return self.anchors.positions[self.b]
 
 
-def samples_at(t, a, b, poses, anchors, start=0.0, motion=True):
-    """Samples of TDOAs (t, a, b as in Samples) at poses interpolated linearly, attitudes on the great circle.
+@dataclass(frozen=True)
+class ImuSamples:
+    """An inertial sensor over short cells, as effects see it.
 
-    poses : Truth, or anything with t (m,), p (m, 3), q (m, 4). Beyond its ends the nearest pose counts.
-    motion : give velocity, acceleration and turning rate too.
+    channel : "gyro" or "accel"; t (n,) s, of the cells; p (n, 3) m, world; start : s, as of Samples.
+    reading (n, 3): what it should have read, body axes: of the gyroscope what it did read, which is less noisy there.
+    Noise in a regressor shrinks what is fitted.
+    change (n, 3): how fast the reading changes, per s, None if nobody knows; up (n, 3): the world's vertical, body axes.
+    features (n, len(OF_IMU)): covariates; motion : Motion.
     """
-    stamps, first = np.unique(poses.t, return_index=True)
-    p, q = poses.p[first], poses.q[first]
-    if len(stamps) < 2:
-        stamps, p, q = np.array([stamps[0], stamps[0] + 1.0]), np.repeat(p, 2, axis=0), np.repeat(q, 2, axis=0)
 
-    def place(at):
-        return np.stack([np.interp(at, stamps, p[:, k]) for k in range(3)], axis=1)
+    channel: str
+    t: np.ndarray
+    p: np.ndarray
+    start: float
+    reading: np.ndarray
+    change: np.ndarray | None
+    up: np.ndarray
+    features: np.ndarray
+    motion: Motion
 
-    h = 0.5 * MOTION_TIME
-    at, turn = place(t), None
-    attitude, rate = np.full((len(t), 4), np.nan), np.full((len(t), 3), np.nan)
-    known = np.isfinite(q).all(axis=1)
-    if known.sum() > 1:
-        turn = Slerp(stamps[known], Rotation.from_quat(q[known]))
-        low, high = stamps[known][0], stamps[known][-1]
-        attitude = turn(np.clip(t, low, high)).as_quat()
-    if not motion:
-        return Samples(t, a, b, at, attitude, anchors, start)
-    if turn is not None:
-        swing = turn(np.clip(t - h, low, high)).inv() * turn(np.clip(t + h, low, high))
-        rate = swing.as_rotvec() / MOTION_TIME
-    return Samples(
-        t, a, b, at, attitude, anchors, start,
-        v=(place(t + h) - place(t - h)) / MOTION_TIME,
-        acceleration=(place(t + 2 * h) - 2.0 * at + place(t - 2 * h)) / (2 * h) ** 2,
-        rate=rate,
-    )  # fmt: skip
+    def __len__(self):
+        return len(self.t)
+
+
+class Track:
+    """Poses, to be asked at any stamp: positions interpolated linearly, attitudes on the great circle."""
+
+    def __init__(self, poses):
+        """poses : Truth, or anything with t (m,), p (m, 3), q (m, 4). Beyond its ends the nearest pose counts."""
+        self.t, first = np.unique(poses.t, return_index=True)
+        self.p, self.q = poses.p[first], poses.q[first]
+        known = np.isfinite(self.q).all(axis=1)
+        self._turn, self._ends = None, (0.0, 0.0)
+        if known.sum() > 1:
+            self._turn = Slerp(self.t[known], Rotation.from_quat(self.q[known]))
+            self._ends = self.t[known][0], self.t[known][-1]
+
+    def positions(self, t):
+        """(n, 3) m at stamps t (n,), s."""
+        return np.stack([np.interp(t, self.t, self.p[:, k]) for k in range(3)], axis=1)
+
+    def attitudes(self, t):
+        """(n, 4) x y z w, body to world, at stamps t (n,), s; NaN where none is known."""
+        return np.full((len(t), 4), np.nan) if self._turn is None else self._turn(np.clip(t, *self._ends)).as_quat()
+
+    def velocities(self, t):
+        """(n, 3) m/s, world, at stamps t (n,), s."""
+        return (self.positions(t + 0.5 * STEP) - self.positions(t - 0.5 * STEP)) / STEP
+
+    def motion(self, t):
+        """Motion up to the last pose no later than t (n,), s."""
+        return motion_at(self.t, self.p, self.q, np.searchsorted(self.t, t, side="right") - 1)
+
+
+def samples_at(t, a, b, poses, anchors, start=0.0, motion=True, lag=POSE_LAG):
+    """Samples of TDOAs (t, a, b as in Samples, t in the order of arrival) at poses, as of a Track.
+
+    motion : give velocity and motion too, the latter up to the pose that a node would have, `lag` s old.
+    """
+    track = Track(poses)
+    samples = Samples(t, a, b, track.positions(t), track.attitudes(t), anchors, start)
+    if not motion or not len(t):
+        return samples
+    return replace(samples, velocity=track.velocities(t), motion=track.motion(preceding(t) - lag))
 
 
 def true_samples(flight):

@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 
 from ..foundation.errors import InputError
 from .base import Effect, known_anchors, once_per_anchors, tile
-from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_TDOA
+from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_TDOA, imu_covariate
 
 DEGREE = 2
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
@@ -33,6 +33,7 @@ class SmoothTerm(Effect):
     knots: tuple = field(default_factory=tuple)
 
     name: ClassVar[str] = "smooth_term"
+    price: ClassVar[float] = 6.0  # of having no name: of equals, a declared effect is preferred
     settings: ClassVar[tuple] = ("channel", "covariate", "form", "knots")
     unit: ClassVar[str] = "m, rad/s or m/s^2"
     bound: ClassVar[float] = 100.0
@@ -58,6 +59,10 @@ class SmoothTerm(Effect):
         super().__post_init__()
 
     @classmethod
+    def plausible(cls, values):
+        return True
+
+    @classmethod
     def check_key(cls, key):
         if not key.rpartition(".")[2].removeprefix("c").isdigit():
             raise InputError(f"effects: smooth_term: parameter {key!r} is not a coefficient such as c0 or 3.c0.")
@@ -65,6 +70,19 @@ class SmoothTerm(Effect):
     @classmethod
     def typical_of(cls, key):
         return 0.5 * cls.typical if "." in key else cls.typical  # a function for each anchor: many, hence small
+
+    @property
+    def channels(self):
+        """Where it acts."""
+        return (self.channel.partition(".")[0],)
+
+    @property
+    def label(self):
+        return f"{self.channel} over {self.covariate}"
+
+    @property
+    def needs_motion(self):
+        return self.channel == "tdoa" and self.covariate in OF_MOTION
 
     @property
     def usable(self):
@@ -128,7 +146,20 @@ class SmoothTerm(Effect):
             late = np.einsum("nk,nk->n", self.basis(both), weights)
         return late[n:] - late[:n]
 
+    def sensor_bias(self, channel, features):
+        sensor, _, axis = self.channel.partition(".")
+        if sensor != channel or not self.usable:
+            return None
+        out = np.zeros((len(features), 3))
+        out[:, "xyz".index(axis)] = self.curve(features[:, OF_IMU.index(self.covariate)])
+        return out
+
     def regressors(self, samples, keys):
+        if samples.channel != "tdoa":
+            out = np.zeros((len(samples), 3, len(keys)))
+            basis = self.basis(imu_covariate(self.covariate, samples))
+            out[:, "xyz".index(self.channel[-1])] = basis[:, [int(key[1:]) for key in keys]]
+            return out
         n, out = len(samples), np.zeros((len(samples), len(keys)))
         values, both = self._covariate(samples)
         if self.channel != "tdoa" or both is None:
@@ -142,6 +173,8 @@ class SmoothTerm(Effect):
             out[:, column] = late[n:] - late[:n]
         return out
 
-    @classmethod
-    def groups(cls, anchors, pairs):
-        return [()]
+    def groups(self, anchors, pairs):
+        keys = self.keys(anchors)
+        each = dict.fromkeys(key.rpartition(".")[0] for key in keys)
+        alone = [tuple(key for key in keys if key.rpartition(".")[0] == name) for name in each]
+        return [keys, *alone] if self.form == "anchor" else [keys]

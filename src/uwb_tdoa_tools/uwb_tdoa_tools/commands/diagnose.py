@@ -4,8 +4,6 @@ import json
 import sys
 from pathlib import Path
 
-from tqdm import tqdm
-
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -13,6 +11,8 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from .. import cli
 from ..readers import inputs
 from ..diagnosis import diagnose
+from ..diagnosis.references import GroundTruth, Nothing
+from ..progress import Progress
 from ..readers import read_flight
 
 DESCRIPTION = """Find out what is wrong with the measurements of some flights, and put it right.
@@ -58,9 +58,9 @@ def _diagnose(args):
     shared = {f.name for f in flights} & {f.name for f in holdout}
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
-    with tqdm(total=100, desc="diagnose", unit="step", disable=None, bar_format="{desc}: {bar} {elapsed}") as bar:
-        result = diagnose(flights, holdout, base, config, truth=not args.no_truth, progress=bar.update)
-        bar.update(bar.total - bar.n)
+    reference = Nothing(config) if args.no_truth else GroundTruth()
+    with Progress("diagnose") as progress:
+        result = diagnose(flights, holdout, base, config, reference, progress)
     out.mkdir(parents=True, exist_ok=True)
     (out / "diagnosis.json").write_text(json.dumps(result.as_json(), indent=1, allow_nan=False))
     result.effects.to_yaml(out / "effects.yaml")

@@ -12,7 +12,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli
 from ..diagnosis import diagnose
-from ..diagnosis.attribute import attribute
+from ..diagnosis.attribution import attribute
+from ..diagnosis.references import GroundTruth
 from ..studies.diagnosis import bank, measured, undeclared
 
 PARTS = ("bank", "no-truth", "undeclared", "injected", "measured", "speed")
@@ -116,7 +117,7 @@ def _measured(args):
 
 def _speed(args):
     flight = bank.effect_of("anchor_delay", True, 1).inject(bank.clean_flight(500, 126.0))
-    attribute([bank.clean_flight(501, 30.0)])  # compile
+    attribute([bank.clean_flight(501, 30.0)], GroundTruth())  # compile
     started = time.monotonic()
     result = diagnose([flight])
     return {"figures": {"seconds for 120 s of flight": round(time.monotonic() - started, 1)}, "cases": result.as_text()}

@@ -1,6 +1,6 @@
 """The whole loop in one call."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,99 +10,116 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 
 from ..scoring.metrics import Score
-from . import closing, confounding, report
-from .attribute import attribute, restricted
-from .findings import Attribution
+from . import judging, output
+from .attribution import Attribution, attribute
+from .channels import residuals
+from .findings import Refused, usable
 from .health import health
+from .references import GroundTruth, Reference
+from .regression.confounding import unobservable
+
+SAME_PLACE = 0.05  # m by which an anchor may differ between flights of one installation
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """attribution : Attribution; effects : EffectSet, the base and what is added; findings, unattributed,
-    ambiguous, unobservable, refused : lists of dicts as in diagnosis.json; before, after : {"runs", "pooled"};
-    judged_on : sentence; health : dict; flights : names."""
+    """What was found in some flights, and what it is worth.
 
-    attribution: Attribution
-    effects: EffectSet
+    flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [Finding]; effects :
+    EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
+    `judging.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
+    ChannelResidual}] under `effects`.
+    """
+
+    flights: tuple
+    reference: Reference
     findings: list
-    unattributed: list
-    ambiguous: list
-    unobservable: list
+    effects: EffectSet
     refused: list
+    unobservable: list
     before: dict
     after: dict
     judged_on: str
     health: dict
-    flights: list
+    attribution: Attribution
+    remaining: list
 
     def as_json(self):
         """What diagnosis.json holds."""
-        names = (
-            "findings",
-            "unattributed",
-            "ambiguous",
-            "unobservable",
-            "refused",
-            "before",
-            "after",
-            "judged_on",
-            "health",
-        )
-        return {"flights": self.flights, **{name: plain(getattr(self, name)) for name in names}}
+        return output.as_json(self)
 
     def as_text(self):
         """A few lines for the screen."""
-        return report.text(self)
+        return output.as_text(self)
 
     def as_html(self):
         """One self-contained page."""
+        from . import report  # here, because drawing takes a second to import
+
         return report.html(self)
 
 
-def diagnose(flights, holdout=(), base=EffectSet(), config=None, truth=True, progress=None):
-    """Diagnosis of Flights. holdout : Flights to judge on; base : EffectSet that is in the model already; config :
-    FilterConfig; truth : use the ground truth (False: do without it); progress() is called now and then.
+def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None, progress=lambda what: None):
+    """Diagnosis of Flights.
 
-    Raises InputError where a flight cannot be used: flights of different anchors, or without ground truth.
+    holdout : Flights to judge on; base : EffectSet that is in the model already; config : FilterConfig; reference :
+    Reference, by default the recorded ground truth; progress(what) is called every few seconds at least.
+    Raises InputError where a flight cannot be used: flights of different anchors, or without the reference.
     """
-    tick = progress or (lambda: None)
+    reference = reference or GroundTruth()
     _same_anchors([*flights, *holdout])
+    flights, holdout = (tuple(map(reference.prepare, some)) for some in (flights, holdout))
+
+    def saying(what):
+        return lambda: progress(what)
+
+    attribution = attribute(flights, reference, base, progress=saying("tracing residuals to effects"))
+    kept = judging.Kept(attribution.selection.chosen, (), (), {})
+    if reference.judges:  # a finding stays one even if the filter does without it; it is only not added
+        kept = judging.useful(attribution, flights, base, config, saying("running the filter without each"))
+    model = attribution.only(kept.candidates, kept.detections)
+    effects = EffectSet((*base.effects, *usable(model.effects).effects))
+    judged = judging.judge(model, flights, holdout, base, effects, reference, config, saying("judging"))
+    before, after, judged_on = judged
+    refused = [*attribution.refused, *kept.refused]
+    if reference.judges and after["pooled"]["rmse_3d"] >= before["pooled"]["rmse_3d"] and len(effects) > len(base):
+        refused.append(Refused("all", "together they do not make the error smaller on held-out data"))
+        effects, after, kept = base, before, judging.Kept((), (), (), {})
+        model = attribution.only((), ())
+    remaining = [residuals(flight, reference, effects) for flight in flights]
+    progress("judging")
     runs = [run_offline(flight, config, Corrector(flight.anchors, base)) for flight in flights]
-    tick()
-
-    def estimator(flight, effects):
-        return run_offline(flight, config, Corrector(flight.anchors, effects)).odometry
-
-    attribution = attribute(flights, base, None if truth else estimator, tick)
-    judgeable = all(f.truth is not None for f in [*flights, *holdout])
-    # A finding stays one even if the filter does without it; it is only not added.
-    kept, noise, not_added = list(attribution.selection.chosen), [], []
-    if all(f.truth is not None for f in flights):
-        kept, noise, not_added = closing.useful(attribution, flights, base, config, tick)
-    lean = restricted(attribution, kept, noise)
-    effects = EffectSet((*base.effects, *(e for e in lean.effects if getattr(e, "usable", True))))
-    before, after, judged_on = closing.judge(lean, flights, holdout, base, effects, config, judgeable, tick)
-    if judgeable and after["pooled"]["rmse_3d"] >= before["pooled"]["rmse_3d"] and len(effects) > len(base):
-        kept, noise = [], []
-        not_added = not_added + [("all", "together they do not make the error smaller on held-out data")]
-        effects, after = base, before
     scores = [
-        Score(f.name, run.odometry, f.truth, run.residuals) for f, run in zip(flights, runs) if f.truth is not None
+        Score(flight.name, run.odometry, flight.truth, run.residuals)
+        for flight, run in zip(flights, runs)
+        if reference.judges
     ]
     return Diagnosis(
-        attribution,
+        flights,
+        reference,
+        _findings(attribution, model, kept),
         effects,
-        [_finding(f, attribution, kept, noise) for f in attribution.findings],
-        _unattributed(attribution, kept),
-        _ambiguous(attribution),
-        confounding.unobservable(attribution),
-        [{"what": what, "why": why} for what, why in [*attribution.refused, *not_added]],
+        refused,
+        unobservable(attribution.selection, attribution.candidates),
         before,
         after,
         judged_on,
-        health(attribution.found, runs, scores),
-        [f.name for f in flights],
+        health(attribution.residuals, runs, scores),
+        attribution,
+        remaining,
     )
+
+
+def _findings(attribution, model, kept):
+    """[Finding]: those that are added, with the values that are written, then the others."""
+    detected = {detection.effect.name: detection for detection in attribution.detections}
+    out = []
+    for finding in model.findings():
+        tried = finding.candidates or (detected[finding.effect.name],)
+        worth = [kept.worth[each] for each in tried if each in kept.worth]
+        out.append(replace(finding, added=finding.effect.usable, worth=float(np.sum(worth)) if worth else None))
+    added = {finding.key for finding in out}
+    return out + [replace(each, added=False) for each in attribution.findings() if each.key not in added]
 
 
 def _same_anchors(flights):
@@ -111,83 +128,7 @@ def _same_anchors(flights):
     first = flights[0]
     for flight in flights[1:]:
         same = np.array_equal(flight.anchors.ids, first.anchors.ids)
-        if not (same and np.allclose(flight.anchors.positions, first.anchors.positions, atol=0.05)):
+        if not (same and np.allclose(flight.anchors.positions, first.anchors.positions, atol=SAME_PLACE)):
             raise InputError(
                 f"{flight.name}: its anchors are not those of {first.name}; diagnose each installation and day alone."
             )
-
-
-def _finding(finding, attribution, kept, noise):
-    one, effect = finding.candidate, finding.effect
-    return {
-        "effect": effect.name,
-        "parameters": dict(effect.values),
-        "std": dict(effect.std),
-        "unit": effect.unit,
-        "channel": finding.channel,
-        "evidence": finding.evidence,
-        "variance_explained": finding.variance_explained,
-        "confounded_with": confounding.confounded(attribution, one) if one is not None else [],
-        "could_be_mistaken_for": list(effect.confounded_with),
-        "added": any(finding is f for f in noise) if one is None else any(one is other for other in kept),
-    }
-
-
-def _unattributed(attribution, kept):
-    out = []
-    for finding in sorted(attribution.terms, key=lambda f: -f.evidence["held_out_gain"]):
-        term, spread = finding.effect, np.linspace(finding.effect.knots[0], finding.effect.knots[-1], 25)
-        prefixes = sorted({key.rpartition("c")[0] for key in term.values})
-        out.append(
-            {
-                "channel": term.channel,
-                "covariate": term.covariate,
-                "form": term.form,
-                "strength": finding.variance_explained,
-                "evidence": finding.evidence,
-                "together_with": [t.covariate for t in finding.candidate.terms if t.covariate != term.covariate],
-                "shape": {
-                    "at": spread,
-                    "values": {prefix.rstrip("."): term.curve(spread, prefix) for prefix in prefixes},
-                },
-                "usable": term.usable,
-                "added": term.usable and any(finding.candidate is one for one in kept),
-            }
-        )
-    return out
-
-
-def _ambiguous(attribution):
-    out = []
-    for finding in attribution.findings:
-        rivals = {candidate.effect: gap for gap, candidate in finding.rivals if candidate.effect != finding.effect.name}
-        if rivals:
-            out.append(
-                {
-                    "found": finding.effect.name,
-                    "alternatives": [
-                        {
-                            "effect": name,
-                            "criterion_gap": gap,
-                            "tell_apart": confounding.flight_to_tell(finding.effect.name, name),
-                        }
-                        for name, gap in sorted(rivals.items(), key=lambda item: item[1])
-                    ],
-                }
-            )
-    return out
-
-
-def plain(value):
-    """numpy and non-finite numbers as JSON has them."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [plain(item) for item in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value

@@ -1,38 +1,49 @@
 """What a diagnosis says."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+
+from uwb_tdoa_bias.effects import Effect, EffectSet
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Finding:
-    """effect : Effect with values and std; channel; evidence : {figure: number}; variance_explained : share of the
-    channel's variance on held-out rows; candidate : the Candidate it was, None for noise; rivals : [(gap,
-    Candidate)]."""
+    """An effect that was found.
 
-    effect: object
+    effect : Effect with values and std; channel : where it shows most; evidence : {figure: number}; explained : share of
+    the channel's variance on held-out rows; alternatives : (Alternative, ...); candidates : the (Candidate, ...) it was, ()
+    for what a detector found in what is left; added : is in the model that is written; worth : m by which the filter's 3D
+    RMSE is larger without it, None if nobody tried; together_with : covariates of the same candidate.
+    """
+
+    effect: Effect
     channel: str
     evidence: dict
-    variance_explained: float
-    candidate: object = None
-    rivals: list = field(default_factory=list)
-
-
-@dataclass
-class Attribution:
-    """findings : [Finding], declared; terms : [Finding], undeclared; found : FlightResiduals under the base model;
-    left : under the whole model; table, selection : of the last fit; refused : [(name, reason)]; candidates : all
-    declared."""
-
-    findings: list
-    terms: list
-    found: list
-    left: list
-    table: object
-    selection: object
-    refused: list
-    candidates: list
+    explained: float
+    alternatives: tuple = ()
+    candidates: tuple = ()
+    added: bool = True
+    worth: float | None = None
+    together_with: tuple = ()
 
     @property
-    def effects(self):
-        """All Effects found."""
-        return tuple(f.effect for f in self.findings + self.terms)
+    def declared(self):
+        """Whether it is in the catalogue, not a function without a name."""
+        return not self.effect.settings
+
+    @property
+    def key(self):
+        """Hashable: equal for findings of one effect."""
+        return self.effect.name if self.declared else self.effect.identity
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Something that was looked at and is not in the model: what, and why not."""
+
+    what: str
+    why: str
+
+
+def usable(effects):
+    """EffectSet of those of some Effects that nodes can take out."""
+    return EffectSet(tuple(effect for effect in effects if effect.usable))

@@ -7,15 +7,15 @@ from uwb_tdoa_ekf.core.engine import REJECTED, USED
 LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s
 
 
-def health(found, runs=(), scores=()):
-    """What FlightResiduals `found` look like: {"pairs", "anchors", "axes", "cross_correlation", "filter"}.
+def health(residuals, runs=(), scores=()):
+    """What [{channel: ChannelResidual}] look like: {"pairs", "anchors", "axes", "cross_correlation", "filter"}.
 
     Each pair, anchor and axis: bias (median), spread (1.48 MAD), tails (share beyond 4 spreads), autocorrelation at
     0.1 to
     2 s, count. runs, scores : Run and Score of each flight, for NIS (1 is honest) and NEES (3 is honest).
     """
-    tdoa = _joined([one.tdoa for one in found])
-    anchors = found[0].tdoa.samples.anchors.ids
+    parts = [flight["tdoa"] for flight in residuals]
+    tdoa, anchors = _joined(parts), parts[0].samples.anchors.ids
     pairs = {}
     for label in np.unique(tdoa["pair"]):
         mine = tdoa["pair"] == label
@@ -28,9 +28,9 @@ def health(found, runs=(), scores=()):
             each.append({"anchor": anchor, **_figures(None, late)})
     axes = []
     for sensor in ("gyro", "accel"):
-        parts = [getattr(one, sensor) for one in found if getattr(one, sensor) is not None]
+        parts = [flight[sensor] for flight in residuals if sensor in flight]
         for k, axis in enumerate("xyz") if parts else ():
-            t = np.concatenate([part.t + 1e4 * number for number, part in enumerate(parts)])
+            t = np.concatenate([part.samples.t + 1e4 * number for number, part in enumerate(parts)])
             axes.append({"axis": f"{sensor}.{axis}", **_figures(t, np.concatenate([p.residual[:, k] for p in parts]))})
     return {
         "pairs": list(pairs.values()),

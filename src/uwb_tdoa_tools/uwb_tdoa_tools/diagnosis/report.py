@@ -3,6 +3,7 @@
 import base64
 import html as escape_html
 import io
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -13,37 +14,10 @@ table{border-collapse:collapse;margin:.6em 0}td,th{border:1px solid #bbb;padding
 th{background:#eee}img{max-width:100%}h2{margin-top:1.8em}.good{color:#060}.bad{color:#900}small{color:#555}"""
 
 
-def text(result):
-    """Lines for the screen: findings, what has no name, what is unclear, before and after."""
-    lines = []
-    for found in result.findings:
-        lines.append(
-            f"found     {found['effect']}: {_parameters(found)}{_share(found)}"
-            + ("" if found["added"] else ", not added: the filter does as well without it")
-        )
-    for term in result.unattributed:
-        lines.append(
-            f"no name   {term['channel']} over {term['covariate']} ({term['form']}): "
-            f"{term['strength']:.0%} of held-out variance"
-        )
-    if not lines:
-        lines.append("nothing found: the residuals look like noise")
-    for case in result.ambiguous:
-        others = ", ".join(other["effect"] for other in case["alternatives"])
-        lines.append(
-            f"unclear   {case['found']} could as well be {others}; to tell: {case['alternatives'][0]['tell_apart']}"
-        )
-    before, after = result.before["pooled"], result.after["pooled"]
-    if before.get("rmse_3d") is not None:
-        lines.append(f"3D RMSE   {before['rmse_3d']:.3f} -> {after['rmse_3d']:.3f} m, on {result.judged_on}")
-    else:
-        lines.append(f"innovations' spread {before['residual_spread']:.3f} -> {after['residual_spread']:.3f} m")
-    return "\n".join(lines)
-
-
-def html(result):
+def html(diagnosis):
     """One page with everything in it."""
-    parts = [f"<h1>Diagnosis of {_e(', '.join(result.flights))}</h1>", f"<pre>{_e(text(result))}</pre>"]
+    result = SimpleNamespace(**diagnosis.as_json(), residuals=diagnosis.attribution.residuals, remaining=diagnosis.remaining)
+    parts = [f"<h1>Diagnosis of {_e(', '.join(result.flights))}</h1>", f"<pre>{_e(diagnosis.as_text())}</pre>"]
     parts += ["<h2>Before and after</h2>", _errors(result), _picture(_plot_errors, result)]
     parts += ["<h2>Effects that were found</h2>", _findings(result)]
     parts += [
@@ -268,7 +242,7 @@ def _plot_terms(result, plt):
 
 
 def _plot_residuals(result, plt):
-    sides = [_series(found[0]) for found in (result.attribution.found, result.attribution.left)]
+    sides = [_series(found[0]) for found in (result.residuals, result.remaining)]
     names = [name for name in sides[0] if name in sides[1]]
     figure, axes = plt.subplots(
         len(names), 1, figsize=(11, 1.7 * len(names) + 0.6), layout="constrained", sharex=True, squeeze=False
@@ -284,27 +258,21 @@ def _plot_residuals(result, plt):
     return figure
 
 
-def _series(found):
-    """{channel: (stamps, residuals)} of FlightResiduals."""
-    chosen = found.tdoa.airborne
-    out = {"TDOA [m]": (found.tdoa.samples.t[chosen], found.tdoa.residual[chosen])}
-    for name, unit in (("gyro", "rad/s"), ("accel", "m/s^2")):
-        part = getattr(found, name)
-        for k, axis in enumerate("xyz") if part is not None else ():
-            out[f"{name}.{axis} [{unit}]"] = (part.t, part.residual[:, k])
-    return out
+def _series(flight):
+    """{channel: (stamps, residuals)} of {channel: ChannelResidual}."""
+    return {label: series for part in flight.values() for label, series in part.series().items()}
 
 
 def _plot_pairs(result, plt):
-    ids = result.attribution.found[0].tdoa.samples.anchors.ids
+    ids = result.residuals[0]["tdoa"].samples.anchors.ids
     sides = []
-    for found in (result.attribution.found, result.attribution.left):
+    for found in (result.residuals, result.remaining):
         groups = {}
         for one in found:
-            chosen, samples = one.tdoa.airborne, one.tdoa.samples
+            chosen, samples = one["tdoa"].airborne, one["tdoa"].samples
             label = ids[samples.a[chosen]] * 1000 + ids[samples.b[chosen]]
             for pair in np.unique(label):
-                groups.setdefault(int(pair), []).append(one.tdoa.residual[chosen][label == pair])
+                groups.setdefault(int(pair), []).append(one["tdoa"].residual[chosen][label == pair])
         sides.append({pair: np.concatenate(values) for pair, values in groups.items()})
     pairs = sorted(sides[0], key=lambda pair: -len(sides[0][pair]))[:16]
     figure, ax = plt.subplots(figsize=(11, 3.6), layout="constrained")

@@ -4,22 +4,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 
-from ..diagnosis import closing
-from ..diagnosis.attribute import attribute, effects_of, restricted
-from ..diagnosis.findings import Attribution
-from ..diagnosis.fit import refit
-from ..diagnosis.select import columns_of
+from ..diagnosis.attribution import Attribution, attribute, effects_of
+from ..diagnosis.findings import usable
+from ..diagnosis.judging import useful
+from ..diagnosis.references import GroundTruth
+from ..diagnosis.regression.fit import refit
+from ..diagnosis.regression.terms import columns_of
 from .labels import constellations, level
 
-# What belongs to the tag, to the vehicle and to the modules of the anchors, and goes with them to another place. Where
-# the anchors stand, what blocks them there and the anchor-to-anchor links of TDoA2 (pair_offset) belong to one
-# installation.
-CARRIED = (
-    "anchor_delay", "tag_lever_arm", "tdoa_time_offset", "range_scale", "range_bias", "received_power_bias",
-    "antenna_pattern", "gyro_bias", "gyro_scale", "accel_bias", "accel_scale", "imu_misalignment", "imu_gravity",
-)  # fmt: skip
+# What goes with the tag, the vehicle and the modules of the anchors to another installation.
+PORTABLE = tuple(name for name, effect in EFFECTS.items() if effect.portable)
 
 
 @dataclass(frozen=True)
@@ -31,10 +27,10 @@ class Physics:
 
     def fitted_to(self, flights):
         """EffectSet of the same effects, fitted to the flights with these numbers alone."""
-        table, selection = self.attribution.table, self.attribution.selection
-        rows = [number in flights for number in table.flight]
-        fewer = replace(selection, fit=refit(table, columns_of(selection.chosen), selection.fit, rows))
-        return EffectSet(effects_of(fewer))
+        selection = self.attribution.selection
+        rows = np.isin(selection.table.flight, list(flights))
+        model = refit(selection.table, columns_of(selection.chosen), selection.fit, rows)
+        return EffectSet(effects_of(replace(selection, fit=model)))
 
 
 def separate(effects):
@@ -70,11 +66,11 @@ def find(flights, progress=lambda: None):
     """Physics of Flights with ground truth. progress() is called now and then.
 
     Of flights in one constellation, all that `diagnose` can name; of several, what goes from one to the other
-    (CARRIED). An effect stays if it helps the likelihood of flights that it was not fitted to, and the filter's error
+    (PORTABLE). An effect stays if it helps the likelihood of flights that it was not fitted to, and the filter's error
     on them."""
-    flights = [level(flight) for flight in flights]
-    kinds = CARRIED if len(constellations(flights)) > 1 else None
-    attribution = attribute(flights, progress=progress, undeclared=False, kinds=kinds)
-    kept, noise, _ = closing.useful(attribution, flights, EffectSet(), None, progress)
-    kept = restricted(attribution, kept, noise)
-    return Physics(EffectSet(kept.effects), kept)
+    flights, reference = [level(flight) for flight in flights], GroundTruth()
+    kinds = PORTABLE if len(constellations(flights)) > 1 else None
+    attribution = attribute(flights, reference, kinds=kinds, undeclared=False, progress=progress)
+    kept = useful(attribution, flights, EffectSet(), progress=progress)
+    model = attribution.only(kept.candidates, kept.detections)
+    return Physics(usable(model.effects), model)

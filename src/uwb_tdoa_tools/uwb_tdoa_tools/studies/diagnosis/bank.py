@@ -1,14 +1,14 @@
 """The bank of simulated flights with known effects."""
 
 import numpy as np
-from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_ekf.offline import run_offline
 
 from ...scoring.evaluation import evaluate
 from ...simulation import ImuErrors, SimulationConfig, simulate
-from ...diagnosis.attribute import attribute
-from ...diagnosis.confounding import unobservable
+from ...diagnosis.attribution import attribute
+from ...diagnosis.findings import usable
+from ...diagnosis.references import GroundTruth, Nothing
+from ...diagnosis.regression.confounding import unobservable
 
 PATHS = ("sines", "rising_circle", "square", "sines", "rising_circle")
 # Without effects: white noise, outliers within the nominal 2 %, an inertial sensor without bias.
@@ -88,11 +88,14 @@ def effect_of(name, large, seed):
 
 
 def names_found(attribution):
-    """Names of effects, the most certain first, smooth terms as channel/covariate."""
-    ranked = sorted(
-        attribution.findings, key=lambda f: -f.evidence.get("held_out_gain", f.evidence.get("standard_errors", 0.0))
+    """Names of effects, the most certain first, functions without a name as channel/covariate."""
+    findings = attribution.findings()
+    declared = sorted(
+        (finding for finding in findings if finding.declared),
+        key=lambda f: -f.evidence.get("held_out_gain", f.evidence.get("standard_errors", 0.0)),
     )
-    return [f.effect.name for f in ranked] + [f"{f.effect.channel}/{f.effect.covariate}" for f in attribution.terms]
+    unnamed = [finding.effect for finding in findings if not finding.declared]
+    return [f.effect.name for f in declared] + [f"{effect.channel}/{effect.covariate}" for effect in unnamed]
 
 
 def diagnose_case(effects, seed, truth=True):
@@ -106,12 +109,10 @@ def diagnose_case(effects, seed, truth=True):
             flight = effect.inject(flight, rng)
         return flight
 
-    def estimator(flight, model):
-        return run_offline(flight, None, Corrector(flight.anchors, model)).odometry
-
-    attribution = attribute([flown(seed)], estimator=None if truth else estimator)
+    reference = GroundTruth() if truth else Nothing()
+    attribution = attribute([reference.prepare(flown(seed))], reference)
     found = names_found(attribution)
-    ambiguous = {c.effect for f in attribution.findings for _, c in f.rivals}
+    ambiguous = {other.effect for f in attribution.findings() for other in f.alternatives if other.gap is not None}
     case = {
         "put_in": [effect.name for effect in effects],
         "seed": seed,
@@ -120,11 +121,10 @@ def diagnose_case(effects, seed, truth=True):
         "parameters_right": _right(effects, attribution),
     }
     if not truth:
-        case["unobservable"] = sorted({item["effect"] for item in unobservable(attribution)})
+        case["unobservable"] = sorted({item.effect for item in unobservable(attribution.selection, attribution.candidates)})
         return case
     other = flown(seed + 5000)
-    usable = EffectSet(tuple(e for e in attribution.effects if getattr(e, "usable", True)))
-    for name, model in (("before", EffectSet()), ("found_rmse", usable), ("told_rmse", EffectSet(tuple(effects)))):
+    for name, model in (("before", EffectSet()), ("found_rmse", usable(attribution.effects)), ("told_rmse", EffectSet(tuple(effects)))):
         case[name] = evaluate(other, effects=model)[0].row()["rmse_3d"]
     return case
 
@@ -132,7 +132,7 @@ def diagnose_case(effects, seed, truth=True):
 def _right(effects, attribution):
     """Whether every injected parameter was found within 10 % or 3 standard errors; limits of time and place are not
     judged."""
-    found = {f.effect.name: f.effect for f in attribution.findings}
+    found = {effect.name: effect for effect in attribution.effects}
     for effect in effects:
         other = found.get(effect.name)
         if other is None:

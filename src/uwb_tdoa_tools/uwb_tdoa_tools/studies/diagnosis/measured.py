@@ -5,11 +5,11 @@ import time
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EffectSet
-
 from ...readers import inputs
-from ...diagnosis.attribute import attribute
-from ...diagnosis.diagnose import diagnose
+from ...diagnosis import diagnose
+from ...diagnosis.attribution import attribute
+from ...diagnosis.findings import usable
+from ...diagnosis.references import GroundTruth
 from .bank import SIZES, effect_of
 
 _T2, _T3 = "flights/0425/TDOA2/0425-traj", "flights/0425/TDOA3/0425-traj"
@@ -109,15 +109,15 @@ def injected(data, each):
     def one(path, name):
         if path not in known:
             flight = _load(data, [path])[0]
-            own = attribute([flight])
-            known[path] = flight, EffectSet(tuple(e for e in own.effects if getattr(e, "usable", True)))
+            known[path] = flight, usable(attribute([flight], GroundTruth()).effects)
         flight, base = known[path]
         effect = effect_of(name, True, len(path) + len(name))
-        found = attribute([effect.inject(flight, np.random.default_rng(1))], base, undeclared=False)
-        names = [f.effect.name for f in found.findings]
-        same = next((f.effect for f in found.findings if f.effect.name == name), None)
+        injected_flight = effect.inject(flight, np.random.default_rng(1))
+        findings = attribute([injected_flight], GroundTruth(), base, undeclared=False).findings()
+        names = [f.effect.name for f in findings]
+        same = next((f.effect for f in findings if f.effect.name == name), None)
         hit = same is not None and bool(set(same.values) & set(effect.values))
-        rivals = sorted({candidate.effect for f in found.findings for _, candidate in f.rivals})
+        rivals = sorted({other.effect for f in findings for other in f.alternatives if other.gap is not None})
         return {"flight": flight.name, "put_in": name, "found": names, "ambiguous": rivals, "hit": hit}
 
     return each(cases, one)

@@ -5,27 +5,30 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 
 from ...scoring.evaluation import evaluate
-from ...diagnosis.attribute import attribute
+from ...diagnosis.attribution import attribute
 from ...diagnosis.channels import residuals
+from ...diagnosis.findings import usable
+from ...diagnosis.references import GroundTruth
 from .bank import clean_flight, names_found
 
 
 def run(name, case, seed):
     """dict of one case: (function, channel, covariates) put into one flight, judged on another."""
     put_in, channel, covariates = case
-    attribution = attribute([put_in(clean_flight(seed))])
-    terms = sorted(attribution.terms, key=lambda f: -f.evidence["held_out_gain"])
+    attribution = attribute([put_in(clean_flight(seed))], GroundTruth())
+    terms = [finding for finding in attribution.findings() if not finding.declared]
+    terms = sorted(terms, key=lambda f: -f.evidence["held_out_gain"])
     first = terms[0].effect if terms else None
     other, plain = put_in(clean_flight(seed + 5000)), clean_flight(seed + 5000)
-    usable = EffectSet(tuple(e for e in attribution.effects if getattr(e, "usable", True)))
+    model = usable(attribution.effects)
     return {
         "name": name,
         "seed": seed,
         "found": names_found(attribution),
         "right": first is not None and first.channel == channel and first.covariate in covariates,
-        "residual_removed": _removed(channel, plain, other, usable),
+        "residual_removed": _removed(channel, plain, other, model),
         "rmse": [
-            evaluate(f, effects=e)[0].row()["rmse_3d"] for f, e in ((plain, None), (other, None), (other, usable))
+            evaluate(f, effects=e)[0].row()["rmse_3d"] for f, e in ((plain, None), (other, None), (other, model))
         ],
     }
 
@@ -34,12 +37,9 @@ def _removed(channel, plain, other, effects):
     """Share of the root mean square of the channel's excess residual that the effects remove."""
     values = []
     for flight, model in ((plain, EffectSet()), (other, EffectSet()), (other, effects)):
-        found = residuals(flight, model)
-        if channel == "tdoa":
-            r = found.tdoa.residual[found.tdoa.airborne]
-        else:
-            sensor, axis = channel.split(".")
-            r = getattr(found, sensor).residual[:, "xyz".index(axis)]
+        sensor, _, axis = channel.partition(".")
+        part = residuals(flight, GroundTruth(), model)[sensor]
+        r = part.residual[:, "xyz".index(axis)] if axis else part.residual[part.airborne]
         limit = 5.0 * 1.4826 * np.median(np.abs(r))
         values.append(np.mean(np.clip(r, -limit, limit) ** 2))
     none, before, after = values

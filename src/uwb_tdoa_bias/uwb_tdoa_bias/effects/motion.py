@@ -1,0 +1,66 @@
+"""Velocity, acceleration and turning rate out of a history of poses: what a node can know when it corrects a TDOA."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from ..foundation.compiled import compiled
+
+SPAN = 0.2  # s over which differences are taken
+POSE_LAG = 0.05  # s by which the pose that a TDOA is corrected at is older than the TDOA before it
+
+
+@dataclass(frozen=True)
+class Motion:
+    """velocity, acceleration : (n, 3) m/s, m/s^2, world; rate : (n, 3) rad/s, body; NaN where unknown."""
+
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    rate: np.ndarray
+
+
+def motion_at(t, p, q, places):
+    """Motion at some of the poses, from those before them alone: backward differences over SPAN.
+
+    t (m,) rising stamps, s; p (m, 3) m; q (m, 4) x y z w; places (n,) numbers of poses, -1 for none.
+    """
+    out = np.full((3, len(places), 3), np.nan)
+    _differences(t, p, q, places, out)
+    return Motion(*out)
+
+
+def preceding(t, newest=None):
+    """Stamp of the TDOA that precedes each of some: (n,) s. t (n,) s, in order of arrival; newest : latest stamp of all
+    before them, s. The first of all precedes itself; a stamp that has fallen back counts as its own."""
+    first = t[0] if newest is None else newest
+    return np.minimum(np.maximum.accumulate(np.concatenate([[first], t]))[:-1], t)
+
+
+@compiled
+def _differences(t, p, q, places, out):
+    for i in range(len(places)):
+        k = places[i]
+        if k <= 0:
+            continue
+        near = np.searchsorted(t, t[k] - SPAN, side="right") - 1
+        far = np.searchsorted(t, t[k] - 2.0 * SPAN, side="right") - 1
+        if near < 0:
+            continue
+        dt = t[k] - t[near]
+        for axis in range(3):
+            velocity = (p[k, axis] - p[near, axis]) / dt
+            out[0, i, axis] = velocity
+            if far >= 0:
+                out[1, i, axis] = (velocity - (p[near, axis] - p[far, axis]) / (t[near] - t[far])) / dt
+        # the turn from the earlier attitude to the later one, in the body frame, as a rotation vector
+        ax, ay, az, aw = -q[near, 0], -q[near, 1], -q[near, 2], q[near, 3]
+        bx, by, bz, bw = q[k, 0], q[k, 1], q[k, 2], q[k, 3]
+        x = aw * bx + ax * bw + ay * bz - az * by
+        y = aw * by - ax * bz + ay * bw + az * bx
+        z = aw * bz + ax * by - ay * bx + az * bw
+        w = aw * bw - ax * bx - ay * by - az * bz
+        sine = math.sqrt(x * x + y * y + z * z)
+        angle = 2.0 * math.atan2(sine, abs(w))
+        scale = (angle / sine if sine > 1e-12 else 2.0) * (1.0 if w >= 0.0 else -1.0) / dt
+        out[2, i, 0], out[2, i, 1], out[2, i, 2] = scale * x, scale * y, scale * z

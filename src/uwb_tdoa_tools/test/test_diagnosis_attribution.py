@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+
+import undeclared
+from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
+from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.channels import residuals
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.studies.diagnosis.bank import SIZES, clean_flight, effect_of, names_found
+
+TRUTH = GroundTruth()
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return clean_flight(100, 40.0)
+
+
+def quick(flight):
+    """The declared effects alone, without functions without a name: Attribution."""
+    return attribute([flight], TRUTH, undeclared=False)
+
+
+def test_nothing_is_found_where_nothing_is(flight):
+    assert quick(flight).effects == ()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "anchor_delay",
+        "pair_offset",
+        "tag_lever_arm",
+        "tdoa_time_offset",
+        "truth_time_offset",
+        "gyro_scale",
+        "imu_misalignment",
+    ],
+)
+def test_a_declared_effect_is_found_with_its_size(flight, name):
+    effect = effect_of(name, False, 1)
+    (found,) = quick(effect.inject(flight)).effects
+    assert found.name == name and set(found.values) == set(found.std) == set(effect.values)
+    for key, value in effect.values.items():
+        assert found.values[key] == pytest.approx(value, rel=0.1)
+
+
+def test_every_declared_effect_is_in_the_bank():
+    from uwb_tdoa_bias.effects import EFFECTS
+
+    assert set(SIZES) == set(EFFECTS)
+
+
+def test_an_interval_of_nlos_is_found_with_its_anchor_and_time(flight):
+    effect = effect_of("nlos", True, 2)
+    (finding,) = quick(effect.inject(flight)).findings()
+    for key, value in effect.values.items():
+        assert finding.effect.values[key] == pytest.approx(value, abs=0.02 if key.endswith("delay") else 1.0)
+
+
+@pytest.mark.parametrize("name", ["noise_level", "outlier_rate"])
+def test_noise_is_told_from_bias(flight, name):
+    rng = np.random.default_rng(0)
+    assert names_found(quick(effect_of(name, True, 3).inject(flight, rng))) == [name]
+
+
+def test_an_undeclared_effect_is_found_by_its_covariate(flight):
+    attribution = attribute([undeclared.drag_on_cable(flight)], TRUTH)
+    assert names_found(attribution) == ["tdoa/speed"]
+    term = attribution.effects[0]
+    assert isinstance(term, SmoothTerm) and term.usable
+    left = attribution.remaining[0]["tdoa"]
+    assert 1.4826 * np.median(np.abs(left.residual[left.airborne])) == pytest.approx(0.06, rel=0.1)
+
+
+@pytest.mark.slow
+def test_measured_flight(shared_data):
+    from uwb_tdoa_tools.readers import read_flight
+
+    survey = shared_data / "surveys" / "anchor_const1.csv"
+    one, two = (read_flight(shared_data / "util" / f"const1-trial{k}-tdoa2.csv.gz", survey) for k in (1, 2))
+    effects = EffectSet(attribute([one], TRUTH).effects)
+    before, after = (residuals(two, TRUTH, model)["tdoa"] for model in (EffectSet(), effects))  # of a flight that was not fitted
+    assert np.median(np.abs(after.residual[after.airborne])) < 0.7 * np.median(np.abs(before.residual[before.airborne]))

@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
+from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return residuals(clean_flight(100, 40.0), GroundTruth(), EffectSet())
+
+
+def test_residuals_of_a_clean_flight_are_its_noise(parts):
+    assert np.std(parts["gyro"].residual) < 0.002 and np.std(parts["accel"].residual) < 0.01
+    tdoa = parts["tdoa"]
+    assert 1.4826 * np.median(np.abs(tdoa.residual[tdoa.airborne])) == pytest.approx(0.06, rel=0.05)
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_rows_and_columns_fit_together(parts, name):
+    from uwb_tdoa_bias.effects import EFFECTS
+
+    rows = parts[name].rows()
+    assert len(rows.y) == len(rows.series) == len(rows.t) == len(rows.count) == len(rows.place)
+    for effect in EFFECTS.values():
+        if effect.fitted and name in effect.channels:
+            keys = effect().groups(parts["tdoa"].samples.anchors, np.array([[0, 1], [1, 2]]))[0]
+            assert parts[name].columns(effect(), keys).shape == (len(rows.y), len(keys))
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_every_function_that_is_looked_for_has_columns(parts, name):
+    anchors = parts["tdoa"].samples.anchors
+    terms = CHANNELS[name].smooth_terms([parts[name]])
+    assert terms
+    for term in terms:
+        keys = term.keys(anchors)
+        assert np.isfinite(parts[name].columns(term, keys)).all()
+
+
+def test_an_error_of_an_unknown_position_leaves_no_trace():
+    flight = clean_flight(103, 30.0)
+    reference = Nothing()
+    part = residuals(reference.prepare(flight), reference, EffectSet())["tdoa"]
+    shift = part.free @ np.array([0.1, -0.2, 0.3])
+    assert np.abs(part.cells.means(shift[:, None])).max() < 0.02 < 0.2 < np.abs(shift).max()
+
+
+def test_without_attitude_the_gyroscope_is_judged_at_rest_and_the_accelerometer_not_at_all():
+    reference = Nothing()
+    parts = residuals(reference.prepare(clean_flight(103, 30.0)), reference, EffectSet())
+    assert "accel" not in parts
+    assert "gyro" not in parts or np.abs(parts["gyro"].residual).max() < 0.1

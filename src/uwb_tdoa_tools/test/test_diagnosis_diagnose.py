@@ -1,0 +1,54 @@
+from dataclasses import replace
+import json
+
+import pytest
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands.diagnose import main
+from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis.references import Nothing
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return clean_flight(100, 40.0)
+
+
+def test_anchors_of_two_installations_are_refused(flight):
+    other = replace(
+        flight,
+        name="elsewhere",
+        anchors=Anchors(flight.anchors.ids, flight.anchors.positions + 1.0, flight.anchors.orientations),
+    )
+    with pytest.raises(InputError, match="elsewhere: its anchors are not those"):
+        diagnose([flight, other])
+
+
+@pytest.mark.slow
+def test_the_loop_is_closed(flight, tmp_path, capsys):
+    write_bag(effect_of("anchor_delay", True, 4).inject(flight), tmp_path / "late")
+    write_bag(effect_of("anchor_delay", True, 4).inject(clean_flight(101, 30.0)), tmp_path / "other")
+    out = tmp_path / "out"
+    assert main([str(tmp_path / "late"), "--holdout", str(tmp_path / "other"), "--out", str(out)]) == 0
+    assert "found     anchor_delay" in capsys.readouterr().out
+    content = json.loads((out / "diagnosis.json").read_text())
+    (finding,) = content["findings"]
+    assert finding["effect"] == "anchor_delay" and finding["channel"] == "tdoa" and finding["added"]
+    assert {"parameters", "std", "evidence", "variance_explained", "confounded_with"} <= set(finding)
+    before, after = content["before"]["pooled"]["rmse_3d"], content["after"]["pooled"]["rmse_3d"]
+    assert after < 0.3 * before and content["unattributed"] == [] and content["ambiguous"] == []
+    assert len(EffectSet.from_yaml(out / "effects.yaml")) == 1
+    page = (out / "report.html").read_text()
+    assert "anchor_delay" in page and "data:image/png" in page and "http" not in page
+
+
+@pytest.mark.slow
+def test_without_truth(flight):
+    result = diagnose([effect_of("anchor_delay", True, 4).inject(flight)], reference=Nothing())
+    assert [finding.effect.name for finding in result.findings] == ["anchor_delay"]
+    hidden = {item.effect for item in result.unobservable}
+    assert {"tag_lever_arm", "truth_frame", "tdoa_time_offset"} <= hidden

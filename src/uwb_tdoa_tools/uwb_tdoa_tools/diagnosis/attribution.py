@@ -1,0 +1,268 @@
+"""From flights to a model: which effects are there, how large, how sure, and what else it could be."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
+
+from .channels import CHANNELS, residuals
+from .detectors import DETECTORS
+from .findings import Finding, Refused
+from .regression.confounding import alternatives
+from .regression.fit import fit
+from .regression.held_out import held_out
+from .regression.select import Selection, select, worth
+from .regression.table import table_of
+from .regression.terms import Candidate, Term, candidates_of, columns_of
+
+ROUNDS = 2  # of linearising about what was found
+MAPS_GAIN, MAPS_SURE = 20.0, 3.0  # held-out log-likelihood, twice, and its t value over blocks, that maps must bring
+MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
+
+
+@dataclass(frozen=True, eq=False)
+class Attribution:
+    """residuals, remaining : [{channel: ChannelResidual}] under the base model and under the whole; selection : Selection;
+    detections : (Detection, ...); candidates : all declared Candidates; refused : (Refused, ...)."""
+
+    residuals: list
+    remaining: list
+    selection: Selection
+    detections: tuple
+    candidates: list
+    refused: tuple
+
+    @property
+    def effects(self):
+        """All Effects found: tuple."""
+        return (*effects_of(self.selection), *(detection.effect for detection in self.detections))
+
+    def only(self, candidates, detections):
+        """The Attribution with some of its chosen Candidates, fitted anew, and of its detections."""
+        return replace(self, selection=self.selection.only(candidates), detections=tuple(detections))
+
+    def findings(self):
+        """[Finding], those by regression first."""
+        return [*_findings(self.selection, self.candidates), *map(_of_detection, self.detections)]
+
+
+def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True, progress=lambda: None):
+    """Attribution of the residuals of Flights, which the Reference has prepared, to effects beyond `base`.
+
+    kinds : names of the declared effects to look for, None for all; undeclared : look for functions without a name too;
+    progress() is called now and then.
+    """
+    detectors = [detector for name, detector in DETECTORS.items() if kinds is None or name in kinds]
+
+    def at(model):
+        return _residuals(flights, reference, EffectSet((*base.effects, *model)), progress)
+
+    def search(table, model, chosen):
+        return [candidate for detector in detectors for candidate in detector.search(table, model, chosen)]
+
+    under_base = at(())
+    installation = _installation(flights)
+    declared = _declared(under_base, kinds, installation)
+    current, model, inflation = under_base, (), None
+    for last in (number == ROUNDS - 1 for number in range(ROUNDS)):
+        table = _linearised(current, declared, model)
+        if inflation is None:
+            inflation = fit(table, columns_of(declared)).inflation
+        progress()
+        selection = select(table, declared, inflation, search, progress=progress)
+        model = effects_of(selection)
+        if not model:
+            break
+        current = current if last else at(model)
+    refused = []
+    selection = _that_hold_on_other_data(selection, refused)
+    if undeclared:
+        smooth = _smooth(current, installation)
+        selection = _with_smooth(selection, declared, smooth, search, progress)
+        selection = _that_hold_on_other_data(selection, refused)
+        selection = _with_maps(selection, smooth, refused)
+    remaining = at(effects_of(selection))
+    detections = (detector.detect(remaining) for detector in detectors)
+    found = tuple(detection for detection in detections if detection is not None)
+    return Attribution(under_base, remaining, selection, found, declared, tuple(refused))
+
+
+def effects_of(selection):
+    """The chosen Candidates with the values of the fit, parameters of one effect together: tuple of Effects."""
+    values, std = {}, {}
+    error = np.sqrt(np.diag(selection.fit.cov)) if len(selection.fit.beta) else ()
+    fitted = dict(zip(selection.fit.columns, zip(selection.fit.beta.tolist(), map(float, error))))
+    effects = {}
+    for term in (term for candidate in selection.chosen for term in candidate.terms):
+        effect = term.effect
+        identity = _merged_as(effect)
+        effects.setdefault(identity, effect)
+        values.setdefault(identity, {}).update(effect.values)
+        for column in term.columns:
+            values[identity][column.key], std.setdefault(identity, {})[column.key] = fitted[column]
+    return tuple(
+        replace(effect, values=values[identity], std=std[identity], source="diagnose")
+        for identity, effect in effects.items()
+    )
+
+
+def _merged_as(effect):
+    """Equal for Effects that are one entry of effects.yaml."""
+    return effect.identity if effect.settings else effect.name
+
+
+def _residuals(flights, reference, effects, progress):
+    out = []
+    for flight in flights:
+        out.append(residuals(flight, reference, effects))
+        progress()
+    return out
+
+
+def _installation(flights):
+    """(Anchors with every id of the flights, each at the first of its places; (m, 2) ids of the pairs that were heard, the
+    most frequent first)."""
+    several = [flight.anchors for flight in flights]
+    ids, positions, orientations = (
+        np.concatenate([getattr(anchors, name) for anchors in several]) for name in ("ids", "positions", "orientations")
+    )
+    first = np.unique(ids, return_index=True)[1]
+    anchors = Anchors(ids[first], positions[first], orientations[first], several[0].frame)
+    heard = np.concatenate([np.column_stack([flight.tdoa.a, flight.tdoa.b]) for flight in flights])
+    heard = heard[np.isin(heard, ids).all(axis=1) & (heard[:, 0] != heard[:, 1])]
+    pairs, count = np.unique(heard, axis=0, return_counts=True)
+    return anchors, pairs[np.argsort(-count, kind="stable")]
+
+
+def _declared(found, kinds, installation):
+    """[Candidate] of the catalogue, of effects that a channel shows."""
+    shown = {name for flight in found for name in flight}
+    effects = [effect for effect in EFFECTS.values() if effect.fitted and shown & set(effect.channels)]
+    chosen = [effect for effect in effects if kinds is None or effect.name in kinds]
+    return [candidate for effect in chosen for candidate in candidates_of(effect(), *installation)]
+
+
+def _smooth(found, installation):
+    """[Candidate] of functions of whatever each channel may depend on."""
+    out = []
+    for name, channel in CHANNELS.items():
+        parts = [flight[name] for flight in found if name in flight]
+        for term in channel.smooth_terms(parts) if parts else ():
+            out += candidates_of(term, *installation)
+    return out
+
+
+def _linearised(found, candidates, model):
+    """Table with the columns of all candidates about `model`, whose contribution is put back: a fit gives whole values, not
+    increments."""
+    here = {effect.identity: effect for effect in model}
+    terms = [term for candidate in candidates for term in candidate.terms]
+    own = [Term(effect, tuple(effect.std)) for effect in model]
+    about = [Term(here.get(term.effect.identity, term.effect), term.keys) for term in terms]
+    table = table_of(found).with_terms([*own, *about])
+    return table.with_contribution([(term.effect, term.columns) for term in own])
+
+
+def _with_smooth(selection, declared, smooth, search, progress):
+    """The selection carried on with functions without a name; or begun anew with them, if that explains more: the declared
+    effect was a stopgap."""
+    everything = smooth + declared
+    table = selection.table.with_terms([term for candidate in smooth for term in candidate.terms])
+    progress()
+    inflation = selection.fit.inflation
+    after = select(table, everything, inflation, search, start=selection.chosen, progress=progress)
+    if selection.chosen and any(not candidate.declared for candidate in after.chosen):
+        anew = select(table, everything, inflation, search, progress=progress)
+        after = max(after, anew, key=lambda each: worth(each, len(everything)))
+    return after
+
+
+def _with_maps(selection, smooth, refused):
+    """Add functions of the place for every anchor, each too weak alone, if together they are plainly worth it on data that
+    they were not fitted to."""
+    taken = {term.effect.identity for candidate in selection.chosen for term in candidate.terms}
+    for channel in CHANNELS.values():
+        terms = {}
+        for candidate in smooth:  # the first of a function is that of all anchors
+            term = candidate.terms[0]
+            if term.effect.form == "anchor" and channel.name in candidate.channels and term.effect.covariate in channel.maps:
+                terms.setdefault(term.effect.identity, term)
+        maps = Candidate(tuple(term for identity, term in terms.items() if identity not in taken))
+        if not maps.terms:
+            continue
+        trial = selection.plus(maps)
+        scores = [held_out(trial)[-1]]
+        if selection.table.flights >= 3:
+            scores.append(held_out(trial, by_flight=True)[-1])
+        if min(score.gain for score in scores) > MAPS_GAIN and min(score.t for score in scores) > MAPS_SURE:
+            selection = trial
+        elif min(scores).gain > 0.0:
+            worth_it = 0.5 * min(scores).gain
+            refused.append(Refused(maps.label, f"does not help held-out data enough (log-likelihood {worth_it:.1f})"))
+    return selection
+
+
+def _that_hold_on_other_data(selection, refused):
+    """Drop, one by one, what does not help rows that it was not fitted to."""
+    while selection.chosen:
+        scores = held_out(selection)
+        if selection.table.flights >= 3:
+            across = held_out(selection, by_flight=True)
+            scores = [
+                min(score, other) if _recurs(candidate) else score
+                for score, other, candidate in zip(scores, across, selection.chosen)
+            ]
+        worst = min(range(len(scores)), key=lambda k: scores[k].gain)
+        if scores[worst].gain > MIN_GAIN:
+            break
+        candidate = selection.chosen[worst]
+        reason = f"does not help held-out data (log-likelihood {0.5 * scores[worst].gain:.1f})"
+        refused.append(Refused(candidate.label, reason))
+        selection = selection.only([other for other in selection.chosen if other is not candidate])
+    return selection
+
+
+def _recurs(candidate):
+    """Whether it should hold on other flights too: not what happened at a time."""
+    return not any(key.endswith((".start", ".end")) for term in candidate.terms for key in term.effect.values)
+
+
+def _findings(selection, candidates):
+    effects = {_merged_as(effect): effect for effect in effects_of(selection)}
+    out = {}
+    for candidate, score, loss in zip(selection.chosen, held_out(selection), selection.loss):
+        evidence = {
+            "criterion": round(float(loss), 1),
+            "held_out_gain": round(score.gain, 1),
+            "held_out_t": round(score.t, 1),
+        }
+        others = tuple(alternatives(selection, candidate, candidates))
+        for term in candidate.terms:
+            identity = _merged_as(term.effect)
+            covariates = tuple(t.effect.covariate for t in candidate.terms if t is not term) if term.effect.settings else ()
+            finding = Finding(
+                effects[identity], candidate.channels[0], evidence, score.explained, others, (candidate,),
+                together_with=covariates,
+            )  # fmt: skip
+            out[identity] = _merged(out[identity], finding) if identity in out else finding
+    return list(out.values())
+
+
+def _merged(finding, other):
+    """One Finding of two of one effect."""
+    evidence = {key: round(finding.evidence[key] + other.evidence[key], 1) for key in other.evidence}
+    named = {alternative.effect for alternative in finding.alternatives}
+    more = tuple(alternative for alternative in other.alternatives if alternative.effect not in named)
+    return replace(
+        finding,
+        evidence=evidence,
+        explained=max(finding.explained, other.explained),
+        alternatives=(*finding.alternatives, *more),
+        candidates=(*finding.candidates, *other.candidates),
+    )
+
+
+def _of_detection(detection):
+    return Finding(detection.effect, detection.channel, detection.evidence, 0.0)

@@ -1,0 +1,55 @@
+"""The accelerometer."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_ekf.core.state import GRAVITY
+
+from .inertial import CELL, ImuResidual, Inertial, cells_in_the_air, features_of, means
+
+SHIFT = 0.05  # s; the cells are those of the gyroscope
+FEWEST_ATTITUDES = 10
+
+
+class Accel(Inertial):
+    """Specific force, averaged with a triangular window, minus the second difference of the true positions, which is the
+    same average of the true acceleration."""
+
+    name = "accel"
+    unit = "m/s^2"
+    negligible = 0.01
+
+    def residual(self, comparison):
+        imu, poses, reference = comparison.flight.imu, comparison.poses, comparison.reference
+        if imu is None or not (reference.attitude_known and all(reference.positions_known)):
+            return None
+        if np.isfinite(poses.q).all(axis=1).sum() <= FEWEST_ATTITUDES:
+            return None
+        track, edges = comparison.track, cells_in_the_air(comparison, SHIFT)
+        middles = edges[1:-1]
+        to_body = Rotation.from_quat(track.attitudes(middles)).inv()
+        positions = track.positions(edges)
+        acceleration = (positions[2:] - 2.0 * positions[1:-1] + positions[:-2]) / CELL**2
+        true = to_body.apply(acceleration + [0.0, 0.0, GRAVITY])
+        flown = (imu.t >= edges[0]) & (imu.t <= edges[-1])
+        world = Rotation.from_quat(track.attitudes(imu.t[flown])).apply(imu.accel[flown])
+        measured = to_body.apply(_triangular_means(imu.t[flown], world, edges))
+        features = means(imu.t, features_of(imu), edges)
+        samples = self._samples(comparison, middles, true, 0.5 * (features[1:] + features[:-1]))
+        measured = measured - sum(effect.uncorrected(samples) for effect in comparison.effects.effects)
+        return ImuResidual(samples, measured - true, self.unit)
+
+
+def _triangular_means(t, values, edges):
+    """Means of (n, 3) values with the triangular window over two intervals, for every inner edge. With it, the mean
+    of a second derivative is the second difference of the function: both sides of the residual see the same filter."""
+    place = np.searchsorted(edges, t, side="right") - 1
+    out, total = np.zeros((len(edges), 3)), np.zeros(len(edges))
+    inside = (place >= 0) & (place < len(edges) - 1)
+    part = np.where(inside, (t - edges[np.clip(place, 0, len(edges) - 1)]) / CELL, 0.0)
+    for shift, weight in ((0, 1.0 - part), (1, part)):
+        rows = place[inside] + shift
+        total += np.bincount(rows, weight[inside], len(edges))
+        for k in range(3):
+            out[:, k] += np.bincount(rows, weight[inside] * values[inside, k], len(edges))
+    return out[1:-1] / np.maximum(total[1:-1, None], 1e-9)

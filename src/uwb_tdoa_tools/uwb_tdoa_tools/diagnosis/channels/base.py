@@ -1,0 +1,93 @@
+"""What a channel is, and what it makes of a flight."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet, Track
+from uwb_tdoa_bias.foundation.flight import Flight, Truth
+
+from ..references import Reference
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A flight beside its reference.
+
+    flight : Flight, its streams corrected by `effects`; poses : Truth; span : (first, last) s of what counts."""
+
+    flight: Flight
+    reference: Reference
+    effects: EffectSet
+    poses: Truth
+    span: tuple
+
+    @classmethod
+    def of(cls, flight, reference, effects):
+        """Comparison of a prepared Flight with a Reference."""
+        poses = reference.poses(flight, effects)
+        corrected = effects.correct_streams(replace(flight, truth=None))
+        return cls(corrected, reference, effects, poses, reference.span(flight, poses))
+
+    @cached_property
+    def track(self):
+        """The poses, to be asked at any stamp."""
+        return Track(self.poses)
+
+    @property
+    def start(self):
+        """Stamp of the first TDOA, s, from which slow changes count."""
+        return float(self.flight.tdoa.t[0])
+
+
+@dataclass(frozen=True)
+class Rows:
+    """m rows of a linear fit: y (m,); series (m,) int, what is one series in time; t (m,) s since the start; count (m,)
+    samples averaged; place (m, 3) m, world."""
+
+    y: np.ndarray
+    series: np.ndarray
+    t: np.ndarray
+    count: np.ndarray
+    place: np.ndarray
+
+
+class ChannelResidual:
+    """The residual of a channel in one flight: measured minus what the model says at the poses of the reference.
+
+    Subclasses hold `samples`, what effects take (Samples, ImuSamples), and `residual`, one per sample.
+    """
+
+    samples: object
+    residual: np.ndarray
+
+    def rows(self):
+        """Rows for a fit."""
+        raise NotImplementedError
+
+    def columns(self, effect, keys):
+        """Regressors of an Effect for the parameters `keys`, averaged as the rows are: (m, len(keys))."""
+        raise NotImplementedError
+
+    def series(self):
+        """{label with unit: (t (k,) s, residual (k,))}, to be plotted and judged."""
+        raise NotImplementedError
+
+
+class Channel:
+    """A kind of measurement. One channel, one file: subclass it and list it in CHANNELS."""
+
+    name: ClassVar[str]
+    unit: ClassVar[str]
+    negligible: ClassVar[float]  # root mean square, in `unit`, of a contribution that is not worth a term
+    maps: ClassVar[tuple] = ()  # covariates whose functions, each too weak alone, are tried together
+
+    def residual(self, comparison):
+        """ChannelResidual of a Comparison; None if the flight or its reference does not show this channel."""
+        raise NotImplementedError
+
+    def smooth_terms(self, residuals):
+        """SmoothTerms without values: whatever the ChannelResiduals of some flights may depend on."""
+        return []

@@ -1,0 +1,59 @@
+"""The gyroscope."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.effects.covariates import OF_IMU
+
+from .inertial import CELL, ImuResidual, Inertial, cells_in_the_air, features_of, means
+
+SHIFT = 0.05  # s, for derivatives by time, of what was measured: noise of the truth would shrink what is fitted to them
+STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration and rad/s, below which the vehicle stands
+FEWEST_ATTITUDES, FEWEST_CELLS = 10, 4
+
+
+class Gyro(Inertial):
+    """Turning rates, averaged over cells, minus the mean of the true turns; before take-off alone where no attitude is
+    known: a vehicle that stands does not turn."""
+
+    name = "gyro"
+    unit = "rad/s"
+    negligible = 5e-4
+
+    def residual(self, comparison):
+        imu, poses = comparison.flight.imu, comparison.poses
+        if imu is None:
+            return None
+        if not comparison.reference.attitude_known:
+            return self._at_rest(comparison, imu)
+        if np.isfinite(poses.q).all(axis=1).sum() <= FEWEST_ATTITUDES:
+            return None
+        edges = cells_in_the_air(comparison, SHIFT)
+        measured, true = means(imu.t, imu.gyro, edges), _true_rates(poses, edges)
+        before, after = (means(imu.t, imu.gyro, edges + shift) for shift in (-SHIFT, SHIFT))
+        middles = 0.5 * (edges[:-1] + edges[1:])
+        features, change = means(imu.t, features_of(imu), edges), (after - before) / (2.0 * SHIFT)
+        return ImuResidual(self._samples(comparison, middles, measured, features, change), measured - true, self.unit)
+
+    def _at_rest(self, comparison, imu):
+        edges = np.arange(imu.t[0], imu.t[-1], CELL)
+        features, measured = means(imu.t, features_of(imu), edges), means(imu.t, imu.gyro, edges)
+        moving = features[:, OF_IMU.index("vibration")] > STILL_FORCE
+        moving |= np.abs(measured).max(axis=1) > STILL_RATE
+        still = np.flatnonzero(np.cumsum(moving) == 0)[:-1]
+        if len(still) < FEWEST_CELLS:
+            return None
+        middles, measured = 0.5 * (edges[:-1] + edges[1:])[still], measured[still]
+        samples = self._samples(comparison, middles, measured, features[still], np.zeros_like(measured))
+        return ImuResidual(samples, measured, self.unit)
+
+
+def _true_rates(truth, edges):
+    """Mean turning rates in body axes between edges, (n, 3) rad/s: sums of the turns from pose to pose."""
+    known = np.isfinite(truth.q).all(axis=1)
+    t, first = np.unique(truth.t[known], return_index=True)
+    turns = Rotation.from_quat(truth.q[known][first])
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    at = np.stack([np.interp(edges, t, column) for column in total.T], axis=1)
+    return np.diff(at, axis=0) / np.diff(edges)[:, None]

@@ -1,0 +1,84 @@
+"""What gyroscope and accelerometer share: residuals of means over cells, axis by axis."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.effects import ImuSamples, SmoothTerm
+from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, imu_covariate
+
+from .base import Channel, ChannelResidual, Rows
+from .knots import knots_of
+
+CELL = 0.25  # s over which both sides of a residual are averaged
+OF_POSE = ("x", "y", "height", "speed", "climb_rate", "acceleration")  # covariates that TDOAs have too
+
+
+@dataclass(frozen=True)
+class ImuResidual(ChannelResidual):
+    """samples : ImuSamples, cells; residual (n, 3), body axes; unit of the channel."""
+
+    samples: ImuSamples
+    residual: np.ndarray
+    unit: str
+
+    def rows(self):
+        samples, n = self.samples, len(self.samples)
+        t, place = np.tile(samples.t - samples.start, 3), np.tile(samples.p, (3, 1))
+        return Rows(self.residual.T.ravel(), np.repeat(np.arange(3), n), t, np.ones(3 * n), place)
+
+    def columns(self, effect, keys):
+        values = effect.regressors(self.samples, list(keys))
+        return values.transpose(1, 0, 2).reshape(-1, len(keys))
+
+    def series(self):
+        name = self.samples.channel
+        return {f"{name}.{axis} [{self.unit}]": (self.samples.t, self.residual[:, k]) for k, axis in enumerate("xyz")}
+
+
+class Inertial(Channel):
+    """A channel of an inertial sensor."""
+
+    axes: ClassVar[str] = "xyz"
+
+    def smooth_terms(self, residuals):
+        out = []
+        for name in (*OF_IMU, *OF_POSE):
+            knots = knots_of(np.concatenate([imu_covariate(name, part.samples) for part in residuals]), name)
+            if knots is not None:
+                out += [SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots) for axis in self.axes]
+        return out
+
+    def _samples(self, comparison, t, reading, features, change=None):
+        """ImuSamples of this channel at the middles t (n,) of cells."""
+        track = comparison.track
+        q = track.attitudes(t)
+        up = np.full((len(t), 3), [0.0, 0.0, 1.0])
+        known = np.isfinite(q).all(axis=1)
+        if known.any():
+            up[known] = Rotation.from_quat(q[known]).inv().apply([0.0, 0.0, 1.0])
+        place, motion = track.positions(t), track.motion(t)
+        return ImuSamples(self.name, t, place, comparison.start, reading, change, up, features, motion)
+
+
+def features_of(imu):
+    """Covariates OF_IMU along the stream: (n, len(OF_IMU))."""
+    return ImuFeatures()(imu.t, imu.gyro, imu.accel)
+
+
+def cells_in_the_air(comparison, shift):
+    """Edges of the cells, s, of what counts and is covered by IMU and reference, `shift` s more at both ends."""
+    imu, poses, (first, last) = comparison.flight.imu, comparison.poses, comparison.span
+    low = max(first, imu.t[0], poses.t[0]) + CELL + shift
+    high = min(last, imu.t[-1], poses.t[-1]) - CELL - shift
+    return np.arange(low, high, CELL)
+
+
+def means(t, values, edges):
+    """Means of (n, k) values over the intervals between edges: the integral of the linear interpolation."""
+    dt = np.diff(t)[:, None]
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(0.5 * (values[1:] + values[:-1]) * dt, axis=0)])
+    at = np.stack([np.interp(edges, t, column) for column in total.T], axis=1)
+    return np.diff(at, axis=0) / np.diff(edges)[:, None]

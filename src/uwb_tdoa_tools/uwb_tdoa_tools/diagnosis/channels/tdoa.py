@@ -1,0 +1,178 @@
+"""TDOAs.
+
+Neighbouring TDOAs are alike, so that hundreds a second are not hundreds of facts. They are averaged, pair by pair, over
+cells of half a second, without the outliers of the cell; what likeness is left between cells is counted in the fit.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import Samples, SmoothTerm, samples_at
+from uwb_tdoa_bias.effects.covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
+from uwb_tdoa_bias.foundation.geometry import tdoa, tdoa_jacobian
+
+from .base import Channel, ChannelResidual, Rows
+from .knots import knots_of
+
+CELL = 0.5  # s, of TDOAs at known places
+FREE_CELL = 0.25  # s, within which an unknown position error is taken as constant
+OUTLIER = 4.0  # spreads within a cell
+WILD = 20.0  # m; a larger residual is no measurement
+
+
+@dataclass(frozen=True)
+class TdoaResidual(ChannelResidual):
+    """samples : Samples, of the whole recording; residual (n,) m; jacobian (n, 3) of the TDOA by the position; airborne
+    (n,) bool, False for those near the floor before and after; free (n, k) directions of an unknown position error."""
+
+    samples: Samples
+    residual: np.ndarray
+    airborne: np.ndarray
+    free: np.ndarray
+
+    @cached_property
+    def cells(self):
+        """How the TDOAs in the air are averaged."""
+        return Cells(self)
+
+    def rows(self):
+        cells, samples = self.cells, self.samples
+        place = np.stack([cells.mean(column) for column in samples.p.T], axis=1)
+        y = cells.means(self.residual[:, None])[:, 0]
+        return Rows(y, cells.pair, cells.t - samples.start, cells.size, place)
+
+    def columns(self, effect, keys):
+        return self.cells.means(effect.regressors(self.samples, list(keys)))
+
+    def series(self):
+        return {"TDOA [m]": (self.samples.t[self.airborne], self.residual[self.airborne])}
+
+    def arrivals(self, series):
+        """Anchor rows (a, b) of series numbers (m,) in Rows."""
+        return np.divmod(series, len(self.samples.anchors))
+
+
+class Cells:
+    """The cells of one flight, and the averages over them."""
+
+    def __init__(self, part):
+        samples, chosen = part.samples, np.flatnonzero(part.airborne)
+        n, width = len(samples.anchors), FREE_CELL if part.free.shape[1] else CELL
+        t = samples.t[chosen]
+        cell = ((t - t[0]) / width).astype(np.int64)
+        pair = samples.a[chosen].astype(np.int64) * n + samples.b[chosen]
+        label = cell * n * n + pair
+        y = part.residual[chosen]
+        order = np.lexsort((y, label))
+        _, first, group, size = np.unique(label[order], return_index=True, return_inverse=True, return_counts=True)
+        median = 0.5 * (y[order][first + (size - 1) // 2] + y[order][first + size // 2])
+        away = np.abs(y[order] - median[group])
+        crowded = size[group] >= 4
+        scatter = 1.4826 * np.median(away[crowded]) * 1.2 if crowded.sum() > 50 else np.inf
+        good = (away <= OUTLIER * scatter) & (np.abs(y[order]) < WILD)
+        self.chosen = chosen[order][good]
+        self.group = np.unique(group[good], return_inverse=True)[1]
+        self.size = np.bincount(self.group).astype(float)
+        self.t = self.mean(samples.t)
+        start = np.searchsorted(self.group, np.arange(len(self.size)))
+        self.pair = samples.a[self.chosen][start] * n + samples.b[self.chosen][start]
+        self._bases = []
+        if part.free.shape[1]:
+            free = np.stack([self.mean(column) for column in part.free.T], axis=1)
+            cell, root = ((self.t - t[0]) / width).astype(np.int64), np.sqrt(self.size)[:, None]
+            for places in (np.flatnonzero(cell == c) for c in np.unique(cell)):
+                self._bases.append((places, root[places], np.linalg.qr(root[places] * free[places])[0]))
+
+    def mean(self, values):
+        """Means of values of all TDOAs (n,) over the cells: (m,)."""
+        return np.bincount(self.group, values[self.chosen]) / self.size
+
+    def means(self, values):
+        """Columns (n, k) averaged, without what an unknown position error would explain: (m, k)."""
+        out = np.stack([self.mean(np.nan_to_num(column)) for column in values.T], axis=1)
+        for places, root, basis in self._bases:
+            scaled = root * out[places]
+            out[places] = (scaled - basis @ (basis.T @ scaled)) / root
+        return out
+
+
+class Tdoa(Channel):
+    """Differences of the distances to two anchors."""
+
+    name = "tdoa"
+    unit = "m"
+    negligible = 0.004
+    maps = ("x", "y", "height", "range")
+
+    def residual(self, comparison):
+        flight, anchors, poses = comparison.flight, comparison.flight.anchors, comparison.poses
+        raw = flight.tdoa
+        a, b = anchors.index(raw.a), anchors.index(raw.b)
+        inside = (raw.t >= poses.t[0]) & (raw.t <= poses.t[-1])
+        usable = np.flatnonzero((a >= 0) & (b >= 0) & (a != b) & np.isfinite(raw.d) & inside)
+        t, a, b = raw.t[usable], a[usable], b[usable]
+        samples = replace(
+            samples_at(t, a, b, poses, anchors, comparison.start),
+            interval=np.diff(t, prepend=t[:1]),
+            previous=np.concatenate([[-1], anchors.ids[b[:-1]]]),
+            vibration=_vibration(flight.imu, t),
+            extra=_extra(flight, t),
+        )
+        at_a, at_b = samples.position_a, samples.position_b
+        residual = raw.d[usable] - tdoa(samples.p, at_a, at_b) - comparison.effects.bias(samples)
+        first, last = comparison.span
+        unknown = ~np.array(comparison.reference.positions_known)
+        free = tdoa_jacobian(samples.p, at_a, at_b)[:, unknown]
+        return TdoaResidual(samples, residual, (t >= first) & (t <= last), free)
+
+    def smooth_terms(self, residuals):
+        out, chosen = [], [part.airborne for part in residuals]
+        extra = sorted(set.intersection(*(set(part.samples.extra) for part in residuals)))
+        for name in (*OF_TDOA, *(f"extra.{key}" for key in extra)):
+            values = [_covariate(name, part.samples) for part in residuals]
+            knots = None
+            if all(v is not None for v in values):
+                knots = knots_of(np.concatenate([v[rows] for v, rows in zip(values, chosen)]), name)
+            if knots is not None:
+                out.append(SmoothTerm(covariate=name, form="common", knots=knots))
+                if name not in CATEGORIES and not name.startswith("extra."):
+                    out.append(SmoothTerm(covariate=name, form="anchor", knots=knots))
+        for name, function in OF_ARRIVAL.items():
+            values = [_of_arrivals(function, part.samples)[:, rows] for part, rows in zip(residuals, chosen)]
+            knots = knots_of(np.concatenate(values, axis=1).ravel(), name)
+            if knots is not None:
+                out += [SmoothTerm(covariate=name, form=form, knots=knots) for form in ("arrival", "anchor")]
+        return out
+
+
+def _covariate(name, samples):
+    return OF_TDOA[name](samples) if name in OF_TDOA else samples.extra[name.removeprefix("extra.")]
+
+
+def _of_arrivals(function, samples):
+    """(2, n): of the first and of the second anchor."""
+    return function(samples, np.concatenate([samples.a, samples.b])).reshape(2, -1)
+
+
+def _vibration(imu, t):
+    if imu is None:
+        return None
+    features = ImuFeatures()(imu.t, imu.gyro, imu.accel)
+    return np.interp(t, imu.t, features[:, OF_IMU.index("vibration")])
+
+
+def _extra(flight, t):
+    """Whatever else the log holds, at the stamps t: {"stream.column": (n,)}. What a simulation tells of itself is no
+    log."""
+    out = {}
+    for name, columns in flight.extra.items():
+        stamps = np.asarray(columns.get("t", ()), dtype=float)
+        if name.endswith("_truth") or len(stamps) < 10:
+            continue
+        for column, values in columns.items():
+            values = np.asarray(values)
+            if column != "t" and values.dtype.kind in "fiu" and np.ptp(values) > 0:
+                out[f"{name}.{column}"] = np.interp(t, stamps, values.astype(float))
+    return out

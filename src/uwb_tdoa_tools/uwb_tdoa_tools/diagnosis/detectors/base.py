@@ -1,0 +1,33 @@
+"""What a detector is."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from uwb_tdoa_bias.effects import Effect
+
+
+@dataclass(frozen=True)
+class Detection:
+    """effect : Effect with values and std; channel : where it shows; evidence : {figure: number}, how sure that is."""
+
+    effect: Effect
+    channel: str
+    evidence: dict
+
+
+class Detector:
+    """The search for one effect with `fitted` False. One effect, one file of its name: subclass and list it in DETECTORS.
+
+    An effect with a regressor at hand for some of its parameters, once the others are given, is searched for among the
+    candidates of the selection (`search`). One without any is judged on what all others leave (`detect`).
+    """
+
+    effect: ClassVar[type]
+
+    def search(self, table, model, chosen):
+        """[Candidate] for the residual of `model`, a Fit of the chosen Candidates to the Table."""
+        return []
+
+    def detect(self, residuals):
+        """Detection in what the whole model leaves, [{channel: ChannelResidual}], one dict a flight; or None."""
+        return None

@@ -1,0 +1,50 @@
+"""Is a pair noisier than the others?"""
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EFFECTS
+
+from .base import Detection, Detector
+from .series import series_of
+
+NEAR = 0.3  # s, within which two TDOAs of a pair share their slow error
+FEWEST, FEWEST_LINKS = 30, 3
+RATIO, SURE = 1.25, 5.0  # to the median of all pairs, and standard errors above it
+MOST = 0.4  # share of the pairs; if more are noisy, that is how it is
+
+
+class NoiseLevelDetector(Detector):
+    """Compares the steps from one TDOA of a pair to the next."""
+
+    effect = EFFECTS["noise_level"]
+
+    def detect(self, residuals):
+        ids = next(flight["tdoa"] for flight in residuals if "tdoa" in flight).samples.anchors.ids
+        steps = {}
+        for series in series_of(residuals):
+            first, second = series.steps()
+            near = series.t[second] - series.t[first] < NEAR
+            step = (series.residual[second] - series.residual[first])[near]
+            a, b = series.a[first][near], series.b[first][near]
+            link = np.minimum(a, b) * 1000 + np.maximum(a, b)
+            for number in np.unique(link):
+                steps.setdefault(int(number), []).append(step[link == number])
+        joined = {link: np.concatenate(several) for link, several in steps.items()}
+        size = {
+            link: (1.4826 * np.median(np.abs(s)) / np.sqrt(2.0), len(s)) for link, s in joined.items() if len(s) >= FEWEST
+        }
+        if len(size) < FEWEST_LINKS:
+            return None
+        level = np.median([s for s, _ in size.values()])
+        values, std, evidence = {}, {}, 0.0
+        for link, (s, count) in size.items():
+            error = 1.17 * s / np.sqrt(count)  # of a MAD; steps share their samples, hence not sqrt(2 count)
+            extra = np.sqrt(max(s**2 - level**2, 0.0))
+            if s > RATIO * level and s - level > SURE * error and extra > self.effect.negligible:
+                key = f"{ids[link // 1000]}-{ids[link % 1000]}"
+                values[key], std[key] = extra, s * error / max(extra, 1e-9)
+                evidence = max(evidence, (s - level) / error)
+        if not values or len(values) > MOST * len(size):
+            return None
+        effect = self.effect(values, std, "diagnose")
+        return Detection(effect, "tdoa", {"standard_errors": round(float(evidence), 1)})

@@ -1,0 +1,43 @@
+"""TDOA residuals in the air, sorted by pair and time: what the detectors of noise look at."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..regression.table import BLOCK
+
+
+@dataclass(frozen=True)
+class Series:
+    """t (n,) s; residual (n,) m; a, b (n,) anchor rows; pair (n,) a number for each ordered pair; block (n,) of 5 s."""
+
+    t: np.ndarray
+    residual: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    pair: np.ndarray
+    block: np.ndarray
+
+    @classmethod
+    def of(cls, part):
+        """Series of a TdoaResidual."""
+        samples, rows = part.samples, np.flatnonzero(part.airborne)
+        pair = samples.a * 100000 + samples.b
+        order = rows[np.lexsort((samples.t[rows], pair[rows]))]
+        t = samples.t[order]
+        block = ((t - t.min()) / BLOCK).astype(int)
+        return cls(t, part.residual[order], samples.a[order], samples.b[order], pair[order], block)
+
+    def steps(self, lag=1):
+        """(places, following places) of one pair, `lag` apart in order."""
+        first = np.flatnonzero(self.pair[lag:] == self.pair[:-lag])
+        return first, first + lag
+
+    def label(self):
+        """(n,) pairs numbered from 0 on without gaps."""
+        return np.unique(self.pair, return_inverse=True)[1]
+
+
+def series_of(residuals):
+    """[Series] of [{channel: ChannelResidual}]."""
+    return [Series.of(flight["tdoa"]) for flight in residuals if "tdoa" in flight]

@@ -1,0 +1,231 @@
+"""The loop closed: the filter with and without the effects, on data that they were not fitted to."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.rehearsal import RecordingCorrector, RehearsedCorrector
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects.stamp_error import shifted
+from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_ekf.estimator import VERDICTS
+from uwb_tdoa_ekf.offline import run_offline
+
+from ..scoring.metrics import Score, airborne, as_json, pooled
+from .attribution import effects_of
+from .findings import Refused, usable
+from .regression.fit import refit
+from .regression.terms import columns_of
+
+BOOTSTRAPS = 400
+BLOCK = 5.0  # s
+JUDGES = 3  # flights, or halves of one, on which trials are judged
+WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
+USED = next(value for value, name in VERDICTS.items() if name == "used")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A flight to judge on, and an EffectSet that it took no part in fitting. span : (first, last) s, None for all."""
+
+    flight: object
+    effects: EffectSet
+    span: tuple | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What makes the filter no worse: candidates, detections; refused : (Refused, ...) of the others; worth : {candidate or
+    detection: m by which the mean 3D RMSE is larger without it}."""
+
+    candidates: tuple
+    detections: tuple
+    refused: tuple
+    worth: dict
+
+
+def cross_fitted(attribution, flights, base, candidates, detections):
+    """[Case]: each flight, or each half of a single one, with the effects of `candidates` fitted to the others alone."""
+    table, selection = attribution.selection.table, attribution.selection
+    if len(flights) > 1:
+        parts = [(k, table.flight != k, None) for k in range(len(flights))]
+    else:
+        first, last = airborne(flights[0].truth)
+        middle, start = 0.5 * (first + last), float(flights[0].tdoa.t[0])
+        early = table.t + start < middle
+        parts = [(0, ~early, (first, middle)), (0, early, (middle, last))]
+    out, columns = [], columns_of(candidates)
+    for k, rows, span in parts:
+        others = replace(selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows))
+        found = usable([*effects_of(others), *(detection.effect for detection in detections)])
+        out.append(Case(flights[k], EffectSet((*base.effects, *found.effects)), span))
+    return out
+
+
+def useful(attribution, flights, base, config=None, progress=lambda: None):
+    """Kept: what makes the filter no worse where it was not fitted.
+
+    Candidates go, one by one, if the error is smaller without; detections stay only if it is smaller with them. At most
+    JUDGES flights are judged. Trials run the filter with the corrections that it would get at the poses of a run with all.
+    """
+    candidates, detections, refused = list(attribution.selection.chosen), [], []
+    trials = _Trials(attribution, flights, base, config, progress)
+    error = trials.start(candidates, detections)
+    without = {}
+    while candidates:
+        without = {one: trials.error([c for c in candidates if c is not one], detections) for one in candidates}
+        worst = min(without, key=without.get)
+        if without[worst] > error * (1.0 - WORSE):
+            break
+        why = f"the filter does better without it: {error:.3f} m with, {without[worst]:.3f} m without"
+        refused.append(Refused(worst.label, why))
+        candidates.remove(worst)
+        error = trials.start(candidates, detections)
+        without = {}
+    worth = {candidate: trial - error for candidate, trial in without.items()}
+    for detection in attribution.detections:
+        if not detection.effect.usable:
+            continue
+        trial = trials.error(candidates, [*detections, detection])
+        if trial < error * (1.0 - WORSE):
+            detections.append(detection)
+            worth[detection] = error - trial
+            error = trial
+        else:
+            why = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
+            refused.append(Refused(detection.effect.label, why))
+    return Kept(tuple(candidates), tuple(detections), tuple(refused), worth)
+
+
+class _Trials:
+    """Mean 3D RMSE, m, of cross-fitted models."""
+
+    def __init__(self, attribution, flights, base, config, progress):
+        self._arguments = attribution, flights, base
+        self._config, self._progress, self._samples = config, progress, []
+
+    def start(self, candidates, detections):
+        """The error of a model, run as the nodes would; later trials take the poses of this run."""
+        self._samples, errors = [], []
+        for case in self._cases(candidates, detections):
+            corrector = RecordingCorrector(case.flight.anchors, case.effects)
+            errors.append(self._judge(case, corrector))
+            self._samples.append(corrector.recorded())
+        return float(np.mean(errors))
+
+    def error(self, candidates, detections):
+        """The error of another model."""
+        cases = self._cases(candidates, detections)
+        correctors = (RehearsedCorrector(samples, case.effects) for samples, case in zip(self._samples, cases))
+        return float(np.mean([self._judge(case, corrector) for case, corrector in zip(cases, correctors)]))
+
+    def _cases(self, candidates, detections):
+        cases = cross_fitted(*self._arguments, candidates, detections)
+        return cases[:: -(-len(cases) // JUDGES)]
+
+    def _judge(self, case, corrector):
+        self._progress()
+        return score(case, run_offline(case.flight, self._config, corrector)).row()["rmse_3d"]
+
+
+def judge(attribution, flights, holdout, base, effects, reference, config=None, progress=lambda: None):
+    """(before, after, on what): the errors on the hold-out flights if there are any, or cross-fitted, or, where the
+    reference tells no errors, what the filter's own innovations say. As `compare` gives them."""
+    progress()
+    if holdout:
+        cases, on = [Case(flight, effects) for flight in holdout], "flights that took no part in the fit"
+    elif reference.judges:
+        cases = cross_fitted(attribution, flights, base, attribution.selection.chosen, attribution.detections)
+        on = "each half of the flight with effects fitted to the other"
+        if len(flights) > 1:
+            on = "each flight with effects fitted to the others"
+    else:
+        cases = [Case(flight, effects) for flight in flights]
+        on = "the flights that were fitted, by their innovations alone"
+    before, after = (compare if reference.judges else _innovations)(cases, base, config, progress)
+    return before, after, on
+
+
+def compare(cases, base, config=None, progress=lambda: None):
+    """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, besides
+    residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s)."""
+    sides, draws = [], []
+    for after in (False, True):
+        scores, rows, blocks = [], [], []
+        for case in cases:
+            case = case if after else replace(case, effects=base)
+            run = run_offline(case.flight, config, Corrector(case.flight.anchors, case.effects))
+            progress()
+            scores.append(score(case, run))
+            blocks.append(_blocks(scores[-1]))
+            row = as_json(scores[-1].row())
+            rows.append({**row, "residual_spread": _spread(run), "rmse_3d_ci": _interval(blocks[-1:])})
+        spreads = [row["residual_spread"] for row in rows if row["residual_spread"] is not None]
+        together = {**as_json(pooled(scores)), "residual_spread": float(np.mean(spreads)) if spreads else None}
+        sides.append({"runs": rows, "pooled": {**together, "rmse_3d_ci": _interval(blocks)}, "scores": scores})
+        draws.append(blocks)
+    sides[1]["pooled"]["rmse_3d_gain_ci"] = _gain_interval(*draws)
+    return sides
+
+
+def score(case, run):
+    """Score of a Run on a Case."""
+    truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
+    if case.span is not None:
+        inside = (truth.t >= case.span[0]) & (truth.t <= case.span[1])
+        truth = Truth(truth.t[inside], truth.p[inside], truth.q[inside])
+    return Score(case.flight.name, run.odometry, truth, run.residuals)
+
+
+def _innovations(cases, base, config, progress):
+    sides = []
+    for after in (False, True):
+        rows = []
+        for case in cases:
+            effects = case.effects if after else base
+            run = run_offline(case.flight, config, Corrector(case.flight.anchors, effects))
+            progress()
+            used = run.residuals.verdict == USED
+            nis = run.residuals.innovation[used] ** 2 / run.residuals.variance[used]
+            figures = {"nis_mean": float(np.mean(nis)), "residual_spread": _spread(run)}
+            rows.append({"flight": case.flight.name, "rmse_3d": None, **figures})
+        means = {key: float(np.mean([row[key] for row in rows])) for key in ("nis_mean", "residual_spread")}
+        sides.append({"runs": rows, "pooled": {"rmse_3d": None, **means}, "scores": []})
+    return sides
+
+
+def _spread(run):
+    used = run.residuals.verdict == USED
+    return float(1.4826 * np.median(np.abs(run.residuals.innovation[used]))) if used.any() else None
+
+
+def _blocks(judged):
+    """(sums of squared 3D errors, counts) per block of 5 s."""
+    if not len(judged.t):
+        return np.zeros((1, 2))
+    block = ((judged.t - judged.t[0]) / BLOCK).astype(int)
+    power = np.sum(judged.error**2, axis=1)
+    return np.stack([np.bincount(block, power), np.bincount(block)], axis=1)
+
+
+def _interval(blocks):
+    """95 % interval of the 3D RMSE: [low, high], m."""
+    draws = _draws(np.concatenate(blocks))
+    return [float(x) for x in np.quantile(draws, [0.025, 0.975])] if np.isfinite(draws).all() else None
+
+
+def _draws(blocks):
+    rng = np.random.default_rng(0)
+    chosen = rng.integers(0, len(blocks), (BOOTSTRAPS, len(blocks)))
+    total = blocks[chosen].sum(axis=1)
+    return np.sqrt(total[:, 0] / np.maximum(total[:, 1], 1))
+
+
+def _gain_interval(before, after):
+    """95 % interval of the share of the 3D RMSE that is gone, the same blocks drawn for both."""
+    blocks, others = np.concatenate(before), np.concatenate(after)
+    if len(blocks) != len(others):
+        return None
+    gain = 1.0 - _draws(others) / np.maximum(_draws(blocks), 1e-12)
+    return [float(x) for x in np.quantile(gain, [0.025, 0.975])] if np.isfinite(gain).all() else None

@@ -1,0 +1,40 @@
+"""What a reference is."""
+
+from typing import ClassVar
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from ...scoring.metrics import airborne
+
+MARGIN = 0.5  # s left out at both ends of the airborne part
+SHORTEST = 5.0  # s in the air that can be diagnosed
+
+
+class Reference:
+    """What flights are compared with. One kind, one file: subclass it and give it an option of `diagnose`.
+
+    Nothing that a reference does without is read: `prepare` takes it out of a recording before anything else sees it.
+    """
+
+    positions_known: ClassVar[tuple] = (True, True, True)  # x, y, z, world: False is estimated, and its error projected out
+    attitude_known: ClassVar[bool] = True
+    judges: ClassVar[bool] = True  # errors of the filter's positions can be told with it
+    words: ClassVar[str]  # what a report says the figures rest on
+
+    def prepare(self, flight):
+        """The Flight without what must not be used. Raises InputError where it lacks what the reference is."""
+        return flight
+
+    def poses(self, flight, effects):
+        """Poses, as of a Truth, at which the residuals of a prepared Flight are taken under the EffectSet `effects`."""
+        raise NotImplementedError
+
+    def span(self, flight, poses):
+        """(first, last) stamp, s, of what is diagnosed: in the air, without its ends. Raises InputError if that is short."""
+        first, last = airborne(poses)
+        first, last = first + MARGIN, last - MARGIN
+        if last - first < SHORTEST:
+            raise InputError(
+                f"{flight.name}: only {last - first:.1f} s of it are in the air; {SHORTEST:g} s are needed."
+            )
+        return first, last

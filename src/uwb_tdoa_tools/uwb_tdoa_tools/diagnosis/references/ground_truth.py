@@ -1,0 +1,20 @@
+"""Motion capture: every pose is known."""
+
+from uwb_tdoa_bias.effects.stamp_error import shifted
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from .base import Reference
+
+
+class GroundTruth(Reference):
+    """The ground truth that the recording holds."""
+
+    words = "the recorded ground truth"
+
+    def prepare(self, flight):
+        if flight.truth is None or len(flight.truth) < 2:
+            raise InputError(f"{flight.name}: holds no ground truth to compare with; give --no-truth.")
+        return flight
+
+    def poses(self, flight, effects):
+        return shifted(flight, "truth", -effects.stamp_offset("truth")).truth

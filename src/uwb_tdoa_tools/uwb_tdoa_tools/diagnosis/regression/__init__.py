@@ -1,0 +1,1 @@
+"""Linear regression of residuals on effects: tables, robust fits, selection, held-out checks, confounding."""

@@ -1,0 +1,108 @@
+"""What a finding could be mistaken for in these very flights, and what the flights cannot tell at all."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EFFECTS
+
+from .fit import prior_sizes
+from .terms import columns_of
+
+ALIKE = 0.9  # share of a finding's contribution that another effect would explain as well
+DISTINCT = 0.4  # smallest weight that is worth naming in a direction
+ANY_FLIGHT = "a flight on which the two contributions differ: other places, headings and speeds"
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """An effect that a finding could as well be. share : of the finding's contribution that it would explain, None if
+    less than ALIKE; gap : by how much its criterion is worse, None if more than undecided; tell_apart : which flight would
+    tell."""
+
+    effect: str
+    share: float | None
+    gap: float | None
+    tell_apart: str
+
+
+@dataclass(frozen=True)
+class Unobservable:
+    """A combination of parameters, {key: weight}, of an effect that leaves no trace in the flights; None: the effect has
+    no channel there."""
+
+    effect: str
+    direction: dict | None
+
+
+def flight_to_tell(effect, other):
+    """Which flight would tell two effects apart, by name: a sentence."""
+    for name, opposite in ((effect, other), (other, effect)):
+        sentence = EFFECTS[name].told_apart.get(opposite) if name in EFFECTS else None
+        if sentence:
+            return sentence
+    return ANY_FLIGHT
+
+
+def alternatives(selection, candidate, candidates):
+    """[Alternative] of a chosen Candidate, the nearest first: `candidates`, all declared ones, that explain at least ALIKE
+    of what it contributes beyond the rest of the model, and rivals whose criterion is as good."""
+    rivals = selection.rivals[selection.chosen.index(candidate)]
+    gaps = {rival.candidate.name: rival.gap for rival in rivals if rival.candidate.declared}
+    shares = _shares(selection, candidate, candidates)
+    names = sorted({*gaps, *shares}, key=lambda name: (gaps.get(name, np.inf), -shares.get(name, 0.0)))
+    return [
+        Alternative(name, shares.get(name), gaps.get(name), flight_to_tell(candidate.name, name)) for name in names
+    ]
+
+
+def _shares(selection, candidate, candidates):
+    table, model = selection.table, selection.fit
+    root = np.sqrt(model.information(table))
+    others = columns_of([one for one in selection.chosen if one is not candidate])
+    basis = None
+    if others:
+        rest = np.vstack([table.matrix(others) * root[:, None], np.diag(1.0 / prior_sizes(others))])
+        basis = np.linalg.qr(rest)[0][: len(root)]
+
+    def free(x):
+        return x if basis is None else x - basis @ (basis.T @ x)
+
+    part = free((table.matrix(candidate.columns) @ model.values(candidate.columns)) * root)
+    power, out = float(part @ part), {}
+    for name, columns in _whole(candidates).items():
+        columns = [column for column in columns if column not in others]
+        if name == candidate.name or not columns or power == 0.0:
+            continue
+        x, sizes = free(table.matrix(columns) * root[:, None]), prior_sizes(columns)
+        solution = np.linalg.solve(x.T @ x + np.diag(1.0 / sizes**2), x.T @ part)
+        share = 1.0 - float(np.sum((part - x @ solution) ** 2)) / power
+        if share >= ALIKE:
+            out[name] = round(share, 3)
+    return out
+
+
+def _whole(candidates):
+    """{effect: all its Columns}: the first set of an effect is all of it."""
+    out = {}
+    for candidate in candidates:
+        out.setdefault(candidate.name, candidate.columns)
+    return out
+
+
+def unobservable(selection, candidates):
+    """[Unobservable]: combinations of parameters of a declared effect of which the flights tell less than plausibility
+    does, by the eigenvectors of the information of a fit of that effect alone."""
+    table, out = selection.table, []
+    root, whole = selection.fit.information(table), _whole(candidates)
+    for name, columns in whole.items():
+        x, sizes = table.matrix(columns), prior_sizes(columns)
+        information = (x * root[:, None]).T @ x * np.outer(sizes, sizes)
+        values, vectors = np.linalg.eigh(information)
+        for value, vector in zip(values, vectors.T):
+            if value < 1.0:
+                strong = np.abs(vector) >= DISTINCT * np.abs(vector).max()
+                named = {column.key: round(float(w), 2) for column, w, s in zip(columns, vector, strong) if s}
+                out.append(Unobservable(name, named))
+    missing = [name for name, effect in EFFECTS.items() if effect.fitted and name not in whole]
+    return out + [Unobservable(name, None) for name in missing]

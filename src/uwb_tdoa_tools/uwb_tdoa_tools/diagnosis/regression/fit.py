@@ -1,0 +1,168 @@
+"""Robust linear fits of a Table, and what one is worth.
+
+Noise is Student's t with NU degrees of freedom, fitted by iteratively re-weighted least squares (Lange, Little and
+Taylor, JASA 1989). Rows are not independent: every channel's information is divided by an inflation that is measured
+on the residuals of blocks.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .table import NAMES
+
+NU = 4.0
+ITERATIONS = 12
+MIN_BLOCKS = 6
+LONGEST_MEMORY = 3.0  # s over which rows of a series may be alike
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """columns, beta (k,), cov (k, k): block sandwich, not below the model's; residual (n,), weight (n,) 0 to 1.25;
+    scale, inflation, size (channels,): spread of a row, loss of independence, effective number of rows."""
+
+    columns: tuple
+    beta: np.ndarray
+    cov: np.ndarray
+    residual: np.ndarray
+    weight: np.ndarray
+    scale: np.ndarray
+    inflation: np.ndarray
+    size: np.ndarray
+
+    def information(self, table):
+        """What each row of the Table counts for, (n,), in independent rows per squared unit."""
+        return self.weight / (self.scale**2 * self.inflation)[table.channel]
+
+    def values(self, columns):
+        """beta of some Columns, (k,)."""
+        place = {column: k for k, column in enumerate(self.columns)}
+        return self.beta[[place[column] for column in columns]]
+
+
+def solve(gram, vector, sizes):
+    """Solution of normal equations with a Gaussian prior of standard deviations `sizes`: (beta, covariance, number of
+    parameters that the data tell: each counts by how little the prior says of it). What the data do not tell stays
+    0."""
+    if len(vector) == 0:
+        return vector, np.zeros((0, 0)), 0.0
+    scaled = gram * np.outer(sizes, sizes) + np.eye(len(vector))
+    inverse = np.linalg.inv(scaled)
+    cov = inverse * np.outer(sizes, sizes)
+    return cov @ vector, cov, float(len(vector) - np.trace(inverse))
+
+
+def prior_sizes(columns):
+    """Plausible sizes of Columns: (k,)."""
+    return np.array([column.typical for column in columns])
+
+
+def fit(table, columns, inflation=None):
+    """Fit of some Columns of a Table. inflation : (channels,), measured on this very fit if None."""
+    x, channel, sizes = table.matrix(columns), table.channel, prior_sizes(columns)
+    size = np.array([max(np.sum(channel == k), 1) for k in range(len(NAMES))], dtype=float)
+    weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
+    residual, scale = table.y.copy(), np.ones(len(NAMES))
+    for step in range(ITERATIONS):
+        scale = _scales(residual, channel)
+        weight = (NU + 1.0) / (NU + (residual / scale[channel]) ** 2)
+        if not columns:
+            if step:
+                break
+            continue
+        root = weight / scale[channel] ** 2
+        root /= 1.0 if inflation is None else inflation[channel]
+        beta, _, _ = solve((x * root[:, None]).T @ x, x.T @ (root * table.y), sizes)
+        change = residual - (table.y - x @ beta)
+        residual = residual - change
+        if np.all(np.abs(change) < 0.01 * scale[channel]):
+            break
+    if inflation is None:
+        inflation = measure_inflation(table, residual, weight, scale, columns)
+    root = weight / (scale[channel] ** 2 * inflation[channel])
+    cov = _covariance(table, x, residual, root, sizes) if columns else np.zeros((0, 0))
+    return Fit(tuple(columns), beta, cov, residual, weight, scale, inflation, size / inflation)
+
+
+def refit(table, columns, model, rows):
+    """Fit of some Columns to some rows (n,) bool alone, with the weights and scales of another Fit."""
+    x, sizes, root = table.matrix(columns), prior_sizes(columns), model.information(table)
+    xw = x[rows] * root[rows, None]
+    beta, cov, _ = solve(xw.T @ x[rows], xw.T @ table.y[rows], sizes)
+    return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=table.y - x @ beta)
+
+
+def _scales(residual, channel):
+    """Scale of Student's t per channel, by the fixed point of its likelihood."""
+    out = np.ones(len(NAMES))
+    for k in np.unique(channel):
+        r = residual[channel == k]
+        scale = max(1.4826 * np.median(np.abs(r)), 1e-9)
+        for _ in range(15):
+            w = (NU + 1.0) / (NU + (r / scale) ** 2)
+            scale = max(np.sqrt(np.mean(w * r**2)), 1e-9)
+        out[k] = scale
+    return out
+
+
+def _covariance(table, x, residual, root, sizes):
+    """Sandwich over blocks, at least the model's own."""
+    _, bread, _ = solve((x * root[:, None]).T @ x, np.zeros(x.shape[1]), sizes)
+    blocks = int(table.block.max()) + 1
+    if blocks < MIN_BLOCKS:
+        return bread
+    score = x * (root * residual)[:, None]
+    sums = np.stack([np.bincount(table.block, column, blocks) for column in score.T], axis=1)
+    meat = sums.T @ sums * blocks / max(blocks - min(x.shape[1], blocks // 2), 1)
+    sandwich = bread @ meat @ bread
+    grow = np.sqrt(np.maximum(np.diag(bread) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
+    return sandwich * np.outer(grow, grow)
+
+
+def measure_inflation(table, residual, weight, scale, columns):
+    """By how much fewer the independent rows of each channel are: (channels,), at least 1.
+
+    The larger of two: 1 + 2 sum(rho) over the autocorrelation of each series up to 3 s, and how much larger sums of
+    scores over blocks are than those of independent rows would be, averaged over the columns. The second sees
+    what series have in common. The residual should be that of a fit with all columns, or effects count as noise.
+    """
+    out = np.ones(len(NAMES))
+    x = table.matrix(columns)
+    for k in np.unique(table.channel):
+        rows = table.rows_of(k)
+        r = weight[rows] * residual[rows] / scale[k]
+        raw = max(1.0, _temporal(table, rows, r), _clustered(table.block[rows], x[rows], r))
+        spent = np.sum(np.any(x[rows] != 0.0, axis=0)) * raw / len(r)
+        out[k] = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw  # the fit has followed some of the noise
+    return out
+
+
+def _temporal(table, rows, r):
+    key, t = table.flight[rows] * 100000 + table.series[rows], table.t[rows]
+    order, total = np.lexsort((t, key)), 1.0
+    for lag in range(1, 13):
+        first, second = order[:-lag], order[lag:]
+        near = (key[first] == key[second]) & (t[second] - t[first] < LONGEST_MEMORY)
+        first, second = first[near], second[near]
+        if len(first) < 30:
+            break
+        rho = np.mean(r[first] * r[second]) / np.mean(r**2)
+        if rho < 2.0 / np.sqrt(len(first)):
+            break
+        total += 2.0 * rho
+    return total
+
+
+def _clustered(blocks, x, r):
+    block = np.unique(blocks, return_inverse=True)[1]
+    count, ratios = block.max() + 1, []
+    if count < MIN_BLOCKS:
+        return 1.0
+    for column in x.T:
+        score = column * r
+        alone = np.sum(score**2)
+        if alone > 0.0 and np.count_nonzero(score) > 0.1 * len(score):
+            sums = np.bincount(block, score, count)
+            ratios.append(np.sum((sums - sums.mean()) ** 2) / alone * count / (count - 1))
+    return float(np.mean(ratios)) if len(ratios) else 1.0

@@ -1,0 +1,99 @@
+"""What sets of columns would gain, in closed form.
+
+All that candidates need of the rows is computed for all of them at once: products with the base of the model, channel by
+channel. A candidate is then a small system of equations on top of that of the base (Schur complement).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .fit import prior_sizes, solve
+from .table import NAMES
+
+
+@dataclass(frozen=True, eq=False)
+class Gain:
+    """beta (k,) of the candidate's columns; told : parameters that the data tell beyond the base; gain : twice what the
+    likelihood gains."""
+
+    beta: np.ndarray
+    told: float
+    gain: float
+
+
+class Scorer:
+    """Judges sets of Columns on top of a base, with the weights, scales and inflation of one Fit."""
+
+    def __init__(self, table, base, model, others):
+        """base : Columns that are in the model already; model : Fit, whose weights count; others : Columns that may be
+        judged."""
+        self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
+        self._size, self._base = model.size, np.arange(len(base))
+        x, root = table.matrix(list(self._place)), model.information(table)
+        self._channels = [k for k in range(len(NAMES)) if np.any(table.channel == k)]
+        self._parts = [self._part(x, table.y, root, table.rows_of(k)) for k in self._channels]
+        self._sizes = prior_sizes(list(self._place))
+        sizes = self._sizes[self._base]
+        gram = sum(part.cross[:, self._base] for part in self._parts)
+        vector = sum(part.vector[self._base] for part in self._parts)
+        beta, _, self._told = solve(gram, vector, sizes)
+        self._inverse = np.linalg.inv(gram * np.outer(sizes, sizes) + np.eye(len(sizes))) if len(sizes) else gram
+        self._squares = [part.squares(beta, self._base) for part in self._parts]
+        self._penalty = float(np.sum((beta / sizes) ** 2))
+
+    def _part(self, x, y, root, rows):
+        weighted = x[rows] * root[rows, None]
+        cross = x[rows][:, self._base].T @ weighted
+        return _Part(x[rows], weighted, cross, weighted.T @ y[rows], float(root[rows] @ y[rows] ** 2))
+
+    def judge(self, columns):
+        """Gain of having some Columns too; None if all are there already."""
+        all_places = np.array([self._place[column] for column in columns])
+        new = np.unique(all_places[all_places >= len(self._base)])
+        if not len(new):
+            return None
+        base, sizes = self._base, self._sizes
+        both = np.concatenate([base, new])
+        cross = sum(part.cross[:, new] for part in self._parts) * np.outer(sizes[base], sizes[new])
+        own = [part.gram(new) for part in self._parts]
+        vector = sum(part.vector[both] for part in self._parts) * sizes[both]
+        half = self._inverse @ cross
+        schur = np.linalg.inv(sum(own) * np.outer(sizes[new], sizes[new]) + np.eye(len(new)) - cross.T @ half)
+        z_new = schur @ (vector[len(base) :] - half.T @ vector[: len(base)])
+        z = np.concatenate([self._inverse @ (vector[: len(base)] - cross @ z_new), z_new])
+        told = len(both) - np.trace(self._inverse) - np.trace(schur) - np.sum((half @ schur) * half)
+        beta, gain = z * sizes[both], self._penalty - float(z @ z)
+        for k, part, gram, before in zip(self._channels, self._parts, own, self._squares):
+            gain += self._size[k] * np.log(before / part.squares(beta, both, gram))
+        values = dict(zip(both.tolist(), beta.tolist()))
+        return Gain(np.array([values[place] for place in all_places.tolist()]), float(told - self._told), float(gain))
+
+    def price(self, candidate, told, choices):
+        """What the parameters of a Candidate, `told` of them by the data, must at least gain, if it is one of `choices`."""
+        rows = sum(self._size[k] for k in self._channels if NAMES[k] in candidate.channels)
+        return told * np.log(max(rows, 10.0)) + 2.0 * np.log(max(choices, 2)) + candidate.price
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One channel: x, weighted (n, k); cross (base, k) and vector (k,): X' W X and X' W y; power : y' W y."""
+
+    x: np.ndarray
+    weighted: np.ndarray
+    cross: np.ndarray
+    vector: np.ndarray
+    power: float
+
+    def gram(self, places):
+        return self.x[:, places].T @ self.weighted[:, places]
+
+    def squares(self, beta, places, own=None):
+        """Weighted sum of squares that beta (k,) of the columns at `places`, those of the base first, leaves. own : gram
+        of those after the base."""
+        base = self.cross.shape[0]
+        first, last = beta[:base], beta[base:]
+        out = self.power - 2.0 * beta @ self.vector[places] + first @ self.cross[:, places[:base]] @ first
+        if own is not None:
+            out += 2.0 * first @ self.cross[:, places[base:]] @ last + last @ own @ last
+        return max(float(out), 1e-12)

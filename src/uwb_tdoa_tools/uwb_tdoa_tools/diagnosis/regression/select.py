@@ -1,0 +1,161 @@
+"""Which effects explain the residuals: forward and backward steps with a price on every parameter.
+
+The statistic of a candidate is what it gains in log-likelihood, twice, over all channels together and counted in
+independent rows. A parameter costs log(rows) as in the Bayesian information criterion, and choosing among C candidates
+costs 2 log C (Chen and Chen, Biometrika 2008, extended BIC): that holds the false-alarm rate of the whole catalogue.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..channels import CHANNELS
+from .fit import Fit, fit
+from .scorer import Scorer
+from .table import NAMES, Table
+from .terms import columns_of
+
+MAX_STEPS = 14
+LEAST_TOLD = 0.3  # parameters that the data must tell of a candidate
+AMBIGUOUS = 10.0  # less difference in the criterion is no decision
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A Candidate that could stand in the place of a chosen one, and by how much its criterion is worse."""
+
+    gap: float
+    candidate: object
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """table : Table with the columns of all candidates; chosen : (Candidate, ...); fit : Fit of all of them; loss :
+    criterion that each is worth beside the others; rivals : for each, (Rival, ...)."""
+
+    table: Table
+    chosen: tuple
+    fit: Fit
+    loss: tuple
+    rivals: tuple
+
+    def only(self, candidates):
+        """Selection of some of the chosen Candidates, fitted anew."""
+        places = [k for k, candidate in enumerate(self.chosen) if candidate in candidates]
+        chosen = tuple(self.chosen[k] for k in places)
+        model = fit(self.table, columns_of(chosen), self.fit.inflation)
+        loss, rivals = (tuple(each[k] for k in places) for each in (self.loss, self.rivals))
+        return replace(self, chosen=chosen, fit=model, loss=loss, rivals=rivals)
+
+    def plus(self, candidate):
+        """Selection with one more Candidate, whose columns the table has."""
+        chosen = (*self.chosen, candidate)
+        model = fit(self.table, columns_of(chosen), self.fit.inflation)
+        return replace(self, chosen=chosen, fit=model, loss=(*self.loss, 0.0), rivals=(*self.rivals, ()))
+
+
+def select(table, candidates, inflation, search=None, start=(), progress=lambda: None):
+    """Selection among `candidates`, whose columns the Table holds.
+
+    search(table, fit, chosen) -> more Candidates, found for this residual. start : Candidates that are in the model to
+    begin with, and may fall out again. progress() is called now and then.
+    """
+    chosen = list(start)
+    model = fit(table, columns_of(chosen), inflation)
+    for _ in range(MAX_STEPS):
+        found = search(table, model, chosen) if search else []
+        wider = table.with_terms([term for candidate in found for term in candidate.terms])
+        ranked = rank(wider, candidates + found, chosen, model)
+        progress()
+        if not ranked or ranked[0][0] <= 0.0:
+            break
+        best = ranked[0][1]
+        table = table.with_terms(best.terms)
+        chosen.append(best)
+        model = fit(table, columns_of(chosen), inflation)
+        chosen, model = _backward(table, chosen, model, len(candidates))
+    loss = _losses(table, chosen, model, len(candidates))
+    progress()
+    return Selection(table, tuple(chosen), model, tuple(loss), _rivals(table, candidates, chosen, model, progress))
+
+
+def worth(selection, choices):
+    """Criterion of a whole Selection against a model with nothing in it, with the weights of its own fit."""
+    chosen, table = selection.chosen, selection.table
+    if not chosen:
+        return 0.0
+    total = Scorer(table, [], selection.fit, columns_of(chosen)).judge(columns_of(chosen)).gain
+    for k, candidate in enumerate(chosen):
+        scorer = Scorer(table, columns_of(chosen[:k]), selection.fit, candidate.columns)
+        judged = scorer.judge(candidate.columns)
+        total -= scorer.price(candidate, judged.told if judged else 0.0, choices)
+    return total
+
+
+def rank(table, candidates, chosen, model):
+    """[(criterion, Candidate)], best first; without those of negligible or impossible size."""
+    scorer, out = Scorer(table, columns_of(chosen), model, columns_of(candidates)), []
+    for candidate in candidates:
+        judged = scorer.judge(candidate.columns)
+        if judged is None or judged.told < LEAST_TOLD or not acceptable(table, candidate, judged.beta):
+            continue
+        out.append((judged.gain - scorer.price(candidate, judged.told, len(candidates)), candidate))
+    return sorted(out, key=lambda item: -item[0])
+
+
+def acceptable(table, candidate, beta):
+    """Whether values beta (k,) of a Candidate could be, and move a channel by more than what nobody would model."""
+    if not (candidate.sizable(beta) and candidate.plausible(beta)):
+        return False
+    part = table.matrix(candidate.columns) @ beta
+    for k, name in enumerate(NAMES):
+        moved = part[table.rows_of(k)]
+        moved = moved[moved != 0.0]
+        if len(moved) and np.sqrt(np.mean(moved**2)) > CHANNELS[name].negligible:
+            return True
+    return False
+
+
+def _backward(table, chosen, model, choices):
+    """Drop what is no longer worth its price, once others are in, or has become negligible or impossible."""
+    while len(chosen) > 1:
+        losses = _losses(table, chosen, model, choices)
+        for k, candidate in enumerate(chosen):
+            if not acceptable(table, candidate, model.values(candidate.columns)):
+                losses[k] = -np.inf
+        worst = int(np.argmin(losses))
+        if losses[worst] > 0.0:
+            break
+        chosen = chosen[:worst] + chosen[worst + 1 :]
+        model = fit(table, columns_of(chosen), model.inflation)
+    return chosen, model
+
+
+def _losses(table, chosen, model, choices):
+    """Criterion that each chosen Candidate is worth beside the others."""
+    out = []
+    for k, candidate in enumerate(chosen):
+        scorer = Scorer(table, columns_of(chosen[:k] + chosen[k + 1 :]), model, candidate.columns)
+        judged = scorer.judge(candidate.columns)
+        if judged is None:  # others hold all of its columns
+            out.append(-scorer.price(candidate, 0.0, choices))
+        else:
+            out.append(judged.gain - scorer.price(candidate, judged.told, choices))
+    return out
+
+
+def _rivals(table, candidates, chosen, model, progress):
+    """For each chosen Candidate, the other effects that could replace it: (Rival, ...)."""
+    out = []
+    for k, candidate in enumerate(chosen):
+        others = chosen[:k] + chosen[k + 1 :]
+        rest = fit(table, columns_of(others), model.inflation)
+        ranked = rank(table, [c for c in candidates if c.name != candidate.name] + [candidate], others, rest)
+        own = next((score for score, ranked_one in ranked if ranked_one is candidate), None)
+        near = {}
+        for score, other in ranked if own is not None else []:
+            if other.name != candidate.name and score > own - AMBIGUOUS:
+                near.setdefault(other.name, Rival(float(own - score), other))
+        out.append(tuple(near.values()))
+        progress()
+    return tuple(out)

@@ -1,0 +1,102 @@
+"""Residuals of several flights and channels, and regressors, as one immutable table of a linear fit."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..channels import CHANNELS
+
+BLOCK = 5.0  # s, taken as independent of each other
+NAMES = tuple(CHANNELS)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """n rows of a linear model y = X beta + noise, those of one channel after the other.
+
+    y (n,); channel (n,) place in NAMES; series (n,) int, different in every flight; block (n,) number of an independent
+    block; flight (n,); t (n,) s since the start; count (n,) samples averaged; place (n, 3) m.
+    parts : ((flight, channel, first row, ChannelResidual), ...); columns : {Column: place in X}; x : X, (n, k).
+    """
+
+    y: np.ndarray
+    channel: np.ndarray
+    series: np.ndarray
+    block: np.ndarray
+    flight: np.ndarray
+    t: np.ndarray
+    count: np.ndarray
+    place: np.ndarray
+    parts: tuple
+    columns: dict
+    x: np.ndarray
+
+    @property
+    def flights(self):
+        """How many."""
+        return int(self.flight.max()) + 1
+
+    def rows_of(self, channel):
+        """Slice of the rows of a channel, by its place in NAMES."""
+        return slice(*np.searchsorted(self.channel, [channel, channel + 1]))
+
+    def places(self, columns):
+        """Places in X of some Columns: (k,) int."""
+        return np.array([self.columns[column] for column in columns], dtype=int)
+
+    def matrix(self, columns):
+        """X of some Columns, (n, k)."""
+        return self.x[:, self.places(columns)]
+
+    def with_terms(self, terms):
+        """A Table that has the columns of some Terms too, at the values that their effects have."""
+        wanted = {}
+        for term in terms:
+            effect, keys = wanted.setdefault(term.effect.identity, (term.effect, {}))
+            keys.update((column.key, column) for column in term.columns if column not in self.columns)
+        wanted = {identity: item for identity, item in wanted.items() if item[1]}
+        new = [column for _, keys in wanted.values() for column in keys.values()]
+        if not new:
+            return self
+        x, first = np.zeros((len(self.y), len(new))), 0
+        for effect, keys in wanted.values():
+            columns = slice(first, first + len(keys))
+            for _, channel, row, part in self.parts:
+                if NAMES[channel] in effect.channels:
+                    values = part.columns(effect, tuple(keys))
+                    x[row : row + len(values), columns] = np.nan_to_num(values)
+            first = columns.stop
+        places = {column: len(self.columns) + k for k, column in enumerate(new)}
+        return replace(self, columns={**self.columns, **places}, x=np.hstack([self.x, x]))
+
+    def with_contribution(self, effects):
+        """A Table whose y also holds what Effects, at their values, contribute; it has their columns."""
+        y = self.y.copy()
+        for effect, columns in effects:
+            values = np.array([effect.values[column.key] for column in columns])
+            y += self.matrix(columns) @ values
+        return replace(self, y=y)
+
+
+def table_of(residuals):
+    """Table without columns of [{name of a channel: ChannelResidual}], one dict for each flight."""
+    parts, pieces = [], {key: [] for key in ("y", "channel", "series", "block", "flight", "t", "count", "place")}
+    rows = [{name: part.rows() for name, part in flight.items()} for flight in residuals]
+    start = [min(part.t.min() for part in flight.values()) for flight in rows]
+    blocks = [1 + max(int((part.t.max() - t) / BLOCK) for part in flight.values()) for flight, t in zip(rows, start)]
+    offset, first = np.concatenate([[0], np.cumsum(blocks)]), 0
+    for channel, name in enumerate(NAMES):
+        for number, flight in enumerate(rows):
+            if name not in flight:
+                continue
+            part = flight[name]
+            n = len(part.y)
+            parts.append((number, channel, first, residuals[number][name]))
+            first += n
+            pieces["block"].append(offset[number] + ((part.t - start[number]) / BLOCK).astype(int))
+            pieces["channel"].append(np.full(n, channel))
+            pieces["flight"].append(np.full(n, number))
+            for key in ("y", "series", "t", "count", "place"):
+                pieces[key].append(getattr(part, key))
+    merged = {key: np.concatenate(several) for key, several in pieces.items()}
+    return Table(**merged, parts=tuple(parts), columns={}, x=np.empty((len(merged["y"]), 0)))
