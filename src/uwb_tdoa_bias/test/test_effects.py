@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 from finite_differences import numerical_jacobian
@@ -39,6 +40,16 @@ def test_regressors_against_finite_differences(effect, seed):
     found = effect(values).regressors(samples, keys)
     assert found.shape == (len(samples), len(keys))
     np.testing.assert_allclose(found, numerical_jacobian(bias, [values[k] for k in keys]), atol=1e-5)
+
+
+@pytest.mark.parametrize("effect", EFFECTS.values())
+def test_says_whether_it_uses_the_attitude(effect):
+    samples = random_samples(7)
+    groups = effect.groups(samples.anchors, np.array([[0, 1]]))[0] or (effect.example,)
+    values = {key: 0.1 * effect.bound_of(key) for key in groups}
+    turned = replace(samples, q=Rotation.random(len(samples), random_state=1).as_quat())
+    changed = np.abs(effect(values).bias(samples) - effect(values).bias(turned)).max() > 1e-9
+    assert changed == effect.uses_attitude
 
 
 @pytest.mark.parametrize("effect", FITTED)
@@ -160,6 +171,18 @@ def test_is_in_the_document(effect):
         f"| {effect.bound:g} | {effect.typical:g} | {effect.negligible:g} |"
         in text.partition(f"[`{effect.name}`]")[2].split("\n")[0]
     )
+
+
+@given(st.lists(st.floats(-5, 15), min_size=1, max_size=20), st.integers(0, 50))
+def test_splines_are_those_of_scipy(values, seed):
+    from scipy.interpolate import BSpline
+
+    rng = np.random.default_rng(seed)
+    knots = np.cumsum(rng.uniform(0.1, 3.0, rng.integers(2, 8)))
+    smooth = SmoothTerm(knots=tuple(knots))
+    clamped = np.array([knots[0]] * 2 + list(knots) + [knots[-1]] * 2)
+    expected = BSpline(clamped, np.eye(len(knots) + 1), 2)(np.clip(values, knots[0], knots[-1]))
+    np.testing.assert_allclose(smooth.basis(np.array(values)), expected, atol=1e-12)
 
 
 def term(**changes):

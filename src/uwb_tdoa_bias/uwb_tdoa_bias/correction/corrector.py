@@ -92,9 +92,10 @@ class Corrector:
             return np.zeros(len(samples)), np.zeros(len(samples))
         bias, spread = self.effects.bias(samples), self.effects.spread(samples)
         unknown = samples.yaw_std > LARGEST_YAW_STD
-        if unknown.any():
-            each = np.stack([self.effects.bias(replace(samples, q=turned(samples.q, k))) for k in range(4)])
-            bias = np.where(unknown, each.mean(axis=0), bias)
+        turning = self.effects.of_attitude
+        if len(turning) and unknown.any():
+            each = np.stack([turning.bias(replace(samples, q=turned(samples.q, k))) for k in range(4)])
+            bias = np.where(unknown, bias - turning.bias(samples) + each.mean(axis=0), bias)
             spread = np.where(unknown, np.hypot(spread, each.std(axis=0)), spread)
         return bias, spread
 

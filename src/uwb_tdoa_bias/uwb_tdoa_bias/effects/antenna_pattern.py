@@ -24,6 +24,7 @@ class AntennaPattern(ArrivalEffect):
         "received_power_bias": "one place at many headings, then one heading at many ranges",
     }
     reference = "Qorvo support: 10 - 15 cm over direction for a module; the shape is that of uwb_tdoa_bias.foundation.antenna"
+    uses_attitude = True
 
     @classmethod
     def groups(cls, anchors, pairs):

@@ -45,6 +45,7 @@ class Effect:
     told_apart: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
     usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
+    uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
 
     def __post_init__(self):
         for group in ("values", "std"):

@@ -43,6 +43,11 @@ class EffectSet:
         return np.sqrt(sum((effect.spread(samples) ** 2 for effect in self.effects), np.zeros(len(samples))))
 
     @property
+    def of_attitude(self):
+        """EffectSet of those whose part of a TDOA changes with the attitude of the tag."""
+        return EffectSet(tuple(effect for effect in self.effects if effect.uses_attitude))
+
+    @property
     def needs_motion(self):
         """True if an effect looks at more than poses."""
         return any(effect.needs_motion for effect in self.effects)

@@ -23,6 +23,7 @@ class ReceivedPowerBias(ArrivalEffect):
     physics = "the leading edge is detected earlier in a strong signal and later in a weak one"
     confounded_with = ("range_bias", "antenna_pattern")
     reference = "Decawave APS011, table 2 (500 MHz, 64 MHz PRF)"
+    uses_attitude = True
 
     @classmethod
     def groups(cls, anchors, pairs):

@@ -5,8 +5,8 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from scipy.interpolate import BSpline
 
+from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
 from .base import Effect, known_anchors, once_per_anchors, tile
 from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_TDOA, imu_covariate
@@ -81,6 +81,10 @@ class SmoothTerm(Effect):
         return f"{self.channel} over {self.covariate}"
 
     @property
+    def uses_attitude(self):
+        return self.covariate.endswith("_in_tag")
+
+    @property
     def needs_motion(self):
         return self.channel == "tdoa" and self.covariate in OF_MOTION
 
@@ -93,34 +97,44 @@ class SmoothTerm(Effect):
 
     def keys(self, anchors=None):
         """All coefficients: of every anchor for the form "anchor"."""
-        count = len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
-        each = tuple(f"c{k}" for k in range(count))
+        each = tuple(f"c{k}" for k in range(self._count))
         return tuple(f"{i}.{c}" for i in known_anchors(anchors) for c in each) if self.form == "anchor" else each
 
     def basis(self, values):
         """The functions that the coefficients c0, c1, ... multiply, at covariate values (n,): (n, k), NaN stays NaN."""
+        values = np.asarray(values, dtype=float)
         if self.covariate in CATEGORIES:
-            return (np.asarray(values)[:, None] == np.array(self.knots)).astype(float)
-        return self._spline(np.clip(values, self.knots[0], self.knots[-1]))
+            return (values[:, None] == self._at).astype(float)
+        out = np.zeros((len(values), self._count))
+        _basis(self._at, values, out)
+        return out
 
     def curve(self, values, prefix=""):
         """The function at covariate values (n,): (n,). prefix : "3." for that of anchor 3 of the form "anchor"."""
-        basis = self.basis(values)
-        return basis @ self._weights(prefix, basis.shape[1])
+        weights = np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self._count)]])
+        return self._functions(values, weights, np.zeros(len(values), dtype=np.int64))
 
     @cached_property
-    def _spline(self):
-        t = np.array([self.knots[0]] * DEGREE + list(self.knots) + [self.knots[-1]] * DEGREE)
-        return BSpline(t, np.eye(len(t) - DEGREE - 1), DEGREE)
+    def _at(self):
+        return np.array(self.knots, dtype=float)
 
-    def _weights(self, prefix, count):
-        return np.array([self.values.get(f"{prefix}c{k}", 0.0) for k in range(count)])
+    @property
+    def _count(self):
+        return len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
+
+    def _functions(self, values, weights, rows):
+        """Functions with weights (m, k) at values (n,), each that of its row (n,): (n,)."""
+        if self.covariate in CATEGORIES:
+            return np.einsum("nk,nk->n", self.basis(values), weights[rows])
+        out = np.empty(len(values))
+        _curves(self._at, np.asarray(values, dtype=float), weights, rows, out)
+        return out
 
     @once_per_anchors
-    def _anchor_weights(self, anchors):
+    def _weights(self, anchors):
         """Coefficients of every anchor's function, (m, k); zero for an anchor without one."""
-        count = self.basis(np.array(self.knots[:1])).shape[1]
-        return np.stack([self._weights(f"{i}.", count) for i in known_anchors(anchors)])
+        prefixes = [f"{i}." if self.form == "anchor" else "" for i in known_anchors(anchors)]
+        return np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self._count)] for prefix in prefixes])
 
     def _covariate(self, samples):
         """(values per TDOA or None, values per arrival or None)"""
@@ -139,11 +153,7 @@ class SmoothTerm(Effect):
             return np.zeros(n)
         if self.form == "common":
             return self.curve(values)
-        if self.form == "arrival":
-            late = self.curve(both)
-        else:
-            weights = self._anchor_weights(samples.anchors)[np.concatenate([samples.a, samples.b])]
-            late = np.einsum("nk,nk->n", self.basis(both), weights)
+        late = self._functions(both, self._weights(samples.anchors), np.concatenate([samples.a, samples.b]))
         return late[n:] - late[:n]
 
     def sensor_bias(self, channel, features):
@@ -178,3 +188,40 @@ class SmoothTerm(Effect):
         each = dict.fromkeys(key.rpartition(".")[0] for key in keys)
         alone = [tuple(key for key in keys if key.rpartition(".")[0] == name) for name in each]
         return [keys, *alone] if self.form == "anchor" else [keys]
+
+
+@compiled
+def _pieces(knots, value):
+    """(number of the first of three quadratic B-splines that are not zero at a value, held at the ends of the knots, and
+    their values): de Boor's recursion with clamped ends."""
+    last = len(knots) - 1
+    if not value > knots[0]:
+        value = knots[0] if value == value else value  # NaN stays NaN
+    elif value > knots[last]:
+        value = knots[last]
+    piece = 0
+    while piece < last - 1 and value >= knots[piece + 1]:
+        piece += 1
+    left, right = knots[piece], knots[piece + 1]
+    before = knots[piece - 1] if piece > 0 else knots[0]
+    after = knots[piece + 2] if piece + 2 <= last else knots[last]
+    up, down = (value - left) / (right - left), (right - value) / (right - left)
+    rise, fall = (value - before) / (right - before), (after - value) / (after - left)
+    first = (1.0 - rise) * down
+    third = (1.0 - fall) * up
+    return piece, first, 1.0 - first - third, third
+
+
+@compiled
+def _basis(knots, values, out):
+    for i in range(len(values)):
+        piece, first, second, third = _pieces(knots, values[i])
+        out[i, piece], out[i, piece + 1], out[i, piece + 2] = first, second, third
+
+
+@compiled
+def _curves(knots, values, weights, rows, out):
+    for i in range(len(values)):
+        piece, first, second, third = _pieces(knots, values[i])
+        w = weights[rows[i]]
+        out[i] = first * w[piece] + second * w[piece + 1] + third * w[piece + 2]

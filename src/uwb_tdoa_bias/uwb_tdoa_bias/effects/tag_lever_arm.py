@@ -22,6 +22,7 @@ class TagLeverArm(Effect):
         "truth_frame": "a flight that turns through all headings: the arm turns with the body, the frame does not",
     }
     reference = "any text on strapdown navigation: lever arm compensation"
+    uses_attitude = True
 
     @classmethod
     def groups(cls, anchors, pairs):

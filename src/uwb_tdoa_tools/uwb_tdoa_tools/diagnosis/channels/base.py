@@ -91,3 +91,7 @@ class Channel:
     def smooth_terms(self, residuals):
         """SmoothTerms without values: whatever the ChannelResiduals of some flights may depend on."""
         return []
+
+    def health(self, residuals):
+        """{"pairs", "anchors", "axes" or "cross_correlation": [dict of figures]} of the ChannelResiduals of some flights."""
+        return {}

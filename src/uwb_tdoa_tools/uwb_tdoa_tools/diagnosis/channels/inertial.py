@@ -10,7 +10,9 @@ from uwb_tdoa_bias.effects import ImuSamples, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, imu_covariate
 
 from .base import Channel, ChannelResidual, Rows
+from .figures import figures
 from .knots import knots_of
+from .pairs import APART
 
 CELL = 0.25  # s over which both sides of a residual are averaged
 OF_POSE = ("x", "y", "height", "speed", "climb_rate", "acceleration")  # covariates that TDOAs have too
@@ -50,6 +52,11 @@ class Inertial(Channel):
             if knots is not None:
                 out += [SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots) for axis in self.axes]
         return out
+
+    def health(self, residuals):
+        t = np.concatenate([part.samples.t + APART * number for number, part in enumerate(residuals)])
+        r = np.concatenate([part.residual for part in residuals])
+        return {"axes": [{"axis": f"{self.name}.{axis}", **figures(t, r[:, k])} for k, axis in enumerate(self.axes)]}
 
     def _samples(self, comparison, t, reading, features, change=None):
         """ImuSamples of this channel at the middles t (n,) of cells."""

@@ -13,6 +13,7 @@ from uwb_tdoa_bias.effects import Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
 from uwb_tdoa_bias.foundation.geometry import tdoa, tdoa_jacobian
 
+from . import pairs
 from .base import Channel, ChannelResidual, Rows
 from .knots import knots_of
 
@@ -145,6 +146,9 @@ class Tdoa(Channel):
             if knots is not None:
                 out += [SmoothTerm(covariate=name, form=form, knots=knots) for form in ("arrival", "anchor")]
         return out
+
+    def health(self, residuals):
+        return pairs.health(residuals)
 
 
 def _covariate(name, samples):

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.rehearsal import RecordingCorrector, RehearsedCorrector
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.judging import Case, compare, cross_fitted, useful
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+
+TRUTH = GroundTruth()
+NONE = EffectSet()
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return [effect_of("anchor_delay", True, 1).inject(clean_flight(seed, 30.0)) for seed in (100, 101)]
+
+
+@pytest.fixture(scope="module")
+def attribution(flights):
+    return attribute(flights, TRUTH, undeclared=False)
+
+
+def test_every_flight_is_judged_with_effects_that_it_took_no_part_in(flights, attribution):
+    cases = cross_fitted(attribution, flights, NONE, attribution.selection.chosen, ())
+    assert [case.flight.name for case in cases] == [flight.name for flight in flights]
+    spoilt = [flights[0], effect_of("anchor_delay", True, 2).inject(flights[1])]
+    other = attribute(spoilt, TRUTH, undeclared=False)
+    values = [list(case.effects.effects[0].values.values()) for case in cases]
+    assert values[0] != values[1]
+    assert other.selection.table.flights == 2
+
+
+def test_halves_of_a_single_flight_judge_each_other(flights):
+    single = attribute(flights[:1], TRUTH, undeclared=False)
+    first, second = cross_fitted(single, flights[:1], NONE, single.selection.chosen, ())
+    assert first.span[1] == second.span[0]
+    assert first.effects.effects[0].values != second.effects.effects[0].values
+
+
+def test_what_helps_is_kept_and_said_what_it_is_worth(flights, attribution):
+    kept = useful(attribution, flights, NONE)
+    assert kept.candidates == attribution.selection.chosen and not kept.refused
+    assert kept.worth[kept.candidates[0]] > 0.05
+
+
+def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
+    clean = [clean_flight(seed, 30.0) for seed in (100, 101)]
+    kept = useful(attribution, clean, NONE)
+    assert kept.candidates == () and "the filter does better without it" in kept.refused[0].why
+
+
+def test_a_rehearsal_with_the_same_model_is_the_run_itself(flights):
+    effects = EffectSet((AnchorDelay({"1": 0.3}), TagLeverArm({"x": 0.1, "z": 0.1})))
+    recording = RecordingCorrector(flights[0].anchors, effects)
+    run = run_offline(flights[0], None, recording)
+    plain = run_offline(flights[0], None, Corrector(flights[0].anchors, effects))
+    np.testing.assert_array_equal(run.odometry.p, plain.odometry.p)
+    again = run_offline(flights[0], None, RehearsedCorrector(recording.recorded(), effects))
+    np.testing.assert_allclose(again.odometry.p, run.odometry.p, atol=1e-9)
+
+
+def test_a_rehearsal_with_another_model_is_nearly_its_run(flights):
+    recording = RecordingCorrector(flights[0].anchors, EffectSet((AnchorDelay({"1": 0.3}),)))
+    run_offline(flights[0], None, recording)
+    without = run_offline(flights[0], None, RehearsedCorrector(recording.recorded()))
+    plain = run_offline(flights[0], None, Corrector(flights[0].anchors))
+    np.testing.assert_allclose(without.odometry.p, plain.odometry.p, atol=1e-9)  # what needs no pose is the same at any
+
+
+def test_before_and_after_with_intervals(flights):
+    told = EffectSet((effect_of("anchor_delay", True, 1),))
+    before, after = compare([Case(flight, told) for flight in flights], NONE)
+    assert after["pooled"]["rmse_3d"] < 0.5 * before["pooled"]["rmse_3d"]
+    low, high = after["pooled"]["rmse_3d_ci"]
+    assert low < after["pooled"]["rmse_3d"] < high
+    low, high = after["pooled"]["rmse_3d_gain_ci"]
+    assert 0.4 < low < high < 1.0
+    assert [row["flight"] for row in after["runs"]] == [flight.name for flight in flights]

@@ -1,0 +1,161 @@
+"""Tables, fits, selection, held-out checks and confounding, on small tables of known content."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_tools.diagnosis.channels import residuals
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.regression.confounding import alternatives, flight_to_tell, unobservable
+from uwb_tdoa_tools.diagnosis.regression.fit import fit, refit
+from uwb_tdoa_tools.diagnosis.regression.held_out import held_out
+from uwb_tdoa_tools.diagnosis.regression.scorer import Scorer
+from uwb_tdoa_tools.diagnosis.regression.select import rank, select
+from uwb_tdoa_tools.diagnosis.regression.table import NAMES, table_of
+from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term, candidates_of, columns_of
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+
+PAIRS = np.array([[k, (k + 1) % 8] for k in range(8)])
+
+
+def table_with(*flights, names=("anchor_delay", "pair_offset", "anchor_position", "gyro_bias", "accel_bias")):
+    """(Table, [Candidate]) of flights with the columns of some effects."""
+    parts = [residuals(flight, GroundTruth(), EffectSet()) for flight in flights]
+    candidates = [c for name in names for c in candidates_of(EFFECTS[name](), flights[0].anchors, PAIRS)]
+    table = table_of(parts).with_terms([term for candidate in candidates for term in candidate.terms])
+    return table, candidates
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return table_with(clean_flight(100, 30.0))
+
+
+@pytest.fixture(scope="module")
+def late():
+    return table_with(effect_of("anchor_delay", True, 1).inject(clean_flight(100, 30.0)))
+
+
+def named(candidates, name, keys=None):
+    return next(c for c in candidates if c.name == name and (keys is None or c.terms[0].keys == keys))
+
+
+def test_a_table_is_not_changed_by_a_wider_one(clean):
+    table, candidates = clean
+    before = table.x.copy(), dict(table.columns), table.y.copy()
+    nlos = EFFECTS["nlos"]({"3.start": 2.0, "3.end": 9.0})
+    wider = table.with_terms([Term(nlos, ("3.delay",))])
+    assert len(wider.columns) == len(table.columns) + 1
+    np.testing.assert_array_equal(table.x, before[0])
+    assert table.columns == before[1]
+    contributed = wider.with_contribution([(EFFECTS["anchor_delay"]({"2": 0.5}), named(candidates, "anchor_delay", ("2",)).columns)])
+    np.testing.assert_array_equal(table.y, before[2])
+    assert np.abs(contributed.y - table.y).max() == pytest.approx(0.5)
+
+
+def test_rows_of_a_channel_lie_together(clean):
+    table, _ = clean
+    for number in range(len(NAMES)):
+        rows = table.rows_of(number)
+        assert (table.channel[rows] == number).all() and np.sum(table.channel == number) == rows.stop - rows.start
+
+
+def test_columns_of_one_parameter_are_one_column(clean):
+    _, candidates = clean
+    everyone, alone = named(candidates, "anchor_delay"), named(candidates, "anchor_delay", ("2",))
+    assert set(alone.columns) < set(everyone.columns)
+    one, other = (EFFECTS["nlos"]({"3.start": start}) for start in (1.0, 2.0))
+    assert Term(one, ("3.delay",)).columns != Term(other, ("3.delay",)).columns
+
+
+@cache
+def short():
+    return table_with(clean_flight(100, 20.0), names=("anchor_delay", "gyro_bias", "anchor_position"))
+
+
+@settings(max_examples=25)
+@given(st.data())
+def test_the_scorer_gives_what_the_whole_equations_would(data):
+    rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    table, candidates = short()
+    base = columns_of(data.draw(st.lists(st.sampled_from(candidates), max_size=2)))
+    candidate = data.draw(st.sampled_from(candidates))
+    model = fit(table, base, np.ones(len(NAMES)))
+    model = type(model)(**{**vars(model), "weight": rng.uniform(0.5, 1.5, len(table.y))})
+    judged = Scorer(table, base, model, candidate.columns).judge(candidate.columns)
+    both = list(dict.fromkeys([*base, *candidate.columns]))
+    if set(candidate.columns) <= set(base):
+        assert judged is None
+        return
+    information, x, sizes = model.information(table), table.matrix(both), np.array([c.typical for c in both])
+    gram = (x * information[:, None]).T @ x + np.diag(sizes**-2)
+    beta = np.linalg.solve(gram, x.T @ (information * table.y))
+    place = {column: k for k, column in enumerate(both)}
+    np.testing.assert_allclose(judged.beta, beta[[place[column] for column in candidate.columns]], rtol=1e-6, atol=1e-9)
+    told = len(both) - np.trace(np.linalg.inv(gram) / np.outer(sizes, sizes))
+    assert judged.told == pytest.approx(told - Scorer(table, base, model, [])._told, abs=1e-6)
+
+
+def test_a_delay_is_ranked_first_and_a_clean_flight_has_nothing(clean, late):
+    table, candidates = clean
+    model = fit(table, [], np.ones(len(NAMES)))
+    assert all(criterion < 0.0 for criterion, _ in rank(table, candidates, [], model))
+    table, candidates = late
+    inflation = fit(table, columns_of(candidates)).inflation
+    selection = select(table, candidates, inflation)
+    assert [candidate.name for candidate in selection.chosen] == ["anchor_delay"]
+
+
+def test_what_is_implausible_is_not_chosen(late):
+    table, candidates = late
+    model = fit(table, [], np.ones(len(NAMES)))
+    nlos = EFFECTS["nlos"]
+    early = Candidate((Term(nlos({"1.start": 0.0, "1.end": 60.0}), ("1.delay",)),))
+    assert not early.plausible(np.array([-0.3])) and early.plausible(np.array([0.3]))
+    assert not named(candidates, "anchor_delay", ("1",)).plausible(np.array([6.0]))
+    assert not named(candidates, "anchor_delay", ("1",)).sizable(np.array([0.001]))
+    assert model.columns == ()
+
+
+def test_held_out_gain_is_large_for_what_is_there_and_none_for_what_is_not(late):
+    table, candidates = late
+    inflation = fit(table, columns_of(candidates)).inflation
+    selection = select(table, candidates, inflation)
+    (there,) = held_out(selection)
+    assert there.gain > 50.0 and there.t > 3.0 and there.explained > 0.3
+    with_idle = selection.plus(named(candidates, "gyro_bias", ("x",)))
+    assert held_out(with_idle)[-1].gain < 2.0
+
+
+def test_a_refit_to_some_rows_does_not_look_at_the_others(late):
+    table, candidates = late
+    columns = named(candidates, "anchor_delay").columns
+    model = fit(table, columns)
+    half = table.block % 2 == 0
+    spoilt = type(table)(**{**vars(table), "y": np.where(half, table.y, 1e3)})
+    np.testing.assert_allclose(refit(table, columns, model, half).beta, refit(spoilt, columns, model, half).beta)
+
+
+def test_an_alternative_is_named_where_the_flight_cannot_tell(late):
+    table, candidates = late
+    inflation = fit(table, columns_of(candidates)).inflation
+    selection = select(table, candidates, inflation)
+    names = {alternative.effect for alternative in alternatives(selection, selection.chosen[0], candidates)}
+    assert "pair_offset" in names  # TDoA2: a delay of an anchor is two offsets of pairs
+    assert "gyro_bias" not in names
+
+
+def test_what_no_tdoa_can_tell_is_named(late):
+    table, candidates = late
+    selection = select(table, candidates, fit(table, columns_of(candidates)).inflation)
+    hidden = unobservable(selection, candidates)
+    assert any(item.effect == "anchor_delay" and len(item.direction) == 8 for item in hidden)  # the sum of all
+    assert any(item.effect == "range_scale" and item.direction is None for item in hidden)  # has no column here
+
+
+def test_a_flight_that_tells_is_the_same_both_ways():
+    assert flight_to_tell("nlos", "anchor_delay") == flight_to_tell("anchor_delay", "nlos")
+    assert "flight" in flight_to_tell("gyro_bias", "pair_offset")

@@ -1,0 +1,49 @@
+"""Health of TDOAs: of pairs and of anchors."""
+
+import numpy as np
+
+from .figures import FEWEST, figures
+
+APART = 1e4  # s between the stamps of two flights: nothing of one is near the other
+STRONGEST = 10
+
+
+def health(parts):
+    """{"pairs", "anchors", "cross_correlation"} of the TdoaResiduals of some flights in the air."""
+    ids = parts[0].samples.anchors.ids
+    t, r, a, b = (np.concatenate(column) for column in zip(*map(_columns, enumerate(parts))))
+    pairs, each = [], []
+    label = a * 1000 + b
+    for number in np.unique(label):
+        mine = label == number
+        pairs.append({"pair": f"{ids[number // 1000]}-{ids[number % 1000]}", **figures(t[mine], r[mine])})
+    for row, anchor in enumerate(ids.tolist()):
+        late = np.concatenate([r[b == row], -r[a == row]])
+        if len(late):
+            each.append({"anchor": anchor, **figures(None, late)})
+    return {"pairs": pairs, "anchors": each, "cross_correlation": _crossed(t, r, label, ids)}
+
+
+def _columns(numbered):
+    number, part = numbered
+    rows, samples = part.airborne, part.samples
+    return samples.t[rows] + APART * number, part.residual[rows], samples.a[rows], samples.b[rows]
+
+
+def _crossed(t, r, label, anchors):
+    """The strongest correlations between half-second means of two pairs: [{"pairs", "correlation"}]."""
+    labels, place = np.unique(label, return_inverse=True)
+    cell = np.unique((t * 2.0).astype(int), return_inverse=True)[1]
+    shape = (cell.max() + 1, len(labels))
+    at = cell * len(labels) + place
+    count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
+    mean = np.bincount(at, r, shape[0] * shape[1]).reshape(shape) / np.maximum(count, 1)
+    out = []
+    for i in range(len(labels)):
+        for k in range(i):
+            both = (count[:, i] > 0) & (count[:, k] > 0)
+            if both.sum() > FEWEST and mean[both, i].std() > 0.0 and mean[both, k].std() > 0.0:
+                rho = float(np.corrcoef(mean[both, i], mean[both, k])[0, 1])
+                names = [f"{anchors[x // 1000]}-{anchors[x % 1000]}" for x in (labels[k], labels[i])]
+                out.append({"pairs": names, "correlation": round(rho, 3)})
+    return sorted(out, key=lambda item: -abs(item["correlation"]))[:STRONGEST]
