@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
-from uwb_tdoa_tools.diagnosis.regression.table import NAMES, table_of
+from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
+from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
 
 OF_NOISE = ("outlier_rate", "noise_level", "noise_correlation", "floor_multipath")
@@ -39,7 +39,7 @@ def test_nothing_is_detected_in_a_clean_flight(clean, name):
 
 def searched(*flights):
     table = table_of(seen(*flights))
-    return DETECTORS["nlos"].search(table, fit(table, [], np.ones(len(NAMES))), [])
+    return DETECTORS["nlos"].search(table, fit(table, [], np.ones(len(CHANNELS))), [])
 
 
 def test_an_interval_without_sight_is_searched_in_a_single_flight(clean):
@@ -62,7 +62,7 @@ def test_time_is_no_limit_where_there_are_several_flights(clean):
 def test_an_anchor_that_is_blocked_already_is_not_searched_again(clean):
     flight = effect_of("nlos", True, 2).inject(clean)
     table = table_of(seen(flight))
-    model = fit(table, [], np.ones(len(NAMES)))
+    model = fit(table, [], np.ones(len(CHANNELS)))
     first = DETECTORS["nlos"].search(table, model, [])
     keys = {c.terms[0].keys for c in first}
     again = DETECTORS["nlos"].search(table, model, first)

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.regression.confounding import alternatives, flight_to_tell, unobservable
 from uwb_tdoa_tools.diagnosis.regression.fit import fit, refit
 from uwb_tdoa_tools.diagnosis.regression.held_out import held_out
 from uwb_tdoa_tools.diagnosis.regression.scorer import Scorer
 from uwb_tdoa_tools.diagnosis.regression.select import rank, select
-from uwb_tdoa_tools.diagnosis.regression.table import NAMES, table_of
+from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
+from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term, candidates_of, columns_of
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
 
@@ -58,8 +58,8 @@ def test_a_table_is_not_changed_by_a_wider_one(clean):
 
 def test_rows_of_a_channel_lie_together(clean):
     table, _ = clean
-    for number in range(len(NAMES)):
-        rows = table.rows_of(number)
+    for number, name in enumerate(table.channels):
+        rows = table.rows_of(name)
         assert (table.channel[rows] == number).all() and np.sum(table.channel == number) == rows.stop - rows.start
 
 
@@ -83,7 +83,7 @@ def test_the_scorer_gives_what_the_whole_equations_would(data):
     table, candidates = short()
     base = columns_of(data.draw(st.lists(st.sampled_from(candidates), max_size=2)))
     candidate = data.draw(st.sampled_from(candidates))
-    model = fit(table, base, np.ones(len(NAMES)))
+    model = fit(table, base, np.ones(len(CHANNELS)))
     model = type(model)(**{**vars(model), "weight": rng.uniform(0.5, 1.5, len(table.y))})
     judged = Scorer(table, base, model, candidate.columns).judge(candidate.columns)
     both = list(dict.fromkeys([*base, *candidate.columns]))
@@ -101,7 +101,7 @@ def test_the_scorer_gives_what_the_whole_equations_would(data):
 
 def test_a_delay_is_ranked_first_and_a_clean_flight_has_nothing(clean, late):
     table, candidates = clean
-    model = fit(table, [], np.ones(len(NAMES)))
+    model = fit(table, [], np.ones(len(CHANNELS)))
     assert all(criterion < 0.0 for criterion, _ in rank(table, candidates, [], model))
     table, candidates = late
     inflation = fit(table, columns_of(candidates)).inflation
@@ -111,7 +111,7 @@ def test_a_delay_is_ranked_first_and_a_clean_flight_has_nothing(clean, late):
 
 def test_what_is_implausible_is_not_chosen(late):
     table, candidates = late
-    model = fit(table, [], np.ones(len(NAMES)))
+    model = fit(table, [], np.ones(len(CHANNELS)))
     nlos = EFFECTS["nlos"]
     early = Candidate((Term(nlos({"1.start": 0.0, "1.end": 60.0}), ("1.delay",)),))
     assert not early.plausible(np.array([-0.3])) and early.plausible(np.array([0.3]))

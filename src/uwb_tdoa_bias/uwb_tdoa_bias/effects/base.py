@@ -106,7 +106,8 @@ class Effect:
         return all(abs(value) <= cls.bound_of(key) for key, value in values.items())
 
     def bias(self, samples):
-        """Contribution to the measured d_ab, (n,) metres; NaN where it cannot be told (unknown pose)."""
+        """Contribution to what `samples.channel` measures, (n,): of Samples to d_ab, metres; NaN where it cannot be told
+        (unknown pose)."""
         return np.zeros(len(samples))
 
     def regressors(self, samples, keys):

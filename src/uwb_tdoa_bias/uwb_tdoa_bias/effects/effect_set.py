@@ -31,9 +31,10 @@ class EffectSet:
         return len(self.effects)
 
     def bias(self, samples):
-        """Sum of all contributions to d_ab, (n,) metres. An effect that cannot tell (unknown attitude) adds nothing."""
+        """Sum of all contributions to what `samples.channel` measures, (n,): of Samples to d_ab, metres. An effect that cannot
+        tell (unknown attitude) adds nothing."""
         total = np.zeros(len(samples))
-        for effect in self.effects:
+        for effect in (effect for effect in self.effects if samples.channel in effect.channels):
             part = effect.bias(samples)
             total += np.where(np.isfinite(part), part, 0.0)
         return total

@@ -4,7 +4,6 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
 
-from ..regression.table import NAMES
 from ..regression.terms import Candidate, Term
 from .base import Detector
 
@@ -23,8 +22,8 @@ class NlosDetector(Detector):
     effect = EFFECTS["nlos"]
 
     def search(self, table, model, chosen):
-        rows = table.rows_of(NAMES.index("tdoa"))
-        part = next(part for _, channel, _, part in table.parts if NAMES[channel] == "tdoa")
+        rows = table.rows_of("tdoa")
+        part = next(part for _, channel, _, part in table.parts if channel == "tdoa")
         a, b = part.arrivals(table.series[rows])
         information, residual = model.information(table)[rows], model.residual[rows]
         keys = {key for candidate in chosen if candidate.name == self.effect.name for key in candidate.terms[0].keys}

@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .table import NAMES
-
 NU = 4.0
 ITERATIONS = 12
 MIN_BLOCKS = 6
@@ -61,11 +59,11 @@ def prior_sizes(columns):
 def fit(table, columns, inflation=None):
     """Fit of some Columns of a Table. inflation : (channels,), measured on this very fit if None."""
     x, channel, sizes = table.matrix(columns), table.channel, prior_sizes(columns)
-    size = np.array([max(np.sum(channel == k), 1) for k in range(len(NAMES))], dtype=float)
+    size = np.maximum(np.bincount(channel, minlength=len(table.channels)), 1).astype(float)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
-    residual, scale = table.y.copy(), np.ones(len(NAMES))
+    residual, scale = table.y.copy(), np.ones(len(table.channels))
     for step in range(ITERATIONS):
-        scale = _scales(residual, channel)
+        scale = _scales(table, residual)
         weight = (NU + 1.0) / (NU + (residual / scale[channel]) ** 2)
         if not columns:
             if step:
@@ -93,11 +91,11 @@ def refit(table, columns, model, rows):
     return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=table.y - x @ beta)
 
 
-def _scales(residual, channel):
+def _scales(table, residual):
     """Scale of Student's t per channel, by the fixed point of its likelihood."""
-    out = np.ones(len(NAMES))
-    for k in np.unique(channel):
-        r = residual[channel == k]
+    out = np.ones(len(table.channels))
+    for k in np.unique(table.channel):
+        r = residual[table.channel == k]
         scale = max(1.4826 * np.median(np.abs(r)), 1e-9)
         for _ in range(15):
             w = (NU + 1.0) / (NU + (r / scale) ** 2)
@@ -127,10 +125,10 @@ def measure_inflation(table, residual, weight, scale, columns):
     scores over blocks are than those of independent rows would be, averaged over the columns. The second sees
     what series have in common. The residual should be that of a fit with all columns, or effects count as noise.
     """
-    out = np.ones(len(NAMES))
+    out = np.ones(len(table.channels))
     x = table.matrix(columns)
     for k in np.unique(table.channel):
-        rows = table.rows_of(k)
+        rows = table.rows_of(table.channels[k])
         r = weight[rows] * residual[rows] / scale[k]
         raw = max(1.0, _temporal(table, rows, r), _clustered(table.block[rows], x[rows], r))
         spent = np.sum(np.any(x[rows] != 0.0, axis=0)) * raw / len(r)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from .fit import prior_sizes, solve
-from .table import NAMES
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +28,10 @@ class Scorer:
         """base : Columns that are in the model already; model : Fit, whose weights count; others : Columns that may be
         judged."""
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
-        self._size, self._base = model.size, np.arange(len(base))
+        self._size, self._base = dict(zip(table.channels, model.size)), np.arange(len(base))
         x, root = table.matrix(list(self._place)), model.information(table)
-        self._channels = [k for k in range(len(NAMES)) if np.any(table.channel == k)]
-        self._parts = [self._part(x, table.y, root, table.rows_of(k)) for k in self._channels]
+        self._channels = table.present
+        self._parts = [self._part(x, table.y, root, table.rows_of(name)) for name in self._channels]
         self._sizes = prior_sizes(list(self._place))
         sizes = self._sizes[self._base]
         gram = sum(part.cross[:, self._base] for part in self._parts)
@@ -64,14 +63,14 @@ class Scorer:
         z = np.concatenate([self._inverse @ (vector[: len(base)] - cross @ z_new), z_new])
         told = len(both) - np.trace(self._inverse) - np.trace(schur) - np.sum((half @ schur) * half)
         beta, gain = z * sizes[both], self._penalty - float(z @ z)
-        for k, part, gram, before in zip(self._channels, self._parts, own, self._squares):
-            gain += self._size[k] * np.log(before / part.squares(beta, both, gram))
+        for name, part, gram, before in zip(self._channels, self._parts, own, self._squares):
+            gain += self._size[name] * np.log(before / part.squares(beta, both, gram))
         values = dict(zip(both.tolist(), beta.tolist()))
         return Gain(np.array([values[place] for place in all_places.tolist()]), float(told - self._told), float(gain))
 
     def price(self, candidate, told, choices):
         """What the parameters of a Candidate, `told` of them by the data, must at least gain, if it is one of `choices`."""
-        rows = sum(self._size[k] for k in self._channels if NAMES[k] in candidate.channels)
+        rows = sum(self._size[name] for name in self._channels if name in candidate.channels)
         return told * np.log(max(rows, 10.0)) + 2.0 * np.log(max(choices, 2)) + candidate.price
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..channels import CHANNELS
 from .fit import Fit, fit
 from .scorer import Scorer
-from .table import NAMES, Table
+from .table import Table
 from .terms import columns_of
 
 MAX_STEPS = 14
@@ -108,8 +108,8 @@ def acceptable(table, candidate, beta):
     if not (candidate.sizable(beta) and candidate.plausible(beta)):
         return False
     part = table.matrix(candidate.columns) @ beta
-    for k, name in enumerate(NAMES):
-        moved = part[table.rows_of(k)]
+    for name in table.present:
+        moved = part[table.rows_of(name)]
         moved = moved[moved != 0.0]
         if len(moved) and np.sqrt(np.mean(moved**2)) > CHANNELS[name].negligible:
             return True

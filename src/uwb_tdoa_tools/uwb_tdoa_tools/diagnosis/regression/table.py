@@ -7,18 +7,18 @@ import numpy as np
 from ..channels import CHANNELS
 
 BLOCK = 5.0  # s, taken as independent of each other
-NAMES = tuple(CHANNELS)
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
     """n rows of a linear model y = X beta + noise, those of one channel after the other.
 
-    y (n,); channel (n,) place in NAMES; series (n,) int, different in every flight; block (n,) number of an independent
+    channels : names; y (n,); channel (n,) place in `channels`; series (n,) int, different in every flight; block (n,) number of an independent
     block; flight (n,); t (n,) s since the start; count (n,) samples averaged; place (n, 3) m.
-    parts : ((flight, channel, first row, ChannelResidual), ...); columns : {Column: place in X}; x : X, (n, k).
+    parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column: place in X}; x : X, (n, k).
     """
 
+    channels: tuple
     y: np.ndarray
     channel: np.ndarray
     series: np.ndarray
@@ -32,13 +32,19 @@ class Table:
     x: np.ndarray
 
     @property
+    def present(self):
+        """Names of the channels that have rows."""
+        return tuple(self.channels[place] for place in np.unique(self.channel))
+
+    @property
     def flights(self):
         """How many."""
         return int(self.flight.max()) + 1
 
     def rows_of(self, channel):
-        """Slice of the rows of a channel, by its place in NAMES."""
-        return slice(*np.searchsorted(self.channel, [channel, channel + 1]))
+        """Slice of the rows of a channel, by its name."""
+        place = self.channels.index(channel)
+        return slice(*np.searchsorted(self.channel, [place, place + 1]))
 
     def places(self, columns):
         """Places in X of some Columns: (k,) int."""
@@ -62,7 +68,7 @@ class Table:
         for effect, keys in wanted.values():
             columns = slice(first, first + len(keys))
             for _, channel, row, part in self.parts:
-                if NAMES[channel] in effect.channels:
+                if channel in effect.channels:
                     values = part.columns(effect, tuple(keys))
                     x[row : row + len(values), columns] = np.nan_to_num(values)
             first = columns.stop
@@ -85,18 +91,19 @@ def table_of(residuals):
     start = [min(part.t.min() for part in flight.values()) for flight in rows]
     blocks = [1 + max(int((part.t.max() - t) / BLOCK) for part in flight.values()) for flight, t in zip(rows, start)]
     offset, first = np.concatenate([[0], np.cumsum(blocks)]), 0
-    for channel, name in enumerate(NAMES):
+    channels = tuple(CHANNELS)
+    for place, name in enumerate(channels):
         for number, flight in enumerate(rows):
             if name not in flight:
                 continue
             part = flight[name]
             n = len(part.y)
-            parts.append((number, channel, first, residuals[number][name]))
+            parts.append((number, name, first, residuals[number][name]))
             first += n
             pieces["block"].append(offset[number] + ((part.t - start[number]) / BLOCK).astype(int))
-            pieces["channel"].append(np.full(n, channel))
+            pieces["channel"].append(np.full(n, place))
             pieces["flight"].append(np.full(n, number))
             for key in ("y", "series", "t", "count", "place"):
                 pieces[key].append(getattr(part, key))
     merged = {key: np.concatenate(several) for key, several in pieces.items()}
-    return Table(**merged, parts=tuple(parts), columns={}, x=np.empty((len(merged["y"]), 0)))
+    return Table(channels, **merged, parts=tuple(parts), columns={}, x=np.empty((len(merged["y"]), 0)))

@@ -1,0 +1,63 @@
+"""What docs/effects.md tells people to write is written here as they would, and works."""
+
+from dataclasses import replace
+from pathlib import Path
+import re
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.channels import CHANNELS
+from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "effects.md"
+
+
+def written(heading):
+    """The names that the code under a heading of the document defines."""
+    section = DOCUMENT.read_text().partition(f"### {heading}\n")[2].partition("\n## ")[0].partition("\n### ")[0]
+    names = {"__name__": "worked_example"}
+    for block in re.findall(r"```python\n(.*?)```", section, re.DOTALL):
+        exec(compile(block, str(DOCUMENT), "exec"), names)
+    return names
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return clean_flight(104, 40.0)
+
+
+def test_an_effect_with_a_search_of_its_own(flight, monkeypatch):
+    names = written("An effect with a search of its own")
+    ripple = names["RangeRipple"]
+    monkeypatch.setitem(EFFECTS, ripple.name, ripple)
+    monkeypatch.setitem(DETECTORS, ripple.name, names["RangeRippleDetector"]())
+    wavelength = names["WAVELENGTHS"][9]
+    put_in = ripple({"sine": 0.15, "cosine": -0.1, "wavelength": wavelength})
+    attribution = attribute([put_in.inject(flight)], GroundTruth(), undeclared=False)
+    (found,) = attribution.effects
+    assert found.name == "range_ripple" and found.values["wavelength"] == pytest.approx(wavelength)
+    assert found.values["sine"] == pytest.approx(0.15, abs=0.02)
+    assert found.values["cosine"] == pytest.approx(-0.1, abs=0.02)
+    assert attribute([flight], GroundTruth(), undeclared=False).effects == ()
+
+
+def test_a_channel(flight, monkeypatch, tmp_path):
+    names = written("A channel")
+    offset = names["HeightOffset"]
+    monkeypatch.setitem(EFFECTS, offset.name, offset)
+    monkeypatch.setitem(CHANNELS, "height", names["Height"]())
+    truth = flight.truth
+    noise = 0.01 * np.random.default_rng(0).standard_normal(len(truth))
+    tilt = 1.0 - 2.0 * (truth.q[:, 0] ** 2 + truth.q[:, 1] ** 2)
+    stream = {"t": truth.t, "distance": (truth.p[:, 2] - 0.04 + noise) / tilt}
+    seen = replace(flight, extra={"range": stream})
+    attribution = attribute([seen], GroundTruth())
+    assert [effect.name for effect in attribution.effects] == ["height_offset"]
+    assert attribution.effects[0].values["offset"] == pytest.approx(-0.04, abs=0.01)
+    EffectSet(attribution.effects).to_yaml(tmp_path / "effects.yaml")
+    assert EffectSet.from_yaml(tmp_path / "effects.yaml").effects == attribution.effects
