@@ -67,7 +67,7 @@ def test_is_declared_in_full(effect):
     assert effect.bound > effect.negligible > 0.0 and effect.unit and effect.reference and effect.physics
     assert set(effect.confounded_with) <= set(EFFECTS) and set(effect.channels) <= {"tdoa", "gyro", "accel"}
     np.testing.assert_array_equal(effect().bias(random_samples(1)), 0.0)  # no parameter, no effect
-    np.testing.assert_array_equal(effect().spread(random_samples(1)), 0.0)
+    np.testing.assert_array_equal(effect().noise_std(random_samples(1)), 0.0)
     bound = effect.bound_of(effect.example)
     for wrong in (np.nan, np.inf, 1.01 * bound, -1.01 * bound, "much", None, [0.1]):
         with pytest.raises(InputError, match="values"):
@@ -246,8 +246,14 @@ def test_stamps_and_spread():
     ids = samples.anchors.ids
     noisy = EFFECTS["noise_level"]({f"{ids[0]}-{ids[1]}": 0.3})
     hit = np.isin(samples.a, (0, 1)) & np.isin(samples.b, (0, 1))
-    np.testing.assert_allclose(EffectSet((noisy,)).spread(samples), 0.3 * hit)
+    np.testing.assert_allclose(EffectSet((noisy,)).noise_std(samples), 0.3 * hit)
     late = EffectSet((EFFECTS["tdoa_time_offset"]({"offset": 0.03}),))
     flight = Flight("f", samples.anchors, Tdoas(samples.t, ids[samples.a], ids[samples.b], samples.t))
     assert late.stamp_offset("tdoa") == 0.03 and late.stamp_offset("imu") == 0.0
     np.testing.assert_allclose(late.correct_streams(flight).tdoa.t, samples.t - 0.03)
+
+
+def test_a_covariate_keeps_working_under_its_old_name():
+    with pytest.warns(FutureWarning, match="force_x is now accel_x"):
+        old = SmoothTerm(channel="gyro.x", covariate="force_x", knots=(0.0, 1.0))
+    assert old == SmoothTerm(channel="gyro.x", covariate="accel_x", knots=(0.0, 1.0))

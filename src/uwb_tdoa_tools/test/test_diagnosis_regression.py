@@ -96,7 +96,7 @@ def test_the_scorer_gives_what_the_whole_equations_would(data):
     place = {column: k for k, column in enumerate(both)}
     np.testing.assert_allclose(judged.beta, beta[[place[column] for column in candidate.columns]], rtol=1e-6, atol=1e-9)
     told = len(both) - np.trace(np.linalg.inv(gram) / np.outer(sizes, sizes))
-    assert judged.told == pytest.approx(told - Scorer(table, base, model, [])._told, abs=1e-6)
+    assert judged.determined == pytest.approx(told - Scorer(table, base, model, [])._determined, abs=1e-6)
 
 
 def test_a_delay_is_ranked_first_and_a_clean_flight_has_nothing(clean, late):

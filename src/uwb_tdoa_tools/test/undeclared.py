@@ -90,6 +90,6 @@ CASES = {
     "standing_wave": (standing_wave, "tdoa", ("range",)),
     "mirror_wall": (mirror_wall, "tdoa", ("x",)),
     "cooling_gyro": (cooling_gyro, "gyro.x", ("time",)),
-    "loaded_gyro": (loaded_gyro, "gyro.z", ("force", "force_z")),
+    "loaded_gyro": (loaded_gyro, "gyro.z", ("accel", "accel_z")),
     "spun_accelerometer": (spun_accelerometer, "accel.y", ("turning_rate", "rate_z")),
 }

@@ -74,30 +74,30 @@ class Corrector:
         if self.idle or n == 0:
             return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
         samples = self.samples(t, a, b)
-        bias, spread = self.contribution(samples)
-        std = spread
+        bias, noise = self.contribution(samples)
+        std = noise
         status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
         if self.network is not None:
             learned, std, share = self.network.predict(samples)
-            told = np.isfinite(learned)
-            bias = bias + np.where(told, learned, 0.0)
-            std = np.hypot(spread, np.where(told & np.isfinite(std), std, 0.0))
-            status[told] = np.where(share[told] < FADED_BELOW, FADED, NETWORK)
+            known = np.isfinite(learned)
+            bias = bias + np.where(known, learned, 0.0)
+            std = np.hypot(noise, np.where(known & np.isfinite(std), std, 0.0))
+            status[known] = np.where(share[known] < FADED_BELOW, FADED, NETWORK)
         return Correction(bias, std, d - bias, status)
 
     def contribution(self, samples):
-        """(bias, spread) of the effects in Samples, (n,) m; while the yaw is unknown their mean over four headings, and its
+        """(bias, standard deviation) of the effects in Samples, (n,) m; while the yaw is unknown their mean over four headings, and its
         scatter."""
         if not len(self.effects):
             return np.zeros(len(samples)), np.zeros(len(samples))
-        bias, spread = self.effects.bias(samples), self.effects.spread(samples)
+        bias, noise = self.effects.bias(samples), self.effects.noise_std(samples)
         unknown = samples.yaw_std > LARGEST_YAW_STD
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
             each = np.stack([turning.bias(replace(samples, q=turned(samples.q, k))) for k in range(4)])
             bias = np.where(unknown, bias - turning.bias(samples) + each.mean(axis=0), bias)
-            spread = np.where(unknown, np.hypot(spread, each.std(axis=0)), spread)
-        return bias, spread
+            noise = np.where(unknown, np.hypot(noise, each.std(axis=0)), noise)
+        return bias, noise
 
     def samples(self, t, a, b):
         """Samples of a batch at the poses that are known by now."""

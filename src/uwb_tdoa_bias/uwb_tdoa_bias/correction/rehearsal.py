@@ -40,8 +40,8 @@ class RehearsedCorrector(Corrector):
 
     def correct(self, t, a, b, d):
         samples = replace(self._recorded, t=t)
-        bias, spread = self.contribution(samples)
-        return Correction(bias, spread, d - bias, np.full(len(t), EFFECTS, dtype=np.uint8))
+        bias, noise = self.contribution(samples)
+        return Correction(bias, noise, d - bias, np.full(len(t), EFFECTS, dtype=np.uint8))
 
 
 def _joined(batches):

@@ -17,7 +17,7 @@ class AccelScale(ImuEffect):
     example = "z"
     physics = "sensitivity error of a MEMS accelerometer"
     confounded_with = ("accel_bias", "imu_gravity")
-    told_apart = {
+    distinguished_by = {
         "accel_bias": "hard manoeuvres: a scale grows with them, a bias does not",
     }
     reference = "BMI088 data sheet: sensitivity tolerance 0.7 %"

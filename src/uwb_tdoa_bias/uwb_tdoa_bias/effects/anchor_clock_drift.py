@@ -16,7 +16,7 @@ class AnchorClockDrift(Effect):
     example = "0"
     physics = "the correction of an anchor's clock lags behind its crystal, which warms up: its delay grows with time"
     confounded_with = ("anchor_delay", "nlos")
-    told_apart = {
+    distinguished_by = {
         "nlos": "a longer flight: a drift goes on, an obstacle ends",
         "anchor_delay": "a longer flight",
     }

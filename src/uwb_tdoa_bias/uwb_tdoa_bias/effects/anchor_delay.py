@@ -19,7 +19,7 @@ class AnchorDelay(Effect):
     example = "0"
     physics = "the antenna delay of an anchor is not calibrated: it always seems farther away by the same distance"
     confounded_with = ("anchor_position", "pair_offset")
-    told_apart = {
+    distinguished_by = {
         "pair_offset": "TDoA3, where each anchor is heard in many pairs",
         "anchor_position": "a flight that passes the anchor on several sides, near and far",
     }

@@ -21,7 +21,7 @@ class AnchorPosition(Effect):
         "line of sight"
     )
     confounded_with = ("anchor_delay", "truth_frame", "tag_lever_arm")
-    told_apart = {
+    distinguished_by = {
         "tag_lever_arm": "a flight that turns through all headings and passes on all sides of the anchor",
         "truth_frame": "a flight through the whole room; several anchors that moved alike are a frame",
     }

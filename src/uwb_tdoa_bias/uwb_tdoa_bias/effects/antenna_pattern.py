@@ -20,7 +20,7 @@ class AntennaPattern(ArrivalEffect):
     example = "tag"
     physics = "off its best direction an antenna radiates over longer ways: the group delay grows towards its nulls"
     confounded_with = ("received_power_bias", "tag_lever_arm")
-    told_apart = {
+    distinguished_by = {
         "received_power_bias": "one place at many headings, then one heading at many ranges",
     }
     reference = "Qorvo support: 10 - 15 cm over direction for a module; the shape is that of uwb_tdoa_bias.foundation.antenna"
@@ -30,11 +30,11 @@ class AntennaPattern(ArrivalEffect):
     def groups(cls, anchors, pairs):
         return [("tag", "anchor"), ("tag",), ("anchor",)]
 
-    def late(self, samples, rows):
+    def delays(self, samples, rows):
         keys = tuple(self.values)
-        return self.late_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
+        return self.delay_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
 
-    def late_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples, rows, keys):
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
         out = np.zeros((len(rows), len(keys)))
         for column, key in enumerate(keys):

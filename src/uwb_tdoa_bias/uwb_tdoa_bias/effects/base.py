@@ -20,7 +20,7 @@ class Effect:
     values : {parameter name: value in `unit`}; std : the same keys, standard errors, empty if unknown;
     source : where the values came from, free text.
     An effect says what it does to measurements, and by that how it is undone, the same way in a node, off line and in a
-    recording: `bias` and `spread` of TDOAs, `stamp_offset` of streams, `sensor_model` and `sensor_bias` of inertial
+    recording: `bias` and `noise_std` of TDOAs, `stamp_offset` of streams, `sensor_model` and `sensor_bias` of inertial
     samples. For `diagnose` it gives `regressors` on the channels where it shows.
     """
 
@@ -42,7 +42,7 @@ class Effect:
     portable: ClassVar[bool] = True  # goes with the tag, the vehicle and the anchors' modules to another installation
     settings: ClassVar[tuple] = ()  # further entries in effects.yaml, constructor arguments
     price: ClassVar[float] = 0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
-    told_apart: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
+    distinguished_by: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
     usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
     uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
@@ -115,7 +115,7 @@ class Effect:
         `unit`; of ImuSamples (n, 3, len(keys)), body axes. Asked for the channels in `channels` only."""
         return np.zeros((len(samples), len(keys)))
 
-    def spread(self, samples):
+    def noise_std(self, samples):
         """Standard deviation that it adds to d_ab, (n,) metres."""
         return np.zeros(len(samples))
 
@@ -149,22 +149,22 @@ class Effect:
 
 
 class ArrivalEffect(Effect):
-    """An effect that makes the signals of single anchors arrive late: bias of d_ab = late_b - late_a."""
+    """An effect that makes the signals of single anchors arrive late: bias of d_ab = delay_b - delay_a."""
 
-    def late(self, samples, rows):
+    def delays(self, samples, rows):
         """By how much the anchors in `rows` (k * n,), the samples repeated k times, seem too far: (k * n,) m."""
         raise NotImplementedError
 
-    def late_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples, rows, keys):
         """Its derivative with respect to `keys`, (k * n, len(keys))."""
         raise NotImplementedError
 
     def bias(self, samples):
-        both = self.late(samples, np.concatenate([samples.a, samples.b]))
+        both = self.delays(samples, np.concatenate([samples.a, samples.b]))
         return both[len(samples) :] - both[: len(samples)]
 
     def regressors(self, samples, keys):
-        both = self.late_regressors(samples, np.concatenate([samples.a, samples.b]), keys)
+        both = self.delay_regressors(samples, np.concatenate([samples.a, samples.b]), keys)
         return both[len(samples) :] - both[: len(samples)]
 
 

@@ -58,14 +58,15 @@ OF_ARRIVAL = {
 
 # One value per inertial sample: columns of what ImuFeatures gives.
 OF_IMU = (
-    "time", "vibration", "turning_rate", "rate_x", "rate_y", "rate_z", "force", "force_x", "force_y", "force_z",
+    "time", "vibration", "turning_rate", "rate_x", "rate_y", "rate_z", "accel", "accel_x", "accel_y", "accel_z",
 )  # fmt: skip
+OF_ACCEL = ("accel", "accel_x", "accel_y", "accel_z")  # specific force, m/s^2
 
 
 def imu_covariate(name, samples):
     """Covariate `name`, of OF_IMU or of a pose in OF_TDOA, of ImuSamples: (n,)."""
-    if samples.channel == "accel" and name.startswith("force"):  # the measured one shares its noise with the residual
-        return _norm(samples.reading) if name == "force" else samples.reading[:, "xyz".index(name[-1])]
+    if samples.channel == "accel" and name in OF_ACCEL:  # the measured one shares its noise with the residual
+        return _norm(samples.reading) if name == "accel" else samples.reading[:, "xyz".index(name[-1])]
     return samples.features[:, OF_IMU.index(name)] if name in OF_IMU else OF_TDOA[name](samples)
 
 

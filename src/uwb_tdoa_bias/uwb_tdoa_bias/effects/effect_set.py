@@ -39,9 +39,9 @@ class EffectSet:
             total += np.where(np.isfinite(part), part, 0.0)
         return total
 
-    def spread(self, samples):
+    def noise_std(self, samples):
         """Standard deviation that the effects add to d_ab, (n,) metres."""
-        return np.sqrt(sum((effect.spread(samples) ** 2 for effect in self.effects), np.zeros(len(samples))))
+        return np.sqrt(sum((effect.noise_std(samples) ** 2 for effect in self.effects), np.zeros(len(samples))))
 
     @property
     def of_attitude(self):

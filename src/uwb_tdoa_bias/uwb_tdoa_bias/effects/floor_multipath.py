@@ -34,13 +34,13 @@ class FloorMultipath(ArrivalEffect):
         """1 on the floor, 0 above 0.4 m, of heights z (n,), m."""
         return np.clip((HIGH - z) / (HIGH - LOW), 0.0, 1.0)
 
-    def late(self, samples, rows):
-        return self.values.get("size", 0.0) * self.late_regressors(samples, rows, ("size",))[:, 0]
+    def delays(self, samples, rows):
+        return self.values.get("size", 0.0) * self.delay_regressors(samples, rows, ("size",))[:, 0]
 
-    def late_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples, rows, keys):
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
         grazing = np.hypot(to_anchor[:, 0], to_anchor[:, 1]) / np.maximum(np.linalg.norm(to_anchor, axis=1), 1e-9)
         return np.repeat((tile(samples, self.strength(samples.p[:, 2])) * grazing)[:, None], len(keys), axis=1)
 
-    def spread(self, samples):
+    def noise_std(self, samples):
         return abs(self.values.get("size", 0.0)) * np.nan_to_num(self.strength(samples.p[:, 2]))

@@ -23,7 +23,7 @@ class ImuGravity(ImuEffect):
     example = "excess"
     physics = "local gravity, or the factor from g to m/s^2, differs from the 9.81 m/s^2 of the filter"
     confounded_with = ("accel_bias", "accel_scale")
-    told_apart = {
+    distinguished_by = {
         "accel_bias": "a flight that tilts, or the vehicle at rest on its sides",
         "accel_scale": "hard manoeuvres up and down: a scale grows with them, gravity does not",
     }

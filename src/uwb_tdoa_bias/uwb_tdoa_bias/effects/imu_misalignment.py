@@ -19,7 +19,7 @@ class ImuMisalignment(ImuEffect):
     example = "x"
     physics = "the sensor, or the frame of the ground truth, is turned against the body's axes"
     confounded_with = ("accel_bias", "gyro_scale")
-    told_apart = {
+    distinguished_by = {
         "accel_bias": "quick turns: a misalignment also shows on the gyroscope",
     }
     reference = "strapdown navigation: mounting misalignment"

@@ -20,7 +20,7 @@ class Nlos(ArrivalEffect):
     example = "0.delay"
     physics = "something between tag and anchor: the direct path is slowed or lost, and a later one is taken for it"
     confounded_with = ("anchor_delay", "anchor_clock_drift", "anchor_position")
-    told_apart = {
+    distinguished_by = {
         "anchor_delay": "the same path again without the obstacle, or from another side",
     }
     reference = "UTIL identification data: metal 0.2 - 0.6 m, wood 0.03 - 0.24 m, people up to 2 m"
@@ -62,11 +62,11 @@ class Nlos(ArrivalEffect):
             blocked &= tile(samples, near)
         return blocked
 
-    def late(self, samples, rows):
+    def delays(self, samples, rows):
         keys = [key for key in self.values if key.endswith(".delay")]
-        return self.late_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
+        return self.delay_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
 
-    def late_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples, rows, keys):
         out = np.zeros((len(rows), len(keys)))
         for column, key in enumerate(keys):
             out[:, column] = self._blocked(samples, rows, key.partition(".")[0])

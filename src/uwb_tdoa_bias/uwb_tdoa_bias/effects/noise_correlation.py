@@ -27,7 +27,7 @@ class NoiseCorrelation(Effect):
     def groups(cls, anchors, pairs):
         return [("std", "time")]
 
-    def spread(self, samples):
+    def noise_std(self, samples):
         return np.full(len(samples), np.sqrt(2.0) * abs(self.values.get("std", 0.0)))
 
     def inject(self, flight, rng=None):

@@ -30,7 +30,7 @@ class NoiseLevel(Effect):
         keys = link_keys(pairs)
         return [keys, *((key,) for key in keys)]
 
-    def spread(self, samples):
+    def noise_std(self, samples):
         a, b = samples.anchors.ids[samples.a], samples.anchors.ids[samples.b]
         variance = np.zeros(len(samples))
         for key, value in self.values.items():
@@ -45,4 +45,4 @@ class NoiseLevel(Effect):
         a, b = np.maximum(flight.anchors.index(tdoa.a), 0), np.maximum(flight.anchors.index(tdoa.b), 0)
         samples = Samples(tdoa.t, a, b, np.zeros((n, 3)), np.full((n, 4), np.nan), flight.anchors)
         rng = rng or np.random.default_rng()
-        return replace(flight, tdoa=replace(tdoa, d=tdoa.d + self.spread(samples) * rng.standard_normal(n)))
+        return replace(flight, tdoa=replace(tdoa, d=tdoa.d + self.noise_std(samples) * rng.standard_normal(n)))

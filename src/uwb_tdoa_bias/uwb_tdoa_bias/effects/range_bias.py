@@ -16,7 +16,7 @@ class RangeBias(ArrivalEffect):
     example = "quadratic"
     physics = "the detector fires later on weak, far signals: a range error that bends over range"
     confounded_with = ("received_power_bias", "range_scale")
-    told_apart = {
+    distinguished_by = {
         "received_power_bias": "one range at many headings: power changes with the antennas, range does not",
         "range_scale": "a flight near to and far from the anchors",
     }
@@ -26,9 +26,9 @@ class RangeBias(ArrivalEffect):
     def groups(cls, anchors, pairs):
         return [("quadratic",)]
 
-    def late(self, samples, rows):
-        return self.values.get("quadratic", 0.0) * self.late_regressors(samples, rows, ("quadratic",))[:, 0]
+    def delays(self, samples, rows):
+        return self.values.get("quadratic", 0.0) * self.delay_regressors(samples, rows, ("quadratic",))[:, 0]
 
-    def late_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples, rows, keys):
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
         return np.repeat(np.sum(to_anchor**2, axis=1)[:, None], len(keys), axis=1)

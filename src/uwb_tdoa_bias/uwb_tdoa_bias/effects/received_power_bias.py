@@ -29,10 +29,10 @@ class ReceivedPowerBias(ArrivalEffect):
     def groups(cls, anchors, pairs):
         return [("scale",)]
 
-    def late(self, samples, rows):
-        return self.values.get("scale", 0.0) * self.late_regressors(samples, rows, ("scale",))[:, 0]
+    def delays(self, samples, rows):
+        return self.values.get("scale", 0.0) * self.delay_regressors(samples, rows, ("scale",))[:, 0]
 
-    def late_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples, rows, keys):
         anchors = samples.anchors
         power = received_power_dbm(
             tile(samples, samples.p),

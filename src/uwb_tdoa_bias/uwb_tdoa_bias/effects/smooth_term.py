@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
+import warnings
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_TDOA, imu_
 DEGREE = 2
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
 FORMS = ("common", "arrival", "anchor")
+OLD_NAMES = {"force": "accel", **{f"force_{axis}": f"accel_{axis}" for axis in "xyz"}}  # of covariates, until 0.3
 
 
 @dataclass
@@ -44,6 +46,9 @@ class SmoothTerm(Effect):
     fitted: ClassVar[bool] = False
 
     def __post_init__(self):
+        if self.covariate in OLD_NAMES:
+            warnings.warn(f"effects: smooth_term: covariate {self.covariate} is now {OLD_NAMES[self.covariate]}", FutureWarning)
+            self.covariate = OLD_NAMES[self.covariate]
         try:
             self.knots = tuple(float(knot) for knot in self.knots)
         except (TypeError, ValueError):

@@ -18,7 +18,7 @@ class TagLeverArm(Effect):
     example = "z"
     physics = "the tag's antenna is off the origin of the body frame, by an arm that turns with the body"
     confounded_with = ("truth_frame", "anchor_position")
-    told_apart = {
+    distinguished_by = {
         "truth_frame": "a flight that turns through all headings: the arm turns with the body, the frame does not",
     }
     reference = "any text on strapdown navigation: lever arm compensation"

@@ -18,7 +18,7 @@ class TdoaTimeOffset(StampEffect):
     example = "offset"
     physics = "the radio's stamps lag behind the IMU's: by buffers, or because they are taken on arrival at the host"
     confounded_with = ("truth_time_offset",)
-    told_apart = {
+    distinguished_by = {
         "truth_time_offset": "a flight with IMU: its stamps belong to neither",
     }
     reference = "UTIL web page: about 10 ms of radio latency"

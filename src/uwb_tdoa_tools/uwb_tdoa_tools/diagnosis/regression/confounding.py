@@ -38,7 +38,7 @@ class Unobservable:
 def flight_to_tell(effect, other):
     """Which flight would tell two effects apart, by name: a sentence."""
     for name, opposite in ((effect, other), (other, effect)):
-        sentence = EFFECTS[name].told_apart.get(opposite) if name in EFFECTS else None
+        sentence = EFFECTS[name].distinguished_by.get(opposite) if name in EFFECTS else None
         if sentence:
             return sentence
     return ANY_FLIGHT

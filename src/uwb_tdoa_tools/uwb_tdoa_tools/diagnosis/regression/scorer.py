@@ -13,11 +13,11 @@ from .fit import prior_sizes, solve
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """beta (k,) of the candidate's columns; told : parameters that the data tell beyond the base; gain : twice what the
+    """beta (k,) of the candidate's columns; determined : parameters that the data determine beyond the base; gain : twice what the
     likelihood gains."""
 
     beta: np.ndarray
-    told: float
+    determined: float
     gain: float
 
 
@@ -36,7 +36,7 @@ class Scorer:
         sizes = self._sizes[self._base]
         gram = sum(part.cross[:, self._base] for part in self._parts)
         vector = sum(part.vector[self._base] for part in self._parts)
-        beta, _, self._told = solve(gram, vector, sizes)
+        beta, _, self._determined = solve(gram, vector, sizes)
         self._inverse = np.linalg.inv(gram * np.outer(sizes, sizes) + np.eye(len(sizes))) if len(sizes) else gram
         self._squares = [part.squares(beta, self._base) for part in self._parts]
         self._penalty = float(np.sum((beta / sizes) ** 2))
@@ -61,17 +61,17 @@ class Scorer:
         schur = np.linalg.inv(sum(own) * np.outer(sizes[new], sizes[new]) + np.eye(len(new)) - cross.T @ half)
         z_new = schur @ (vector[len(base) :] - half.T @ vector[: len(base)])
         z = np.concatenate([self._inverse @ (vector[: len(base)] - cross @ z_new), z_new])
-        told = len(both) - np.trace(self._inverse) - np.trace(schur) - np.sum((half @ schur) * half)
+        determined = len(both) - np.trace(self._inverse) - np.trace(schur) - np.sum((half @ schur) * half)
         beta, gain = z * sizes[both], self._penalty - float(z @ z)
         for name, part, gram, before in zip(self._channels, self._parts, own, self._squares):
             gain += self._size[name] * np.log(before / part.squares(beta, both, gram))
         values = dict(zip(both.tolist(), beta.tolist()))
-        return Gain(np.array([values[place] for place in all_places.tolist()]), float(told - self._told), float(gain))
+        return Gain(np.array([values[place] for place in all_places.tolist()]), float(determined - self._determined), float(gain))
 
-    def price(self, candidate, told, choices):
-        """What the parameters of a Candidate, `told` of them by the data, must at least gain, if it is one of `choices`."""
+    def price(self, candidate, determined, choices):
+        """What the parameters of a Candidate, `determined` of them by the data, must at least gain, if it is one of `choices`."""
         rows = sum(self._size[name] for name in self._channels if name in candidate.channels)
-        return told * np.log(max(rows, 10.0)) + 2.0 * np.log(max(choices, 2)) + candidate.price
+        return determined * np.log(max(rows, 10.0)) + 2.0 * np.log(max(choices, 2)) + candidate.price
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from .table import Table
 from .terms import columns_of
 
 MAX_STEPS = 14
-LEAST_TOLD = 0.3  # parameters that the data must tell of a candidate
+LEAST_DETERMINED = 0.3  # parameters that the data must tell of a candidate
 AMBIGUOUS = 10.0  # less difference in the criterion is no decision
 
 
@@ -88,7 +88,7 @@ def worth(selection, choices):
     for k, candidate in enumerate(chosen):
         scorer = Scorer(table, columns_of(chosen[:k]), selection.fit, candidate.columns)
         judged = scorer.judge(candidate.columns)
-        total -= scorer.price(candidate, judged.told if judged else 0.0, choices)
+        total -= scorer.price(candidate, judged.determined if judged else 0.0, choices)
     return total
 
 
@@ -97,9 +97,9 @@ def rank(table, candidates, chosen, model):
     scorer, out = Scorer(table, columns_of(chosen), model, columns_of(candidates)), []
     for candidate in candidates:
         judged = scorer.judge(candidate.columns)
-        if judged is None or judged.told < LEAST_TOLD or not acceptable(table, candidate, judged.beta):
+        if judged is None or judged.determined < LEAST_DETERMINED or not acceptable(table, candidate, judged.beta):
             continue
-        out.append((judged.gain - scorer.price(candidate, judged.told, len(candidates)), candidate))
+        out.append((judged.gain - scorer.price(candidate, judged.determined, len(candidates)), candidate))
     return sorted(out, key=lambda item: -item[0])
 
 
@@ -140,7 +140,7 @@ def _losses(table, chosen, model, choices):
         if judged is None:  # others hold all of its columns
             out.append(-scorer.price(candidate, 0.0, choices))
         else:
-            out.append(judged.gain - scorer.price(candidate, judged.told, choices))
+            out.append(judged.gain - scorer.price(candidate, judged.determined, choices))
     return out
 
 
