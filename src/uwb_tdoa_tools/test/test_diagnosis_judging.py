@@ -1,11 +1,14 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.rehearsal import RecordingCorrector, RehearsedCorrector
-from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.judging import Case, compare, cross_fitted, useful
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
@@ -51,6 +54,20 @@ def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
     clean = [clean_flight(seed, 30.0) for seed in (100, 101)]
     kept = useful(attribution, clean, NONE)
     assert kept.candidates == () and "the filter does better without it" in kept.refused[0].why
+
+
+def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_not_is_not(flights, attribution):
+    def judged(std):
+        noise = Detection(EFFECTS["noise_level"]({"0-1": std, "1-2": std}), "tdoa", {})
+        return useful(replace(attribution, detections=(noise,)), noisy, NONE), noise
+
+    rng = np.random.default_rng(0)
+    noisy = [EFFECTS["noise_level"]({"0-1": 1.5, "1-2": 1.5}).inject(flight, rng) for flight in flights]
+    kept, noise = judged(1.5)
+    assert kept.detections == (noise,) and kept.worth[noise] > 0.0
+    noisy = flights
+    kept, noise = judged(3.0)
+    assert kept.detections == () and "does not make the filter better" in kept.refused[-1].why
 
 
 def test_a_rehearsal_with_the_same_model_is_the_run_itself(flights):

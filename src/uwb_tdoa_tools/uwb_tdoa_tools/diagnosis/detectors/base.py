@@ -6,7 +6,7 @@ from typing import ClassVar
 from uwb_tdoa_bias.effects import Effect
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Detection:
     """effect : Effect with values and std; channel : where it shows; evidence : {figure: number}, how sure that is."""
 
