@@ -168,6 +168,32 @@ class ArrivalEffect(Effect):
         return both[len(samples) :] - both[: len(samples)]
 
 
+class AnchorEffect(Effect):
+    """An effect with one parameter for each anchor, named by its id, that makes its arrivals late in proportion."""
+
+    @classmethod
+    def check_key(cls, key):
+        check_anchor(cls.name, key, key)
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        ids = known_anchors(anchors)
+        return [ids, *((key,) for key in ids)]
+
+    def delay_per_unit(self, samples):
+        """By how many metres an anchor is late for each unit of its parameter, (n,) or a scalar."""
+        return 1.0
+
+    def bias(self, samples):
+        values = np.array([self.values.get(str(i), 0.0) for i in samples.anchors.ids.tolist()])
+        return (values[samples.b] - values[samples.a]) * self.delay_per_unit(samples)
+
+    def regressors(self, samples, keys):
+        ids, wanted = samples.anchors.ids, np.array([int(key) for key in keys])
+        sign = (ids[samples.b][:, None] == wanted).astype(float) - (ids[samples.a][:, None] == wanted)
+        return sign * np.reshape(self.delay_per_unit(samples), (-1, 1))
+
+
 def need_truth(effect, flight):
     """Raise InputError if the flight has no ground truth to compute `effect` at."""
     if flight.truth is None or len(flight.truth) == 0:
