@@ -3,7 +3,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 from random_samples import random_rotation
 
-from uwb_tdoa_bias.foundation.geometry import rotate, tdoa, tdoa_jacobian
+from uwb_tdoa_bias.foundation.geometry import linearized_tdoa, ranges, rotate, tdoa, tdoa_jacobian
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -57,6 +57,24 @@ def test_jacobian_on_an_antenna_keeps_the_other_anchor_only():
     a, b = np.zeros(3), np.array([4.0, 0.0, 0.0])
     assert tdoa_jacobian(a, a, b).tolist() == [-1.0, 0.0, 0.0]
     assert tdoa_jacobian(b, a, b).tolist() == [-1.0, 0.0, 0.0]
+
+
+@given(seeds, st.sampled_from([None, "a", "b"]))
+def test_a_single_tdoa_in_compiled_code_is_that_of_the_arrays_to_the_bit(seed, on_antenna):
+    p, a, b = points(seed)
+    p = {"a": a, "b": b}.get(on_antenna, p)
+    jacobian = np.empty(3)
+    assert linearized_tdoa(p, a, b, jacobian) == tdoa(p, a, b)
+    np.testing.assert_array_equal(jacobian, tdoa_jacobian(p, a, b))
+
+
+def test_ranges_broadcast_and_have_unit_derivatives():
+    p, anchors = points(1, 5), points(2, 4)
+    distance, unit = ranges(p[:, None], anchors)
+    assert distance.shape == (5, 4) and unit.shape == (5, 4, 3)
+    np.testing.assert_allclose(distance[..., None] * unit, p[:, None] - anchors, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(unit, axis=-1), 1.0)
+    assert ranges(p[0], p[0])[1].tolist() == [0.0, 0.0, 0.0]
 
 
 @given(seeds)

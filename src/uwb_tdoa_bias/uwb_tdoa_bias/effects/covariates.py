@@ -6,11 +6,11 @@ import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.radio import into_frame
+from ..foundation.vibration import VIBRATION_CORNER, low_pass, track_vibration
 from .base import tile
 
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes
 OF_MOTION = ("speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor")  # need a history
-VIBRATION_CORNER, VIBRATION_TIME = 0.05, 0.3  # s: faster is vibration; its power is averaged over the second
 
 
 def _norm(v):
@@ -95,10 +95,9 @@ def _features(state, t, gyro, accel, out):
             rate[:], force[:], power[:] = gyro[i], accel[i], 0.0
             dt = 0.0
         state[0, 0] = t[i]
+        track_vibration(force, power, accel[i], dt)
         for k in range(3):
-            rate[k] += min(1.0, dt / VIBRATION_CORNER) * (gyro[i, k] - rate[k])
-            force[k] += min(1.0, dt / VIBRATION_CORNER) * (accel[i, k] - force[k])
-            power[k] += min(1.0, dt / VIBRATION_TIME) * ((accel[i, k] - force[k]) ** 2 - power[k])
+            rate[k] = low_pass(rate[k], gyro[i, k], dt, VIBRATION_CORNER)
             out[i, 3 + k] = rate[k]
             out[i, 7 + k] = force[k]
         out[i, 0] = t[i] - state[0, 1]

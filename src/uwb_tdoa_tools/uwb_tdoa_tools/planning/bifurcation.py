@@ -18,6 +18,7 @@ from itertools import combinations
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.geometry import ranges
 
 from .installation import principal_extents
 from .precision import weigh
@@ -81,9 +82,7 @@ class Subsets:
         With A q = -D and u_j the direction from anchor j to the tag, d|q|^2 / dm_j = 2 c_j (q - u_j), where c_j is q
         times the column of j in q = columns @ distances; along a known height, where q has no part, -2 c_j u_j.
         """
-        away = points[:, None] - self.anchors.positions
-        distances = np.linalg.norm(away, axis=-1)
-        unit = away / np.maximum(distances, 1e-12)[..., None]
+        distances, unit = ranges(points[:, None], self.anchors.positions)
         size, k = len(self.rows), self.dimensions
         total = np.zeros_like(self.anchors.positions)
         for chunk in np.array_split(np.arange(len(points)), max(1, len(points) * size * len(total) // _CHUNK)):

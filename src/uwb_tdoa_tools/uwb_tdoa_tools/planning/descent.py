@@ -7,6 +7,7 @@ from scipy.special import expit
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.geometry import ranges
 
 from .bifurcation import Subsets
 from .goal import UNUSABLE
@@ -29,8 +30,7 @@ def errors_and_slopes(goal, layout, x, points):
     positions, orientations, steps = layout.nudged(x)
     every = Anchors(np.arange(len(positions)), positions, orientations)
     variance = installation.noise.variance(points, every)
-    away = points[:, None] - positions
-    unit = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
+    unit = ranges(points[:, None], positions)[1]
     chosen = layout.columns()
     pairing = PAIRINGS[goal.pairing](chosen.shape[1])
     information = np.concatenate(

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.geometry import ranges
+
 SWEEPS = 40
 SOLVED = 1e-9  # m, residual of a solution
 APART = 3e-4  # of the anchors' extent: two solutions nearer than this are one
@@ -60,9 +62,7 @@ def _normal_equations(x, heights, wanted, corners):
 
 def _tdoas(x, corners):
     """TDOAs (n, k) m of the other corners against the first, and their derivatives (n, k, 3)."""
-    away = x[:, None] - corners
-    distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-12)
-    unit = away / distance[..., None]
+    distance, unit = ranges(x[:, None], corners)
     return distance[:, 1:] - distance[:, :1], unit[:, 1:] - unit[:, :1]
 
 

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
+from uwb_tdoa_bias.foundation.geometry import ranges
+
 from .noise import FixedNoise, variance_gradient
 
 NORMAL_99 = 2.58  # standard deviations of a normal variable that hold 99 %, as rounded in Grasso et al., sec. 2.2.3
@@ -25,8 +27,7 @@ def information(points, installation, correction=True):
 
 def _information(points, installation, correction):
     anchors, k = installation.anchors, installation.dimensions
-    away = points[:, None, :] - anchors.positions
-    unit = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
+    unit = ranges(points[:, None, :], anchors.positions)[1]
     variance = installation.noise.variance(points, anchors)
     total = weigh(unit[..., :k], variance, installation.pairing, installation.link_std)
     if correction:

@@ -1,0 +1,31 @@
+"""Robust losses: how little a residual counts that is larger than it should be.
+
+A loss rho(e) of the normalised residual e gives iteratively re-weighted least squares with the weight rho'(e) / e, 1
+at e = 0 (MacTavish and Barfoot, At all costs: a comparison of robust cost functions for camera correspondence
+outliers, 2015, table I).
+"""
+
+import math
+
+from .compiled import compiled
+
+LOSSES = ("geman_mcclure", "huber", "cauchy")
+GEMAN_MCCLURE, HUBER, CAUCHY = range(3)  # places in LOSSES
+
+
+@compiled
+def weight(loss, e, scale):
+    """rho'(e) / e, 0 to 1. loss : place in LOSSES; e : normalised residual; scale : where the loss bends, same unit."""
+    u = (e / scale) ** 2
+    if loss == GEMAN_MCCLURE:
+        return 1.0 / ((1.0 + u) * (1.0 + u))
+    if loss == HUBER:
+        return 1.0 if u <= 1.0 else 1.0 / math.sqrt(u)
+    return 1.0 / (1.0 + u)
+
+
+@compiled
+def geman_mcclure_loss(e, scale):
+    """2 rho(e) / scale^2 of Geman and McClure, 0 to 1. e, scale : as for `weight`."""
+    u = (e / scale) ** 2
+    return u / (1.0 + u)
