@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, structured
 
 GRAVITY = 9.81
 
@@ -62,8 +63,8 @@ def fly(
     middle = anchors.positions.mean(axis=0)
     wave = Wave(rng, middle, 0.0, 0.0, 0.0) if hover else Wave(rng, middle)
     imu_t = np.arange(int(duration * imu_rate)) / imu_rate
-    _, _, _, force, rates = wave.motion(imu_t)
-    force = force + _inertial_error(rng, len(imu_t), imu_rate, accel_noise, accel_bias, accel_bias_walk)
+    _, _, _, accel, rates = wave.motion(imu_t)
+    accel = accel + _inertial_error(rng, len(imu_t), imu_rate, accel_noise, accel_bias, accel_bias_walk)
     rates = rates + _inertial_error(rng, len(imu_t), imu_rate, gyro_noise, gyro_bias, gyro_bias_walk)
     # off the grid of the IMU, so that no two stamps of different streams agree
     tdoa_t = (np.arange(int(duration * tdoa_rate)) + rng.uniform(0.1, 0.9, int(duration * tdoa_rate))) / tdoa_rate
@@ -79,7 +80,7 @@ def fly(
         name=f"wave-{seed}",
         anchors=anchors,
         tdoa=Tdoas(tdoa_t + begin, anchors.ids[a], anchors.ids[b], d),
-        imu=Imu(imu_t + begin, rates, force),
+        imu=Imu(imu_t + begin, rates, accel),
         truth=Truth(truth_t + begin, p, attitude.as_quat()),
         meta={"wave": wave},
     )
@@ -89,6 +90,15 @@ def _inertial_error(rng, n, rate, noise, bias, walk):
     steps = walk / np.sqrt(rate) * rng.standard_normal((n, 3))
     white = noise * np.sqrt(rate) * rng.standard_normal((n, 3))
     return bias * rng.standard_normal(3) + np.cumsum(steps, axis=0) + white
+
+
+def measurements(flight):
+    """A Flight as the core is fed with it."""
+    imu, d, rows = flight.imu, flight.tdoa, flight.anchors.index
+    return Measurements(
+        structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel),
+        structured(TDOA, d.t, rows(d.a), rows(d.b), d.d, np.zeros(len(d))),
+    )
 
 
 def position_at(flight, t):

@@ -252,11 +252,11 @@ class Rig:
         message.header.stamp, message.header.frame_id = stamp(t, epoch), frame
         self._publishers[topic].publish(message)
 
-    def send_imu(self, t, gyro=(0.0, 0.0, 0.0), force=(0.0, 0.0, 9.81), epoch=EPOCH):
+    def send_imu(self, t, gyro=(0.0, 0.0, 0.0), accel=(0.0, 0.0, 9.81), epoch=EPOCH):
         message = Imu()
         rate, acceleration = message.angular_velocity, message.linear_acceleration
         rate.x, rate.y, rate.z = map(float, gyro)
-        acceleration.x, acceleration.y, acceleration.z = map(float, force)
+        acceleration.x, acceleration.y, acceleration.z = map(float, accel)
         self.send("imu/data", message, t, epoch=epoch)
 
     def send_tdoa(self, t, a, b, d, epoch=EPOCH):
@@ -286,8 +286,8 @@ class Rig:
             (send_tdoa or self.send_tdoa)(t, tdoa.a[k], tdoa.b[k], tdoa.d[k], epoch)
             due = before + np.searchsorted(tdoa.t, t - ahead)
             self.wait(lambda due=due: len(self.residuals) >= due, f"{due} residuals", 60.0)
-        for t, gyro, force in zip(imu.t[i:], imu.gyro[i:], imu.accel[i:]):
-            self.send_imu(t, gyro, force, epoch)
+        for t, gyro, accel in zip(imu.t[i:], imu.gyro[i:], imu.accel[i:]):
+            self.send_imu(t, gyro, accel, epoch)
 
 
 def _collect(stream, lines):

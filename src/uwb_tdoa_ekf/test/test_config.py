@@ -1,12 +1,17 @@
 from dataclasses import fields
+from pathlib import Path
+import re
 
+import numpy as np
 import pytest
+import yaml
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.core.config import LOSSES, ROBUST, FilterConfig, Tuning
+from uwb_tdoa_ekf.core.config import CHOICES, RENAMED, TUNING, FilterConfig, current_names
 
+CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"
 SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover")
-OTHERS = ("robust", "loss", "initial_yaw", *SWITCHES)
+OTHERS = (*CHOICES, "initial_yaw", *SWITCHES)
 NUMBERS = [field.name for field in fields(FilterConfig) if field.name not in OTHERS]
 
 
@@ -17,11 +22,47 @@ def write(tmp_path, text):
 
 
 def test_defaults_are_valid_and_reach_the_core_under_the_same_names():
-    config, tuning = FilterConfig(), FilterConfig().tuning()
-    for name in Tuning._fields:
-        if name not in ("robust", "loss"):
-            assert getattr(tuning, name) == getattr(config, name), name
-    assert set(Tuning._fields) == {field.name for field in fields(FilterConfig)}
+    config, (tuning,) = FilterConfig(), FilterConfig().tuning()
+    for name in TUNING.names:
+        if name not in CHOICES:
+            assert tuning[name] == getattr(config, name), name
+    assert TUNING.names == tuple(field.name for field in fields(FilterConfig))
+
+
+def test_the_parameter_file_has_every_parameter_in_order_with_its_default_unit_and_meaning():
+    lines = [line for line in CONFIG.read_text().splitlines() if re.match(r"    \w+: ", line)]
+    written = [re.fullmatch(r"    (\w+): .*?  # (.*)", line).groups() for line in lines]
+    expected = [(field.name, field.metadata["text"]) for field in fields(FilterConfig)]
+    assert written[: len(expected)] == expected
+    assert FilterConfig.from_yaml(CONFIG) == FilterConfig()
+    (node,) = yaml.safe_load(CONFIG.read_text()).values()
+    for field in fields(FilterConfig):
+        assert type(node["ros__parameters"][field.name]) is field.type, field.name
+
+
+def test_old_names_are_taken_with_a_warning():
+    old = {"reach": 2.0, "vibration_trust": 0.5, "tdoa_correlation": 3.0, "start_patience": 4.0}
+    assert old.keys() == RENAMED.keys() and set(RENAMED.values()) <= {field.name for field in fields(FilterConfig)}
+    with pytest.warns(FutureWarning) as said:
+        config = FilterConfig.from_parameters(old | {"gate": 5.0, "reorder": 1.0})
+    assert len(said) == len(old) and all(name in str(w.message) for name, w in zip(RENAMED, said))
+    expected = dict(workspace_margin=2.0, accel_prior_std=0.5, tdoa_correlation_length=3.0, start_timeout=4.0, gate=5.0)
+    assert config == FilterConfig(**expected)
+
+
+def test_old_names_in_a_parameter_file_are_taken_with_a_warning(tmp_path):
+    with pytest.warns(FutureWarning, match="reach: is called workspace_margin now"):
+        config = FilterConfig.from_yaml(write(tmp_path, "ekf_node: {ros__parameters: {reach: 2.0}}"))
+    assert config == FilterConfig(workspace_margin=2.0)
+
+
+def test_a_parameter_under_both_names_is_bad_input(tmp_path):
+    with pytest.raises(InputError, match="reach: is the old name of workspace_margin"):
+        FilterConfig.from_yaml(write(tmp_path, "a: {ros__parameters: {reach: 2.0, workspace_margin: 2.0}}"))
+
+
+def test_present_names_are_left_alone():
+    assert current_names({"workspace_margin": 1, "else": 2}, warn=pytest.fail) == {"workspace_margin": 1, "else": 2}
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), "fast", None])
@@ -63,18 +104,19 @@ def test_names_must_be_known(field, value):
         FilterConfig(**{field: value})
 
 
-def test_names_reach_the_core_as_their_places():
-    for i, robust in enumerate(ROBUST):
-        for k, loss in enumerate(LOSSES):
-            tuning = FilterConfig(robust=robust, loss=loss).tuning()
-            assert (tuning.robust, tuning.loss) == (i, k)
+def test_choices_are_given_to_the_core_as_their_places():
+    for i, robust in enumerate(CHOICES["robust"]):
+        for k, loss in enumerate(CHOICES["loss"]):
+            (tuning,) = FilterConfig(robust=robust, loss=loss).tuning()
+            assert (tuning["robust"], tuning["loss"]) == (i, k)
 
 
-def test_types_that_reach_the_core_do_not_depend_on_how_a_number_was_written(tmp_path):
-    """Every new combination of types compiles the whole core anew, half a minute."""
+def test_how_a_number_was_written_changes_nothing(tmp_path):
     path = write(tmp_path, "ekf_node: {ros__parameters: {gate: 3, tdoa_std: 1, odometry_rate: 100, use_imu: true}}")
-    written = FilterConfig.from_yaml(path).tuning()
-    assert [type(value) for value in written] == [type(value) for value in FilterConfig().tuning()]
+    config = FilterConfig.from_yaml(path)
+    assert isinstance(config.gate, float)
+    expected = FilterConfig(gate=3.0, tdoa_std=1.0, odometry_rate=100.0).tuning()
+    np.testing.assert_array_equal(config.tuning(), expected)
 
 
 def test_from_yaml_takes_what_tunes_the_filter_and_passes_over_the_rest(tmp_path):

@@ -266,8 +266,8 @@ def test_one_stamp_far_from_its_neighbours_changes_nothing(off, verdict, count):
 def test_what_is_invalid_does_not_hold_up_the_others():
     flight = fly(8, 2.0)
     estimator = Estimator(flight.anchors, lag=10.0)
-    for t, gyro, force in zip(flight.imu.t, flight.imu.gyro, flight.imu.accel):
-        estimator.add_imu(t, gyro, force)
+    for t, gyro, accel in zip(flight.imu.t, flight.imu.gyro, flight.imu.accel):
+        estimator.add_imu(t, gyro, accel)
     half, last = len(flight.tdoa) // 2, flight.imu.t[-1]
     for t, a, b, d in zip(flight.tdoa.t[:half], flight.tdoa.a, flight.tdoa.b, flight.tdoa.d):
         estimator.add_tdoa(t, int(a), int(b), d)

@@ -6,8 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.hypotheses import HOPELESS, YAW_STD, add_doubt, blame, choose, quarter
-from uwb_tdoa_ekf.core.memory import BEST, HYPOTHESES, new_memory
+from uwb_tdoa_ekf.core.hypotheses import (
+    LARGEST_NIS, PRUNED_BELOW, YAW_STD, add_log_likelihood, add_spread_of_means, select, yaw_offset,
+)  # fmt: skip
+from uwb_tdoa_ekf.core.memory import HYPOTHESES, new_memory
 from uwb_tdoa_ekf.offline import run_offline
 
 NOISE = dict(accel_noise=0.01, gyro_noise=0.001)  # a common sensor that does not vibrate
@@ -19,38 +21,41 @@ def yaw_errors(flight, odometry):
     return (attitude.inv() * Rotation.from_quat(odometry.q)).as_rotvec()[:, 2]
 
 
-def memory_with(yaws, belief):
-    m = new_memory(4)
-    m.belief[:] = belief
+def ekf_with(yaws, log_weights):
+    ekf = new_memory(np.zeros((4, 3))).record
+    ekf.hypotheses["log_weight"] = log_weights
     for h, yaw in enumerate(yaws):
-        m.x[h, 6:10] = Rotation.from_euler("z", yaw).as_quat()
-    return m
+        ekf.hypotheses["x"][h, 6:10] = Rotation.from_euler("z", yaw).as_quat()
+    return ekf
 
 
 def test_directions_share_the_circle():
-    np.testing.assert_allclose(np.diff([quarter(h) for h in range(HYPOTHESES + 1)]), 2.0 * np.pi / HYPOTHESES)
+    np.testing.assert_allclose(np.diff([yaw_offset(h) for h in range(HYPOTHESES + 1)]), 2.0 * np.pi / HYPOTHESES)
 
 
-def test_blame_is_the_logarithm_of_the_gaussian_density_and_bounded():
-    m = memory_with(np.zeros(4), np.zeros(4))
-    blame(m, 0, 0.3, 0.04)
-    blame(m, 1, 300.0, 0.04)
-    assert m.belief[0] == pytest.approx(-0.5 * (0.3**2 / 0.04 + np.log(0.04)))
-    assert m.belief[1] == pytest.approx(-0.5 * (9.0 + np.log(0.04)))
+def test_log_likelihood_is_the_logarithm_of_the_gaussian_density_and_bounded():
+    ekf = ekf_with(np.zeros(4), np.zeros(4))
+    ekf.innovation.prior_variance, ekf.innovation.noise_variance = 0.01, 0.015
+    for h, value in enumerate((0.3, 300.0)):
+        ekf.innovation.value = value
+        add_log_likelihood(ekf.hypotheses[h], ekf.innovation, 2.0)
+    log_weights = ekf.hypotheses["log_weight"]
+    assert log_weights[0] == pytest.approx(-0.5 * (0.3**2 / 0.04 + np.log(0.04)))
+    assert log_weights[1] == pytest.approx(-0.5 * (LARGEST_NIS + np.log(0.04)))
 
 
-def test_choose_follows_the_best_and_gives_up_the_hopeless_and_the_same():
-    m = memory_with([0.0, 0.05, 2.0, 3.0], [-1.0, -2.0, -3.0, -1.0 + 1.1 * HOPELESS])
-    choose(m, 5.0)
-    assert m.clock[BEST] == 0.0
-    np.testing.assert_array_equal(m.belief, [0.0, -np.inf, -2.0, -np.inf])
+def test_select_follows_the_best_and_prunes_the_improbable_and_the_same():
+    ekf = ekf_with([0.0, 0.05, 2.0, 3.0], [-1.0, -2.0, -3.0, -1.0 + 1.1 * PRUNED_BELOW])
+    select(ekf, 5.0)
+    assert ekf.best == 0
+    np.testing.assert_array_equal(ekf.hypotheses["log_weight"], [0.0, -np.inf, -2.0, -np.inf])
 
 
-def test_doubt_is_the_distance_to_the_others():
-    m = memory_with([0.0, np.pi / 2, 0.0, 0.0], [0.0, np.log(0.25), -np.inf, -np.inf])
-    m.x[1, 0] = 2.0
+def test_spread_of_means_is_the_distance_to_the_others():
+    ekf = ekf_with([0.0, np.pi / 2, 0.0, 0.0], [0.0, np.log(0.25), -np.inf, -np.inf])
+    ekf.hypotheses["x"][1, 0] = 2.0
     covariance = np.zeros((9, 9))
-    add_doubt(m, covariance)
+    add_spread_of_means(ekf, covariance)
     assert covariance[0, 0] == pytest.approx(0.2 * 2.0**2)
     assert covariance[8, 8] == pytest.approx(0.2 * (np.pi / 2) ** 2)
     assert covariance[0, 8] == pytest.approx(0.2 * 2.0 * np.pi / 2)

@@ -1,27 +1,35 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_ekf.core.inertial import quiet, observe, trust
-from uwb_tdoa_ekf.core.memory import LAST_IMU, FORCE, GYRO, MEAN_FORCE, new_memory
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.inertial import PERSISTENCE, QUIET_NOISE, hold, is_quiet, observe, weigh
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, new_memory
 from uwb_tdoa_ekf.core.state import GRAVITY
 
 UP = np.array([0.0, 0.0, GRAVITY])
 
 
-def feed(gyro, force, rate=1000.0, seconds=3.0, m=None, pause=0.0, seed=0):
-    """Memory after a stream of samples: gyro, force are (mean (3,), standard deviation)."""
-    m, rng = m or new_memory(4), np.random.default_rng(seed)
-    start = max(m.clock[LAST_IMU], 0.0) + pause
+def sample_of(t, gyro, accel):
+    return np.array([(t, tuple(gyro), tuple(accel))], IMU_SAMPLE)[0]
+
+
+def fresh():
+    return new_memory(np.zeros((4, 3))).record.imu
+
+
+def after(gyro, accel, rate=1000.0, seconds=3.0, imu=None, pause=0.0, seed=0):
+    """IMU_STATE after a stream of samples: gyro, accel are (mean (3,), standard deviation)."""
+    imu, rng = fresh() if imu is None else imu, np.random.default_rng(seed)
+    start = max(imu.t, 0.0) + pause
     for k in range(int(rate * seconds)):
-        sample = [np.asarray(mean) + std * rng.standard_normal(3) for mean, std in (gyro, force)]
-        t = start + (k + 1) / rate
-        observe(m, t, *sample, 0.1)
-        m.clock[LAST_IMU] = t
-        m.imu[GYRO], m.imu[FORCE] = sample
-    return m
+        rates, accels = (np.asarray(mean) + std * rng.standard_normal(3) for mean, std in (gyro, accel))
+        sample = sample_of(start + (k + 1) / rate, rates, accels)
+        observe(imu, sample, 0.1)
+        hold(imu, sample)
+    return imu
 
 
-STILL = dict(gyro=(np.zeros(3), 0.002), force=(UP, 0.02))
+STILL = dict(gyro=(np.zeros(3), 0.002), accel=(UP, 0.02))
 
 
 @pytest.mark.parametrize(
@@ -30,37 +38,42 @@ STILL = dict(gyro=(np.zeros(3), 0.002), force=(UP, 0.02))
         ({}, True),
         ({"gyro": (np.zeros(3), 0.05)}, False),
         ({"gyro": (np.array([0.0, 0.0, 0.1]), 0.002)}, False),
-        ({"force": (UP, 0.3)}, False),
-        ({"force": (UP + [1.0, 0.0, 0.0], 0.02)}, True),  # a metre per second squared sideways is a tilt of 6 degrees
-        ({"force": (1.1 * UP, 0.02)}, False),
+        ({"accel": (UP, 0.3)}, False),
+        ({"accel": (UP + [1.0, 0.0, 0.0], 0.02)}, True),  # a metre per second squared sideways is a tilt of 6 degrees
+        ({"accel": (1.1 * UP, 0.02)}, False),
     ],
 )
 def test_rest(change, rests):
-    assert quiet(feed(**{**STILL, **change})) == rests
+    assert is_quiet(after(**{**STILL, **change})) == rests
 
 
 def test_rest_is_not_believed_at_once_nor_after_a_gap():
-    m = feed(**STILL, seconds=0.3)
-    assert not quiet(m)
-    m = feed(**STILL, m=m)
-    assert quiet(m)
-    assert not quiet(feed(**STILL, m=m, pause=1.0, seconds=0.3))
+    imu = after(**STILL, seconds=0.3)
+    assert not is_quiet(imu)
+    imu = after(**STILL, imu=imu)
+    assert is_quiet(imu)
+    assert not is_quiet(after(**STILL, imu=imu, pause=1.0, seconds=0.3))
 
 
-def test_the_more_an_axis_vibrates_the_less_it_is_believed():
-    m = feed((np.zeros(3), 0.0), (UP, np.array([0.0, 0.5, 5.0])))
-    shares, errors = zip(*(trust(m, k, 1.5, 4.0) for k in range(3)))
-    assert shares[0] == pytest.approx(1.0, abs=1e-3) and shares[0] > shares[1] > 0.5 > 0.1 > shares[2]
-    assert errors[2] == pytest.approx(shares[2] * 4.0 * 25.0, rel=0.2)
-    assert trust(m, 2, 1.5, 0.0) == (1.0, 0.0)
+def test_the_more_an_axis_vibrates_the_less_it_weighs_and_the_noisier_it_is():
+    imu = after((np.zeros(3), 0.0), (UP, np.array([0.0, 0.5, 5.0])))
+    weigh(imu, False, FilterConfig(accel_prior_std=1.5, vibration_gain=4.0, accel_noise=0.1).tuning()[0])
+    one, two, three = imu.accel_weight
+    assert one == pytest.approx(1.0, abs=1e-3) and one > two > 0.5 > 0.1 > three
+    assert imu.accel_psd[2] == pytest.approx(0.1**2 + 2.0 * PERSISTENCE * three * 4.0 * 25.0, rel=0.2)
+    weigh(imu, False, FilterConfig(vibration_gain=0.0, accel_noise=0.1).tuning()[0])
+    assert imu.accel_weight.tolist() == [1.0] * 3 and imu.accel_psd == pytest.approx([0.1**2] * 3)
+    weigh(imu, True, FilterConfig().tuning()[0])
+    assert imu.accel_psd == pytest.approx([QUIET_NOISE**2] * 3)
 
 
 def test_samples_are_averaged_with_the_last_one_unless_it_is_old():
-    m = new_memory(4)
+    imu = fresh()
     for t, size, expected in ((0.0, 1.0, 1.0), (0.01, 3.0, 2.0), (1.0, 7.0, 7.0)):
-        assert observe(m, t, np.full(3, size), np.full(3, 10.0 * size), 0.1) == (t == 0.01)
-        np.testing.assert_allclose(m.imu[GYRO], expected)
-        np.testing.assert_allclose(m.imu[FORCE], 10.0 * expected)
-        m.imu[GYRO], m.imu[FORCE] = size, 10.0 * size
-        m.clock[LAST_IMU] = t
-    np.testing.assert_allclose(m.imu[MEAN_FORCE], 70.0)
+        sample = sample_of(t, [size] * 3, [10.0 * size] * 3)
+        assert observe(imu, sample, 0.1) == (t == 0.01)
+        np.testing.assert_allclose(imu.gyro, expected)
+        np.testing.assert_allclose(imu.accel, 10.0 * expected)
+        hold(imu, sample)
+        np.testing.assert_allclose(imu.gyro, size)
+    np.testing.assert_allclose(imu.mean_accel, 70.0)

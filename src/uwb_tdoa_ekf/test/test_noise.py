@@ -12,14 +12,16 @@ from uwb_tdoa_ekf.offline import run_offline
 
 def taught(std, noise, seconds=20.0, seed=0):
     """Excess variances after TDOAs at 400 Hz whose anchors have the standard deviations `noise`, (N,) m."""
-    rng, m, n = np.random.default_rng(seed), new_memory(len(noise)), len(noise)
-    sampled = []
+    rng, n = np.random.default_rng(seed), len(noise)
+    memory, tuning = new_memory(np.zeros((n, 3))), FilterConfig(tdoa_std=std).tuning()[0]
+    anchors, innovation, sampled = memory.anchors, memory.record.innovation, []
     for k in range(int(400 * seconds)):
         a = rng.integers(n)
         b = (a + 1 + rng.integers(n - 1)) % n
-        innovation = rng.standard_normal() * np.hypot(noise[a], noise[b])
-        learn(m, k / 400.0, a, b, innovation, 0.0, std**2 + excess_variance(m, a, b), std, 0.5)
-        sampled.append(m.noise[0].copy())
+        innovation.value = rng.standard_normal() * np.hypot(noise[a], noise[b])
+        innovation.noise_variance = std**2 + excess_variance(anchors[a], anchors[b])
+        learn(anchors[a], anchors[b], k / 400.0, innovation, tuning)
+        sampled.append(anchors["excess_variance"].copy())
     return np.mean(sampled[len(sampled) // 2 :], axis=0)
 
 
@@ -31,24 +33,41 @@ def test_the_noisy_anchor_is_found():
     assert np.delete(learned, 2).max() < 0.1 * learned[2]
 
 
-def test_what_is_as_noisy_as_believed_is_not_blamed():
+def test_what_is_as_noisy_as_expected_has_no_excess():
     learned = taught(0.25, np.full(6, 0.25 / np.sqrt(2.0)))
     assert learned.max() < 0.5 * 0.25**2
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50), st.floats(0.0, 1e3))
-def test_variances_stay_finite_and_not_negative(innovations, spread):
-    m = new_memory(3)
-    for k, innovation in enumerate(innovations):
-        learn(m, 0.01 * k, k % 3, (k + 1) % 3, innovation, spread, 0.01 + excess_variance(m, k % 3, (k + 1) % 3), 0.1, 0.5)
-        assert np.isfinite(m.noise).all() and (m.noise >= 0.0).all()
+def test_variances_stay_finite_and_not_negative(values, prior_variance):
+    memory, tuning = new_memory(np.zeros((3, 3))), FilterConfig(tdoa_std=0.1).tuning()[0]
+    innovation, innovation.prior_variance = memory.record.innovation, prior_variance
+    for k, value in enumerate(values):
+        a, b = memory.anchors[k % 3], memory.anchors[(k + 1) % 3]
+        innovation.value, innovation.noise_variance = value, 0.01 + excess_variance(a, b)
+        learn(a, b, 0.01 * k, innovation, tuning)
+        learned = memory.anchors["excess_variance"]
+        assert np.isfinite(learned).all() and (learned >= 0.0).all()
 
 
 def test_one_outlier_counts_as_few_standard_deviations_at_most():
-    m = new_memory(2)
-    m.noise[1] = 0.0
-    learn(m, 0.01, 0, 1, 1e9, 0.0, 0.01, 0.1, 0.5)
-    assert excess_variance(m, 0, 1) < 0.01
+    memory = new_memory(np.zeros((2, 3)))
+    memory.anchors["learned"] = 0.0
+    (a, b), innovation = memory.anchors, memory.record.innovation
+    innovation.value, innovation.noise_variance = 1e9, 0.01
+    learn(a, b, 0.01, innovation, FilterConfig(tdoa_std=0.1).tuning()[0])
+    assert excess_variance(a, b) < 0.01
+
+
+def test_the_first_tdoa_of_an_anchor_counts_in_full_whenever_it_comes():
+    learned = []
+    for t in (0.01, 1000.0):
+        memory = new_memory(np.zeros((2, 3)))
+        (a, b), innovation = memory.anchors, memory.record.innovation
+        innovation.value, innovation.noise_variance = 0.3, 0.01
+        learn(a, b, t, innovation, FilterConfig(tdoa_std=0.1).tuning()[0])
+        learned.append(excess_variance(a, b))
+    assert learned == pytest.approx([0.3**2 - 0.1**2] * 2)
 
 
 def test_an_anchor_that_is_late_for_a_while_disturbs_less():

@@ -191,7 +191,7 @@ def consistency(robust, loss="geman_mcclure", seeds=range(40), duration=20.0, td
     """
     sizes = dict(accel_noise=0.05, gyro_noise=0.003, accel_bias_walk=0.01, gyro_bias_walk=1e-4)
     settings = FilterConfig(
-        robust=robust, loss=loss, tdoa_std=tdoa_std, tdoa_correlation=1.0, gate=1e6,
+        robust=robust, loss=loss, tdoa_std=tdoa_std, tdoa_correlation_length=1.0, gate=1e6,
         initial_accel_bias_std=0.1, initial_gyro_bias_std=0.01, **sizes, **config,
     )  # fmt: skip
     times, nees, nis = np.arange(3.0, duration - 0.1, 0.05), [], []

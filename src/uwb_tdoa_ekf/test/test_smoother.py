@@ -1,13 +1,17 @@
 from dataclasses import replace
 
 from covariances import assert_covariance
-from flights import fly, position_at
+from flights import fly, measurements, position_at
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
+from uwb_tdoa_ekf.core.engine import most_records, run
+from uwb_tdoa_ekf.core.history import RECORD
+from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, Output, new_memory
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
@@ -55,8 +59,10 @@ def test_smoothing_halves_what_filtering_leaves(use_imu):
     ratios = []
     for seed in range(4):
         flight = fly(seed, 12.0, tdoa_std=0.25, outliers=0.05, **NOISE)
-        config = FilterConfig(use_imu=use_imu, tdoa_correlation=1.0, initial_yaw_std=0.5)
-        ratios.append(rmse(flight, smooth(flight, config).odometry) / rmse(flight, run_offline(flight, config).odometry))
+        config = FilterConfig(use_imu=use_imu, tdoa_correlation_length=1.0, initial_yaw_std=0.5)
+        ratios.append(
+            rmse(flight, smooth(flight, config).odometry) / rmse(flight, run_offline(flight, config).odometry)
+        )
     assert np.mean(ratios) < 0.75
 
 
@@ -66,7 +72,7 @@ def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
     for seed in range(8):
         flight = fly(seed, 12.0, tdoa_std=0.1, accel_bias=0.1, gyro_bias=0.01, **NOISE)
         config = FilterConfig(
-            use_imu=use_imu, tdoa_std=0.1, tdoa_correlation=1.0, robust="gate", gate=1e6, adapt_noise=False,
+            use_imu=use_imu, tdoa_std=0.1, tdoa_correlation_length=1.0, robust="gate", gate=1e6, adapt_noise=False,
             accel_noise=0.05, gyro_noise=0.003, vibration_gain=0.0, initial_yaw_std=0.5,
         )  # fmt: skip
         filtered, smoothed = run_offline(flight, config).odometry, smooth(flight, config).odometry
@@ -85,7 +91,7 @@ def test_without_imu_it_is_the_least_squares_solution():
     """After the start, with white noise and a tag at rest, where nothing is non-linear."""
     flight = fly(3, 2.0, hover=True, tdoa_rate=50.0, tdoa_std=0.05)
     config = FilterConfig(
-        use_imu=False, tdoa_std=0.05, tdoa_correlation=1.0, robust="gate", gate=1e6, adapt_noise=False, recover=False,
+        use_imu=False, tdoa_std=0.05, tdoa_correlation_length=1.0, robust="gate", gate=1e6, adapt_noise=False, recover=False,
         odometry_rate=1e4,
     )  # fmt: skip
     first = run_offline(flight, config)
@@ -127,6 +133,39 @@ def test_the_unknown_yaw_is_known_from_the_beginning():
 
     yaw = (attitude.inv() * Rotation.from_quat(odometry.q)).as_rotvec()[:, 2]
     assert np.abs(yaw).max() < np.radians(10.0)
+
+
+@pytest.mark.parametrize("use_imu", [True, False])
+def test_a_tag_outside_of_its_workspace_is_smoothed_to_the_end(use_imu):
+    """Each TDOA then gives up to four updates: its own, and one for each bound."""
+    flight = leaving(fly(6, 4.0, hover=True, tdoa_rate=400.0))
+    odometry = smooth(flight, FilterConfig(use_imu=use_imu)).odometry
+    assert odometry.t[-1] > flight.tdoa.t[-1] - 0.01
+    assert np.diff(odometry.t).max() < 0.05
+    outside = odometry.t > 2.0
+    assert (odometry.p[outside] > WALL).all(axis=1).mean() > 0.5
+
+
+WALL = np.array([8.0, 9.0, 4.5])  # m, upper bounds of the workspace that the corners have
+
+
+def leaving(flight):
+    """The TDOAs of a tag that moves out of the workspace along all axes, at constant velocity, level."""
+    t, anchors = flight.tdoa.t, flight.anchors
+    p = np.array([6.0, 7.0, 3.0]) + np.minimum(t, 3.0)[:, None] * [1.2, 1.2, 1.0]
+    a, b = (anchors.positions[anchors.index(ids)] for ids in (flight.tdoa.a, flight.tdoa.b))
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(t))
+    return replace(flight, tdoa=replace(flight.tdoa, d=tdoa(p, a, b) + noise))
+
+
+def test_a_history_that_is_full_is_an_error_and_no_silence():
+    flight = fly(7, 2.0)
+    memory, fed = new_memory(flight.anchors.positions), measurements(flight)
+    n, k = len(fed.imu), len(fed.tdoa)
+    assert most_records(fed) >= k
+    output = Output(np.empty(n + k, ODOMETRY), np.empty(k, RESIDUAL), np.empty(k // 2, RECORD))
+    with pytest.raises(IndexError, match="history is full"):
+        run(memory, FilterConfig().tuning(), fed, output)
 
 
 def test_a_flight_too_short_to_start():

@@ -6,11 +6,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_ekf.core.startup import INLIER, ROOM, believable, level, locate, reach, share_of_inliers
+from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
+from uwb_tdoa_ekf.core.startup import INLIER, level, locate, share_of_inliers
+from uwb_tdoa_ekf.core.workspace import bounds
 
 SIZE = np.array([7.0, 8.0, 3.0])
 STD = 0.25  # m, what locate is told of one TDOA
-MARGIN = 1.0  # m beyond the anchors
 
 
 def constellation(n, rng):
@@ -32,9 +33,15 @@ def window(rng, positions, p, v, n=100, std=0.0, outliers=0.0, anchor_std=0.0, l
     return t, a, b, d + np.where(wrong, rng.choice([-1.0, 1.0], n) * rng.uniform(1.0, 5.0, n), 0.0)
 
 
+def window_of(t, a, b, d):
+    return structured(TDOA, t, a, b, d, np.zeros(len(t)))
+
+
 def located(tdoas, positions, std=STD):
-    x, covariance = np.empty(6), np.empty((6, 6))
-    share = locate(*tdoas, positions, std, MARGIN, x, covariance)
+    x, covariance, workspace = np.empty(6), np.empty((6, 6)), np.empty((2, 3))
+    anchors = new_memory(positions).anchors
+    bounds(anchors, 1.0, workspace)
+    share = locate(window_of(*tdoas), anchors, workspace, std, x, covariance)
     return x, covariance, share
 
 
@@ -149,24 +156,12 @@ def test_share_of_inliers_at_the_truth_is_one_less_the_outliers():
     t, a, b, d = window(rng, positions, p, v)
     d[:25] += INLIER + 0.01
     d[25:50] -= INLIER - 0.01
-    assert share_of_inliers(t, a, b, d, positions, np.concatenate([p, v])) == 0.75
-
-
-def test_believable_is_within_reach_of_the_anchors():
-    positions = np.array(corners().positions)
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    for k, half in enumerate((3.5 + MARGIN, 4.0 + MARGIN, ROOM)):
-        middle, far = reach(positions, k, MARGIN)
-        assert (middle, far) == (0.5 * (low[k] + high[k]), half)
-        x = 0.5 * (low + high)
-        x[k] += half - 0.01
-        assert believable(positions, MARGIN, x)
-        x[k] += 0.02
-        assert not believable(positions, MARGIN, x)
+    tdoas = window_of(t, a, b, d)
+    assert share_of_inliers(tdoas, new_memory(positions).anchors, np.concatenate([p, v])) == 0.75
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_level_makes_the_force_point_up_and_keeps_the_yaw(seed):
+def test_level_makes_the_specific_force_point_up_and_keeps_the_yaw(seed):
     rng = np.random.default_rng(seed)
     yaw, pitch, roll = rng.uniform([-np.pi, -1.5, -np.pi], [np.pi, 1.5, np.pi])
     true = Rotation.from_euler("ZYX", [yaw, pitch, roll])
@@ -176,7 +171,7 @@ def test_level_makes_the_force_point_up_and_keeps_the_yaw(seed):
     assert abs(np.linalg.norm(x[6:10]) - 1.0) < 1e-12
 
 
-def test_level_without_any_force_is_upright():
+def test_level_without_any_specific_force_is_upright():
     x = np.zeros(16)
     level(np.zeros(3), 0.0, x)
     assert x[6:10].tolist() == [0, 0, 0, 1]

@@ -6,7 +6,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_ekf.core.state import GRAVITY, coast, inject, predict, rotation, turn
+from uwb_tdoa_ekf.core.config import TUNING
+from uwb_tdoa_ekf.core.memory import new_memory
+from uwb_tdoa_ekf.core.state import GRAVITY, coast, exponential, inject, predict, propagate, rotation, turn
 
 seeds = st.integers(0, 2**32 - 1)
 DOWN = np.array([0.0, 0.0, -GRAVITY])
@@ -29,15 +31,21 @@ def minus(x, y):
     return np.concatenate([x[:6] - y[:6], attitude.as_rotvec(), x[10:] - y[10:]])
 
 
-def predicted(x, P, dt, gyro, force, trust, psd=(0.0, 0.0, 0.0), rest=(0.0, 0.0, 0.0)):
+def ekf_with(x, P):
+    ekf = new_memory(np.zeros((1, 3))).record
+    ekf.hypotheses["x"][0], ekf.hypotheses["P"][0] = x, P
+    return ekf
+
+
+def predicted(x, P, dt, gyro, accel, weight, psd=(0.0, 0.0, 0.0), rest=(0.0, 0.0, 0.0)):
     """State and covariance after one prediction; psd of the accelerometer, rest: gyroscope and both bias walks."""
-    x, P = x.copy(), P.copy()
-    gyro_psd, accel_walk, gyro_walk = rest
-    scratch = np.empty((15, 15)), np.empty((3, 3)), np.empty((3, 3)), np.empty(16)
-    predict(
-        x, P, *scratch, dt, gyro, force, np.asarray(trust), np.asarray(psd), gyro_psd, np.full(3, accel_walk), gyro_walk
-    )  # fmt: skip
-    return x, P
+    ekf, tuning = ekf_with(x, P), np.zeros(1, TUNING)[0]
+    for name, value in zip(("gyro", "accel", "accel_weight", "accel_psd"), (gyro, accel, weight, psd)):
+        ekf.imu[name] = value
+    for name, value in zip(("gyro_noise", "accel_bias_walk", "gyro_bias_walk"), np.sqrt(rest)):
+        tuning[name] = value
+    predict(ekf.hypotheses[0], ekf.imu, tuning, dt, ekf.transition)
+    return ekf.hypotheses["x"][0], ekf.hypotheses["P"][0]
 
 
 def cross(v):
@@ -46,14 +54,14 @@ def cross(v):
 
 def random_case(seed):
     rng = np.random.default_rng(seed)
-    trust = rng.uniform(0.0, 1.0, 3) if seed % 2 else np.ones(3)
-    return rng, random_state(rng), rng.normal(0, 2, 3), rng.normal(0, 4, 3) - DOWN, trust
+    weight = rng.uniform(0.0, 1.0, 3) if seed % 2 else np.ones(3)
+    return rng, random_state(rng), rng.normal(0, 2, 3), rng.normal(0, 4, 3) - DOWN, weight
 
 
 @given(seeds)
 def test_rotation_is_that_of_scipy(seed):
     x, R = random_state(np.random.default_rng(seed)), np.empty((3, 3))
-    rotation(x, R)
+    rotation(*x[6:10], R)
     np.testing.assert_allclose(R, Rotation.from_quat(x[6:10]).as_matrix(), atol=1e-12)
 
 
@@ -62,7 +70,7 @@ def test_turn_is_a_rotation_vector_in_the_body_frame(seed, size):
     rng = np.random.default_rng(seed)
     x, r = random_state(rng), size * rng.standard_normal(3)
     expected = Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(r)
-    turn(x, *r)
+    turn(x, *exponential(*r))
     assert abs(np.linalg.norm(x[6:10]) - 1.0) < 1e-14
     assert (expected.inv() * Rotation.from_quat(x[6:10])).magnitude() < 1e-12
 
@@ -99,8 +107,8 @@ def test_free_fall():
 @given(seeds)
 def test_many_small_steps_solve_the_equations_of_motion(seed):
     """Eq. 14 of Zhao et al. with constant rates and specific force, solved by scipy."""
-    _, x, gyro, force, _ = random_case(seed)
-    rates, f = gyro - x[13:], force - x[10:13]
+    _, x, gyro, accel, _ = random_case(seed)
+    rates, f = gyro - x[13:], accel - x[10:13]
 
     def derivative(t, y):
         attitude = Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(rates * t)
@@ -109,53 +117,69 @@ def test_many_small_steps_solve_the_equations_of_motion(seed):
     exact = solve_ivp(derivative, (0.0, 0.2), x[:6], rtol=1e-10, atol=1e-10).y[:, -1]
     P, after = np.eye(15), x
     for _ in range(400):
-        after, _ = predicted(after, P, 0.0005, gyro, force, np.ones(3))
-    np.testing.assert_allclose(after[:6], exact, atol=0.005)  # force held over each step: first order
+        after, _ = predicted(after, P, 0.0005, gyro, accel, np.ones(3))
+    np.testing.assert_allclose(after[:6], exact, atol=0.005)  # input held over each step: first order
     attitude = Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(0.2 * rates)
     assert (attitude.inv() * Rotation.from_quat(after[6:10])).magnitude() < 1e-10
 
 
-def test_no_trust_means_hovering_thrust():
+def test_no_weight_means_hovering_thrust():
     x = random_state(np.random.default_rng(1))
-    for force in (np.zeros(3), np.full(3, 50.0)):
-        after, _ = predicted(x, np.eye(15), 0.01, np.zeros(3), force, np.zeros(3))
+    for accel in (np.zeros(3), np.full(3, 50.0)):
+        after, _ = predicted(x, np.eye(15), 0.01, np.zeros(3), accel, np.zeros(3))
         thrust = Rotation.from_quat(x[6:10]).apply([0, 0, GRAVITY])
         np.testing.assert_allclose(after[3:6] - x[3:6], 0.01 * (thrust + DOWN), atol=1e-12)
 
 
-@given(seeds)
-def test_covariance_is_phi_p_phi_of_the_documented_phi(seed):
-    rng, x, gyro, force, trust = random_case(seed)
-    dt, P = 10.0 ** rng.uniform(-4, -1.3), random_covariance(rng)
-    psd, rest = rng.uniform(0, 1, 3), rng.uniform(0, 1, 3)
+def documented_phi(x, dt, gyro, accel, weight):
     R = Rotation.from_quat(x[6:10]).as_matrix()
-    f = -DOWN + trust * (force - x[10:13] + DOWN)  # share `trust` of what was measured, the rest is hovering
+    f = -DOWN + weight * (accel - x[10:13] + DOWN)  # share `weight` of what was measured, the rest is hovering
     phi = np.eye(15)
     phi[0:3, 3:6] = dt * np.eye(3)
     phi[3:6, 6:9] = -dt * R @ cross(f)
-    phi[3:6, 9:12] = -dt * R @ np.diag(trust)
+    phi[3:6, 9:12] = -dt * R @ np.diag(weight)
     phi[6:9, 6:9] = Rotation.from_rotvec(-dt * (gyro - x[13:])).as_matrix()
     phi[6:9, 12:15] = -dt * np.eye(3)
-    Q = np.zeros((15, 15))
+    return phi
+
+
+@given(seeds)
+def test_propagate_is_the_upper_rows_of_the_documented_phi(seed):
+    rng, x, gyro, accel, weight = random_case(seed)
+    M, ekf = rng.standard_normal((15, 15)), ekf_with(x, np.eye(15))
+    ekf.imu.gyro, ekf.imu.accel, ekf.imu.accel_weight = gyro, accel, weight
+    predict(ekf.hypotheses[0], ekf.imu, np.zeros(1, TUNING)[0], 0.01, ekf.transition)
+    propagate(M, ekf.transition)
+    expected = documented_phi(x, 0.01, gyro, accel, weight) @ M
+    np.testing.assert_allclose(ekf.transition.product, expected[:9], atol=1e-12)
+
+
+@given(seeds)
+def test_covariance_is_phi_p_phi_of_the_documented_phi(seed):
+    rng, x, gyro, accel, weight = random_case(seed)
+    dt, P = 10.0 ** rng.uniform(-4, -1.3), random_covariance(rng)
+    psd, rest = rng.uniform(0, 1, 3), rng.uniform(0, 1, 3)
+    R, phi, Q = Rotation.from_quat(x[6:10]).as_matrix(), documented_phi(x, dt, gyro, accel, weight), np.zeros((15, 15))
     Q[3:6, 3:6] = dt * R @ np.diag(psd) @ R.T
     for first, density in zip((6, 9, 12), rest):
         Q[first : first + 3, first : first + 3] = dt * density * np.eye(3)
-    _, after = predicted(x, P, dt, gyro, force, trust, psd, rest)
+    _, after = predicted(x, P, dt, gyro, accel, weight, psd, rest)
     expected = phi @ P @ phi.T + Q
     np.testing.assert_allclose(after, expected, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_array_equal(after, after.T)
     assert_covariance(after)
 
 
 @given(seeds)
 def test_covariance_follows_the_nominal_state_to_first_order_in_dt(seed):
     """Phi from finite differences of the nominal prediction: what is left falls with the square of dt."""
-    rng, x, gyro, force, trust = random_case(seed)
+    rng, x, gyro, accel, weight = random_case(seed)
     P, left = random_covariance(rng, spread=0.3), []
     for dt in (1e-2, 1e-3):
-        base, after = predicted(x, P, dt, gyro, force, trust)
+        base, after = predicted(x, P, dt, gyro, accel, weight)
 
         def moved(error):
-            return minus(predicted(plus(x, error), P, dt, gyro, force, trust)[0], base)
+            return minus(predicted(plus(x, error), P, dt, gyro, accel, weight)[0], base)
 
         phi = numerical_jacobian(moved, np.zeros(15), 1e-5)
         left.append(np.linalg.norm(after - phi @ P @ phi.T))
@@ -184,21 +208,25 @@ def test_a_spin_about_the_vertical_leaves_the_uncertainty_of_the_tilt_as_it_was(
     np.testing.assert_allclose([P[6, 6], P[7, 7]], 0.01, rtol=0.1)
 
 
+def coasted(x, P, dt, accel_psd, turn_psd):
+    hypotheses = ekf_with(x, P).hypotheses
+    coast(hypotheses[0], dt, accel_psd, turn_psd)
+    return hypotheses["x"][0], hypotheses["P"][0]
+
+
 @given(seeds)
 def test_coast_is_constant_velocity(seed):
     rng = np.random.default_rng(seed)
     x, P, dt = random_state(rng), random_covariance(rng), rng.uniform(0.001, 0.1)
-    base, after = x.copy(), P.copy()
-    coast(base, after, dt, 2.0, 0.5)
+    base, after = coasted(x, P, dt, 2.0, 0.5)
     np.testing.assert_allclose(base[:3], x[:3] + dt * x[3:6])
     np.testing.assert_array_equal(base[3:], x[3:])
 
     def moved(error):
-        out = plus(x, error)
-        coast(out, P.copy(), dt, 0.0, 0.0)
-        return minus(out, base)
+        return minus(coasted(plus(x, error), P, dt, 0.0, 0.0)[0], base)
 
     phi = numerical_jacobian(moved, np.zeros(15), 1e-4)
     Q = np.diag([0.0] * 3 + [2.0 * dt] * 3 + [0.5 * dt] * 3 + [0.0] * 6)
     np.testing.assert_allclose(after, phi @ P @ phi.T + Q, atol=1e-7 * np.abs(P).max())
     assert_covariance(after)
+    np.testing.assert_array_equal(after, after.T)

@@ -1,16 +1,16 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_ekf.core.validity import MARGIN, usable, usable_all
+from uwb_tdoa_ekf.core.validity import LARGEST_ERROR, usable, usable_all
 
 POSITIONS = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])
 CASES = [
     (0, 1, 0.0, 0.0, True),
     (0, 1, 5.0, 0.0, True),  # right behind anchor 0
-    (0, 1, 5.0 + MARGIN, 0.0, True),
-    (0, 1, -5.0 - MARGIN, 0.0, True),
-    (0, 1, 5.001 + MARGIN, 0.0, False),  # no place hears that
-    (1, 0, -5.001 - MARGIN, 0.0, False),
+    (0, 1, 5.0 + LARGEST_ERROR, 0.0, True),
+    (0, 1, -5.0 - LARGEST_ERROR, 0.0, True),
+    (0, 1, 5.001 + LARGEST_ERROR, 0.0, False),  # no place hears that
+    (1, 0, -5.001 - LARGEST_ERROR, 0.0, False),
     (0, 2, 5.0, 0.0, False),
     (0, 0, 0.0, 0.0, False),
     (-1, 1, 0.0, 0.0, False),

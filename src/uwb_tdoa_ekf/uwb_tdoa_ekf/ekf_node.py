@@ -15,6 +15,7 @@ import time
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import Imu
@@ -26,13 +27,28 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
 
-from .core.config import FilterConfig
+from .core.config import RENAMED, FilterConfig, current_names
 from .core.engine import INVALID
 from .estimator import VERDICTS, Estimator
 from .frames import to_odometry
 from .monitoring.health import OK, WARN, Health
 from .monitoring.monitor import Monitor
 
+PARAMETERS = {  # beside those of FilterConfig: default and meaning, as in config/ekf_node.yaml
+    "world_frame": ("", 'frame of the odometry and the parent on /tf; "" for the frame of uwb/anchors'),
+    "body_frame": (
+        "base_link", "frame of tag and IMU, whose axes must agree with it: the child on /tf; one per tag"
+    ),
+    "publish_tf": (True, "world -> body on /tf"),
+    "flyable_volume": (
+        "", 'flyable.npz of plan; a warning on /diagnostics while the tag is outside; "" for none'
+    ),
+    "effects_file": (
+        "", "effects.yaml, the same as bias_node's: what it says of gyroscope and accelerometer is taken out"
+    ),
+    "reorder": (0.003, "s of stamps; how long a TDOA waits for older ones that are still on their way"),
+    "lag": (0.25, "s of stamps; how long a silent stream is waited for; what comes later than that is late"),
+}  # fmt: skip
 EARLY = 5000  # messages kept while there are no anchors
 UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
 
@@ -44,19 +60,11 @@ class EkfNode(Node):
 
     def __init__(self):
         super().__init__(self.NAME)
-        tuning = {
-            field.name: ros.parameter(self, field.name, field.default, "tunes the filter; see config/ekf_node.yaml")
-            for field in fields(FilterConfig)
-        }
-        self._config = FilterConfig(**tuning)
-        self._reorder = ros.parameter(self, "reorder", 0.003, "how long a TDOA waits for older ones, s of stamps")
-        self._lag = ros.parameter(self, "lag", 0.25, "how long a silent stream is waited for, s of stamps")
-        self._world = ros.parameter(self, "world_frame", "", "frame of the odometry; empty for that of the anchors")
-        self._body = ros.parameter(self, "body_frame", "base_link", "frame of the tag and the IMU")
-        volume = ros.parameter(self, "flyable_volume", "", "file of plan: where the tag can be located; empty for none")
-        effects_file = ros.parameter(self, "effects_file", "", "effects.yaml whose inertial effects are taken out")
+        self._config = _declare_filter_config(self)
+        others = {name: ros.parameter(self, name, value, text) for name, (value, text) in PARAMETERS.items()}
+        self._reorder, self._lag, self._world = (others[name] for name in ("reorder", "lag", "world_frame"))
+        volume, effects_file = others["flyable_volume"], others["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
-        publish_tf = ros.parameter(self, "publish_tf", True, "publish world -> body on /tf")
         if not 0.0 <= self._reorder < self._lag < math.inf:
             raise InputError(f"reorder, lag: {self._reorder!r}, {self._lag!r} must be seconds with 0 <= reorder < lag.")
         self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute")
@@ -68,13 +76,13 @@ class EkfNode(Node):
         self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
         # One message object each, for all: what is published is copied.
-        self._odometry = Odometry(child_frame_id=self._body)
-        self._transform = TransformStamped(child_frame_id=self._body)
+        self._odometry = Odometry(child_frame_id=others["body_frame"])
+        self._transform = TransformStamped(child_frame_id=others["body_frame"])
         self._tf, self._residual = TFMessage(transforms=[self._transform]), TdoaResidual()
 
         self._odometry_publisher = ros.publish_stream(self, Odometry, "odometry")
         self._residual_publisher = ros.publish_stream(self, TdoaResidual, "uwb/residual")
-        self._tf_publisher = self.create_publisher(TFMessage, "/tf", ros.TF_QOS) if publish_tf else None
+        self._tf_publisher = self.create_publisher(TFMessage, "/tf", ros.TF_QOS) if others["publish_tf"] else None
         self._anchors = ros.AnchorsInput(self, self._on_anchors)
         self._inputs = {
             "imu/data": ros.subscribe_stream(self, Imu, "imu/data", self._on_imu),
@@ -120,8 +128,8 @@ class EkfNode(Node):
 
     def _take_imu(self, message):
         t = self._epoch.seconds(message.header.stamp)
-        rate, force = message.angular_velocity, message.linear_acceleration
-        gyro, force = (rate.x, rate.y, rate.z), (force.x, force.y, force.z)
+        rate, force = message.angular_velocity, message.linear_acceleration  # the specific force, says REP 145
+        gyro, accel = (rate.x, rate.y, rate.z), (force.x, force.y, force.z)
         if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
             self.get_logger().warning(
                 "imu/data says with a covariance of -1 that it has no angular velocity or no acceleration: such "
@@ -130,8 +138,8 @@ class EkfNode(Node):
             )
             gyro = (math.nan,) * 3
         if not self._imu_corrector.idle:
-            gyro, force = (x[0].tolist() for x in self._imu_corrector.correct(*map(np.array, ([t], [gyro], [force]))))
-        self._estimator.add_imu(t, gyro, force)
+            gyro, accel = (x[0].tolist() for x in self._imu_corrector.correct(*map(np.array, ([t], [gyro], [accel]))))
+        self._estimator.add_imu(t, gyro, accel)
 
     def _take_tdoa(self, message):
         t = self._epoch.seconds(message.header.stamp)
@@ -165,7 +173,9 @@ class EkfNode(Node):
         twist[:, :3, :3] = covariance[:, 6:, 6:]
         rates = self._estimator.rates_at(odometry.t) - odometry.gyro_bias
         known = np.isfinite(rates[:, 0])
-        rate_variance = self._config.gyro_noise**2 * self._config.odometry_rate  # of the mean over one odometry interval
+        rate_variance = (
+            self._config.gyro_noise**2 * self._config.odometry_rate
+        )  # of the mean over one odometry interval
         twist[:, [3, 4, 5], [3, 4, 5]] = np.where(known, rate_variance, UNKNOWN_RATE)[:, None]
         twist = twist.reshape(n, 36)
         out, tf = self._odometry, self._transform.transform
@@ -215,6 +225,23 @@ class EkfNode(Node):
         values |= {"subscribers of odometry": self._odometry_publisher.get_subscription_count()}
         values |= {"subscribers of uwb/residual": self._residual_publisher.get_subscription_count()}
         return level, text, values
+
+
+def _declare_filter_config(node):
+    """Declare every parameter of FilterConfig; what was given under an old name counts, with a warning."""
+    old = {name: _value_of_old(node, name) for name in RENAMED}
+    given = {name: value for name, value in old.items() if value is not None}
+    defaults = {field.name: field.default for field in fields(FilterConfig)}
+    defaults |= current_names(given, node.get_logger().warning)
+    texts = {field.name: field.metadata["text"] for field in fields(FilterConfig)}
+    return FilterConfig(**{name: ros.parameter(node, name, value, texts[name]) for name, value in defaults.items()})
+
+
+def _value_of_old(node, name):
+    """What was given for a parameter that the node does not have any more, or None."""
+    value = node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True)).value
+    node.undeclare_parameter(name)
+    return value
 
 
 def _warm_up(config):

@@ -3,19 +3,20 @@
 from bisect import bisect_right, insort
 from dataclasses import dataclass
 import math
+from operator import itemgetter
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.stamps import StampWatch
 
 from .core.config import FilterConfig
-from .core.engine import INVALID, LATE, REJECTED, STARTUP, USED, run
-from .core.memory import RECOVERIES, RUNNING, new_memory
-from .core.tape import new_tape
-from .core.validity import MAX_FORCE, MAX_RATE, usable
+from .core.engine import INVALID, LATE, REJECTED, STARTUP, USED, feed
+from .core.memory import IMU_SAMPLE, ODOMETRY, TDOA, Measurements, new_memory
+from .core.validity import MAX_ACCEL, MAX_RATE, usable
 
 VERDICTS = {USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup"}
-IMU, TDOA = range(2)  # the streams
+STREAMS = IMU_SAMPLE, TDOA
+IMU_STREAM, TDOA_STREAM = range(2)  # places in STREAMS
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,10 @@ class Odometry:
     covariance: np.ndarray
 
     @classmethod
-    def from_rows(cls, rows, covariance):
-        """From what engine.run writes: rows (n, 17) of stamp and state, covariance (n, 9, 9)."""
-        parts = (rows[:, 0], rows[:, 1:4], rows[:, 4:7], rows[:, 7:11], rows[:, 11:14], rows[:, 14:17])
-        return cls(*parts, covariance)
+    def from_rows(cls, rows):
+        """From (n,) of memory.ODOMETRY."""
+        x = rows["x"]
+        return cls(rows["t"], x[:, :3], x[:, 3:6], x[:, 6:10], x[:, 10:13], x[:, 13:], rows["covariance"])
 
     def __len__(self):
         return len(self.t)
@@ -75,46 +76,47 @@ class Estimator:
         self._restart()
 
     def _restart(self):
-        self._memory = new_memory(len(self.anchors))
+        self._memory = new_memory(self.anchors.positions)
         self._waiting = [], []  # items of each stream in order of their stamps
         self._watches = [StampWatch(), StampWatch()]
         self._done = -math.inf
-        self._last_imu = np.array([[-math.inf] + [math.nan] * 6])  # samples used last, the newest before them in front
+        self._last_imu = np.array(
+            [(-math.inf, math.nan, math.nan)], IMU_SAMPLE
+        )  # used last, the one before them in front
 
     @property
     def running(self):
         """True once a start position was found."""
-        return bool(self._memory.clock[RUNNING])
+        return bool(self._memory.record.running)
 
     @property
     def recoveries(self):
         """How often the filter found that it had lost the tag, and found it again."""
-        return int(self._memory.clock[RECOVERIES])
+        return int(self._memory.record.recoveries)
 
     @property
     def waiting(self):
         """Messages received and neither used nor refused yet: (imu, tdoa)."""
         return tuple(len(stream) + len(watch) for stream, watch in zip(self._waiting, self._watches))
 
-    def add_imu(self, t, gyro, force):
-        """Take one inertial sample: t s; gyro (3,) rad/s; force (3,) m/s^2, specific force; body frame."""
-        sample = (t, *gyro, *force)
-        if not (math.isfinite(t) and max(map(abs, gyro)) < MAX_RATE and max(map(abs, force)) < MAX_FORCE) or any(
-            map(math.isnan, sample)
-        ):
+    def add_imu(self, t, gyro, accel):
+        """Take one inertial sample: t s; gyro (3,) rad/s; accel (3,) m/s^2, specific force; body frame."""
+        sample = (t, tuple(gyro), tuple(accel))
+        rates, accels = (all(abs(x) < limit for x in part) for part, limit in zip(sample[1:], (MAX_RATE, MAX_ACCEL)))
+        if not (math.isfinite(t) and rates and accels):  # NaN is not below anything
             self.counts["imu_invalid"] += 1
-            self._watches[IMU].see(t)
+            self._watches[IMU_STREAM].see(t)
             return
-        self._take(IMU, t, sample)
+        self._take(IMU_STREAM, t, sample)
 
     def add_tdoa(self, t, a, b, d, bias_std=0.0):
         """Take one corrected TDOA: t s; a, b anchor ids; d m; bias_std m."""
         i, k = self.anchors.row(a), self.anchors.row(b)
         if not (math.isfinite(t) and usable(i, k, d, bias_std, self.anchors.positions)):
             self._refused.append((t, a, b, INVALID))
-            self._watches[TDOA].see(t)  # or whoever waits for our pose of this time would wait for the next one
+            self._watches[TDOA_STREAM].see(t)  # or whoever waits for our pose of this time would wait for the next one
             return
-        self._take(TDOA, t, (t, i, k, d, bias_std))
+        self._take(TDOA_STREAM, t, (t, i, k, d, bias_std))
 
     def advance(self):
         """Use every message that nothing earlier can precede any more. Returns (Odometry, Residuals), possibly empty."""
@@ -131,10 +133,10 @@ class Estimator:
     def rates_at(self, t):
         """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample is
         near."""
-        place = np.searchsorted(self._last_imu[:, 0], t, side="right") - 1
+        place = np.searchsorted(self._last_imu["t"], t, side="right") - 1
         sample = self._last_imu[np.maximum(place, 0)]
-        near = (place >= 0) & (np.abs(t - sample[:, 0]) <= self.config.imu_timeout)
-        return np.where(near[:, None], sample[:, 1:4], math.nan)
+        near = (place >= 0) & (np.abs(t - sample["t"]) <= self.config.imu_timeout)
+        return np.where(near[:, None], sample["gyro"], math.nan)
 
     def _take(self, stream, t, item):
         """Keep an item of a stream, and one that was held because of its stamp, if their stamps can be believed."""
@@ -154,7 +156,7 @@ class Estimator:
             self._refuse(stream, item, INVALID if t > self._watches[stream].newest else LATE)
 
     def _refuse(self, stream, item, verdict):
-        if stream == IMU:
+        if stream == IMU_STREAM:
             self.counts["imu_invalid" if verdict == INVALID else "imu_late"] += 1
         else:
             t, i, k, _, _ = item
@@ -173,56 +175,46 @@ class Estimator:
             self._take(other, t, item)
 
     def _use(self, until):
-        n, k = (bisect_right(stream, (until, math.inf)) for stream in self._waiting)
-        if not (n or k or self._refused):
+        counts = [bisect_right(waiting, until, key=itemgetter(0)) for waiting in self._waiting]
+        if not (any(counts) or self._refused):
             return _NOTHING
-        imu, tdoa = (np.array(stream[:m]).reshape(m, size) for stream, m, size in zip(self._waiting, (n, k), (7, 5)))
-        a, b = tdoa[:, 1].astype(np.int64), tdoa[:, 2].astype(np.int64)
-        for stream, m in zip(self._waiting, (n, k)):
-            del stream[:m]
-        fed = imu if self.config.use_imu else imu[:0]
-        fed_t, gyro, force = (np.ascontiguousarray(part) for part in (fed[:, 0], fed[:, 1:4], fed[:, 4:7]))
-        t, d, std = (np.ascontiguousarray(tdoa[:, column]) for column in (0, 3, 4))
-        rows, covariance, used = np.empty((n + k, 17)), np.empty((n + k, 9, 9)), np.empty((k, 4))
-        count = run(
-            self._memory, self._tuning, self.anchors.positions, fed_t, gyro, force,
-            t, a, b, d, std, rows, covariance, used, _NO_TAPE,
-        )  # fmt: skip
-        for stream in (imu, tdoa):
-            if len(stream):
-                self._done = max(self._done, stream[-1, 0])
+        imu, tdoa = (np.array(waiting[:n], kind) for waiting, n, kind in zip(self._waiting, counts, STREAMS))
+        for waiting, n in zip(self._waiting, counts):
+            del waiting[:n]
+        fed = Measurements(imu if self.config.use_imu else imu[:0], tdoa)
+        odometry, outcome = feed(self._memory, self._tuning, fed)
+        for part in (imu, tdoa):
+            if len(part):
+                self._done = max(self._done, part["t"][-1])
         self._last_imu = np.concatenate([self._last_imu[-1:], imu])
-        self.counts["imu_used"] += n
-        residuals = self._residuals(tdoa[:, 0], self.anchors.ids[a], self.anchors.ids[b], used)
-        return Odometry.from_rows(rows[:count], covariance[:count]), residuals
+        self.counts["imu_used"] += len(imu)
+        return Odometry.from_rows(odometry), self._residuals(tdoa, outcome)
 
-    def _residuals(self, t, a, b, used):
+    def _residuals(self, tdoa, outcome):
+        """Residuals of (k,) of TDOA that were fed, with their (k,) of RESIDUAL, and of those that were refused."""
         refused = np.array(self._refused, dtype=float).reshape(-1, 4)
         self._refused = []
         none = np.full(len(refused), np.nan)
-        verdict = np.concatenate([used[:, 3], refused[:, 3]]).astype(np.uint8)
+        ids = self.anchors.ids
+        verdict = np.concatenate([outcome["verdict"], refused[:, 3]]).astype(np.uint8)
         for value in verdict.tolist():
             self.counts[VERDICTS[value]] += 1
         return Residuals(
-            np.concatenate([t, refused[:, 0]]),
-            np.concatenate([a, refused[:, 1].astype(np.int64)]),
-            np.concatenate([b, refused[:, 2].astype(np.int64)]),
-            np.concatenate([used[:, 0], none]),
-            np.concatenate([used[:, 1], none]),
-            np.concatenate([used[:, 2], 0.0 * refused[:, 3]]),
+            np.concatenate([tdoa["t"], refused[:, 0]]),
+            np.concatenate([ids[tdoa["a"]], refused[:, 1].astype(np.int64)]),
+            np.concatenate([ids[tdoa["b"]], refused[:, 2].astype(np.int64)]),
+            np.concatenate([outcome["innovation"], none]),
+            np.concatenate([outcome["variance"], none]),
+            np.concatenate([outcome["weight"], np.zeros(len(refused))]),
             verdict,
         )
 
 
-_NO_TAPE = new_tape()
-_NOTHING = (
-    Odometry.from_rows(np.empty((0, 17)), np.empty((0, 9, 9))),
-    Residuals(*(np.empty(0) for _ in range(7))),
-)
+_NOTHING = Odometry.from_rows(np.empty(0, ODOMETRY)), Residuals(*(np.empty(0) for _ in range(7)))
 
 
-def _insert(stream, item):
-    if stream and item < stream[-1]:
-        insort(stream, item)
+def _insert(waiting, item):
+    if waiting and item < waiting[-1]:
+        insort(waiting, item)
     else:
-        stream.append(item)
+        waiting.append(item)

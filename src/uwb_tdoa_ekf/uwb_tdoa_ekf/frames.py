@@ -27,7 +27,7 @@ def to_odometry(q, v, covariance):
 
 
 def rotation_std(q, covariance):
-    """Standard deviations of the rotation about the world's axes, (n, 3) rad: those of to_odometry. Arguments as there, without
-    v."""
+    """Standard deviations of the rotation about the world's axes, (n, 3) rad: those of to_odometry. Arguments as
+    there, without v."""
     rotation = Rotation.from_quat(q).as_matrix()
     return np.sqrt(np.einsum("nki,nij,nkj->nk", rotation, covariance[:, 6:, 6:], rotation))

@@ -1,7 +1,7 @@
 """Fixed-interval smoother over the filter's own run: every estimate from all measurements, before and after it.
 
 Modified Bryson-Frazier recursion (Bierman, Fixed interval smoothing with discrete measurements, Int. J. Control 1973):
-backwards through the scalar updates on the filter's tape, with its robust weights, inverting no covariance.
+backwards through the scalar updates of the filter's history, with its robust weights, inverting no covariance.
 """
 
 from dataclasses import replace
@@ -12,12 +12,12 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .core.config import FilterConfig
-from .core.engine import REST_PERIOD
-from .estimator import Odometry
+from .core.history import RESET
 from .core.hypotheses import YAW_STD
+from .core.memory import ODOMETRY
+from .core.state import ERROR_STATES, MOVING_STATES, inject
+from .estimator import Odometry
 from .offline import run_offline
-from .core.state import inject
-from .core.tape import REPLACED, new_tape
 
 
 def smooth(flight, config=None, corrector=None):
@@ -25,62 +25,110 @@ def smooth(flight, config=None, corrector=None):
 
     Takes what run_offline takes and returns its Run with the odometry smoothed: at the stamps of updates, thinned to
     odometry_rate. If the yaw is unknown, the direction that the filter believes in the end counts from the beginning.
-    Memory: 5 kB per TDOA.
+    Memory: 3.5 kB per update.
     """
     config = config or FilterConfig()
     if config.use_imu and config.initial_yaw_std > YAW_STD:
-        turned = run_offline(flight, config, corrector).turned
-        config = replace(config, initial_yaw=config.initial_yaw + turned, initial_yaw_std=YAW_STD)
-    duration = np.ptp(flight.tdoa.t) if len(flight.tdoa) else 0.0
-    tape = new_tape(len(flight.tdoa) + 3 * int(duration / REST_PERIOD) + 100)
-    result = run_offline(flight, config, corrector, tape)
-    n = result.taped
-    rows, covariance = np.empty((n, 17)), np.empty((n, 9, 9))
-    count = _backward(tape, n, config.odometry_rate, rows, covariance)
-    rows, covariance = rows[n - count :], covariance[n - count :]
-    return replace(result, odometry=Odometry.from_rows(rows, covariance))
+        offset = run_offline(flight, config, corrector).yaw_offset
+        config = replace(config, initial_yaw=config.initial_yaw + offset, initial_yaw_std=YAW_STD)
+    records = []
+    result = run_offline(flight, config, corrector, records)
+    records = [some for some in records if len(some)]
+    before = [-math.inf] + [some["t"][-1] for some in records]  # stamp of the record before each array of them
+    adjoint, information = np.zeros(ERROR_STATES), np.zeros((ERROR_STATES, ERROR_STATES))
+    rows = [np.empty(0, ODOMETRY)]
+    for k in reversed(range(len(records))):
+        room = np.empty(len(records[k]), ODOMETRY)
+        count = _backward(records[k], before[k], config.odometry_rate, adjoint, information, room)
+        rows.append(room[len(room) - count :])
+    return replace(result, odometry=Odometry.from_rows(np.concatenate(rows[::-1])))
 
 
 @compiled
-def _backward(tape, n, rate, rows, covariance):
-    """Fill rows (n, 17) and covariance (n, 9, 9) from the end on; returns how many."""
-    adjoint = np.zeros(15)
-    information = np.zeros((15, 15))
-    shift = np.zeros(15)
-    moved = np.empty((15, 15))
-    count = 0
-    for i in range(n - 1, -1, -1):
-        P = tape.P[i]
-        if i == 0 or math.floor(tape.t[i] * rate) != math.floor(tape.t[i - 1] * rate):
+def _backward(records, before, rate, adjoint, information, rows):
+    """Through (n,) of RECORD from the end on; `before` : s, stamp of the record in front of them.
+
+    adjoint (15,), information (15, 15): Bierman's lambda and Lambda, those behind the records, which become those in
+    front of them. Fills (n,) of ODOMETRY from the end on, and returns how many.
+    """
+    count, work = 0, np.empty((ERROR_STATES, ERROR_STATES))
+    for i in range(len(records) - 1, -1, -1):
+        record = records[i]
+        earlier = records[i - 1].t if i > 0 else before
+        if math.floor(record.t * rate) != math.floor(earlier * rate):
             count += 1
-            out = rows[n - count]
-            out[0] = tape.t[i]
-            out[1:] = tape.x[i]
-            for j in range(15):
-                shift[j] = -np.dot(P[j], adjoint)
-            inject(out[1:], shift, 1.0)
-            reduced = P[:9, :9] - P[:9] @ information @ np.ascontiguousarray(P[:, :9])
-            covariance[n - count] = 0.5 * (reduced + reduced.T)
-        if tape.kind[i] == REPLACED:
+            _smoothed(record, adjoint, information, rows[len(rows) - count], work)
+        if record.kind == RESET:
             adjoint[:] = 0.0
             information[:, :] = 0.0
-            continue
-        # through the update: C = I - gain h
-        h, gain = tape.h[i], tape.gain[i]
-        lean = information @ gain
-        both = np.dot(gain, lean) + 1.0 / tape.total[i]
-        pull = np.dot(gain, adjoint) + tape.innovation[i] / tape.total[i]
-        for j in range(15):
-            adjoint[j] -= h[j] * pull
-            for k in range(15):
-                information[j, k] += h[j] * h[k] * both - h[j] * lean[k] - lean[j] * h[k]
-        # through the prediction: the lower rows of the transition are those of the identity
-        phi = tape.phi[i]
-        shift[:] = phi.T @ adjoint[:9]
-        shift[9:] += adjoint[9:]
-        adjoint[:] = shift
-        moved[:, :] = np.ascontiguousarray(information[:, :9]) @ phi
-        moved[:, 9:] += information[:, 9:]
-        information[:, :] = phi.T @ moved[:9]
-        information[9:] += moved[9:]
+        else:
+            _through_update(record, adjoint, information)
+            _through_prediction(record.transition, adjoint, information, work)
     return count
+
+
+@compiled
+def _smoothed(record, adjoint, information, row, work):
+    """Write x - P lambda and P - P Lambda P to one of ODOMETRY. work (15, 15): scratch."""
+    P = record.P
+    shift = work[0]
+    for j in range(ERROR_STATES):
+        shift[j] = 0.0
+        for k in range(ERROR_STATES):
+            shift[j] -= P[j, k] * adjoint[k]
+    row.t = record.t
+    row.x[:] = record.x
+    inject(row.x, shift, 1.0)
+    for i in range(9):
+        for j in range(ERROR_STATES):
+            work[i, j] = 0.0
+            for k in range(ERROR_STATES):
+                work[i, j] += P[i, k] * information[k, j]
+    for i in range(9):
+        for j in range(i, 9):
+            reduction = 0.0
+            for k in range(ERROR_STATES):
+                reduction += work[i, k] * P[k, j]
+            row.covariance[i, j] = row.covariance[j, i] = P[i, j] - reduction
+
+
+@compiled
+def _through_update(record, adjoint, information):
+    """lambda <- C' lambda - h' y / S,  Lambda <- C' Lambda C + h' h / S, with C = I - K h, innovation y of variance S."""
+    h, gain = record.row, record.gain
+    information_gain = np.zeros(ERROR_STATES)  # Lambda K
+    for j in range(ERROR_STATES):
+        for k in range(ERROR_STATES):
+            information_gain[j] += information[j, k] * gain[k]
+    along, across = record.innovation / record.variance, 1.0 / record.variance  # K' lambda + y / S, K' Lambda K + 1 / S
+    for k in range(ERROR_STATES):
+        along += gain[k] * adjoint[k]
+        across += gain[k] * information_gain[k]
+    for j in range(ERROR_STATES):
+        adjoint[j] -= h[j] * along
+        for k in range(ERROR_STATES):
+            information[j, k] += h[j] * h[k] * across - h[j] * information_gain[k] - information_gain[j] * h[k]
+
+
+@compiled
+def _through_prediction(transition, adjoint, information, work):
+    """lambda <- Phi' lambda,  Lambda <- Phi' Lambda Phi; the lower rows of Phi are those of the identity."""
+    for j in range(ERROR_STATES):
+        work[0, j] = adjoint[j] if j >= MOVING_STATES else 0.0
+    for i in range(MOVING_STATES):
+        for j in range(ERROR_STATES):
+            work[0, j] += transition[i, j] * adjoint[i]
+    adjoint[:] = work[0]
+    for i in range(ERROR_STATES):  # Lambda Phi
+        for j in range(ERROR_STATES):
+            work[i, j] = information[i, j] if j >= MOVING_STATES else 0.0
+        for k in range(MOVING_STATES):
+            for j in range(ERROR_STATES):
+                work[i, j] += information[i, k] * transition[k, j]
+    for i in range(ERROR_STATES):
+        for j in range(ERROR_STATES):
+            information[i, j] = work[i, j] if i >= MOVING_STATES else 0.0
+    for k in range(MOVING_STATES):
+        for i in range(ERROR_STATES):
+            for j in range(ERROR_STATES):
+                information[i, j] += transition[k, i] * work[k, j]

@@ -223,7 +223,7 @@ def test_a_simulated_flight_without_bias_is_consistent():
     than 16 happen once in 400 times to an honest filter)."""
     noise = dict(accel_noise=0.05, gyro_noise=0.003, accel_bias_walk=0.01, gyro_bias_walk=1e-4)
     told = FilterConfig(
-        robust="gate", gate=1e6, tdoa_std=0.1, tdoa_correlation=1.0, vibration_gain=0.0, adapt_noise=False, **noise
+        robust="gate", gate=1e6, tdoa_std=0.1, tdoa_correlation_length=1.0, vibration_gain=0.0, adapt_noise=False, **noise
     )  # fmt: skip
     errors = ImuErrors(**noise, accel_bias=told.initial_accel_bias_std, gyro_bias=told.initial_gyro_bias_std)
     clean = {**CLEAN, "duration": 25.0, "start_in_air": True, "noise_std": 0.1, "protocol": "tdoa3"}
@@ -249,6 +249,12 @@ def test_parameters_on_the_command_line_are_those_of_a_file(bag, tmp_path):
     one = report([bag, "--config", file, "-p", "loss:=huber"], tmp_path)
     other = report([bag, "-p", "adapt_noise:=false", "-p", "tdoa_std:=0.1", "-p", "loss:=huber"], tmp_path)
     assert one["runs"][0] == other["runs"][0] != report([bag], tmp_path)["runs"][0]
+
+
+def test_a_parameter_under_its_old_name_counts_with_a_warning(bag, tmp_path):
+    with pytest.warns(FutureWarning, match="tdoa_correlation: is called tdoa_correlation_length now"):
+        old = report([bag, "-p", "tdoa_correlation:=1"], tmp_path)
+    assert old["runs"][0] == report([bag, "-p", "tdoa_correlation_length:=1.0"], tmp_path)["runs"][0]
 
 
 @pytest.mark.parametrize("text", ["tdoa_std=0.1", "sdt:=0.1", "tdoa_std:=[", "tdoa_std:=much", "adapt_noise:=1", ":=", ""])

@@ -7,10 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.engine import run
-from uwb_tdoa_ekf.core.memory import new_memory
+from uwb_tdoa_ekf.core.engine import feed
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_memory, structured
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.core.tape import new_tape
 from uwb_tdoa_tools.readers.inputs import load_flights
 from uwb_tdoa_tools.scoring.metrics import airborne
 
@@ -40,13 +39,11 @@ def cut(flight, low, high=np.inf):
 
 def drive(flight, memory):
     anchors, imu, tdoa = flight.anchors, flight.imu, flight.tdoa
-    n, k = len(imu), len(tdoa)
-    rows, covariance, residuals = np.empty((n + k, 17)), np.empty((n + k, 9, 9)), np.empty((k, 4))
-    count = run(
-        memory, FilterConfig().tuning(), anchors.positions, imu.t, imu.gyro, imu.accel, tdoa.t,
-        anchors.index(tdoa.a), anchors.index(tdoa.b), tdoa.d, np.zeros(k), rows, covariance, residuals, new_tape(),
-    )  # fmt: skip
-    return rows[:count, 0], rows[:count, 1:4]
+    samples = structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
+    rows = anchors.index(tdoa.a), anchors.index(tdoa.b)
+    tdoas = structured(TDOA, tdoa.t, *rows, tdoa.d, np.zeros(len(tdoa)))
+    odometry, _ = feed(memory, FilterConfig().tuning(), Measurements(samples, tdoas))
+    return odometry["t"], odometry["x"][:, :3]
 
 
 def rms(flight, t, p, low, high):
@@ -67,11 +64,11 @@ def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(fl
         steady = rms(flight, usual.t, usual.p, first + 3.0, last)
         cells = []
         for at in TIMES:
-            memory = new_memory(len(flight.anchors))
+            memory = new_memory(flight.anchors.positions)
             drive(cut(flight, -np.inf, first + at), memory)
-            memory.x[:, :3] += 2.0 * np.array([2.0, -2.0, 1.0]) / 3.0
+            memory.record.hypotheses["x"][:, :3] += 2.0 * np.array([2.0, -2.0, 1.0]) / 3.0
             off = drive(cut(flight, first + at), memory)
-            anew = drive(cut(flight, first + at), new_memory(len(flight.anchors)))
+            anew = drive(cut(flight, first + at), new_memory(flight.anchors.positions))
             judged = first + at + AFTER, first + at + AFTER + WINDOW
             now, *found = (rms(flight, *path, *judged) for path in ((usual.t, usual.p), off, anew))
             assert max(found) < 2.0 * max(steady, now), flight.name

@@ -22,12 +22,6 @@ def compiled(function):
         config.CACHE_DIR = before
 
 
-def inlined(function):
-    """Decorator for a small function that only compiled ones call: it is pasted into them, because handing over a filter's
-    whole memory costs more than what such a function does."""
-    return njit(error_model="numpy", inline="always")(function)
-
-
 def _base():
     """NUMBA_CACHE_DIR if set, else the user's cache folder."""
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

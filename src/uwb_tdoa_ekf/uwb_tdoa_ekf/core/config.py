@@ -1,76 +1,107 @@
 """Every number that tunes the filter, with its unit and why it is what it is."""
 
 import math
-from dataclasses import dataclass, fields
+import warnings
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import NamedTuple
 
+import numpy as np
 import yaml
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.robust_loss import LOSSES
 
 ROBUST = ("innovation", "gate", "m_estimation")
-LOSSES = ("geman_mcclure", "huber", "cauchy")
+CHOICES = {"robust": ROBUST, "loss": LOSSES}  # parameters that are one of a few names
+RENAMED = {  # old name: present name; the old ones work until the release after 0.1
+    "tdoa_correlation": "tdoa_correlation_length",
+    "vibration_trust": "accel_prior_std",
+    "reach": "workspace_margin",
+    "start_patience": "start_timeout",
+}
+
+
+def _parameter(default, text, low=0.0, with_low=False):
+    """A field of FilterConfig. text : unit and meaning, as in ekf_node.yaml; a number must be above `low`, or may be
+    that too."""
+    return field(default=default, metadata={"text": text, "low": low, "with_low": with_low})
 
 
 @dataclass(frozen=True)
 class FilterConfig:
     """Tuning of the filter. The node's parameters have the same names."""
 
-    tdoa_std: float = 0.25  # m, spread of a TDOA about its prediction, systematic part that was not corrected included
-    tdoa_correlation: float = 6.0  # n successive TDOAs tell as much as n / this independent ones; 1 for white noise
-    adapt_noise: bool = True  # learn the noise of each anchor beyond tdoa_std from the innovations
-    noise_memory: float = 0.5  # s over which it is learned
-    robust: str = "innovation"  # weight from the whitened innovation; "gate": 0 or 1; "m_estimation": Zhao et al. IV-A
-    loss: str = "geman_mcclure"  # or "huber", "cauchy": for "innovation" and "m_estimation"
-    measurement_scale: float = 2.5  # standard deviations at which the loss bends
-    state_scale: float = 2.5  # the same for the prior's share in "m_estimation"
-    iterations: int = 2  # of "m_estimation"
-    gate: float = 3.0  # standard deviations, for "gate"
+    # The measurement
+    tdoa_std: float = _parameter(
+        0.25, "m; deviation of a TDOA from its prediction, uncorrected systematic part included"
+    )
+    tdoa_correlation_length: float = _parameter(
+        6.0, "n successive TDOAs tell as much as n / this independent ones; 1.0 for white noise"
+    )
+    adapt_noise: bool = _parameter(True, "learn the noise of each anchor beyond tdoa_std from the innovations")
+    noise_memory: float = _parameter(0.5, "s over which it is learned")
+    robust: str = _parameter(
+        "innovation", "against outliers: innovation (weight from the whitened innovation), gate, m_estimation"
+    )
+    loss: str = _parameter(
+        "geman_mcclure", "weight function of innovation and m_estimation: geman_mcclure, huber, cauchy"
+    )
+    measurement_scale: float = _parameter(2.5, "standard deviations of a measurement at which the loss bends")
+    state_scale: float = _parameter(2.5, "the same for the prior's share in m_estimation")
+    iterations: int = _parameter(2, "re-weightings per update of m_estimation")
+    gate: float = _parameter(3.0, "standard deviations beyond which gate rejects")
 
-    use_imu: bool = True  # False: constant velocity, for tags without an IMU
-    motion_noise: float = 1.5  # m/s^2/sqrt(Hz), random acceleration of the tag while no IMU says better
-    imu_timeout: float = 0.1  # s without an IMU sample after which motion_noise takes over
-    accel_noise: float = 0.1  # m/s^2/sqrt(Hz), motors running
-    gyro_noise: float = 0.005  # rad/s/sqrt(Hz)
-    accel_bias_walk: float = 0.01  # m/s^3/sqrt(Hz)
-    gyro_bias_walk: float = 1e-4  # rad/s^2/sqrt(Hz)
-    vibration_trust: float = 1.5  # m/s^2, acceleration that is plausible for the vehicle; stronger vibration is not believed
-    vibration_gain: float = 4.0  # variance of a vibrating accelerometer's error over that of its vibration; 0: it has none
+    # The motion
+    use_imu: bool = _parameter(True, "false: constant velocity, for a tag without an IMU")
+    motion_noise: float = _parameter(1.5, "m/s^2/sqrt(Hz); random acceleration of the tag while no IMU says better")
+    imu_timeout: float = _parameter(0.1, "s without an IMU sample after which motion_noise takes over")
+    accel_noise: float = _parameter(0.1, "m/s^2/sqrt(Hz); accelerometer, motors running")
+    gyro_noise: float = _parameter(0.005, "rad/s/sqrt(Hz); gyroscope")
+    accel_bias_walk: float = _parameter(0.01, "m/s^3/sqrt(Hz); how fast the accelerometer's bias wanders")
+    gyro_bias_walk: float = _parameter(1e-4, "rad/s^2/sqrt(Hz); how fast the gyroscope's bias wanders")
+    accel_prior_std: float = _parameter(
+        1.5, "m/s^2; deviation of the specific force from hovering, per axis, known before it is measured"
+    )
+    vibration_gain: float = _parameter(
+        4.0, "variance of a vibrating accelerometer's error over that of its vibration; 0.0: it has none", with_low=True
+    )
+    workspace_margin: float = _parameter(
+        1.0, "m beyond the anchors' extent; a tag further out is drawn back, against weak evidence"
+    )
+    zero_velocity: bool = _parameter(True, "a tag whose inertial sensors neither shake nor turn stands still")
+    recover: bool = _parameter(True, "find the tag anew, untold where it is, when the TDOAs agree on another place")
 
-    reach: float = 1.0  # m beyond the anchors' extent, where a tag is not believed to be without strong evidence
-    zero_velocity: bool = True  # a tag whose inertial sensors neither shake nor turn stands still
-    recover: bool = True  # find the tag anew, without being told where it is, when the TDOAs agree on another place
+    # The start
+    initial_yaw: float = _parameter(0.0, "rad; yaw of the body at the start", low=-1e9)
+    initial_yaw_std: float = _parameter(
+        6.3, "rad; its deviation; above 0.6 it is unknown: four yaws are followed until motion tells"
+    )
+    initial_accel_bias_std: float = _parameter(0.1, "m/s^2; of the accelerometer's bias about 0")
+    initial_gyro_bias_std: float = _parameter(0.01, "rad/s; of the gyroscope's bias about 0")
+    start_window: float = _parameter(0.5, "s of TDOAs from which the start position is found")
+    start_timeout: float = _parameter(1.0, "s after which a start from contradicting TDOAs is better than none")
 
-    initial_yaw: float = 0.0  # rad
-    initial_yaw_std: float = 6.3  # rad; above 0.6 the yaw counts as unknown: four directions are followed until one is left
-    initial_accel_bias_std: float = 0.1  # m/s^2
-    initial_gyro_bias_std: float = 0.01  # rad/s
-    start_window: float = 0.5  # s of TDOAs from which the start position is found
-    start_patience: float = 1.0  # s after which a start from contradicting TDOAs is better than none
-
-    odometry_rate: float = 200.0  # Hz
+    # The output
+    odometry_rate: float = _parameter(200.0, "Hz of stamps; at most this often")
 
     def __post_init__(self):
-        for name, allowed in (("robust", ROBUST), ("loss", LOSSES)):
-            if getattr(self, name) not in allowed:
-                raise InputError(f"{name}: {getattr(self, name)!r} is not one of {', '.join(allowed)}.")
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.type is bool and not isinstance(value, bool):
-                raise InputError(f"{field.name}: {value!r} must be true or false.")
-            if field.type not in (float, int):
-                continue
-            try:
-                number = field.type(value)  # one set of types, or the core would be compiled for every mixture
-            except (TypeError, ValueError, OverflowError):
-                number = math.nan
-            low = -1e9 if field.name == "initial_yaw" else 0.0
-            zero = field.name == "vibration_gain" and number == 0.0
-            if not (low < number < 1e9 or zero) or number != value:
-                kind = "whole number" if field.type is int else "number"
-                raise InputError(f"{field.name}: {value!r} must be a {kind} above {low:g}.")
-            object.__setattr__(self, field.name, number)
+        for parameter in fields(self):
+            name, value = parameter.name, getattr(self, parameter.name)
+            if name in CHOICES:
+                if value not in CHOICES[name]:
+                    raise InputError(f"{name}: {value!r} is not one of {', '.join(CHOICES[name])}.")
+            elif parameter.type is bool:
+                if not isinstance(value, bool):
+                    raise InputError(f"{name}: {value!r} must be true or false.")
+            else:
+                object.__setattr__(self, name, _number(parameter, value))
+
+    @classmethod
+    def from_parameters(cls, parameters, warn=None):
+        """Of a dict by name; names that are no parameter of the filter are passed over, old ones taken with a warning
+        (see `current_names`). Raises InputError."""
+        parameters = current_names(parameters, warn)
+        return cls(**{f.name: parameters[f.name] for f in fields(cls) if f.name in parameters})
 
     @classmethod
     def from_yaml(cls, path):
@@ -78,48 +109,47 @@ class FilterConfig:
         try:
             content = yaml.safe_load(Path(path).read_text())
             (node,) = content.values()
-            parameters = node["ros__parameters"]
-            return cls(**{field.name: parameters[field.name] for field in fields(cls) if field.name in parameters})
+            return cls.from_parameters(node["ros__parameters"])
         except (OSError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(f"{path}: expected one node's 'ros__parameters' mapping, as in ekf_node.yaml.") from error
 
     def tuning(self):
-        """The numbers the compiled core reads."""
-        values = {name: getattr(self, name) for name in Tuning._fields if name not in ("robust", "loss")}
-        return Tuning(robust=ROBUST.index(self.robust), loss=LOSSES.index(self.loss), **values)
+        """The numbers as the compiled core takes them: (1,) of TUNING, for choices their places in CHOICES."""
+        values = (getattr(self, name) for name in TUNING.names)
+        places = (CHOICES[name].index(v) if name in CHOICES else v for name, v in zip(TUNING.names, values))
+        return np.array([tuple(places)], TUNING)
 
 
-class Tuning(NamedTuple):
-    """FilterConfig as the compiled core takes it: names replaced by their place in ROBUST and LOSSES."""
+TUNING = np.dtype([(f.name, np.int64 if f.name in CHOICES else f.type) for f in fields(FilterConfig)], align=True)
 
-    tdoa_std: float
-    tdoa_correlation: float
-    adapt_noise: bool
-    noise_memory: float
-    robust: int
-    loss: int
-    measurement_scale: float
-    state_scale: float
-    iterations: int
-    gate: float
-    use_imu: bool
-    motion_noise: float
-    imu_timeout: float
-    accel_noise: float
-    gyro_noise: float
-    accel_bias_walk: float
-    gyro_bias_walk: float
-    vibration_trust: float
-    vibration_gain: float
-    reach: float
-    zero_velocity: bool
-    recover: bool
-    initial_yaw: float
-    initial_yaw_std: float
-    initial_accel_bias_std: float
-    initial_gyro_bias_std: float
-    start_window: float
-    start_patience: float
-    odometry_rate: float
+
+def current_names(parameters, warn=None):
+    """A dict of parameters with old names (RENAMED) replaced by the present ones.
+
+    warn : is called with one sentence for each that had an old name; default: a FutureWarning. Raises InputError for a
+    parameter given under both.
+    """
+    out = dict(parameters)
+    for old, new in RENAMED.items():
+        if old in out:
+            if new in out:
+                raise InputError(f"{old}: is the old name of {new}, which is given too; give {new} alone.")
+            out[new] = out.pop(old)
+            sentence = f"{old}: is called {new} now; the old name will not be understood for long."
+            warnings.warn(sentence, FutureWarning, stacklevel=2) if warn is None else warn(sentence)
+    return out
+
+
+def _number(parameter, value):
+    """`value` as the type of a field of FilterConfig; raises InputError if it is none, or out of bounds."""
+    low, with_low = parameter.metadata["low"], parameter.metadata["with_low"]
+    try:
+        number = parameter.type(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not (low < number < 1e9 or (with_low and number == low)) or number != value:
+        kind = "whole number" if parameter.type is int else "number"
+        raise InputError(f"{parameter.name}: {value!r} must be a {kind} above {low:g}.")
+    return number

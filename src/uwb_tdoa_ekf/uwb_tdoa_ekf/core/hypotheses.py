@@ -9,66 +9,74 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled, inlined
+from uwb_tdoa_bias.foundation.compiled import compiled
 
-from .memory import BEST, HYPOTHESES, NEXT_MERGE
+from .memory import HYPOTHESES
 from .state import difference
 
 YAW_STD = 0.6  # rad, of each hypothesis: they start 90 degrees apart
-HOPELESS = -8.0  # log probability relative to the best at which a hypothesis is given up
-SAME = 0.1  # rad between two hypotheses that have become one
+PRUNED_BELOW = -8.0  # log probability relative to the best at which a hypothesis is pruned
+MERGED_BELOW = 0.1  # rad between two hypotheses that have become one
 MERGE_PERIOD = 0.1  # s
-SURPRISE = 9.0  # squared standard deviations that one TDOA counts as at most
+LARGEST_NIS = 9.0  # normalised innovation squared that one measurement counts as at most
 
 
 @compiled
-def quarter(h):
+def yaw_offset(h):
     """Angle of hypothesis h to initial_yaw, rad."""
     return h * 2.0 * math.pi / HYPOTHESES
 
 
-@inlined
-def blame(m, h, innovation, total):
-    """Hypothesis h met an innovation (m) of variance `total` (m^2), errors alike included."""
-    m.belief[h] -= 0.5 * (min(innovation * innovation / total, SURPRISE) + math.log(total))
-
-
-@inlined
-def choose(m, t):
-    """Follow the most probable hypothesis; give up those that are hopeless, or have become the same as a better one."""
-    best = 0
-    for h in range(HYPOTHESES):
-        if m.belief[h] > m.belief[best]:
-            best = h
-    top = m.belief[best]
-    for h in range(HYPOTHESES):
-        m.belief[h] -= top
-        if m.belief[h] < HOPELESS:
-            m.belief[h] = -np.inf
-    m.clock[BEST] = best
-    if t < m.clock[NEXT_MERGE]:
-        return
-    m.clock[NEXT_MERGE] = t + MERGE_PERIOD
-    apart = m.S[:9, 0]  # scratch
-    for h in range(HYPOTHESES):
-        if h != best and m.belief[h] > -np.inf:
-            difference(m.x[best], m.x[h], apart)
-            if apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2 < SAME**2:
-                m.belief[h] = -np.inf
+@compiled
+def alive(hypothesis):
+    """False once it was pruned."""
+    return hypothesis.log_weight > -np.inf
 
 
 @compiled
-def add_doubt(m, covariance):
+def add_log_likelihood(hypothesis, innovation, correlation_length):
+    """Weigh a HYPOTHESIS by the Gaussian density of an INNOVATION; correlation_length as in robust.py."""
+    variance = innovation.prior_variance + innovation.noise_variance * correlation_length
+    nis = min(innovation.value**2 / variance, LARGEST_NIS)
+    hypothesis.log_weight -= 0.5 * (nis + math.log(variance))
+
+
+@compiled
+def select(ekf, t):
+    """Follow the most probable hypothesis at stamp t; prune those that are improbable, or have become the same as it."""
+    best = 0
+    for h in range(HYPOTHESES):
+        if ekf.hypotheses[h].log_weight > ekf.hypotheses[best].log_weight:
+            best = h
+    highest = ekf.hypotheses[best].log_weight
+    for h in range(HYPOTHESES):
+        hypothesis = ekf.hypotheses[h]
+        hypothesis.log_weight -= highest
+        if hypothesis.log_weight < PRUNED_BELOW:
+            hypothesis.log_weight = -np.inf
+    ekf.best = best
+    if t < ekf.next_merge:
+        return
+    ekf.next_merge = t + MERGE_PERIOD
+    for h in range(HYPOTHESES):
+        if h != best and alive(ekf.hypotheses[h]):
+            apart = difference(ekf.hypotheses[best].x, ekf.hypotheses[h].x)
+            if apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2 < MERGED_BELOW**2:
+                ekf.hypotheses[h].log_weight = -np.inf
+
+
+@compiled
+def add_spread_of_means(ekf, covariance):
     """Add to the (9, 9) covariance of the best hypothesis what the others say: their mean square distance from it."""
-    best = int(m.clock[BEST])
-    apart = m.S[:9, 0]  # scratch
+    best = ekf.hypotheses[ekf.best]
     weights = 0.0
     for h in range(HYPOTHESES):
-        weights += math.exp(m.belief[h])
+        weights += math.exp(ekf.hypotheses[h].log_weight)
     for h in range(HYPOTHESES):
-        if h != best and m.belief[h] > -np.inf:
-            difference(m.x[best], m.x[h], apart)
-            share = math.exp(m.belief[h]) / weights
+        other = ekf.hypotheses[h]
+        if h != ekf.best and alive(other):
+            apart = difference(best.x, other.x)
+            share = math.exp(other.log_weight) / weights
             for i in range(9):
                 for j in range(9):
                     covariance[i, j] += share * apart[i] * apart[j]

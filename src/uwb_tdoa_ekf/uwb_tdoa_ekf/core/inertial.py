@@ -2,58 +2,75 @@
 
 import math
 
-from uwb_tdoa_bias.foundation.compiled import inlined
+from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.vibration import VIBRATION_AVERAGE, low_pass, track_vibration
 
-from .memory import FORCE, FORCE_POWER, GYRO, GYRO_POWER, LAST_IMU, MEAN_FORCE, SLOW_FORCE, SLOW_GYRO
 from .state import GRAVITY
 
-CORNER, AVERAGE = 0.05, 0.3  # s: what is faster than the first is vibration; its power is averaged over the second
-PERSISTENCE = 0.2  # s over which that error stays alike
-QUIET_FORCE, QUIET_GYRO = 0.05, 0.02  # m/s^2 and rad/s, rms per axis: less is quiet; hovering has 0.1 and 0.03, idling motors more
+PERSISTENCE = 0.2  # s over which the error of a vibrating accelerometer stays alike
+QUIET_ACCEL, QUIET_GYRO = (
+    0.05,
+    0.02,
+)  # m/s^2 and rad/s, rms per axis: less is quiet; hovering has 0.1 and 0.03, idling motors more
 RESTLESS = 0.01  # rad^2/s^2 that fades before a tag counts as quiet, about a second after the first sample
 QUIET_TILT = 0.5  # m/s^2 by which the mean specific force may differ from gravity
+QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
 
 
-@inlined
-def observe(m, t, gyro, force, timeout):
-    """Take one sample into the statistics; GYRO and FORCE become the mean of the last sample and this one."""
-    imu = m.imu
-    dt = t - m.clock[LAST_IMU]
-    fresh = dt < timeout
-    fast, slow = min(1.0, dt / CORNER), min(1.0, dt / AVERAGE)
+@compiled
+def observe(imu, sample, timeout):
+    """Take an IMU_SAMPLE into the statistics of an IMU_STATE; its input becomes the mean of the last sample and this
+    one. Returns whether the last one was less than `timeout` s ago."""
+    dt = sample.t - imu.t
+    if not dt < timeout:
+        _restart(imu, sample)
+        return False
+    track_vibration(imu.slow_accel, imu.vibration, sample.accel, dt)
     for k in range(3):
-        if fresh:
-            imu[SLOW_FORCE, k] += fast * (force[k] - imu[SLOW_FORCE, k])
-            imu[SLOW_GYRO, k] += fast * (gyro[k] - imu[SLOW_GYRO, k])
-            imu[MEAN_FORCE, k] += slow * (imu[SLOW_FORCE, k] - imu[MEAN_FORCE, k])
-            imu[FORCE_POWER, k] += slow * ((force[k] - imu[SLOW_FORCE, k]) ** 2 - imu[FORCE_POWER, k])
-            imu[GYRO_POWER, k] += slow * (gyro[k] ** 2 - imu[GYRO_POWER, k])
-            imu[GYRO, k], imu[FORCE, k] = 0.5 * (imu[GYRO, k] + gyro[k]), 0.5 * (imu[FORCE, k] + force[k])
-        else:
-            imu[SLOW_FORCE, k] = imu[MEAN_FORCE, k] = imu[FORCE, k] = force[k]
-            imu[SLOW_GYRO, k] = imu[GYRO, k] = gyro[k]
-            imu[FORCE_POWER, k], imu[GYRO_POWER, k] = 0.0, RESTLESS
-    return fresh
+        imu.mean_accel[k] = low_pass(imu.mean_accel[k], imu.slow_accel[k], dt, VIBRATION_AVERAGE)
+        imu.gyro_power[k] = low_pass(imu.gyro_power[k], sample.gyro[k] ** 2, dt, VIBRATION_AVERAGE)
+        imu.gyro[k], imu.accel[k] = 0.5 * (imu.gyro[k] + sample.gyro[k]), 0.5 * (imu.accel[k] + sample.accel[k])
+    return True
 
 
-@inlined
-def trust(m, k, plausible, gain):
-    """Share of the measured specific force to believe along body axis k, 0 to 1, and the variance of its error, m^2/s^4.
+@compiled
+def _restart(imu, sample):
+    for k in range(3):
+        imu.slow_accel[k] = imu.mean_accel[k] = imu.accel[k] = sample.accel[k]
+        imu.gyro[k] = sample.gyro[k]
+        imu.vibration[k], imu.gyro_power[k] = 0.0, RESTLESS
 
-    plausible : m/s^2, standard deviation of what else the axis could measure; gain : variance of the error of a vibrating
-    axis, which rectifies, over that of its vibration. Linear least squares of the two.
+
+@compiled
+def hold(imu, sample):
+    """Keep an IMU_SAMPLE as the input of what comes after it."""
+    imu.t = sample.t
+    for k in range(3):
+        imu.gyro[k], imu.accel[k] = sample.gyro[k], sample.accel[k]
+
+
+@compiled
+def weigh(imu, quiet, tuning):
+    """Fill in accel_weight and accel_psd of an IMU_STATE: how far each axis of the accelerometer counts against
+    hovering, and the noise that is left.
+
+    A vibrating axis rectifies: its error has vibration_gain times the variance of the vibration. The weight is that of
+    linear least squares of the measurement with this variance, and of hovering with accel_prior_std.
     """
-    doubt = gain * m.imu[FORCE_POWER, k]
-    share = plausible * plausible / (plausible * plausible + doubt)
-    return share, share * doubt
-
-
-@inlined
-def quiet(m):
-    """True if the last AVERAGE seconds of samples show neither vibration nor rotation nor acceleration."""
-    norm = 0.0
+    prior = tuning.accel_prior_std**2
     for k in range(3):
-        norm += m.imu[MEAN_FORCE, k] ** 2
-        if m.imu[FORCE_POWER, k] > QUIET_FORCE**2 or m.imu[GYRO_POWER, k] > QUIET_GYRO**2:
+        error = tuning.vibration_gain * imu.vibration[k]
+        weight = prior / (prior + error)
+        noise = tuning.accel_noise**2 + 2.0 * PERSISTENCE * (weight * error)
+        imu.accel_weight[k], imu.accel_psd[k] = weight, QUIET_NOISE**2 if quiet else noise
+
+
+@compiled
+def is_quiet(imu):
+    """True if the last VIBRATION_AVERAGE seconds of samples show neither vibration nor rotation nor acceleration."""
+    squared = 0.0
+    for k in range(3):
+        squared += imu.mean_accel[k] ** 2
+        if imu.vibration[k] > QUIET_ACCEL**2 or imu.gyro_power[k] > QUIET_GYRO**2:
             return False
-    return abs(math.sqrt(norm) - GRAVITY) < QUIET_TILT
+    return abs(math.sqrt(squared) - GRAVITY) < QUIET_TILT

@@ -1,53 +1,137 @@
-"""Everything one filter remembers between two events. A copy of its arrays is a copy of the filter."""
+"""Everything one filter remembers between two events, by name. A copy of its two arrays is a copy of the filter.
+
+The types are rows of numpy's structured arrays: compiled code reads and writes `ekf.imu.slow_accel[k]` where it lies in
+memory, a function takes a whole record as one pointer, and Python sees the same bytes (`Memory.record`).
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from .state import GRAVITY
+from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
+from .update import INNOVATION
 
 HYPOTHESES = 4  # starts in as many directions while the yaw is unknown
 WINDOW = 512  # TDOAs kept for a start
 
-# places in Memory.clock
-(NOW, LAST_IMU, FIRST_TDOA, LAST_TDOA, NEXT_TRY, NEXT_ODOMETRY, NEXT_REST, NEXT_MERGE,
- AGREEMENT, RUNNING, QUIET, RECOVERIES, KEPT, BEST, TAPED) = range(15)  # fmt: skip
 
-# rows of Memory.imu
-GYRO, FORCE, SLOW_FORCE, FORCE_POWER, MEAN_FORCE, SLOW_GYRO, GYRO_POWER = range(7)
+def _record(*columns):
+    return np.dtype(list(columns), align=True)
+
+
+# What is measured. Rows of an anchor, not ids; both in the order of their stamps.
+IMU_SAMPLE = _record(("t", float), ("gyro", float, 3), ("accel", float, 3))  # s, rad/s, m/s^2 (specific force); body
+TDOA = _record(("t", float), ("a", int), ("b", int), ("d", float), ("bias_std", float))  # s, rows, m (corrected), m
+
+# One estimate of the state, for one direction that the tag may have started in.
+HYPOTHESIS = _record(
+    ("log_weight", float),  # log probability relative to the best; -inf: pruned
+    ("x", float, NOMINAL_STATES),  # see state.py
+    ("P", float, (ERROR_STATES, ERROR_STATES)),  # symmetric to the bit
+)
+
+# What is known of the inertial sensor.
+IMU_STATE = _record(
+    ("t", float),  # s, stamp of the last sample
+    ("gyro", float, 3),  # rad/s and
+    ("accel", float, 3),  # m/s^2, held until the next sample: input of the prediction
+    ("slow_accel", float, 3),  # m/s^2, low pass
+    ("vibration", float, 3),  # m^2/s^4, power of what is faster
+    ("mean_accel", float, 3),  # m/s^2, over a longer time
+    ("gyro_power", float, 3),  # rad^2/s^2
+    ("accel_weight", float, 3),  # of the measurement against hovering, 0 to 1, by inertial.weigh
+    ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
+)
+
+ANCHOR = _record(
+    ("position", float, 3),  # m
+    ("excess_variance", float),  # m^2, of what is received of it beyond tdoa_std, see noise.py
+    ("learned", float),  # s, stamp of the last change
+)
+
+EKF = _record(
+    ("t", float),  # s, stamp of the hypotheses
+    ("running", bool),
+    ("best", int),  # the most probable hypothesis
+    ("hypotheses", HYPOTHESIS, HYPOTHESES),
+    ("imu", IMU_STATE),
+    ("quiet", bool),  # the inertial sensor neither shakes nor turns
+    ("workspace", float, (2, 3)),  # m, lower and upper bounds of where a tag is expected
+    ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
+    ("recoveries", int),
+    ("first_tdoa", float),  # s, stamps: of the first TDOA since the filter stopped, and the last one
+    ("last_tdoa", float),
+    ("next_search", float),  # s, stamps before which not to do again: look for the tag,
+    ("next_odometry", float),
+    ("next_rest", float),  # say that a quiet tag stands still,
+    ("next_merge", float),  # compare hypotheses
+    ("kept", int),  # TDOAs in the window
+    ("window", TDOA, 2 * WINDOW),  # recent TDOAs, oldest first
+    ("recorded", int),  # records written to the history, see history.py
+    ("since_record", float, (ERROR_STATES, ERROR_STATES)),  # transition of the best hypothesis since the last record
+    # Scratch: nothing below outlives an event.
+    ("transition", TRANSITION),
+    ("innovation", INNOVATION),
+)
+
+# What comes out.
+ODOMETRY = _record(("t", float), ("x", float, NOMINAL_STATES), ("covariance", float, (9, 9)))  # of [p, v, attitude]
+RESIDUAL = _record(("innovation", float), ("variance", float), ("weight", float), ("verdict", int))
 
 
 class Memory(NamedTuple):
-    """State of one filter: one nominal state and covariance per yaw hypothesis, the rest shared."""
+    """State of one filter. ekf : (1,) of EKF; anchors : (N,) of ANCHOR."""
 
-    x: np.ndarray  # (HYPOTHESES, 16) nominal states, see state.py
-    P: np.ndarray  # (HYPOTHESES, 15, 15) error covariances
-    belief: np.ndarray  # (HYPOTHESES,) log probability relative to the best; -inf: given up
-    clock: np.ndarray  # stamps, s, counters and flags
-    imu: np.ndarray  # (7, 3): last sample and running statistics
-    window: np.ndarray  # (4, 2 * WINDOW): t, a, b, d of recent TDOAs, oldest first
-    noise: np.ndarray  # (2, N): variance of what is received of each anchor, m^2, and stamp of its last change, s
-    box: np.ndarray  # (2, 3): lower and upper end of where the tag is believed to be, m
-    F: np.ndarray  # the rest is scratch
-    R: np.ndarray
-    E: np.ndarray
-    K: np.ndarray
-    g: np.ndarray
-    S: np.ndarray
-    step: np.ndarray
+    ekf: np.ndarray
+    anchors: np.ndarray
+
+    @property
+    def record(self):
+        """The fields of EKF as attributes: a view."""
+        return self.ekf.view(np.recarray)[0]
+
+    def copy(self):
+        """Another filter that remembers the same."""
+        return Memory(*(array.copy() for array in self))
 
 
-def new_memory(anchors):
-    """Memory of a filter that has seen nothing; anchors : how many there are."""
-    clock = np.full(15, -np.inf)
-    clock[[AGREEMENT, RUNNING, QUIET, RECOVERIES, KEPT, BEST, TAPED]] = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    imu = np.zeros((7, 3))
-    imu[[FORCE, SLOW_FORCE, MEAN_FORCE], 2] = GRAVITY
-    x = np.zeros((HYPOTHESES, 16))
-    x[:, 9] = 1.0
-    P = np.tile(np.eye(15), (HYPOTHESES, 1, 1))
-    belief = np.full(HYPOTHESES, -np.inf)
-    belief[0] = 0.0
-    shapes = ((15, 15), (3, 3), (3, 3), (15,), (3,), (15, 3), (16,))
-    scratch = (np.zeros(shape) for shape in shapes)
-    return Memory(x, P, belief, clock, imu, np.zeros((4, 2 * WINDOW)), np.zeros((2, anchors)), np.zeros((2, 3)), *scratch)
+class Measurements(NamedTuple):
+    """What a filter is fed with at once. imu : (n,) of IMU_SAMPLE; tdoa : (k,) of TDOA."""
+
+    imu: np.ndarray
+    tdoa: np.ndarray
+
+
+class Output(NamedTuple):
+    """Room for what it makes of that. odometry : at least (n + k,) of ODOMETRY; residuals : (k,) of RESIDUAL;
+    history : of history.RECORD, with room for history.most_records, or empty for no recording."""
+
+    odometry: np.ndarray
+    residuals: np.ndarray
+    history: np.ndarray
+
+
+def new_memory(positions):
+    """Memory of a filter that has seen nothing; positions : (N, 3) m, of the anchors."""
+    memory = Memory(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR))
+    memory.anchors["position"], memory.anchors["learned"] = positions, -np.inf
+    ekf = memory.record
+    for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge"):
+        ekf[stamp] = -np.inf
+    ekf.imu.t = -np.inf
+    for name in ("accel", "slow_accel", "mean_accel"):
+        ekf.imu[name][2] = GRAVITY
+    ekf.hypotheses["log_weight"][1:] = -np.inf
+    ekf.hypotheses["x"][:, 9] = 1.0
+    ekf.hypotheses["P"][:] = np.eye(ERROR_STATES)
+    ekf.since_record[:] = np.eye(ERROR_STATES)
+    ekf.consistency = 1.0
+    return memory
+
+
+def structured(kind, *columns):
+    """(n,) array of a type of this module; columns : one array for each of its fields, in their order."""
+    out = np.empty(len(columns[0]), kind)
+    for name, column in zip(kind.names, columns):
+        out[name] = column
+    return out

@@ -1,28 +1,34 @@
 """How noisy each anchor is, learned from the innovations while flying."""
 
-from uwb_tdoa_bias.foundation.compiled import inlined
+from uwb_tdoa_bias.foundation.compiled import compiled
 
-WILD = 5.0  # standard deviations that one outlier counts as at most
-
-
-@inlined
-def excess_variance(m, a, b):
-    """Variance of a TDOA beyond tdoa_std, m^2: what was learned of its two anchors (rows a, b)."""
-    return m.noise[0, a] + m.noise[0, b]
+LARGEST_OUTLIER = 5.0  # standard deviations that one outlier counts as at most
 
 
-@inlined
-def learn(m, t, a, b, innovation, spread, variance, std, memory):
-    """Learn from one innovation (m), whose variance is spread + variance, what it has too much, or too little, of.
+@compiled
+def excess_variance(a, b):
+    """Variance of a TDOA beyond tdoa_std, m^2: what was learned of its two anchors (of ANCHOR)."""
+    return a.excess_variance + b.excess_variance
+
+
+@compiled
+def learn(a, b, t, innovation, tuning):
+    """Learn from one INNOVATION, stamped t (s), what its noise_variance has too little, or too much, of.
 
     An anchor that is received late, e.g. around an obstacle, disturbs every pair it is in: exponential average per
-    anchor over `memory` seconds; a pair's excess is divided as the noise believed so far.
+    anchor over noise_memory; a pair's excess is divided as the noise learned so far.
     """
-    excess = min(innovation * innovation, WILD * WILD * variance) - spread - variance
-    base = 0.5 * std * std
-    whole = m.noise[0, a] + m.noise[0, b] + 2.0 * base
-    for i in (a, b):
-        share = (m.noise[0, i] + base) / whole
-        step = min(1.0, max(0.0, t - m.noise[1, i]) / memory)
-        m.noise[0, i] = max(0.0, m.noise[0, i] + step * share * excess)
-        m.noise[1, i] = t
+    noise = innovation.noise_variance
+    squared = min(innovation.value**2, LARGEST_OUTLIER**2 * noise)
+    excess = squared - innovation.prior_variance - noise
+    base = 0.5 * tuning.tdoa_std**2
+    whole = a.excess_variance + b.excess_variance + 2.0 * base
+    _learn_one(a, t, (a.excess_variance + base) / whole * excess, tuning.noise_memory)
+    _learn_one(b, t, (b.excess_variance + base) / whole * excess, tuning.noise_memory)
+
+
+@compiled
+def _learn_one(anchor, t, excess, memory):
+    step = min(1.0, max(0.0, t - anchor.learned) / memory)
+    anchor.excess_variance = max(0.0, anchor.excess_variance + step * excess)
+    anchor.learned = t

@@ -1,8 +1,8 @@
-"""One scalar TDOA against the state: three ways not to be misled by an outlier.
+"""Three ways not to be misled by an outlier.
 
-All share the model d = |p - b| - |p - a| + n, whose Jacobian g is zero but for the position, and work on x (16,), P (15, 15)
-of `state`. `variance` is that of one measurement; `dilution` >= 1 says how many successive measurements count as one,
-because their errors are alike: the update uses variance * dilution, the weight judges with variance.
+All work on a HYPOTHESIS and an INNOVATION after `update.project`, whose noise_variance is that of one measurement. The
+errors of successive ones are alike: as many as `correlation_length` tell as much as one independent of the others. The
+update therefore takes noise_variance times that, while the weight is judged with noise_variance itself.
 """
 
 import math
@@ -10,114 +10,113 @@ import math
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.robust_loss import weight
 
-from .state import inject
+from .config import ROBUST
+from .state import ERROR_STATES
+from .update import kalman
 
-GEMAN_MCCLURE, HUBER, CAUCHY = 0, 1, 2  # as in config.LOSSES
 NEGLIGIBLE = 0.01  # weight below which a measurement is not used
+SMALLEST_WEIGHT = 1e-6  # of a measurement in the M-estimation
+_INNOVATION, _GATE = ROBUST.index("innovation"), ROBUST.index("gate")
 
 
 @compiled
-def weight(loss, e, scale):
-    """IRLS weight w(e) = rho'(e) / e, 1 at e = 0. e: normalised residual; scale: where the loss bends, same unit."""
-    u = (e / scale) ** 2
-    if loss == GEMAN_MCCLURE:
-        return 1.0 / ((1.0 + u) * (1.0 + u))
-    if loss == HUBER:
-        return 1.0 if u <= 1.0 else 1.0 / math.sqrt(u)
-    return 1.0 / (1.0 + u)
+def update(hypothesis, innovation, tuning):
+    """Robust update in the way that TUNING says. Sets weight, 0 for none, and total_variance, inf for none."""
+    if tuning.robust == _INNOVATION:
+        update_innovation(hypothesis, innovation, tuning)
+    elif tuning.robust == _GATE:
+        update_gate(hypothesis, innovation, tuning)
+    else:
+        update_m_estimation(hypothesis, innovation, tuning)
 
 
 @compiled
-def predicted(x, a, b, g):
-    """Predicted d_ab (m) for antenna positions a, b (3,); writes its derivative by the position to g (3,)."""
-    ax, ay, az = x[0] - a[0], x[1] - a[1], x[2] - a[2]
-    bx, by, bz = x[0] - b[0], x[1] - b[1], x[2] - b[2]
-    ra = max(math.sqrt(ax * ax + ay * ay + az * az), 1e-6)
-    rb = max(math.sqrt(bx * bx + by * by + bz * bz), 1e-6)
-    g[0], g[1], g[2] = bx / rb - ax / ra, by / rb - ay / ra, bz / rb - az / ra
-    return rb - ra
-
-
-@compiled
-def gain_terms(P, g, K):
-    """K <- P g (15,); returns g' P g, m^2."""
-    for j in range(15):
-        K[j] = P[j, 0] * g[0] + P[j, 1] * g[1] + P[j, 2] * g[2]
-    return g[0] * K[0] + g[1] * K[1] + g[2] * K[2]
-
-
-@compiled
-def update_innovation(x, P, K, innovation, spread, variance, dilution, loss, scale):
+def update_innovation(hypothesis, innovation, tuning):
     """Weight from the whitened innovation, then one Kalman update with the variance divided by it.
-    Returns the weight and the total variance used, m^2.
 
-    K = P g and spread = g' P g come from gain_terms. Because the prior's own uncertainty whitens the innovation, a
-    filter that knows little listens to everything: the redescending weight cannot lock it out.
+    Because the prior's own uncertainty whitens the innovation, a filter that knows little listens to everything: the
+    redescending weight cannot lock it out.
     """
-    w = weight(loss, innovation / math.sqrt(spread + variance), scale)
+    prior, noise = innovation.prior_variance, innovation.noise_variance
+    w = weight(tuning.loss, innovation.value / math.sqrt(prior + noise), tuning.measurement_scale)
     if w < NEGLIGIBLE:
-        return 0.0, np.inf
-    total = spread + variance * dilution / w
-    kalman(x, P, K, innovation, total)
-    return w, total
+        innovation.weight, innovation.total_variance = 0.0, np.inf
+        return
+    innovation.weight, innovation.total_variance = w, prior + noise * tuning.tdoa_correlation_length / w
+    kalman(hypothesis, innovation)
 
 
 @compiled
-def update_gate(x, P, K, innovation, spread, variance, dilution, gate):
-    """Kalman update if the innovation is within `gate` standard deviations.
-    Returns the weight, 1 or 0, and the total variance used, m^2."""
-    if innovation * innovation > gate * gate * (spread + variance):
-        return 0.0, np.inf
-    total = spread + variance * dilution
-    kalman(x, P, K, innovation, total)
-    return 1.0, total
+def update_gate(hypothesis, innovation, tuning):
+    """Kalman update if the innovation is within `gate` standard deviations."""
+    prior, noise = innovation.prior_variance, innovation.noise_variance
+    if innovation.value**2 > tuning.gate**2 * (prior + noise):
+        innovation.weight, innovation.total_variance = 0.0, np.inf
+        return
+    innovation.weight, innovation.total_variance = 1.0, prior + noise * tuning.tdoa_correlation_length
+    kalman(hypothesis, innovation)
 
 
 @compiled
-def kalman(x, P, K, innovation, total):
-    """Scalar Kalman update: K = P h' (15,), total = h P h' + variance."""
-    inject(x, K, innovation / total)
-    for i in range(15):
-        k = K[i] / total
-        for j in range(i, 15):
-            P[i, j] -= k * K[j]
-            P[j, i] = P[i, j]
+def update_m_estimation(hypothesis, innovation, tuning):
+    """M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13; cross_covariance becomes that of the weighted prior.
 
-
-@compiled
-def update_m_estimation(x, P, S, K, g, innovation, variance, dilution, loss, state_scale, scale, iterations):
-    """M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13.
-    Returns the measurement's weight and the total variance used, m^2; K becomes that of the weighted prior.
-
-    The error state is scaled by the Cholesky factor of the prior (eq. 9), prior and measurement are re-weighted
-    `iterations` times (eq. 10), and the posterior follows from the weighted gain (eqs. 11 - 13). A TDOA moves only the
-    first three elements of the scaled error, so three columns of the factor suffice: S (15, 3), scratch. The Jacobian
-    is kept at the prior mean: over the centimetres of one update it does not change.
+    The error state is scaled by the Cholesky factor S of the prior (eq. 9), prior and measurement are re-weighted
+    `iterations` times (eq. 10), and the posterior follows from the weighted gain (eqs. 11 - 13). For measurements of
+    the position alone, the first three states: they move only the first three elements of the scaled error, so three
+    columns of S suffice. The Jacobian is kept at the prior mean: over the centimetres of one update it does not change.
     """
+    P, S, covariance = hypothesis.P, innovation.factor, innovation.cross_covariance
+    _factorize(P, S)
+    g0, g1, g2 = _position_row(innovation)
+    y0 = S[0, 0] * g0 + S[1, 0] * g1 + S[2, 0] * g2  # S' h'; its other elements are zero
+    y1 = S[1, 1] * g1 + S[2, 1] * g2
+    y2 = S[2, 2] * g2
+    noise, loss = innovation.noise_variance * tuning.tdoa_correlation_length, tuning.loss
+    e0 = e1 = e2 = 0.0  # scaled error of the state, eq. 9
+    for _ in range(tuning.iterations):
+        left = innovation.value - y0 * e0 - y1 * e1 - y2 * e2
+        w = max(weight(loss, left / math.sqrt(noise), tuning.measurement_scale), SMALLEST_WEIGHT)
+        w0, w1, w2 = (
+            weight(loss, e0, tuning.state_scale),
+            weight(loss, e1, tuning.state_scale),
+            weight(loss, e2, tuning.state_scale),
+        )
+        total = y0 * y0 / w0 + y1 * y1 / w1 + y2 * y2 / w2 + noise / w
+        step = innovation.value / total
+        e0, e1, e2 = y0 / w0 * step, y1 / w1 * step, y2 / w2 * step
+    for i in range(ERROR_STATES):  # the weighted prior: P + S (1/W - 1) S'
+        s0, s1, s2 = (1.0 / w0 - 1.0) * S[i, 0], (1.0 / w1 - 1.0) * S[i, 1], (1.0 / w2 - 1.0) * S[i, 2]
+        for j in range(i, ERROR_STATES):
+            P[i, j] += s0 * S[j, 0] + s1 * S[j, 1] + s2 * S[j, 2]
+            P[j, i] = P[i, j]
+        covariance[i] = S[i, 0] * y0 / w0 + S[i, 1] * y1 / w1 + S[i, 2] * y2 / w2
+    innovation.weight, innovation.total_variance = w, total
+    kalman(hypothesis, innovation)
+
+
+@compiled
+def _factorize(P, S):
+    """S (15, 3) <- the first three columns of the Cholesky factor of P."""
     for i in range(3):
-        for j in range(i, 15):
+        for j in range(i, ERROR_STATES):
             value = P[j, i]
             for k in range(i):
                 value -= S[j, k] * S[i, k]
             S[j, i] = math.sqrt(max(value, 1e-18)) if j == i else value / S[i, i]
         for j in range(i):
             S[j, i] = 0.0
-    noise = variance * dilution
-    y0 = S[0, 0] * g[0] + S[1, 0] * g[1] + S[2, 0] * g[2]  # S' G; its other elements are zero
-    y1 = S[1, 1] * g[1] + S[2, 1] * g[2]
-    y2 = S[2, 2] * g[2]
-    e0 = e1 = e2 = 0.0  # scaled error of the state, eq. 9
-    for _ in range(iterations):
-        w = max(weight(loss, (innovation - y0 * e0 - y1 * e1 - y2 * e2) / math.sqrt(noise), scale), 1e-6)
-        w0, w1, w2 = weight(loss, e0, state_scale), weight(loss, e1, state_scale), weight(loss, e2, state_scale)
-        total = y0 * y0 / w0 + y1 * y1 / w1 + y2 * y2 / w2 + noise / w
-        step = innovation / total
-        e0, e1, e2 = y0 / w0 * step, y1 / w1 * step, y2 / w2 * step
-    for i in range(15):  # the weighted prior: P + S (1/W - 1) S'
-        s0, s1, s2 = (1.0 / w0 - 1.0) * S[i, 0], (1.0 / w1 - 1.0) * S[i, 1], (1.0 / w2 - 1.0) * S[i, 2]
-        for j in range(15):
-            P[i, j] += s0 * S[j, 0] + s1 * S[j, 1] + s2 * S[j, 2]
-        K[i] = S[i, 0] * y0 / w0 + S[i, 1] * y1 / w1 + S[i, 2] * y2 / w2
-    kalman(x, P, K, innovation, total)
-    return w, total
+
+
+@compiled
+def _position_row(innovation):
+    """The entries of the Jacobian row for the position."""
+    g0 = g1 = g2 = 0.0
+    for n in range(innovation.entries):
+        state, entry = innovation.states[n], innovation.row[n]
+        g0 += entry if state == 0 else 0.0
+        g1 += entry if state == 1 else 0.0
+        g2 += entry if state == 2 else 0.0
+    return g0, g1, g2

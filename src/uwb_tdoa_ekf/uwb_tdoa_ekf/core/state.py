@@ -8,15 +8,31 @@ Motion model: eq. 14 of Zhao et al. (RA-L 2021).
 
 import math
 
+import numpy as np
+
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 GRAVITY = 9.81  # m/s^2, along -z of the world
+NOMINAL_STATES, ERROR_STATES = 16, 15
+MOVING_STATES = 9  # the first of the error states; those behind them are biases, which only wander
+
+# One step of the error state: what in its transition differs from the identity, see `propagate`.
+TRANSITION = np.dtype(
+    [
+        ("dt", float),  # s
+        ("rotation", float, (3, 3)),  # body to world at the beginning
+        ("velocity_attitude", float, (3, 3)),  # -R [f]x dt
+        ("velocity_accel_bias", float, (3, 3)),  # -R diag(accel_weight) dt
+        ("attitude_attitude", float, (3, 3)),  # Exp(-w dt)
+        ("product", float, (MOVING_STATES, ERROR_STATES)),  # room for the upper rows of a transition times a matrix
+    ],
+    align=True,
+)
 
 
 @compiled
-def rotation(x, R):
-    """R (3, 3): body to world, from the quaternion in x."""
-    qx, qy, qz, qw = x[6], x[7], x[8], x[9]
+def rotation(qx, qy, qz, qw, R):
+    """R (3, 3): body to world, from a unit quaternion."""
     R[0, 0] = 1 - 2 * (qy * qy + qz * qz)
     R[0, 1] = 2 * (qx * qy - qz * qw)
     R[0, 2] = 2 * (qx * qz + qy * qw)
@@ -29,11 +45,16 @@ def rotation(x, R):
 
 
 @compiled
-def turn(x, r0, r1, r2):
-    """q <- q * Exp(r) for a rotation vector r (rad) in the body frame."""
+def exponential(r0, r1, r2):
+    """Exp(r): the quaternion x y z w of a rotation vector (rad)."""
     angle = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
     s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
-    bx, by, bz, bw = s * r0, s * r1, s * r2, math.cos(0.5 * angle)
+    return s * r0, s * r1, s * r2, math.cos(0.5 * angle)
+
+
+@compiled
+def turn(x, bx, by, bz, bw):
+    """q <- q * b, for a unit quaternion b of a rotation in the body frame."""
     ax, ay, az, aw = x[6], x[7], x[8], x[9]
     qx = aw * bx + ax * bw + ay * bz - az * by
     qy = aw * by - ax * bz + ay * bw + az * bx
@@ -44,102 +65,122 @@ def turn(x, r0, r1, r2):
 
 
 @compiled
-def inject(x, K, gain):
-    """Add the error K * gain, (15,), to the nominal state."""
+def inject(x, direction, size):
+    """Add the error direction * size, (15,), to the nominal state."""
     for j in range(6):
-        x[j] += K[j] * gain
-    turn(x, K[6] * gain, K[7] * gain, K[8] * gain)
-    for j in range(9, 15):
-        x[j + 1] += K[j] * gain
+        x[j] += direction[j] * size
+    bx, by, bz, bw = exponential(direction[6] * size, direction[7] * size, direction[8] * size)
+    turn(x, bx, by, bz, bw)
+    for j in range(9, ERROR_STATES):
+        x[j + 1] += direction[j] * size
 
 
 @compiled
-def predict(x, P, F, R, E, step, dt, gyro, force, trust, accel_psd, gyro_psd, accel_walk_psd, gyro_walk_psd):
-    """Advance state and covariance by dt seconds.
+def predict(hypothesis, imu, tuning, dt, transition):
+    """Advance a HYPOTHESIS by dt seconds with the input that an IMU_STATE holds; fills the TRANSITION."""
+    _move(hypothesis.x, imu, dt, transition)
+    P, T = hypothesis.P, transition.product
+    propagate(P, transition)
+    # P <- T Phi', T = Phi P: the triangle is computed, the rest mirrored
+    A, B, E = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude
+    for i in range(MOVING_STATES):
+        for j in range(MOVING_STATES, ERROR_STATES):
+            P[i, j] = P[j, i] = T[i, j]
+        for r in range(3):
+            if i <= r:
+                P[i, r] = P[r, i] = T[i, r] + dt * T[i, 3 + r]
+            if i <= 3 + r:
+                by_attitude = A[r, 0] * T[i, 6] + A[r, 1] * T[i, 7] + A[r, 2] * T[i, 8]
+                by_bias = B[r, 0] * T[i, 9] + B[r, 1] * T[i, 10] + B[r, 2] * T[i, 11]
+                P[i, 3 + r] = P[3 + r, i] = T[i, 3 + r] + by_attitude + by_bias
+            if i <= 6 + r:
+                turned = E[r, 0] * T[i, 6] + E[r, 1] * T[i, 7] + E[r, 2] * T[i, 8]
+                P[i, 6 + r] = P[6 + r, i] = turned - dt * T[i, 12 + r]
+    _add_noise(P, transition.rotation, imu.accel_psd, tuning, dt)
 
-    gyro (3,) rad/s, force (3,) m/s^2: measured rates and specific force, held over dt; trust (3,): share of the
-    measured specific force in what is used, per body axis (the rest is "hovering": gravity along body z);
-    accel_psd, accel_walk_psd (3,) (m/s^2)^2/Hz and (m/s^3)^2/Hz; the other densities scalar, SI. F (15, 15): scratch;
-    R, E (3, 3) and step (16,): scratch, which then holds what `propagate` needs to repeat the step.
-    """
-    rotation(x, R)
-    f0 = trust[0] * (force[0] - x[10])
-    f1 = trust[1] * (force[1] - x[11])
-    f2 = GRAVITY + trust[2] * (force[2] - x[12] - GRAVITY)
-    w0, w1, w2 = (gyro[0] - x[13]) * dt, (gyro[1] - x[14]) * dt, (gyro[2] - x[15]) * dt
+
+@compiled
+def _move(x, imu, dt, transition):
+    """The nominal state; fills the TRANSITION.
+
+    The specific force that drives it is between hovering (gravity along body z) and what was measured, by
+    imu.accel_weight for each axis."""
+    R, weight = transition.rotation, imu.accel_weight
+    rotation(x[6], x[7], x[8], x[9], R)
+    f0 = weight[0] * (imu.accel[0] - x[10])
+    f1 = weight[1] * (imu.accel[1] - x[11])
+    f2 = GRAVITY + weight[2] * (imu.accel[2] - x[12] - GRAVITY)
+    transition.dt = dt
     for r in range(3):
         a = R[r, 0] * f0 + R[r, 1] * f1 + R[r, 2] * f2 - (GRAVITY if r == 2 else 0.0)
         x[r] += dt * (x[3 + r] + 0.5 * dt * a)
         x[3 + r] += dt * a
-    turn(x, w0, w1, w2)
-
-    step[6] = step[7] = step[8] = 0.0
-    step[9] = 1.0
-    turn(step, -w0, -w1, -w2)
-    rotation(step, E)
-    step[0], step[1], step[2], step[3] = dt, f0, f1, f2
-    step[10], step[11], step[12] = trust[0], trust[1], trust[2]
-    propagate(P, F, R, E, step)
-    for i in range(15):
-        for j in range(i):
-            F[i, j], F[j, i] = F[j, i], F[i, j]
-    propagate(F, P, R, E, step)  # P is symmetric: Phi (Phi P)' = Phi P Phi'
-    for r in range(3):
+        transition.velocity_attitude[r, 0] = dt * (R[r, 2] * f1 - R[r, 1] * f2)
+        transition.velocity_attitude[r, 1] = dt * (R[r, 0] * f2 - R[r, 2] * f0)
+        transition.velocity_attitude[r, 2] = dt * (R[r, 1] * f0 - R[r, 0] * f1)
         for c in range(3):
-            white = R[r, 0] * accel_psd[0] * R[c, 0] + R[r, 1] * accel_psd[1] * R[c, 1] + R[r, 2] * accel_psd[2] * R[c, 2]
-            P[3 + r, 3 + c] += dt * white
-        P[6 + r, 6 + r] += dt * gyro_psd
-        P[9 + r, 9 + r] += dt * accel_walk_psd[r]
-        P[12 + r, 12 + r] += dt * gyro_walk_psd
-    for i in range(15):
-        for j in range(i):
-            P[i, j] = P[j, i]
+            transition.velocity_accel_bias[r, c] = -dt * R[r, c] * weight[c]
+    w0, w1, w2 = (imu.gyro[0] - x[13]) * dt, (imu.gyro[1] - x[14]) * dt, (imu.gyro[2] - x[15]) * dt
+    bx, by, bz, bw = exponential(w0, w1, w2)
+    turn(x, bx, by, bz, bw)
+    rotation(-bx, -by, -bz, bw, transition.attitude_attitude)
 
 
 @compiled
-def propagate(A, out, R, E, step):
-    """out <- Phi A for the transition Phi of the error state over one step; A, out: (15, 15).
+def propagate(M, transition):
+    """transition.product <- the upper rows of Phi M for a matrix M (15, 15); its lower rows stay what they are.
 
-    Only the blocks of Phi that differ from those of the identity are written out:
-    dp' = dp + dv dt;  dv' = dv - R ([f]x dtheta + T dba) dt;  dtheta' = Exp(-w dt) dtheta - dbg dt.
+    Phi, by what of it differs from the identity: dp' = dp + dv dt;  dv' = dv - R ([f]x dtheta + W dba) dt;
+    dtheta' = Exp(-w dt) dtheta - dbg dt.
     """
-    dt, f0, f1, f2 = step[0], step[1], step[2], step[3]
-    for j in range(15):
-        t0, t1, t2 = A[6, j], A[7, j], A[8, j]
-        c0 = f1 * t2 - f2 * t1 + step[10] * A[9, j]
-        c1 = f2 * t0 - f0 * t2 + step[11] * A[10, j]
-        c2 = f0 * t1 - f1 * t0 + step[12] * A[11, j]
-        for r in range(3):
-            out[r, j] = A[r, j] + dt * A[3 + r, j]
-            out[3 + r, j] = A[3 + r, j] - dt * (R[r, 0] * c0 + R[r, 1] * c1 + R[r, 2] * c2)
-            out[6 + r, j] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * A[12 + r, j]
-        for r in range(9, 15):
-            out[r, j] = A[r, j]
+    dt, out = transition.dt, transition.product
+    A, B, E = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude
+    for r in range(3):
+        for j in range(ERROR_STATES):
+            out[r, j] = M[r, j] + dt * M[3 + r, j]
+            by_attitude = A[r, 0] * M[6, j] + A[r, 1] * M[7, j] + A[r, 2] * M[8, j]
+            by_bias = B[r, 0] * M[9, j] + B[r, 1] * M[10, j] + B[r, 2] * M[11, j]
+            out[3 + r, j] = M[3 + r, j] + by_attitude + by_bias
+            out[6 + r, j] = E[r, 0] * M[6, j] + E[r, 1] * M[7, j] + E[r, 2] * M[8, j] - dt * M[12 + r, j]
 
 
 @compiled
-def coast(x, P, dt, accel_psd, turn_psd):
+def _add_noise(P, R, accel_psd, tuning, dt):
+    """White noise of the sensors over dt, and the random walks of their biases."""
+    s0, s1, s2 = dt * accel_psd[0], dt * accel_psd[1], dt * accel_psd[2]
+    for r in range(3):
+        for c in range(r, 3):
+            P[3 + r, 3 + c] += R[r, 0] * s0 * R[c, 0] + R[r, 1] * s1 * R[c, 1] + R[r, 2] * s2 * R[c, 2]
+            P[3 + c, 3 + r] = P[3 + r, 3 + c]
+        P[6 + r, 6 + r] += dt * tuning.gyro_noise**2
+        P[9 + r, 9 + r] += dt * tuning.accel_bias_walk**2
+        P[12 + r, 12 + r] += dt * tuning.gyro_bias_walk**2
+
+
+@compiled
+def coast(hypothesis, dt, accel_psd, turn_psd):
     """Advance by dt seconds with no inertial sample: constant velocity with random acceleration, attitude held.
 
     accel_psd (m/s^2)^2/Hz; turn_psd (rad/s)^2/Hz, growth of the attitude's uncertainty.
     """
+    x, P = hypothesis.x, hypothesis.P
     for i in range(3):
         x[i] += dt * x[3 + i]
-        for j in range(15):
+        for j in range(ERROR_STATES):
             P[i, j] += dt * P[3 + i, j]
-    for i in range(15):
-        for j in range(3):
+    for i in range(3):
+        for j in range(i, 3):
             P[i, j] += dt * P[i, 3 + j]
+        for j in range(i, ERROR_STATES):
+            P[j, i] = P[i, j]
     for i in range(3):
         P[3 + i, 3 + i] += dt * accel_psd
         P[6 + i, 6 + i] += dt * turn_psd
 
 
 @compiled
-def difference(a, b, out):
-    """Error state that leads from nominal state a to b, its first nine elements: out (9,) = [dp, dv, dtheta]."""
-    for k in range(6):
-        out[k] = b[k] - a[k]
+def difference(a, b):
+    """Error state that leads from nominal state a to b, its first nine elements: [dp, dv, dtheta]."""
     ax, ay, az, aw = -a[6], -a[7], -a[8], a[9]
     bx, by, bz, bw = b[6], b[7], b[8], b[9]
     x = aw * bx + ax * bw + ay * bz - az * by
@@ -150,4 +191,7 @@ def difference(a, b, out):
         x, y, z, w = -x, -y, -z, -w
     norm = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 if norm < 1e-9 else 2.0 * math.atan2(norm, w) / norm
-    out[6], out[7], out[8] = scale * x, scale * y, scale * z
+    return (
+        b[0] - a[0], b[1] - a[1], b[2] - a[2], b[3] - a[3], b[4] - a[4], b[5] - a[5],
+        scale * x, scale * y, scale * z,
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Which TDOAs cannot be measurements at all."""
+"""Which measurements cannot be any."""
 
 import math
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-MAX_RATE, MAX_FORCE = 100.0, 1000.0  # rad/s, m/s^2: beyond what any inertial sensor reads
-MARGIN = 1.0  # m by which |d_ab| may exceed the distance between a and b: its largest believable error
+MAX_RATE, MAX_ACCEL = 100.0, 1000.0  # rad/s, m/s^2: beyond what any inertial sensor reads
+LARGEST_ERROR = 1.0  # m by which |d_ab| may exceed the distance between a and b
 
 
 @compiled
@@ -21,7 +21,7 @@ def usable(a, b, d, bias_std, positions):
     baseline = 0.0
     for k in range(3):
         baseline += (positions[a, k] - positions[b, k]) ** 2
-    return abs(d) <= math.sqrt(baseline) + MARGIN
+    return abs(d) <= math.sqrt(baseline) + LARGEST_ERROR
 
 
 @compiled
@@ -33,6 +33,6 @@ def usable_all(a, b, d, bias_std, positions):
     return out
 
 
-def usable_imu(gyro, force):
-    """(n,) bool: finite and within the range of any sensor. gyro (n, 3) rad/s, force (n, 3) m/s^2."""
-    return (np.abs(gyro) < MAX_RATE).all(axis=-1) & (np.abs(force) < MAX_FORCE).all(axis=-1)
+def usable_imu(gyro, accel):
+    """(n,) bool: finite and within the range of any sensor. gyro (n, 3) rad/s, accel (n, 3) m/s^2."""
+    return (np.abs(gyro) < MAX_RATE).all(axis=-1) & (np.abs(accel) < MAX_ACCEL).all(axis=-1)

@@ -5,9 +5,8 @@ import time
 import numpy as np
 
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.core.engine import run
-from uwb_tdoa_ekf.core.memory import HYPOTHESES, RUNNING, Memory, new_memory
-from uwb_tdoa_ekf.core.tape import new_tape
+from uwb_tdoa_ekf.core.engine import feed
+from uwb_tdoa_ekf.core.memory import HYPOTHESES, IMU_SAMPLE, TDOA, Measurements, new_memory, structured
 
 from .figures import Figure
 from .flights import make_flight
@@ -54,45 +53,42 @@ def per_event(anchors, robust, hypotheses, repeats):
     )
     core = Core(flight, config)
     core.run(BEFORE, core.memory)
-    if not core.memory.clock[RUNNING]:
+    if not core.memory.record.running:
         raise RuntimeError("the filter has not started, so that there is nothing to measure")
     seconds = np.array([[core.timed(False), core.timed(True)] for _ in range(repeats + 1)])
     seconds = seconds[1:]  # the first fills caches
-    alive = np.count_nonzero(np.isfinite(core.last.belief))
+    alive = np.count_nonzero(np.isfinite(core.last.record.hypotheses["log_weight"]))
     if alive != hypotheses:
         raise RuntimeError(f"{alive} yaws were followed instead of {hypotheses}")
     return 1e6 * seconds[:, 0] / core.samples, 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.tdoas
 
 
 class Core:
-    """engine.run on a stretch of a flight, again and again from the same Memory."""
+    """engine.feed on a stretch of a flight, again and again from the same Memory."""
 
     def __init__(self, flight, config):
-        self.memory, self.last = new_memory(len(flight.anchors)), None
-        self._tuning, self._tape, self._positions = config.tuning(), new_tape(), flight.anchors.positions
+        self.memory, self.last, self._tuning = new_memory(flight.anchors.positions), None, config.tuning()
         imu, tdoa = flight.imu, flight.tdoa
-        self._imu = (imu.t, *(np.ascontiguousarray(columns) for columns in (imu.gyro, imu.accel)))
+        self._imu = structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
         # no prediction of their own: at the stamp of the inertial sample before
         stamps = imu.t[np.maximum(np.searchsorted(imu.t, tdoa.t, side="right") - 1, 0)]
         rows = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
-        self._tdoa = (stamps, *rows, tdoa.d, np.zeros(len(tdoa)))
+        self._tdoa = structured(TDOA, stamps, *rows, tdoa.d, np.zeros(len(tdoa)))
         self._begin = imu.t[0]
 
     def run(self, until, memory):
         """Feed the flight's first seconds; what is measured is the rest."""
-        k, n = (int(np.searchsorted(stream[0], self._begin + until)) for stream in (self._imu, self._tdoa))
-        self._feed(memory, [c[:k] for c in self._imu], [c[:n] for c in self._tdoa])
-        self._imu, self._tdoa = [c[k:] for c in self._imu], [c[n:] for c in self._tdoa]
-        self.samples, self.tdoas = len(self._imu[0]), len(self._tdoa[0])
+        k, n = (int(np.searchsorted(stream["t"], self._begin + until)) for stream in (self._imu, self._tdoa))
+        self._feed(memory, self._imu[:k], self._tdoa[:n])
+        self._imu, self._tdoa = self._imu[k:], self._tdoa[n:]
+        self.samples, self.tdoas = len(self._imu), len(self._tdoa)
 
     def timed(self, tdoa):
         """s that the rest takes, with or without its TDOAs."""
-        self.last = Memory(*(array.copy() for array in self.memory))
-        return self._feed(self.last, self._imu, self._tdoa if tdoa else [c[:0] for c in self._tdoa])
+        self.last = self.memory.copy()
+        return self._feed(self.last, self._imu, self._tdoa if tdoa else self._tdoa[:0])
 
     def _feed(self, memory, imu, tdoa):
-        n = len(imu[0]) + len(tdoa[0])
-        out = np.empty((n, 17)), np.empty((n, 9, 9)), np.empty((len(tdoa[0]), 4))
         began = time.perf_counter()
-        run(memory, self._tuning, self._positions, *imu, *tdoa, *out, self._tape)
+        feed(memory, self._tuning, Measurements(imu, tdoa))
         return time.perf_counter() - began

@@ -12,7 +12,7 @@ import yaml
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.correction.network import load_network
-from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
@@ -70,7 +70,7 @@ def main(argv=None):
 
 def _evaluate(args):
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
-    config = replace(config, **dict(map(_parameter, args.parameters)))
+    config = replace(config, **current_names(dict(map(_parameter, args.parameters))))
     effects = EffectSet.from_yaml(args.effects) if args.effects and not args.no_bias else None
     network = None if args.no_bias else load_network(args.model)
     found = inputs.find_flights(args.flights, args.survey, absolute=bool(args.dask))
@@ -103,7 +103,7 @@ def _parameter(text):
     """(name, value) of "name:=value". Raises InputError."""
     name, assigned, value = text.partition(":=")
     names = [field.name for field in fields(FilterConfig)]
-    if not assigned or name not in names:
+    if not assigned or name not in (*names, *RENAMED):
         raise InputError(f"-p {text}: write NAME:=VALUE, where NAME is one of {', '.join(names)}.")
     try:
         return name, yaml.safe_load(value)

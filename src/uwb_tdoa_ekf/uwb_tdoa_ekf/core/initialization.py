@@ -1,0 +1,120 @@
+"""The beginning of a run, and the new beginning of one that has lost its tag."""
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+from . import hypotheses, inertial, workspace
+from .history import add_reset
+from .memory import HYPOTHESES, WINDOW
+from .startup import level, locate, share_of_inliers
+from .state import GRAVITY
+
+MINIMUM = 12  # TDOAs a search needs
+AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
+CLEARLY_MORE = 0.2  # share by which a recovery must explain more than the filter does
+SEARCH_PERIOD = 0.1  # s between two searches
+TILT_STD = 0.1  # rad, at the start
+
+
+@compiled
+def remember(ekf, tdoa):
+    """Append a TDOA to the window."""
+    if ekf.kept == 2 * WINDOW:
+        for i in range(WINDOW):
+            ekf.window[i] = ekf.window[WINDOW + i]
+        ekf.kept = WINDOW
+    ekf.window[ekf.kept] = tdoa
+    ekf.kept += 1
+
+
+@compiled
+def start(ekf, anchors, tuning, t, anyhow, history):
+    """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
+    window = _recent(ekf, tuning.start_window)
+    if len(window) < MINIMUM:
+        return
+    ekf.next_search = t + SEARCH_PERIOD
+    workspace.bounds(anchors, tuning.workspace_margin, ekf.workspace)
+    x, covariance = np.empty(6), np.empty((6, 6))
+    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, x, covariance)
+    if not anyhow and (share < AGREE or not workspace.contains(ekf.workspace, x)):
+        return
+    accel = _mean_accel(ekf.imu, tuning)
+    unknown = tuning.use_imu and tuning.initial_yaw_std > hypotheses.YAW_STD
+    for h in range(HYPOTHESES):
+        hypothesis, offset = ekf.hypotheses[h], hypotheses.yaw_offset(h)
+        nearest = min(offset, 2.0 * math.pi - offset)
+        hypothesis.log_weight = -0.5 * (nearest / tuning.initial_yaw_std) ** 2 if unknown or h == 0 else -np.inf
+        level(accel, tuning.initial_yaw + offset, hypothesis.x)
+        hypothesis.x[10:] = 0.0
+        hypothesis.P[:] = 0.0
+        _put(hypothesis, x, covariance)
+        _spread_attitude(hypothesis.P, tuning)
+    ekf.best = 0
+    ekf.t = ekf.last_tdoa = t
+    ekf.consistency = 1.0
+    ekf.running = True
+    add_reset(ekf, t, history)
+
+
+@compiled
+def recover(ekf, anchors, tuning, t, history):
+    """If the window agrees on a position and the filter on another one, go there; attitude and biases stay."""
+    window = _recent(ekf, tuning.start_window)
+    if len(window) < MINIMUM:
+        return
+    ekf.next_search = t + SEARCH_PERIOD
+    x, covariance = np.empty(6), np.empty((6, 6))
+    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, x, covariance)
+    explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
+    if not workspace.contains(ekf.workspace, x) or share < AGREE_ANYHOW or share < CLEARLY_MORE + explained:
+        return
+    for h in range(HYPOTHESES):
+        hypothesis = ekf.hypotheses[h]
+        hypothesis.P[:6, :] = 0.0
+        hypothesis.P[:, :6] = 0.0
+        _put(hypothesis, x, covariance)
+    ekf.consistency = 1.0
+    ekf.recoveries += 1
+    add_reset(ekf, t, history)
+
+
+@compiled
+def _recent(ekf, seconds):
+    """The TDOAs of the last `seconds`: (n,) of TDOA."""
+    first = ekf.kept - 1
+    since = ekf.window[ekf.kept - 1].t - seconds
+    while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > since:
+        first -= 1
+    return ekf.window[first : ekf.kept]
+
+
+@compiled
+def _mean_accel(imu, tuning):
+    """Mean specific force (3,) m/s^2, each axis by how far it can be relied on."""
+    inertial.weigh(imu, False, tuning)
+    accel = np.empty(3)
+    for k in range(3):
+        hovering = GRAVITY if k == 2 else 0.0
+        accel[k] = hovering + imu.accel_weight[k] * (imu.mean_accel[k] - hovering)
+    return accel
+
+
+@compiled
+def _put(hypothesis, x, covariance):
+    """Position and velocity x (6,) and their covariance (6, 6)."""
+    hypothesis.x[:6] = x
+    hypothesis.P[:6, :6] = covariance
+
+
+@compiled
+def _spread_attitude(P, tuning):
+    """The variances of attitude and biases at the start."""
+    P[6, 6] = P[7, 7] = TILT_STD**2
+    P[8, 8] = min(tuning.initial_yaw_std, hypotheses.YAW_STD) ** 2
+    for k in range(3):
+        P[9 + k, 9 + k] = tuning.initial_accel_bias_std**2
+        P[12 + k, 12 + k] = tuning.initial_gyro_bias_std**2

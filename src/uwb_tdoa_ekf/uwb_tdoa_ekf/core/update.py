@@ -1,0 +1,72 @@
+"""One scalar measurement against the state, whatever it measures.
+
+A kind of measurement fills an INNOVATION: which error states it depends on and how, by how much it differs from what
+the state predicts, and the variance of its noise. The rest is the same for all: `project`, then `kalman`, by way of
+`robust.update` if the measurement may be an outlier.
+"""
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+from .state import ERROR_STATES, inject
+
+LONGEST_ROW = 6  # error states that one measurement may depend on
+
+INNOVATION = np.dtype(
+    [
+        ("states", np.int64, LONGEST_ROW),  # the error states that the Jacobian row h has an entry for,
+        ("row", float, LONGEST_ROW),  # the entries,
+        ("entries", np.int64),  # and how many there are
+        ("value", float),  # measured minus predicted
+        ("noise_variance", float),  # of one measurement
+        ("prior_variance", float),  # h P h'
+        (
+            "cross_covariance",
+            float,
+            ERROR_STATES,
+        ),  # P h', of state and prediction; the gain is this over total_variance
+        ("weight", float),  # 0 to 1, given by robust.update
+        ("total_variance", float),  # of the value, as the update took it
+        ("factor", float, (ERROR_STATES, 3)),  # scratch of the M-estimation
+    ],
+    align=True,
+)
+
+
+@compiled
+def project(P, innovation):
+    """Fill in what the prior P (15, 15) makes of the Jacobian row: prior_variance and cross_covariance."""
+    covariance = innovation.cross_covariance
+    for j in range(ERROR_STATES):
+        covariance[j] = 0.0
+    for n in range(innovation.entries):
+        state, entry = innovation.states[n], innovation.row[n]
+        for j in range(ERROR_STATES):
+            covariance[j] += entry * P[state, j]
+    variance = 0.0
+    for n in range(innovation.entries):
+        variance += innovation.row[n] * covariance[innovation.states[n]]
+    innovation.prior_variance = variance
+
+
+@compiled
+def kalman(hypothesis, innovation):
+    """Kalman update of a HYPOTHESIS with an INNOVATION of value, cross_covariance and total_variance."""
+    P, covariance, total = hypothesis.P, innovation.cross_covariance, innovation.total_variance
+    inject(hypothesis.x, covariance, innovation.value / total)
+    for i in range(ERROR_STATES):
+        gain = covariance[i] / total
+        for j in range(i, ERROR_STATES):
+            P[i, j] -= gain * covariance[j]
+            P[j, i] = P[i, j]
+
+
+@compiled
+def update_state(hypothesis, innovation, state, value, std):
+    """Kalman update with a measurement of one of the first six states, position and velocity: `value` +- `std`."""
+    innovation.entries, innovation.states[0], innovation.row[0] = 1, state, 1.0
+    innovation.value, innovation.noise_variance = value - hypothesis.x[state], std * std
+    project(hypothesis.P, innovation)
+    innovation.total_variance = innovation.prior_variance + innovation.noise_variance
+    kalman(hypothesis, innovation)
