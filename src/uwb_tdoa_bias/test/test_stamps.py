@@ -1,29 +1,29 @@
-"""Which stamps are believed, and when."""
+"""Which stamps are accepted, and when."""
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.foundation.stamps import AHEAD, BACK, StampWatch
+from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, StampGate
 
 
 def through(stamps):
-    """(believed, strays, places at which the stream fell back) of stamps fed one after the other."""
-    watch, believed, strays, back = StampWatch(), [], [], []
+    """(accepted, outliers, places at which the stream jumped back) of stamps fed one after the other."""
+    gate, accepted, outliers, back = StampGate(), [], [], []
     for place, t in enumerate(stamps):
-        good, bad, fell_back = watch.take(t, place)
-        believed += good
-        strays += bad
-        back += [place] * fell_back
-    return believed, strays + watch.finish(), back
+        good, bad, jumped_back = gate.take(t, place)
+        accepted += good
+        outliers += bad
+        back += [place] * jumped_back
+    return accepted, outliers + gate.finish(), back
 
 
-def test_a_stream_that_goes_on_is_believed_at_once():
-    watch = StampWatch()
-    for t in (5.0, 5.1, 5.05, 5.1 - BACK, 5.1 + AHEAD):
-        assert watch.take(t, "x") == ([(t, "x")], [], False) and len(watch) == 0
+def test_a_stream_that_goes_on_is_accepted_at_once():
+    gate = StampGate()
+    for t in (5.0, 5.1, 5.05, 5.1 - LARGEST_STEP_BACK, 5.1 + LARGEST_STEP_AHEAD):
+        assert gate.take(t, "x") == ([(t, "x")], [], False) and len(gate) == 0
 
 
-def test_one_wrong_stamp_is_a_stray():
+def test_one_wrong_stamp_is_an_outlier():
     for wrong in (-100.0, 100.0):
         assert through([0.0, 0.1, wrong, 0.2]) == ([(0.0, 0), (0.1, 1), (0.2, 3)], [(wrong, 2)], [])
 
@@ -33,15 +33,15 @@ def test_two_that_agree_are_another_time():
     assert through([0.0, 60.0, 60.1]) == ([(0.0, 0), (60.0, 1), (60.1, 2)], [], [])
 
 
-def test_the_time_of_useless_items_is_seen():
-    watch = StampWatch()
-    watch.take(1.0, "x")
+def test_the_time_of_useless_items_is_noted():
+    gate = StampGate()
+    gate.take(1.0, "x")
     for t, newest in ((float("nan"), 1.0), (1.5, 1.5), (1.2, 1.5), (500.0, 1.5), (-500.0, 1.5)):
-        watch.see(t)
-        assert watch.newest == newest
+        gate.note(t)
+        assert gate.newest == newest
 
 
 @given(st.lists(st.floats(-1e6, 1e6) | st.floats(0.0, 3.0)))
 def test_nothing_is_lost_or_told_twice(stamps):
-    believed, strays, _ = through(stamps)
-    assert sorted(place for _, place in believed + strays) == list(range(len(stamps)))
+    accepted, outliers, _ = through(stamps)
+    assert sorted(place for _, place in accepted + outliers) == list(range(len(stamps)))

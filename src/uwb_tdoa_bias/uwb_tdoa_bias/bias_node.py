@@ -23,7 +23,7 @@ from .foundation.errors import InputError
 from .correction.hold import Hold
 from .correction.network import SHIPPED, load_network
 from .correction.poses import told_yaw_std
-from .foundation.stamps import StampWatch
+from .foundation.stamps import StampGate
 
 ROTATIONS = [21, 28, 35]  # places of the variances about the axes in the covariance of a pose
 EARLY = 2000  # TDOAs kept while there are no anchors
@@ -54,7 +54,7 @@ class BiasNode(Node):
         self._corrector = None
         self._epoch, self._counts, self._rate = ros.Epoch(), Counter(), ros.Rate()
         self._early, self._hold = deque(), Hold(self._limit)
-        self._tdoas, self._poses = StampWatch(), StampWatch()
+        self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = 0
         self._message = TdoaCorrected()  # one for all: what is published is copied
 
@@ -100,13 +100,13 @@ class BiasNode(Node):
         self._release()
 
     def _take_pose(self, t, pose):
-        believed, _, fell_back = self._poses.take(t, pose)
-        if fell_back:
+        accepted, _, jumped_back = self._poses.take(t, pose)
+        if jumped_back:
             self._start_over()
-            held, self._tdoas = self._tdoas.finish(), StampWatch()
+            held, self._tdoas = self._tdoas.finish(), StampGate()
             for _, message in held:
                 self._take(message)
-        for t, pose in believed:
+        for t, pose in accepted:
             position, turns = pose.pose.position, np.sqrt(np.maximum(pose.covariance[ROTATIONS], 0.0))
             at, orientation = (position.x, position.y, position.z), ros.orientation_of(pose.pose.orientation)
             self._corrector.add_pose(t, at, orientation, told_yaw_std(turns[None])[0])
@@ -125,16 +125,16 @@ class BiasNode(Node):
 
     def _take(self, message):
         t = self._epoch.seconds(message.header.stamp) - self._late
-        believed, strays, fell_back = self._tdoas.take(t, message)
-        for _, stray in strays:  # ekf_node says of it that its stamp is wrong
-            self._publish(stray, 0.0, 0.0, PASSED)
-        if fell_back:
+        accepted, outliers, jumped_back = self._tdoas.take(t, message)
+        for _, outlier in outliers:  # ekf_node says of it that its stamp is wrong
+            self._publish(outlier, 0.0, 0.0, PASSED)
+        if jumped_back:
             self.get_logger().info("time has gone back: starting over")
             self._start_over()
-            held, self._poses = self._poses.finish(), StampWatch()
+            held, self._poses = self._poses.finish(), StampGate()
             for t_held, pose in held:
                 self._take_pose(t_held, pose)
-        for t, message in believed:
+        for t, message in accepted:
             self._hold.add(t, message)
         self._release()
 

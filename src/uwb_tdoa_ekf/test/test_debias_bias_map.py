@@ -25,8 +25,8 @@ def outside(x, d=3):
 def test_inside_the_bias_is_taken_out_and_the_map_s_own_error_added(d):
     one = make_map(d)
     p = np.random.default_rng(1).uniform(0.2, 1.3, (50, 3))
-    found, covariance, trust = one.correct(p, np.tile(0.04 * np.eye(3), (50, 1, 1)))
-    assert (trust == 1.0).all()
+    found, covariance, validity = one.correct(p, np.tile(0.04 * np.eye(3), (50, 1, 1)))
+    assert (validity == 1.0).all()
     expected = np.array([0.1, -0.2, 0.3]) * (np.arange(3) < d)
     np.testing.assert_allclose(p - found, np.tile(expected, (50, 1)), atol=1e-9)
     np.testing.assert_allclose(covariance, np.tile(np.diag(0.04 + 0.01 * (np.arange(3) < d)), (50, 1, 1)), atol=1e-12)
@@ -39,10 +39,10 @@ def test_outside_of_the_hull_the_correction_fades_and_the_covariance_grows(inter
     corrections, traces = [], []
     for x in (-0.1, 0.25 * FADE, 0.5 * FADE, 0.75 * FADE, FADE, 10.0):
         p = outside(x)
-        found, covariance, trust = one.correct(p, before)
+        found, covariance, validity = one.correct(p, before)
         corrections.append(np.linalg.norm(found - p))
         traces.append(np.trace(covariance[0]))
-        assert trust == pytest.approx(np.clip(1.0 - x / FADE, 0.0, 1.0))
+        assert validity == pytest.approx(np.clip(1.0 - x / FADE, 0.0, 1.0))
         assert (np.linalg.eigvalsh(covariance[0] - before[0]) > -1e-12).all()
     assert (np.diff(corrections) <= 1e-12).all() and corrections[-2] == corrections[-1] == 0.0
     assert traces[-1] == pytest.approx(0.12 + 0.1**2 + 0.2**2 + 0.3**2)  # the bias that was not taken out
@@ -52,7 +52,7 @@ def test_outside_of_the_hull_the_correction_fades_and_the_covariance_grows(inter
 def test_a_hole_in_the_markers_is_not_known():
     cell = np.array([[0, 0], [0, 1], [1, 0], [10, 0], [10, 1], [9, 0], [5, 9]])
     one = BiasMap(cell, 0.5 * cell, np.full((7, 2), 0.1), np.full((7, 2), 0.1), np.full(7, 9), np.eye(2), 0.5)
-    assert one.trust(np.array([[0.2, 0.2, 0.0]])) == 1.0 and one.trust(np.array([[2.5, 1.0, 0.0]])) == 0.0
+    assert one.validity(np.array([[0.2, 0.2, 0.0]])) == 1.0 and one.validity(np.array([[2.5, 1.0, 0.0]])) == 0.0
 
 
 def test_a_smooth_field_is_found_between_the_markers():

@@ -19,7 +19,7 @@ def fly(seed, n=4000, noise=0.03, claimed=None, bias=field):
 
 
 def left_over(bias_map, part):
-    known = bias_map.trust(part.measured) == 1.0
+    known = bias_map.validity(part.measured) == 1.0
     return (part.measured - bias_map.bias_at(part.measured) - part.true)[known]
 
 
@@ -52,10 +52,10 @@ def test_covariances_become_honest_but_never_smaller(claimed, honest):
     fresh = [drifting(seed) for seed in range(20, 40)]
     nees = []
     for part in fresh:
-        p, covariance, trust = found.correct(part.measured, part.covariance)
-        error = (p - part.true)[trust == 1.0]
+        p, covariance, validity = found.correct(part.measured, part.covariance)
+        error = (p - part.true)[validity == 1.0]
         nees.append(
-            np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(covariance[trust == 1.0], error[:, :, None])[:, :, 0]))
+            np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(covariance[validity == 1.0], error[:, :, None])[:, :, 0]))
         )
     if honest:
         assert 2.0 < np.mean(nees) < 5.0  # 20 flights: a third of 3 either way, and more above

@@ -8,7 +8,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.stamps import BACK
+from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import INVALID, LATE, STARTUP, USED
 from uwb_tdoa_ekf.estimator import VERDICTS, Estimator
@@ -231,8 +231,8 @@ def test_falling_back_by_less_is_late_not_a_restart():
     flight = fly(8, 2.0)
     estimator = Estimator(flight.anchors)
     feed(estimator, flight)
-    estimator.add_tdoa(flight.tdoa.t[-1] - 0.9 * BACK, FIRST, SECOND, 0.0)
-    estimator.add_imu(flight.imu.t[-1] - 0.9 * BACK, *REST)
+    estimator.add_tdoa(flight.tdoa.t[-1] - 0.9 * LARGEST_STEP_BACK, FIRST, SECOND, 0.0)
+    estimator.add_imu(flight.imu.t[-1] - 0.9 * LARGEST_STEP_BACK, *REST)
     _, residuals = estimator.advance()
     assert residuals.verdict.tolist() == [LATE]
     assert estimator.running and estimator.counts["restarts"] == 0 and estimator.counts["imu_late"] == 1

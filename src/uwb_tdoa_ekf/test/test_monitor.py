@@ -10,14 +10,14 @@ ANCHORS = Anchors.from_positions(np.random.default_rng(0).uniform(-4, 4, (6, 3))
 IDS = ANCHORS.ids
 
 
-def watch(late, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True):
-    """Alarms at the end of a flight in which the anchors are late(t) (6,) m; 100 TDOAs a second in a ring."""
+def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True):
+    """Alarms at the end of a flight in which the anchors have delays_at(t) (6,) m; 100 TDOAs a second in a ring."""
     rng, monitor, seen = np.random.default_rng(seed), Monitor(ANCHORS), []
     for second in range(seconds):
         t = second + np.arange(100) / 100.0
         a = np.arange(100) % 6
         b = (a + 1) % 6
-        delays = np.array([late(x) for x in t])
+        delays = np.array([delays_at(x) for x in t])
         rows = np.arange(100)
         innovation = delays[rows, b] - delays[rows, a] + noise * rng.standard_normal(100)
         verdict = np.full(100, USED)

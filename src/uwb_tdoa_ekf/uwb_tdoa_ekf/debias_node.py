@@ -21,7 +21,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .debias import BiasMap, LayerConfig, Layers
 
 GAP = 1.0  # s; after a longer silence, or when time goes back, the layers start anew
-DOUBT = 0.5  # share of positions outside of the map that becomes a warning
+LARGEST_OUTSIDE = 0.5  # share of positions outside of the map, before it becomes a warning
 
 
 class DebiasNode(Node):
@@ -41,7 +41,7 @@ class DebiasNode(Node):
             for name, value in vars(defaults).items()
         }
         self._layers = Layers(LayerConfig(**layers))
-        self._epoch, self._counts, self._rate, self._judged = ros.Epoch(), Counter(), ros.Rate(), Counter()
+        self._epoch, self._counts, self._rate, self._counts_before = ros.Epoch(), Counter(), ros.Rate(), Counter()
         self._newest = -math.inf
         self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
         self._publisher = ros.publish_stream(self, Odometry, "odometry/debiased")
@@ -59,8 +59,8 @@ class DebiasNode(Node):
             kind = "invalid"
         else:
             covariance = np.array(message.pose.covariance).reshape(6, 6)
-            (p,), (covariance[:3, :3],), (trust,) = self._map.correct(p[None], covariance[None, :3, :3])
-            kind = "corrected" if trust == 1.0 else "faded" if trust > 0.0 else "outside"
+            (p,), (covariance[:3, :3],), (validity,) = self._map.correct(p[None], covariance[None, :3, :3])
+            kind = "corrected" if validity == 1.0 else "faded" if validity > 0.0 else "outside"
             point.x, point.y, point.z = p.tolist()
             message.pose.covariance = covariance.ravel()
         self._counts[kind] += 1
@@ -81,8 +81,8 @@ class DebiasNode(Node):
 
     def _report(self):
         kinds = ("corrected", "faded", "outside", "invalid")
-        recent = {name: self._counts[name] - self._judged[name] for name in kinds}
-        self._judged = Counter(self._counts)
+        recent = {name: self._counts[name] - self._counts_before[name] for name in kinds}
+        self._counts_before = Counter(self._counts)
         rate = self._rate.of(self._counts["received"])
         values = {name: self._counts[name] for name in ("received", *kinds)}
         values |= {"odometry rate": f"{rate:.1f} Hz", "map": self._map.source, "markers": len(self._map.at)}
@@ -96,7 +96,7 @@ class DebiasNode(Node):
         if recent["invalid"]:
             what = f"odometry is not finite, or not in the map's frame '{self._map.frame}', and is passed on as it is"
             return DiagnosticStatus.ERROR, f"{what}: correct world_frame of ekf_node, or make a map in its frame"
-        if recent["outside"] > DOUBT * total:
+        if recent["outside"] > LARGEST_OUTSIDE * total:
             return DiagnosticStatus.WARN, "most positions are outside of the map, not corrected: map more of the room"
         return DiagnosticStatus.OK, "debiasing"
 

@@ -7,7 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.stamps import StampWatch
+from uwb_tdoa_bias.foundation.stamps import StampGate
 
 from .core.config import FilterConfig
 from .core.engine import INVALID, LATE, REJECTED, STARTUP, USED, feed
@@ -73,16 +73,14 @@ class Estimator:
         self._tuning = self.config.tuning()
         self.counts = dict.fromkeys([*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts"], 0)
         self._refused = []
-        self._restart()
+        self._clear()
 
-    def _restart(self):
+    def _clear(self):
         self._memory = new_memory(self.anchors.positions)
         self._waiting = [], []  # items of each stream in order of their stamps
-        self._watches = [StampWatch(), StampWatch()]
-        self._done = -math.inf
-        self._last_imu = np.array(
-            [(-math.inf, math.nan, math.nan)], IMU_SAMPLE
-        )  # used last, the one before them in front
+        self._gates = [StampGate(), StampGate()]
+        self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
+        self._fed_imu = np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)  # lately, the one before them in front
 
     @property
     def running(self):
@@ -97,7 +95,7 @@ class Estimator:
     @property
     def waiting(self):
         """Messages received and neither used nor refused yet: (imu, tdoa)."""
-        return tuple(len(stream) + len(watch) for stream, watch in zip(self._waiting, self._watches))
+        return tuple(len(stream) + len(gate) for stream, gate in zip(self._waiting, self._gates))
 
     def add_imu(self, t, gyro, accel):
         """Take one inertial sample: t s; gyro (3,) rad/s; accel (3,) m/s^2, specific force; body frame."""
@@ -105,7 +103,7 @@ class Estimator:
         rates, accels = (all(abs(x) < limit for x in part) for part, limit in zip(sample[1:], (MAX_RATE, MAX_ACCEL)))
         if not (math.isfinite(t) and rates and accels):  # NaN is not below anything
             self.counts["imu_invalid"] += 1
-            self._watches[IMU_STREAM].see(t)
+            self._gates[IMU_STREAM].note(t)
             return
         self._take(IMU_STREAM, t, sample)
 
@@ -114,46 +112,46 @@ class Estimator:
         i, k = self.anchors.row(a), self.anchors.row(b)
         if not (math.isfinite(t) and usable(i, k, d, bias_std, self.anchors.positions)):
             self._refused.append((t, a, b, INVALID))
-            self._watches[TDOA_STREAM].see(t)  # or whoever waits for our pose of this time would wait for the next one
+            self._gates[TDOA_STREAM].note(t)  # or whoever waits for our pose of this time would wait for the next one
             return
         self._take(TDOA_STREAM, t, (t, i, k, d, bias_std))
 
     def advance(self):
         """Use every message that nothing earlier can precede any more. Returns (Odometry, Residuals), possibly empty."""
-        imu, tdoa = (watch.newest for watch in self._watches)
+        imu, tdoa = (gate.newest for gate in self._gates)
         both = min(imu, tdoa) if self.config.use_imu else tdoa
-        return self._use(max(both - self.reorder, max(imu, tdoa) - self.lag))
+        return self._feed(max(both - self.reorder, max(imu, tdoa) - self.lag))
 
     def finish(self):
         """Use everything that still waits. Returns (Odometry, Residuals)."""
-        for stream, watch in enumerate(self._watches):
-            self._refuse_strays(stream, watch.finish())
-        return self._use(math.inf)
+        for stream, gate in enumerate(self._gates):
+            self._refuse_outliers(stream, gate.finish())
+        return self._feed(math.inf)
 
     def rates_at(self, t):
         """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample is
         near."""
-        place = np.searchsorted(self._last_imu["t"], t, side="right") - 1
-        sample = self._last_imu[np.maximum(place, 0)]
+        place = np.searchsorted(self._fed_imu["t"], t, side="right") - 1
+        sample = self._fed_imu[np.maximum(place, 0)]
         near = (place >= 0) & (np.abs(t - sample["t"]) <= self.config.imu_timeout)
         return np.where(near[:, None], sample["gyro"], math.nan)
 
     def _take(self, stream, t, item):
-        """Keep an item of a stream, and one that was held because of its stamp, if their stamps can be believed."""
-        believed, strays, fell_back = self._watches[stream].take(t, item)
-        if fell_back:
+        """Keep an item of a stream, and one that was held because of its stamp, if their stamps are accepted."""
+        accepted, outliers, jumped_back = self._gates[stream].take(t, item)
+        if jumped_back:
             self._start_anew(stream)
-        self._refuse_strays(stream, strays)
-        for t, item in believed:
-            if t < self._done:
+        self._refuse_outliers(stream, outliers)
+        for t, item in accepted:
+            if t < self._fed_until:
                 self._refuse(stream, item, LATE)
             else:
-                _insert(self._waiting[stream], item)
+                _insert(item, self._waiting[stream])
 
-    def _refuse_strays(self, stream, strays):
+    def _refuse_outliers(self, stream, outliers):
         """Account for items whose stamps are far from those of their neighbours."""
-        for t, item in strays:
-            self._refuse(stream, item, INVALID if t > self._watches[stream].newest else LATE)
+        for t, item in outliers:
+            self._refuse(stream, item, INVALID if t > self._gates[stream].newest else LATE)
 
     def _refuse(self, stream, item, verdict):
         if stream == IMU_STREAM:
@@ -168,16 +166,16 @@ class Estimator:
             for item in waiting:
                 self._refuse(k, item, LATE)
         self.counts["restarts"] += 1
-        other, watch, held = 1 - stream, self._watches[stream], self._watches[1 - stream].finish()
-        self._restart()
-        self._watches[stream] = watch
-        for t, item in held:  # was doubtful in the time that is over
+        other, gate, held = 1 - stream, self._gates[stream], self._gates[1 - stream].finish()
+        self._clear()
+        self._gates[stream] = gate
+        for t, item in held:  # was not plausible in the time that is over
             self._take(other, t, item)
 
-    def _use(self, until):
+    def _feed(self, until):
         counts = [bisect_right(waiting, until, key=itemgetter(0)) for waiting in self._waiting]
         if not (any(counts) or self._refused):
-            return _NOTHING
+            return NOTHING
         imu, tdoa = (np.array(waiting[:n], kind) for waiting, n, kind in zip(self._waiting, counts, STREAMS))
         for waiting, n in zip(self._waiting, counts):
             del waiting[:n]
@@ -185,8 +183,8 @@ class Estimator:
         odometry, outcome = feed(self._memory, self._tuning, fed)
         for part in (imu, tdoa):
             if len(part):
-                self._done = max(self._done, part["t"][-1])
-        self._last_imu = np.concatenate([self._last_imu[-1:], imu])
+                self._fed_until = max(self._fed_until, part["t"][-1])
+        self._fed_imu = np.concatenate([self._fed_imu[-1:], imu])
         self.counts["imu_used"] += len(imu)
         return Odometry.from_rows(odometry), self._residuals(tdoa, outcome)
 
@@ -210,10 +208,10 @@ class Estimator:
         )
 
 
-_NOTHING = Odometry.from_rows(np.empty(0, ODOMETRY)), Residuals(*(np.empty(0) for _ in range(7)))
+NOTHING = Odometry.from_rows(np.empty(0, ODOMETRY)), Residuals(*(np.empty(0) for _ in range(7)))
 
 
-def _insert(waiting, item):
+def _insert(item, waiting):
     if waiting and item < waiting[-1]:
         insort(waiting, item)
     else:

@@ -48,22 +48,24 @@ def run_offline(flight, config=None, corrector=None, records=None):
     corrector = corrector or Corrector(flight.anchors)
     corrector.reset()
     flight = corrector.effects.correct_streams(flight)
-    imu, tdoa = _imu_samples(flight.imu if config.use_imu else None), _tdoas(flight)
-    memory, tuning = new_memory(flight.anchors.positions), config.tuning()
+    tdoa, positions = flight.tdoa, flight.anchors.positions
+    raw = tdoa.t, flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b), tdoa.d
+    imu = _imu_samples(flight.imu if config.use_imu else None)
+    memory, tuning = new_memory(positions), config.tuning()
     bias, std, outcome, parts, fed = np.zeros(len(tdoa)), np.zeros(len(tdoa)), _not_fed(len(tdoa)), [], 0
-    for batch, until in _batches(tdoa, corrector, RECORDED_AT_ONCE if records is not None else len(tdoa)):
-        some = tdoa[batch]
-        correction = corrector.correct(*(some[name] for name in ("t", "a", "b", "d")))
+    for batch, until in _batches(*raw, corrector, RECORDED_AT_ONCE if records is not None else len(tdoa)):
+        t, a, b, d = (column[batch] for column in raw)
+        correction = corrector.correct(t, a, b, d)
         bias[batch], std[batch] = correction.bias, correction.std
-        some["d"], some["bias_std"] = correction.corrected, correction.std
-        sane = usable_all(some["a"], some["b"], some["d"], some["bias_std"], flight.anchors.positions)
+        sane = usable_all(a, b, correction.corrected, correction.std, positions)
+        corrected = structured(TDOA, t, a, b, correction.corrected, correction.std)[sane]
         last = len(imu) if until is None else int(np.searchsorted(imu["t"], until))
-        odometry, outcome[batch[sane]] = feed(memory, tuning, Measurements(imu[fed:last], some[sane]), records)
+        odometry, outcome[batch[sane]] = feed(memory, tuning, Measurements(imu[fed:last], corrected), records)
         fed = last
         parts.append(odometry)
         if not corrector.idle and len(odometry):
-            _tell(corrector, odometry)
-    residuals = Residuals(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, *(outcome[name] for name in RESIDUAL.names))
+            _report_poses(odometry, corrector)
+    residuals = Residuals(tdoa.t, tdoa.a, tdoa.b, *(outcome[name] for name in RESIDUAL.names))
     ekf, odometry = memory.record, Odometry.from_rows(np.concatenate(parts))
     return Run(odometry, residuals, bias, std, int(ekf.recoveries), yaw_offset(int(ekf.best)))
 
@@ -76,12 +78,6 @@ def _imu_samples(imu):
     return structured(IMU_SAMPLE, imu.t[sane], imu.gyro[sane], imu.accel[sane])
 
 
-def _tdoas(flight):
-    """(n,) of TDOA, all of a Flight, raw; with row -1 for an unknown anchor."""
-    tdoa, rows = flight.tdoa, flight.anchors.index
-    return structured(TDOA, tdoa.t, rows(tdoa.a), rows(tdoa.b), tdoa.d, np.zeros(len(tdoa)))
-
-
 def _not_fed(n):
     outcome = np.zeros(n, RESIDUAL)
     outcome["innovation"] = outcome["variance"] = np.nan
@@ -89,27 +85,25 @@ def _not_fed(n):
     return outcome
 
 
-def _batches(tdoa, corrector, longest):
+def _batches(t, a, b, d, corrector, longest):
     """What can be corrected and fed together, at most `longest` TDOAs: [(their places, in the order of their stamps,
     and the stamp of the next one, or None)], at least one.
 
     Corrections need poses that are `lag` old: measurements less than that apart can be corrected as one batch.
     """
-    known = (tdoa["a"] >= 0) & (tdoa["b"] >= 0) & np.isfinite(tdoa["d"]) & np.isfinite(tdoa["t"])
-    places = np.flatnonzero(known)
-    order = np.lexsort(tuple(tdoa[name][places] for name in ("d", "b", "a", "t")))  # siblings of one stamp as on line
-    places = places[order]
-    t, first, batches = tdoa["t"][places], 0, []
-    while first < len(places):
-        end = len(places) if corrector.idle else int(np.searchsorted(t, t[first] + corrector.lag))
+    known = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(d) & np.isfinite(t))
+    known = known[np.lexsort((d[known], b[known], a[known], t[known]))]  # siblings of one stamp as on line
+    stamps, first, batches = t[known], 0, []
+    while first < len(known):
+        end = len(known) if corrector.idle else int(np.searchsorted(stamps, stamps[first] + corrector.lag))
         end = min(end, first + longest)
-        batches.append((places[first:end], t[end] if end < len(places) else None))
+        batches.append((known[first:end], stamps[end] if end < len(known) else None))
         first = end
-    return batches or [(places, None)]
+    return batches or [(known, None)]
 
 
-def _tell(corrector, odometry):
-    """Give the Corrector the poses of an (n,) of ODOMETRY."""
+def _report_poses(odometry, corrector):
+    """Give the Corrector the poses of an (n,) of ODOMETRY, as bias_node gets them."""
     x, covariance = odometry["x"], odometry["covariance"]
-    certain = told_yaw_std(rotation_std(x[:, 6:10], covariance))
-    corrector.add_pose(odometry["t"], x[:, :3], x[:, 6:10], certain)
+    yaw_std = told_yaw_std(rotation_std(x[:, 6:10], covariance))
+    corrector.add_pose(odometry["t"], x[:, :3], x[:, 6:10], yaw_std)

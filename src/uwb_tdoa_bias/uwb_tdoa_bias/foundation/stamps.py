@@ -1,15 +1,16 @@
-"""Whether a stamp can be believed: one far from its neighbours is wrong, two in a row that agree are another time."""
+"""Whether a stamp is plausible: one far from its neighbours is an outlier, two in a row that agree are another time."""
 
 import math
 
-BACK, AHEAD = 1.0, 10.0  # s from the newest stamp of a stream, within which a stamp is believed at once
+LARGEST_STEP_BACK, LARGEST_STEP_AHEAD = 1.0, 10.0  # s from the newest stamp of a stream, within which one is plausible
 
 
-class StampWatch:
-    """Watches one stream of items. A doubtful one is held until the next one of the stream has been seen."""
+class StampGate:
+    """Lets through the items of one stream. One whose stamp is not plausible is held until the next one of the stream
+    tells whether it is an outlier or the beginning of another time."""
 
     def __init__(self):
-        self.newest = -math.inf  # s, of the stamps believed
+        self.newest = -math.inf  # s, of the stamps accepted
         self._held = []
 
     def __len__(self):
@@ -17,31 +18,31 @@ class StampWatch:
         return len(self._held)
 
     def take(self, t, item):
-        """Take an item stamped t, s. Returns (believed, strays, fell_back): lists of (t, item), and whether the believed
-        ones are the first of an earlier time: the stream has started anew."""
-        if not self._held and (self._near(t) or self.newest == -math.inf):
+        """Take an item stamped t, s. Returns (accepted, outliers, jumped_back): lists of (t, item), and whether the
+        accepted ones are the first of an earlier time: the stream has started anew."""
+        if not self._held and (self._is_plausible(t) or self.newest == -math.inf):
             self.newest = max(self.newest, t)
             return [(t, item)], [], False
-        strays, self._held = self._held, []
-        if strays and -BACK <= t - strays[0][0] <= AHEAD:
-            fell_back = t < self.newest
-            self.newest = max(t, strays[0][0])
-            return [*strays, (t, item)], [], fell_back
-        if self._near(t):
+        held, self._held = self._held, []
+        if held and -LARGEST_STEP_BACK <= t - held[0][0] <= LARGEST_STEP_AHEAD:
+            jumped_back = t < self.newest
+            self.newest = max(t, held[0][0])
+            return [*held, (t, item)], [], jumped_back
+        if self._is_plausible(t):
             self.newest = max(self.newest, t)
-            return [(t, item)], strays, False
+            return [(t, item)], held, False
         self._held = [(t, item)]
-        return [], strays, False
+        return [], held, False
 
-    def see(self, t):
+    def note(self, t):
         """Note the time t, s, of an item that is good for nothing else."""
-        if self._near(t):
+        if self._is_plausible(t):
             self.newest = max(self.newest, t)
-
-    def _near(self, t):
-        return self.newest - BACK <= t <= self.newest + AHEAD
 
     def finish(self):
-        """What is held when nothing follows, a list of (t, item): strays."""
-        strays, self._held = self._held, []
-        return strays
+        """What is held when nothing follows, a list of (t, item): outliers."""
+        held, self._held = self._held, []
+        return held
+
+    def _is_plausible(self, t):
+        return self.newest - LARGEST_STEP_BACK <= t <= self.newest + LARGEST_STEP_AHEAD

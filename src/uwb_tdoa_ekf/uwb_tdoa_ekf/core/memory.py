@@ -76,7 +76,7 @@ EKF = _record(
 
 # What comes out.
 ODOMETRY = _record(("t", float), ("x", float, NOMINAL_STATES), ("covariance", float, (9, 9)))  # of [p, v, attitude]
-RESIDUAL = _record(("innovation", float), ("variance", float), ("weight", float), ("verdict", int))
+RESIDUAL = _record(("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8))
 
 
 class Memory(NamedTuple):

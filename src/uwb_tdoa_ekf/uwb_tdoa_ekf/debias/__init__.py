@@ -2,9 +2,9 @@
 UWB-TDoA-Based Indoor Positioning System* (Sensors 2022, 22, 9136).
 
     from uwb_tdoa_ekf.debias import BiasMap, Part, fit
-    found = fit([Part(odometry.p, truth_p, odometry.covariance[:, :3, :3])], step=0.35)
-    found.save("map.npz")
-    p, covariance, trust = BiasMap.load("map.npz").correct(p, covariance)
+    bias_map = fit([Part(odometry.p, truth_p, odometry.covariance[:, :3, :3])], step=0.35)
+    bias_map.save("map.npz")
+    p, covariance, validity = BiasMap.load("map.npz").correct(p, covariance)
 """
 
 from .bias_map import INTERPOLATORS, BiasMap

@@ -73,45 +73,46 @@ class BiasMap:
         object.__setattr__(self, "_hull", (hull[:, :d], hull[:, d]))
         object.__setattr__(self, "_tree", cKDTree(self.at))
         object.__setattr__(self, "_surface", surface)
-        object.__setattr__(self, "_typical", self.bias.T @ self.bias / n)
+        object.__setattr__(self, "_mean_square", self.bias.T @ self.bias / n)
 
     @property
     def planar(self):
         """Whether it knows x and y only; z is then left as it is."""
         return self.at.shape[1] == 2
 
-    def trust(self, p):
-        """How far positions p (m, 3), m, are known: (m,), 1 inside of the known region to 0 from FADE beyond it on."""
+    def validity(self, p):
+        """How far the map is valid at positions p (m, 3), m: (m,), 1 inside of the known region to 0 from FADE beyond it
+        on."""
         p = p[:, : self.at.shape[1]]
         normals, offsets = self._hull
         outside = (p @ normals.T + offsets).max(axis=1)
-        lonely = self._tree.query(p)[0] - self.step
-        return np.clip(1.0 - np.maximum(outside, lonely) / FADE, 0.0, 1.0)
+        far_from_markers = self._tree.query(p)[0] - self.step
+        return np.clip(1.0 - np.maximum(outside, far_from_markers) / FADE, 0.0, 1.0)
 
     def bias_at(self, p):
         """beta of eq. 20 at measured positions p (m, 3), m: (m, 3) m, already faded; 0 in z if the map is planar."""
-        return self._faded(p, self.trust(p))
+        return self._faded(p, self.validity(p))
 
-    def _faded(self, p, trust):
+    def _faded(self, p, validity):
         out = np.zeros((len(p), 3))
-        known = trust > 0.0
+        known = validity > 0.0
         if known.any():
             d = self.at.shape[1]
-            out[known, :d] = trust[known, None] * self._surface(p[known, :d])
+            out[known, :d] = validity[known, None] * self._surface(p[known, :d])
         return out
 
     def correct(self, p, covariance):
         """Positions without their bias (eq. 21) and the covariance of what is left.
 
-        p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, trust). With trust w, what is added to the
+        p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, validity). With validity w, what is added to the
         covariance is w^2 `added` for what the map does not know, and (1 - w)^2 of the mean square of all biases, for
         one that was not taken out.
         """
-        trust, d = self.trust(p), self.at.shape[1]
+        validity, d = self.validity(p), self.at.shape[1]
         covariance = covariance.copy()
-        known, unknown = trust[:, None, None] ** 2, (1.0 - trust[:, None, None]) ** 2
-        covariance[:, :d, :d] += known * self.added + unknown * self._typical
-        return p - self._faded(p, trust), covariance, trust
+        known, unknown = validity[:, None, None] ** 2, (1.0 - validity[:, None, None]) ** 2
+        covariance[:, :d, :d] += known * self.added + unknown * self._mean_square
+        return p - self._faded(p, validity), covariance, validity
 
     def save(self, path):
         """Write what `load` reads: a numpy .npz file that names its format, version and units."""

@@ -1,4 +1,6 @@
-"""Making a BiasMap out of measured and true positions, and saying how far it can be believed elsewhere."""
+"""Making a BiasMap out of measured and true positions, and saying how precise it is elsewhere."""
+
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -29,6 +31,17 @@ class Part:
         return len(self.measured)
 
 
+class _Options(NamedTuple):
+    """Arguments of `fit`."""
+
+    step: float
+    least: int
+    planar: bool
+    interpolator: str
+    frame: str
+    source: str
+
+
 def fit(parts, step, least=1, planar=False, interpolator="thin_plate", frame="map", source=""):
     """BiasMap of a list of Part. Raises InputError where they hold too little.
 
@@ -38,33 +51,44 @@ def fit(parts, step, least=1, planar=False, interpolator="thin_plate", frame="ma
     known, as much of it is added as makes the normalised squared error of the corrected positions d on average there,
     nothing if they are honest as they are; else all of it.
     """
-    grid = (step, least, planar, interpolator, frame, source)
-    whole = _fit(parts, *grid, np.zeros((2, 2) if planar else (3, 3)))
-    folds, d = _folds(parts), whole.at.shape[1]
-    wrong, left, covariances = [], [], []
-    for k, held in enumerate(folds):
+    options = _Options(step, least, planar, interpolator, frame, source)
+    whole = _fit(parts, options, np.zeros((2, 2) if planar else (3, 3)))
+    folds = _folds(parts)
+    bias_errors, errors, covariances = [np.empty((0, whole.at.shape[1]))], [], []
+    for k, held_out in enumerate(folds):
         others = [part for i, fold in enumerate(folds) if i != k for part in fold]
         try:
-            found = _fit(others, *grid, whole.added)
+            bias_map = _fit(others, options, whole.added)
         except InputError:  # the rest alone makes no map
             continue
-        markers = _markers(held, *grid[:3])
-        at = _in_space(measured_places(markers, markers.bias))
-        known = found.trust(at) == 1.0
-        wrong.append((markers.bias - found.bias_at(at)[:, :d])[known])
-        for part in held:
-            known = found.trust(part.measured) == 1.0
-            p = part.measured[known]
-            left.append((p - found.bias_at(p) - part.true[known])[:, :d])
-            covariances.append(None if part.covariance is None else part.covariance[known, :d, :d])
-    wrong = np.concatenate(wrong) if wrong else np.empty((0, d))
-    if len(wrong) == 0:  # nothing was known elsewhere: as unsure as without a map
-        added = whole.bias.T @ whole.bias / len(whole.bias)
-    else:
-        added = wrong.T @ wrong / len(wrong)
-        if sum(map(len, left)) and all(covariance is not None for covariance in covariances):
-            added = added * _needed(np.concatenate(left), np.concatenate(covariances), added)
-    return _fit(parts, *grid, added)
+        bias_errors.append(_bias_errors(bias_map, held_out, options))
+        for part in held_out:
+            error, covariance = _position_errors(bias_map, part)
+            errors.append(error)
+            covariances.append(covariance)
+    bias_errors = np.concatenate(bias_errors)
+    if len(bias_errors) == 0:  # nothing was known elsewhere: as unsure as without a map
+        return _fit(parts, options, whole.bias.T @ whole.bias / len(whole.bias))
+    added = bias_errors.T @ bias_errors / len(bias_errors)
+    if sum(map(len, errors)) and all(covariance is not None for covariance in covariances):
+        added = added * _needed(np.concatenate(errors), np.concatenate(covariances), added)
+    return _fit(parts, options, added)
+
+
+def _bias_errors(bias_map, parts, options):
+    """Biases of the markers that parts make, less what a map of others says where it is valid: (n, d) m."""
+    markers = _markers(parts, options)
+    at = _in_space(measured_places(markers, markers.bias))
+    error = markers.bias - bias_map.bias_at(at)[:, : markers.bias.shape[1]]
+    return error[bias_map.validity(at) == 1.0]
+
+
+def _position_errors(bias_map, part):
+    """What a map of others leaves of the errors of a Part where it is valid, (n, d) m, and their covariances or None."""
+    d, valid = bias_map.at.shape[1], bias_map.validity(part.measured) == 1.0
+    p = part.measured[valid]
+    error = (p - bias_map.bias_at(p) - part.true[valid])[:, :d]
+    return error, None if part.covariance is None else part.covariance[valid, :d, :d]
 
 
 def _needed(error, covariance, added):
@@ -80,20 +104,21 @@ def _needed(error, covariance, added):
     return brentq(excess, 0.0, LARGEST, rtol=1e-3) if excess(LARGEST) < 0.0 else LARGEST
 
 
-def _fit(parts, step, least, planar, interpolator, frame, source, added):
-    markers = _markers(parts, step, least, planar)
+def _fit(parts, options, added):
+    markers = _markers(parts, options)
     bias = corrected_bias(markers)
     at = measured_places(markers, bias)
-    return BiasMap(markers.cell, at, bias, markers.std, markers.count, added, step, interpolator, frame, source)
+    step, _, _, *about = options
+    return BiasMap(markers.cell, at, bias, markers.std, markers.count, added, step, *about)
 
 
-def _markers(parts, step, least, planar):
+def _markers(parts, options):
     parts = [part for part in parts if len(part)]
     if not parts:
         raise InputError(
             f"positions: none is within {LOST:g} m of the truth; is it in the same frame, by the same clock?"
         )
-    d = 2 if planar else 3
+    d, step, least = 2 if options.planar else 3, options.step, options.least
     markers = collect(
         *(np.concatenate([getattr(part, name)[:, :d] for part in parts]) for name in ("measured", "true")), step, least
     )

@@ -37,7 +37,7 @@ class LayerConfig:
     def __post_init__(self):
         for name in ("max_speed", "flipping_speed"):
             value = getattr(self, name)
-            if np.shape(value) != (3,) or not all(0.0 < one < np.inf for one in value):
+            if np.shape(value) != (3,) or not all(0.0 < speed < np.inf for speed in value):
                 raise InputError(f"{name}: {value!r} must be three numbers of m/s above 0, along x, y and z.")
         if not 0.0 < self.max_acceleration < np.inf:
             raise InputError(f"max_acceleration: {self.max_acceleration!r} must be a number of m/s^2 above 0.")

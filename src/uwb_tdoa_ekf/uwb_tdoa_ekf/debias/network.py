@@ -29,7 +29,7 @@ class AngularNetwork:
     def __init__(self, cell, at, values, step):
         """cell : (n, d) int, place in the grid; at : (n, d) m; values : (n, k); step : of the grid, m."""
         self._at, d = np.asarray(at, dtype=float), at.shape[1]
-        self._reach = 2.0 * step  # the 1 m of eq. A8, on the paper's grid of 0.5 m
+        self._cutoff = 2.0 * step  # the 1 m of eq. A8, on the paper's grid of 0.5 m
         self._offset = np.minimum(values.min(axis=0), 0.0)  # b_min, A1
         self._values = values - self._offset
         offsets = np.array([offset for offset in product((-1, 0, 1), repeat=d) if any(offset)])
@@ -57,7 +57,7 @@ class AngularNetwork:
     def _at_places(self, x):
         away = x[:, None] - self._at
         squared = np.einsum("mnd,mnd->mn", away, away)
-        place, node = np.nonzero(squared < self._reach**2)
+        place, node = np.nonzero(squared < self._cutoff**2)
         squared, away = squared[place, node, None], away[place, node]
         there = self._there[node]
         width = self._width_of(away, self._towards[node], there, self._widths[node])

@@ -5,11 +5,11 @@ import time
 from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_tdoa_bias.foundation.ros import Rate
 
-from .place import Place
+from .volume import VolumeCheck
 
-PATIENCE = 5.0  # s of data without a start position before it becomes a warning
+START_TIMEOUT = 5.0  # s of data without a start position before it becomes a warning
 BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is a recording
-DOUBT = 0.5  # share of TDOAs that are not used that becomes a warning
+LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it becomes a warning
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -24,10 +24,10 @@ class Health:
         self.last_position = None  # (3,) m and its covariance (3, 3) m^2
         self.behind = None  # s from the stamp of the newest odometry to the present time of ROS
         self._use_imu, self._lag = config.use_imu, lag
-        self._place = Place(volume)
+        self._volume = VolumeCheck(volume)
         self._imu_rate, self._tdoa_rate = Rate(), Rate()
         self._starting = None
-        self._judged = {}
+        self._counts = {}
 
     def report(self, refused, estimator, counts):
         """Returns (level, text, values).
@@ -52,13 +52,13 @@ class Health:
             judgement = ERROR, "no samples on imu/data: check the IMU's driver, or set use_imu to false"
         elif running:
             judgement = self._judge_use(counts)
-        elif now - self._starting > PATIENCE:
+        elif now - self._starting > START_TIMEOUT:
             judgement = WARN, "no start position found: check ids and positions of the anchors, and that four are heard"
         else:
             judgement = OK, "looking for the start position"
-        there = {}
+        at_position = {}
         if running and self.last_position is not None:
-            trouble, there = self._place.judge(estimator.anchors, *self.last_position)
+            trouble, at_position = self._volume.judge(estimator.anchors, *self.last_position)
             if trouble and judgement[0] == OK:
                 judgement = WARN, trouble
         if running and self.behind is not None and BEHIND[0] < self.behind < BEHIND[1] and judgement[0] == OK:
@@ -68,7 +68,7 @@ class Health:
         values = {"state": "running" if running else "starting", "age of last odometry": age}
         values |= {"odometry behind the clock": "unknown" if self.behind is None else f"{self.behind:.3f} s"}
         values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
-        return *judgement, values | there
+        return *judgement, values | at_position
 
     def _judge_use(self, counts):
         """What became of the TDOAs since the last time."""
@@ -77,9 +77,9 @@ class Health:
             "invalid": "are invalid: check that uwb/anchors lists the anchors that the tag hears, in metres",
             "rejected": "contradict the filter: check the anchors' positions, and tdoa_std",
         }
-        recent = {name: counts[name] - self._judged.get(name, 0) for name in ("used", *reasons)}
-        self._judged = dict(counts)
+        recent = {name: counts[name] - self._counts.get(name, 0) for name in ("used", *reasons)}
+        self._counts = dict(counts)
         for name, reason in reasons.items():
-            if recent[name] > DOUBT * sum(recent.values()):
+            if recent[name] > LARGEST_UNUSED * sum(recent.values()):
                 return WARN, f"more than half of the TDOAs {reason}"
         return OK, "running"

@@ -1,7 +1,7 @@
 """Watches the residuals in flight: has an anchor, or an axis of the IMU, changed since the flight began?
 
 The innovations of all pairs are explained, over the last seconds, by one delay for each anchor: d_ab is off by
-late_b - late_a (recursive least squares with exponential forgetting). What the delays are in the first seconds of
+delay_b - delay_a (recursive least squares with exponential forgetting). What the delays are in the first seconds of
 motion is taken as their calibration; how much they wander then, and how wide the innovations are, says what is no
 change.
 """
@@ -13,20 +13,19 @@ import numpy as np
 
 from ..core.engine import REJECTED, USED
 
-MEMORY = 3.0  # s of innovations that one estimate rests on
+FORGETTING_TIME = 3.0  # s of innovations that one estimate rests on
 MOVING = 0.3  # m/s; on the floor, residuals are not those of the air
-SETTLE, LEARN = 3.0, 15.0  # s in motion: the first are ignored, those up to the second count as calibration
-STEP = 0.2  # s between two estimates
-HISTORY = 30.0  # s of estimates that are kept
-LIMIT, SIGMAS, SPREADS = (
-    0.15,
-    6.0,
-    2.0,
-)  # m, deviations of the calibration, spreads of the innovations: a change is larger
-LAST = 1.5  # s for which it must do so
+SETTLE, CALIBRATE = 3.0, 15.0  # s in motion: the first are ignored, those up to the second count as calibration
+ESTIMATE_PERIOD = 0.2  # s
+KEPT = 30.0  # s of estimates that are kept
+PERSISTENCE = 1.5  # s for which a change must last
+SMALLEST_CHANGE = 0.15  # m; a change of a delay is larger than this,
+DELAY_STDS = 6.0  # this many standard deviations of the delay during calibration, and
+INNOVATION_STDS = 2.0  # this many of the innovations then
 CLIP = 1.5  # m; a larger innovation counts as this
 RIDGE = 2.0  # m^-2, pulls delays that nothing tells to zero
 BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}  # rad/s and m/s^2, by which an estimated bias must have moved
+MAD_TO_STD, MEAN_MAGNITUDE_TO_STD = 1.4826, 1.25  # of normal noise
 
 
 class Monitor:
@@ -38,63 +37,70 @@ class Monitor:
         self._rows = {anchor: row for row, anchor in enumerate(self._ids)}
         n = len(self._ids)
         self._information, self._vector = np.zeros((n, n)), np.zeros(n)
-        self._t = self._first = self._next = None  # stamps: the last TDOA, the beginning of motion, the next estimate
-        self._spread = 0.0
-        self._learned, self._history = [], deque(maxlen=int(HISTORY / STEP))
-        self._bias, self._bias_now, self._bias_sum = None, None, []
+        self._t = None  # s, stamp of the last TDOA
+        self._estimates = deque(maxlen=int(KEPT / ESTIMATE_PERIOD))  # (stamp, delays (N,) m) after calibration
+        self._forget()
+
+    def _forget(self):
+        self._information[:], self._vector[:] = 0.0, 0.0
+        self._moving_since = self._next_estimate = None  # s, stamps
+        self._innovation_std = 0.0  # m, during calibration
+        self._calibration = []  # delays (N,) m
+        self._bias = self._bias_now = None  # (6,): gyroscope, accelerometer; as calibrated, and the latest
+        self._bias_calibration = []
+        self._estimates.clear()
 
     def add(self, residuals):
         """Take Residuals; only those that reached the filter count."""
-        columns = (residuals.t, residuals.a, residuals.b, residuals.innovation, residuals.variance, residuals.verdict)
-        for t, a, b, innovation, variance, verdict in zip(*(column.tolist() for column in columns)):
+        columns = (residuals.t, residuals.a, residuals.b, residuals.innovation, residuals.verdict)
+        for t, a, b, innovation, verdict in zip(*(column.tolist() for column in columns)):
             if verdict in (USED, REJECTED) and math.isfinite(innovation):
-                self._take(t, self._rows[int(a)], self._rows[int(b)], innovation, variance)
+                self._add_innovation(t, self._rows[int(a)], self._rows[int(b)], min(max(innovation, -CLIP), CLIP))
 
     def add_odometry(self, odometry):
         """Take Odometry, for the biases of the IMU."""
         if not len(odometry) or self._t is None:
             return
-        if self._first is None:
+        if self._moving_since is None:
             if np.linalg.norm(odometry.v[-1]) > MOVING:
-                self._first, self._next = self._t, self._t + SETTLE
+                self._moving_since, self._next_estimate = self._t, self._t + SETTLE
             return
-        now = np.concatenate([odometry.gyro_bias[-1], odometry.accel_bias[-1]])
-        if odometry.t[-1] < self._first + LEARN:
-            self._bias_sum.append(now)
-        elif self._bias is None and self._bias_sum:
-            self._bias = np.mean(self._bias_sum[len(self._bias_sum) // 2 :], axis=0)
-        self._bias_now = now
+        bias = np.concatenate([odometry.gyro_bias[-1], odometry.accel_bias[-1]])
+        if odometry.t[-1] < self._moving_since + CALIBRATE:
+            self._bias_calibration.append(bias)
+        elif self._bias is None and self._bias_calibration:
+            self._bias = np.mean(self._bias_calibration[len(self._bias_calibration) // 2 :], axis=0)
+        self._bias_now = bias
 
-    def _take(self, t, a, b, innovation, variance):
-        if self._t is None or not 0.0 <= t - self._t < 10.0 * MEMORY:
-            self._first = None
-            self._information[:], self._vector[:] = 0.0, 0.0
-            self._learned, self._bias, self._bias_sum = [], None, []
-            self._history.clear()
+    def _add_innovation(self, t, a, b, innovation):
+        if self._t is None or not 0.0 <= t - self._t < 10.0 * FORGETTING_TIME:
+            self._forget()
+            dt = 0.0
         else:
-            keep = math.exp((self._t - t) / MEMORY)
+            dt = t - self._t
+            keep = math.exp(-dt / FORGETTING_TIME)
             self._information *= keep
             self._vector *= keep
-        dt = 0.0 if self._t is None else t - self._t
         self._t = t
-        innovation = min(max(innovation, -CLIP), CLIP)
         self._information[a, a] += 1.0
         self._information[b, b] += 1.0
         self._information[a, b] -= 1.0
         self._information[b, a] -= 1.0
         self._vector[a] -= innovation
         self._vector[b] += innovation
-        if self._first is None:
+        if self._moving_since is None:
             return
-        if t < self._first + LEARN:  # 1.25 times the mean magnitude: the deviation of normal noise
-            self._spread += min(1.0, max(dt, 0.0) / MEMORY) * (1.25 * abs(innovation) - self._spread)
-        if t >= self._next:
-            self._next = t + STEP
-            late = np.linalg.solve(self._information + RIDGE * np.eye(len(self._vector)), self._vector)
-            if t < self._first + LEARN:
-                self._learned.append(late)
-            elif self._learned:
-                self._history.append((t, late))
+        calibrating = t < self._moving_since + CALIBRATE
+        if calibrating:
+            std = MEAN_MAGNITUDE_TO_STD * abs(innovation)
+            self._innovation_std += min(1.0, dt / FORGETTING_TIME) * (std - self._innovation_std)
+        if t >= self._next_estimate:
+            self._next_estimate = t + ESTIMATE_PERIOD
+            delays = np.linalg.solve(self._information + RIDGE * np.eye(len(self._vector)), self._vector)
+            if calibrating:
+                self._calibration.append(delays)
+            elif self._calibration:
+                self._estimates.append((t, delays))
 
     @property
     def alarms(self):
@@ -102,29 +108,30 @@ class Monitor:
         return self._anchor_alarms() + self._axis_alarms()
 
     def _anchor_alarms(self):
-        recent = [late for t, late in self._history if t > self._t - LAST]
-        if len(recent) < LAST / STEP - 1:
+        recent = [delays for t, delays in self._estimates if t > self._t - PERSISTENCE]
+        if len(recent) < PERSISTENCE / ESTIMATE_PERIOD - 1:
             return []
-        normal = np.median(self._learned, axis=0)
-        noise = 1.4826 * np.median(np.abs(np.array(self._learned) - normal), axis=0)
-        moved = np.array(recent) - normal
-        limit = np.maximum(max(LIMIT, SPREADS * self._spread), SIGMAS * np.maximum(noise, np.median(noise)))
-        certain = (moved > limit).all(axis=0) | (moved < -limit).all(axis=0)
+        calibrated = np.median(self._calibration, axis=0)
+        std = MAD_TO_STD * np.median(np.abs(np.array(self._calibration) - calibrated), axis=0)
+        change = np.array(recent) - calibrated
+        smallest = max(SMALLEST_CHANGE, INNOVATION_STDS * self._innovation_std)
+        limit = np.maximum(smallest, DELAY_STDS * np.maximum(std, np.median(std)))
+        certain = (change > limit).all(axis=0) | (change < -limit).all(axis=0)
         if not certain.any():
             return []
         n = len(limit)  # what one anchor does, the least-norm solution spreads over all: it keeps (n - 1) / n
-        size = np.median(moved, axis=0) * n / (n - 1)
+        size = np.median(change, axis=0) * n / (n - 1)
         row = int(np.argmax(np.where(certain, np.abs(size), 0.0)))  # the others only make room for it
-        return [self._sentence(row, float(size[row]), normal[row])]
+        return [self._sentence(row, float(size[row]), calibrated[row])]
 
-    def _sentence(self, row, size, normal):
-        t = np.array([t for t, _ in self._history])
+    def _sentence(self, row, size, calibrated):
+        t = np.array([t for t, _ in self._estimates])
         n = len(self._ids)
-        course = (np.array([late[row] for _, late in self._history]) - normal) * n / (n - 1)
-        since = t > t[-1] - 0.7 * HISTORY
+        course = (np.array([delays[row] for _, delays in self._estimates]) - calibrated) * n / (n - 1)
+        since = t > t[-1] - 0.7 * KEPT
         slope, rest = np.polyfit(t[since] - t[-1], course[since], 1)
         ramp = np.std(course[since] - slope * (t[since] - t[-1]) - rest) < 0.5 * np.std(course[since])
-        if ramp and since.sum() > 5.0 / STEP:
+        if ramp and since.sum() > 5.0 / ESTIMATE_PERIOD:
             what = f"its clock drifts ({slope:+.3f} m/s)"
         elif size > 0.0:
             what = "it is blocked (NLOS) or was moved"

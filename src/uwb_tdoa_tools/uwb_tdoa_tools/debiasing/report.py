@@ -42,7 +42,7 @@ def rows(flown, bias_map, effects=None):
         sides = {"before": score.row(), "after": after.row()}
         airborne = odometry.p[(odometry.t >= score.first) & (odometry.t <= score.last)]
         figures = {side: {name: row[name] for name in _RUN} for side, row in sides.items()}
-        out.append({"flight": flight.name, **figures, "known": float(np.mean(bias_map.trust(airborne) == 1.0))})
+        out.append({"flight": flight.name, **figures, "known": float(np.mean(bias_map.validity(airborne) == 1.0))})
     return out
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 
-class Place:
+class VolumeCheck:
     """Judges positions by a FlyableVolume, or says nothing without one."""
 
     def __init__(self, volume=None):
