@@ -1,0 +1,56 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flights import fly
+from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, samples_at
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.sensitivity import record_innovations
+
+# Nothing that decides or learns, so that the filter is as linear as it can be.
+PLAIN = FilterConfig(robust="gate", gate=1e3, adapt_noise=False, recover=False, workspace_margin=1e3, initial_yaw_std=0.1)
+SETTLED = 4.0  # s; the start itself follows biases too, which `Innovations` do not know: it must be forgotten
+
+
+@pytest.mark.parametrize("imu", [True, False])
+def test_derivatives_are_those_of_two_runs(imu):
+    flight, step = fly(seed=3, duration=8.0, tdoa_std=0.02), 1e-4
+    config = replace(PLAIN, use_imu=imu)
+    keys = [str(i) for i in flight.anchors.ids[:3]]
+    found = record_innovations(flight, config)
+    a, b = (flight.anchors.index(ids[found.rows]) for ids in (flight.tdoa.a, flight.tdoa.b))
+    samples = samples_at(flight.tdoa.t[found.rows], a, b, flight.truth, flight.anchors)
+    derivative = found.by_bias(AnchorDelay().regressors(samples, keys))
+    late = flight.tdoa.t[found.rows] > SETTLED
+    for column, key in enumerate(keys):
+        ends = [record_innovations(AnchorDelay({key: s}).inject(flight), config) for s in (-step, step)]
+        assert all(np.array_equal(end.rows, found.rows) for end in ends)
+        numeric = (ends[1].value - ends[0].value) / (2.0 * step)
+        start = found.by_bias(np.zeros((len(found.rows), 1)))[:, 0]
+        assert (start == 0.0).all()
+        error = numeric[late] - derivative[late, column]
+        assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(numeric[late] ** 2))
+
+
+def test_what_the_position_can_follow_leaves_little_trace():
+    flight = fly(seed=4, duration=10.0)
+    found = record_innovations(flight, PLAIN)
+    a, b = (flight.anchors.index(ids[found.rows]) for ids in (flight.tdoa.a, flight.tdoa.b))
+    samples = samples_at(flight.tdoa.t[found.rows], a, b, flight.truth, flight.anchors)
+    shift = EFFECTS["truth_frame"]().regressors(samples, ["x", "y", "z"])  # all anchors by the same
+    delay = AnchorDelay().regressors(samples, [str(flight.anchors.ids[0])])
+    late = samples.t > SETTLED
+
+    def kept(regressors):
+        return np.sqrt(np.mean(found.by_bias(regressors)[late] ** 2) / np.mean(regressors[late] ** 2))
+
+    assert kept(shift) < 0.1 and kept(delay) > 0.5
+
+
+def test_every_used_tdoa_is_found_in_the_history():
+    flight = fly(seed=5, duration=6.0, outliers=0.1)
+    found = record_innovations(flight)
+    places = np.concatenate(found.of)
+    assert sorted(places[places >= 0].tolist()) == list(range(len(found.rows)))
+    assert np.all(np.diff(flight.tdoa.t[found.rows]) >= 0.0)

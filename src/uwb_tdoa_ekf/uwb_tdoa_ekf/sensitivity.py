@@ -1,0 +1,98 @@
+"""What constant errors of the TDOAs would have done to the innovations of a run: the path integrated out.
+
+The derivative of the state by every parameter goes through the recorded transitions and gains as the state itself does
+(B. Friedland, Treatment of bias in recursive filtering, IEEE Trans. Automatic Control 14, 1969). A fit of innovations to
+these derivatives knows of the path whatever the filter knew: the inertial sensor, the motion, every other measurement.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+from .core.history import RESET
+from .core.state import ERROR_STATES, MOVING_STATES
+from .estimator import VERDICTS
+from .offline import run_offline
+
+USED = next(value for value, name in VERDICTS.items() if name == "used")
+
+
+@dataclass(frozen=True, eq=False)
+class Innovations:
+    """Those of one run.
+
+    rows (n,) places in flight.tdoa of the TDOAs that were used, in the order of their stamps; value (n,) m; variance (n,)
+    m^2, prior and one measurement; run : Run; records, of : history of the run, and for each record its place in `rows`,
+    -1 for what is no TDOA.
+    """
+
+    rows: np.ndarray
+    value: np.ndarray
+    variance: np.ndarray
+    run: object
+    records: list
+    of: list
+
+    def by_bias(self, regressors):
+        """Derivative of minus the innovations by parameters: (n, k).
+
+        regressors (n, k): derivative of the measured TDOAs by the parameters, of which the run knew nothing. A bias that
+        the position can follow leaves no trace.
+        """
+        regressors = np.ascontiguousarray(regressors, dtype=float)
+        out = np.zeros_like(regressors)
+        states = np.zeros((2, ERROR_STATES, regressors.shape[1]))
+        for records, of in zip(self.records, self.of):
+            _through(records, of, regressors, states, out)
+        return out
+
+
+def record_innovations(flight, config=None, corrector=None):
+    """Run a Flight through bias correction and filter, and keep what `Innovations` need. Takes what run_offline takes."""
+    records = []
+    run = run_offline(flight, config, corrector, records)
+    residuals = run.residuals
+    used = np.flatnonzero(residuals.verdict == USED)
+    rows = used[np.argsort(residuals.t[used], kind="stable")]
+    waiting = {}
+    for place, row in enumerate(rows.tolist()):
+        waiting.setdefault((residuals.t[row], residuals.innovation[row]), []).append(place)
+    of = []
+    for some in records:
+        keys = zip(some["t"].tolist(), some["innovation"].tolist())
+        of.append(np.array([waiting[key].pop(0) if waiting.get(key) else -1 for key in keys], dtype=np.int64))
+    records = [np.ascontiguousarray(some) for some in records]
+    return Innovations(rows, residuals.innovation[rows], residuals.variance[rows], run, records, of)
+
+
+@compiled
+def _through(records, of, regressors, states, out):
+    """states (2, 15, k): derivative of the error state by the parameters, and room for the next one."""
+    before, after = states[0], states[1]
+    n = regressors.shape[1]
+    for i in range(len(records)):
+        record = records[i]
+        if record.kind == RESET:
+            before[:, :] = 0.0
+            continue
+        for r in range(ERROR_STATES):
+            for j in range(n):
+                after[r, j] = before[r, j] if r >= MOVING_STATES else 0.0
+        for r in range(MOVING_STATES):
+            for c in range(ERROR_STATES):
+                step = record.transition[r, c]
+                if step != 0.0:
+                    for j in range(n):
+                        after[r, j] += step * before[c, j]
+        place = of[i]
+        for j in range(n):
+            change = regressors[place, j] if place >= 0 else 0.0
+            for c in range(ERROR_STATES):
+                change -= record.row[c] * after[c, j]
+            if place >= 0:
+                out[place, j] = change
+            for r in range(ERROR_STATES):
+                after[r, j] += record.gain[r] * change
+        before[:, :] = after
