@@ -51,4 +51,4 @@ def test_without_truth(flight):
     result = diagnose([effect_of("anchor_delay", True, 4).inject(flight)], reference=Nothing())
     assert [finding.effect.name for finding in result.findings] == ["anchor_delay"]
     hidden = {item.effect for item in result.unobservable}
-    assert {"tag_lever_arm", "truth_frame", "tdoa_time_offset"} <= hidden
+    assert {"truth_frame", "accel_bias", "truth_time_offset"} <= hidden

@@ -44,6 +44,7 @@ class Effect:
     price: ClassVar[float] = 0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
     distinguished_by: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
     usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
+    needs_reference: ClassVar[bool] = False  # cannot be told from the filter's innovations alone
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
     uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
 

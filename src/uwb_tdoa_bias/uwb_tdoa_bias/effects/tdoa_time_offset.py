@@ -22,6 +22,7 @@ class TdoaTimeOffset(StampEffect):
         "truth_time_offset": "a flight with IMU: its stamps belong to neither",
     }
     reference = "UTIL web page: about 10 ms of radio latency"
+    needs_reference = True
 
     def regressors(self, samples, keys):
         jacobian = tdoa_jacobian(samples.p, samples.position_a, samples.position_b)

@@ -22,6 +22,7 @@ class TruthFrame(Effect):
     physics = "survey and motion capture do not share one frame: all anchors are shifted and turned together"
     confounded_with = ("tag_lever_arm", "anchor_position")
     reference = "rigid alignment of two coordinate frames"
+    needs_reference = True
     portable = False
 
     @classmethod

@@ -21,6 +21,7 @@ class TruthTimeOffset(StampEffect):
     physics = "motion-capture poses reach the log late, over a radio link"
     confounded_with = ("tdoa_time_offset",)
     reference = "UTIL web page: motion-capture poses logged on board have about 10 ms of radio latency"
+    needs_reference = True
     portable = False
     channels = ("tdoa", "gyro")  # on the accelerometer it is less than its vibration
 

@@ -74,9 +74,9 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         return lambda: progress(what)
 
     attribution = attribute(flights, reference, base, progress=saying("tracing residuals to effects"))
-    kept = judging.Kept(attribution.selection.chosen, (), (), {})
-    if reference.judges:  # a finding stays one even if the filter does without it; it is only not added
-        kept = judging.useful(attribution, flights, base, config, saying("running the filter without each"))
+    decide = judging.useful if reference.judges else judging.borne_out
+    # A finding stays one even if the filter does without it; it is only not added.
+    kept = decide(attribution, flights, base, config, saying("running the filter without each"))
     model = attribution.only(kept.candidates, kept.detections)
     effects = EffectSet((*base.effects, *usable(model.effects).effects))
     judged = judging.judge(model, flights, holdout, base, effects, reference, config, saying("judging"))
