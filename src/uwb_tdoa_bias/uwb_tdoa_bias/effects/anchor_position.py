@@ -5,6 +5,8 @@ import numpy as np
 from ..foundation.errors import InputError
 from ..foundation.geometry import tdoa
 from .base import Effect, check_anchor, known_anchors, once_per_anchors
+from .marks import Shift
+from .wording import counted, listed, significant, size
 
 
 class AnchorPosition(Effect):
@@ -66,6 +68,28 @@ class AnchorPosition(Effect):
                 :, k
             ]
         return out
+
+    def advice(self):
+        shifts = {}
+        for key, value in significant(self).items():
+            anchor, axis = key.split(".")
+            shifts.setdefault(anchor, {})[axis] = f"{size(self, key)} towards {'+' if value > 0.0 else '-'}{axis}"
+        if not shifts:
+            return ()
+        moved = {anchor: listed(by[axis] for axis in sorted(by)) for anchor, by in shifts.items()}
+        each = [f"{f'anchor {anchor}' if len(moved) > 1 else 'it'} seems off by {by}" for anchor, by in moved.items()]
+        return (
+            f"Survey {counted(sorted(shifts, key=int), 'anchor')} again: {'; '.join(each)}. If the survey proves "
+            "right, ranges to there are wrong by direction, which effects.yaml takes out.",
+        )
+
+    def marks(self, anchors):
+        each = {}
+        for key, value in self.values.items():
+            anchor, axis = key.split(".")
+            by, std = each.setdefault(int(anchor), (np.zeros(3), np.full(3, np.nan)))
+            by["xyz".index(axis)], std["xyz".index(axis)] = value, self.std.get(key, np.nan)
+        return tuple(Shift(anchor, *shift) for anchor, shift in each.items())
 
 
 def _unit(v):

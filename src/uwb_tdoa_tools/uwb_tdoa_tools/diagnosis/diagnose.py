@@ -54,9 +54,9 @@ class Diagnosis:
 
     def as_html(self):
         """One self-contained page."""
-        from . import report  # here, because drawing takes a second to import
+        from .report.page import html  # here, because drawing takes a second to import
 
-        return report.html(self)
+        return html(self)
 
 
 def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None, progress=lambda what: None):

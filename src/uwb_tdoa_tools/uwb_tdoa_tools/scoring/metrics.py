@@ -75,12 +75,16 @@ def coverage(error, covariance, sigmas=3.0):
 
 
 class Score:
-    """Errors of one run against its ground truth."""
+    """Errors of one run against its ground truth.
+
+    t (n,) s; p (n, 3) m, true positions; error (n, 3) m; covariance (n, 3, 3) m^2; first, last : s, in the air.
+    """
 
     def __init__(self, name, odometry, truth, residuals=None):
         """name : of the flight; odometry : Odometry; truth : Truth; residuals : Residuals or None."""
         self.name = name
         self.t, self.error, self.covariance = position_errors(odometry, truth)
+        self.p = position_at(self.t, truth)
         self.first, self.last = airborne(truth)
         self.nees = nees(self.error, self.covariance)
         self.nis = nis(residuals) if residuals is not None else np.empty(0)

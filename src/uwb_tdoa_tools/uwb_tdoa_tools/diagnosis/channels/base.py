@@ -87,6 +87,7 @@ class Channel:
     name: ClassVar[str]
     unit: ClassVar[str]
     negligible: ClassVar[float]  # root mean square, in `unit`, of a contribution that is not worth a term
+    needs: ClassVar[str]  # what a recording must hold for it, in words
     maps: ClassVar[tuple] = ()  # covariates whose functions, each too weak alone, are tried together
 
     def residual(self, comparison):

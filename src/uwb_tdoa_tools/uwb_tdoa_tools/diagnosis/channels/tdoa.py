@@ -94,6 +94,7 @@ class Tdoa(Channel):
 
     name = "tdoa"
     unit = "m"
+    needs = "TDOAs"
     negligible = 0.004
     maps = ("x", "y", "height", "range")
 
