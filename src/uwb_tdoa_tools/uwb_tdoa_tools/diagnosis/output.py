@@ -27,7 +27,7 @@ def as_json(diagnosis):
             "unobservable": [
                 {
                     "effect": item.effect,
-                    "direction": item.direction or "the flights lack the channel that shows it",
+                    "direction": item.direction or "the flights lack the channel, or the reference, that shows it",
                     "told_by": words.told_by,
                 }
                 for item, words in zip(diagnosis.unobservable, untold(diagnosis))

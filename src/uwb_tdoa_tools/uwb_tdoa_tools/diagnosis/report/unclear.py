@@ -11,6 +11,7 @@ from ..channels import CHANNELS
 
 NOTHING = 1e-9  # largest contribution, relative to those of its parts, of a combination that cancels
 NAMED = 6  # parameters of a combination that are named
+GROUND_TRUTH = "ground truth, from motion capture for example"
 CANCELS = "nothing: it cancels in every measurement, and hence does no harm"
 
 
@@ -66,15 +67,16 @@ def _what(item):
 
 def _told_by(item, diagnosis):
     effect = EFFECTS[item.effect]
+    alone = not diagnosis.reference.judges
     if item.direction is None:
-        return CHANNELS[effect.channels[0]].needs
+        return GROUND_TRUTH if alone and effect.needs_reference else CHANNELS[effect.channels[0]].needs
     size, parts = _contribution(item, diagnosis)
     if parts > 0.0 and size <= NOTHING * parts:
         return CANCELS
     if parts == 0.0 and effect.uses_attitude:
         return "ground truth of the attitude"
-    if not diagnosis.reference.judges:
-        return "ground truth, from motion capture for example"
+    if alone:
+        return GROUND_TRUTH
     return "a flight through other places, headings, heights and speeds"
 
 
