@@ -30,7 +30,7 @@ setup(
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [
-            "bias_node = uwb_tdoa_bias.bias_node:main",
+            "bias_node = uwb_tdoa_bias.executables:bias_node",
         ]
     },
 )
