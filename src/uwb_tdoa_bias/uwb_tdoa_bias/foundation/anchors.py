@@ -76,6 +76,18 @@ class Anchors:
         return cls(ids, positions, np.full((len(positions), 4), np.nan), frame)
 
     @classmethod
+    def from_message(cls, message):
+        """Anchors of a uwb_tdoa_msgs/AnchorArray, of rclpy or out of a bag. An orientation of (0, 0, 0, 0) is not
+        known; without a frame_id the frame is "map". Raises InputError."""
+        poses = [anchor.pose for anchor in message.anchors]
+        return cls(
+            [anchor.id for anchor in message.anchors],
+            np.array([_numbers(pose.position, "xyz") for pose in poses]).reshape(-1, 3),
+            np.array([_numbers(pose.orientation, "xyzw") for pose in poses]).reshape(-1, 4),
+            message.header.frame_id or "map",
+        )
+
+    @classmethod
     def from_yaml(cls, path):
         """Read `frame` and `anchors: {id: {position: [x, y, z], orientation: [x, y, z, w]}}`; raises InputError."""
         path = Path(path)
@@ -107,3 +119,7 @@ class Anchors:
             entries[i] = {"position": p, **({"orientation": q} if np.isfinite(q).all() else {})}
         text = yaml.safe_dump({"frame": self.frame, "anchors": entries}, sort_keys=False, default_flow_style=None)
         Path(path).write_text(text)
+
+
+def _numbers(message, names):
+    return [getattr(message, name) for name in names]

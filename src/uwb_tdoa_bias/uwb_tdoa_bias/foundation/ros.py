@@ -83,17 +83,6 @@ def orientation_of(q):
     return values if any(values) else (np.nan,) * 4
 
 
-def anchors_from_message(message):
-    """Anchors of an AnchorArray; raises InputError."""
-    poses = [anchor.pose for anchor in message.anchors]
-    return Anchors(
-        [anchor.id for anchor in message.anchors],
-        np.array([(pose.position.x, pose.position.y, pose.position.z) for pose in poses]).reshape(-1, 3),
-        np.array([orientation_of(pose.orientation) for pose in poses]).reshape(-1, 4),
-        message.header.frame_id or "map",
-    )
-
-
 def anchors_to_message(anchors):
     """AnchorArray of Anchors, with a stamp of 0: anchors do not age."""
     message = AnchorArray()
@@ -126,7 +115,7 @@ class AnchorsInput:
 
     def _on_message(self, message):
         try:
-            anchors, self.refused = anchors_from_message(message), None
+            anchors, self.refused = Anchors.from_message(message), None
         except InputError as error:
             self.refused = str(error)
             return
