@@ -18,6 +18,7 @@ setup(
         "numba>=0.57",
         "numpy>=1.26",
         "onnx>=1.14",
+        "Pillow>=9.0",
         "PyYAML>=6.0",
         "rosbags>=0.10",
         "scikit-learn>=1.3",

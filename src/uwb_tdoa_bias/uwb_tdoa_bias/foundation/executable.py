@@ -1,4 +1,4 @@
-"""How every executable starts: Ctrl-C ends it quietly, even while it still imports what it needs.
+"""How every executable starts: Ctrl-C ends it quietly, whenever it comes.
 
     evaluate = executable("uwb_tdoa_tools.commands.evaluate")        # an entry point; the module has a main()
 
@@ -12,6 +12,7 @@ import signal
 import sys
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
+SOON = 0.05  # s, until an interrupt that was lost comes again
 
 
 def executable(module):
@@ -19,10 +20,30 @@ def executable(module):
     return partial(_run, module)
 
 
+def interrupt(number, frame):
+    """Signal handler: raises KeyboardInterrupt, for good.
+
+    What C code calls back cannot raise, and a destructor cannot either: Python tells such an exception on stderr and
+    goes on (the compiler of numba has both). From now on nothing of that kind is told, objects that are half made
+    included, and where it was the KeyboardInterrupt that was lost, SIGINT comes again in a moment.
+    """
+
+    def on_lost(lost):
+        if lost.exc_type is KeyboardInterrupt:
+            signal.setitimer(signal.ITIMER_REAL, SOON)
+
+    sys.unraisablehook = on_lost
+    signal.signal(signal.SIGALRM, lambda number, frame: signal.raise_signal(signal.SIGINT))
+    raise KeyboardInterrupt
+
+
 def _run(module, *arguments):
     name = module.rpartition(".")[2]
     try:
-        return _imported(module).main(*arguments)
+        main = _imported(module).main
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, interrupt)
+        return main(*arguments)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package.startswith("uwb_tdoa_") and package != "uwb_tdoa_msgs":

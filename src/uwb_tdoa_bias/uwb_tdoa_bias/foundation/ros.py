@@ -26,6 +26,7 @@ from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
 from .anchors import Anchors
 from .errors import InputError
+from .executable import interrupt
 
 try:  # not in rclpy before 7.1.4; takes a third of the CPU time
     from rclpy.experimental import EventsExecutor
@@ -182,7 +183,8 @@ class Rate:
 
 
 def run(node_class, description, argv=None):
-    """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, or 2 for bad usage or an InputError.
+    """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an InputError, or 128 and the
+    number of a signal that came before the node was ready.
 
     node_class() makes the node, in an initialised rclpy, and has the executable's NAME; description : for --help.
     """
@@ -193,10 +195,11 @@ def run(node_class, description, argv=None):
     )
     interruptible, stop = True, Future()
 
-    def on_signal(number, _):  # rclpy's own handler would end the context while a callback still publishes
+    def on_signal(number, frame):  # rclpy's own handler would end the context while a callback still publishes
+        if not stop.done():
+            stop.set_result(number)
         if interruptible:
-            raise KeyboardInterrupt
-        stop.set_result(number)
+            interrupt(number, frame)
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
@@ -209,6 +212,8 @@ def run(node_class, description, argv=None):
         gc.collect()
         gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
         interruptible = False
+        if stop.done():
+            raise KeyboardInterrupt
         while not stop.done() and rclpy.ok():  # a signal is seen after a callback, or after the time
             executor.spin_until_future_complete(stop, timeout_sec=LONGEST_WAIT)
     except SystemExit as ended:  # argparse has said it already
@@ -216,7 +221,9 @@ def run(node_class, description, argv=None):
     except InputError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
+        return 128 + stop.result()
+    except ExternalShutdownException:
         pass
     finally:
         interruptible = False
