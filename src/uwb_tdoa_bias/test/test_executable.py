@@ -89,7 +89,8 @@ def test_what_is_not_installed_is_told_in_one_sentence(write, capsys, missing, r
     write("needy", f"import {missing}.part")
     assert executable("needy")() == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"needy: error: the Python package {missing} is missing; {remedy}") and error.count("\n") == 1
+    assert error.startswith(f"needy: error: the Python package {missing} is missing; {remedy}")
+    assert error.count("\n") == 1
 
 
 def test_a_part_of_ours_that_is_missing_is_a_defect():
