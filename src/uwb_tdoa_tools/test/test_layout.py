@@ -184,7 +184,8 @@ def test_package_xml_declares_what_is_imported_and_nothing_else(package):
 @pytest.mark.parametrize("package", PACKAGES)
 def test_setup_py_declares_what_is_imported_and_nothing_else(package):
     tree = ast.parse((SRC / package / "setup.py").read_text())
-    (call,) = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "setup")
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    (call,) = (node for node in calls if getattr(node.func, "id", "") == "setup")
     given = {keyword.arg: keyword.value for keyword in call.keywords}
     extras = ast.literal_eval(given["extras_require"]).values() if "extras_require" in given else []
     required = [*ast.literal_eval(given["install_requires"]), *(text for some in extras for text in some)]
