@@ -16,7 +16,6 @@ setup(
     install_requires=[
         "setuptools",
         "numpy>=1.26",
-        "PyYAML>=6.0",
         "scipy>=1.11",
         "uwb_tdoa_bias",
     ],

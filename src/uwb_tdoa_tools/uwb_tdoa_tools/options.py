@@ -7,10 +7,9 @@
 
 from dataclasses import fields, replace
 
-import yaml
-
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
 from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
 from .readers import inputs
@@ -56,7 +55,4 @@ def _parameter(text):
     names = [field.name for field in fields(FilterConfig)]
     if not assigned or name not in (*names, *RENAMED):
         raise InputError(f"-p {text}: write NAME:=VALUE, where NAME is one of {', '.join(names)}.")
-    try:
-        return name, yaml.safe_load(value)
-    except yaml.YAMLError:
-        raise InputError(f"-p {text}: {value!r} is no value.") from None
+    return name, parse_yaml(value, f"-p {text}")
