@@ -21,6 +21,7 @@ setup(
         "PyYAML>=6.0",
         "scipy>=1.11",
     ],
+    extras_require={"models": ["onnx>=1.14"]},  # to make known_answer.onnx anew
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -30,7 +31,7 @@ setup(
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [
-            "bias_node = uwb_tdoa_bias.bias_node:main",
+            "bias_node = uwb_tdoa_bias.executables:bias_node",
         ]
     },
 )

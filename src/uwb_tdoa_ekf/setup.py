@@ -16,7 +16,6 @@ setup(
     install_requires=[
         "setuptools",
         "numpy>=1.26",
-        "PyYAML>=6.0",
         "scipy>=1.11",
         "uwb_tdoa_bias",
     ],
@@ -29,8 +28,8 @@ setup(
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [
-            "debias_node = uwb_tdoa_ekf.debias_node:main",
-            "ekf_node = uwb_tdoa_ekf.ekf_node:main",
+            "debias_node = uwb_tdoa_ekf.executables:debias_node",
+            "ekf_node = uwb_tdoa_ekf.executables:ekf_node",
         ]
     },
 )

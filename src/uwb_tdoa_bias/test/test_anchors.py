@@ -117,13 +117,27 @@ def test_yaml_as_people_write_it(tmp_path):
         "anchors: {north: {position: [1, 2, 3]}}",
         "anchors: {0: {position: [1, 2, .nan]}}",
         "anchors: {0: {position: [1, 2, 3]",
+        "anchors: {0: {position: [1, 2, 3]}, 0: {position: [1, 2, 4]}}",
+        "anchors: {0: {position: [1, 2, 3]}, '0': {position: [1, 2, 4]}}",
+        "anchors: {1.7: {position: [1, 2, 3]}}",
+        "anchors: {true: {position: [1, 2, 3]}}",
+        "anchors: {-1: {position: [1, 2, 3]}}",
+        "anchors: {65536: {position: [1, 2, 3]}}",
+        "anchors: {12345678901234567890: {position: [1, 2, 3]}}",
+        "anchors: {'12345678901234567890': {position: [1, 2, 3]}}",
+        "anchors: {0: {position: [1, 2, true]}}",
+        "anchors: {0: {position: 123}}",
+        "anchors: {0: {postion: [1, 2, 3]}}",
+        "anchors: {0: {position: [1, 2, 3], orientation: [0, 0, 1, .inf]}}",
+        "anchors: {0: {position: [1, 2, 3], orientation: [0, 0, 1, 1e300]}}",
+        "anchors: {0: {position: [1, 2, 3]}}\nframe: 3",
         "- 1",
     ],
 )
 def test_bad_yaml_is_told_in_one_sentence(tmp_path, text):
     path = tmp_path / "anchors.yaml"
     path.write_text(text)
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match=r"^\S*anchors.yaml: [^\n]*[.]$"):
         Anchors.from_yaml(path)
 
 

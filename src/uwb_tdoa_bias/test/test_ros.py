@@ -47,7 +47,13 @@ def test_anchors_survive_the_message():
     message = ros.anchors_to_message(anchors)
     unknown = message.anchors[1].pose.orientation
     assert (unknown.x, unknown.y, unknown.z, unknown.w) == (0.0, 0.0, 0.0, 0.0)
-    assert ros.same_anchors(ros.anchors_from_message(message), anchors)
+    assert ros.same_anchors(Anchors.from_message(message), anchors)
+
+
+def test_a_message_without_a_frame_is_in_the_map():
+    message = ros.anchors_to_message(Anchors.from_positions(np.eye(3)))
+    message.header.frame_id = ""
+    assert Anchors.from_message(message).frame == "map"
 
 
 def test_same_anchors_notices_every_difference():
@@ -67,10 +73,10 @@ def test_bad_anchors_are_refused():
     message = ros.anchors_to_message(Anchors.from_positions(np.eye(3)))
     message.anchors[1].id = 0
     with pytest.raises(InputError, match="id 0 is given twice"):
-        ros.anchors_from_message(message)
+        Anchors.from_message(message)
     message.anchors.clear()
     with pytest.raises(InputError, match="empty"):
-        ros.anchors_from_message(message)
+        Anchors.from_message(message)
 
 
 def test_stream_subscriptions_match_every_usual_publisher():

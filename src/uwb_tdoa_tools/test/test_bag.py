@@ -16,6 +16,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_bag
+from uwb_tdoa_tools.bags.files import new_bag
 from uwb_tdoa_tools.bags.messages import tdoa_messages
 from uwb_tdoa_tools.bags.message_types import typestore
 
@@ -294,3 +295,22 @@ def test_not_a_bag(tmp_path):
     for path in (tmp_path, tmp_path / "flight"):
         with pytest.raises(InputError, match="is not a bag"):
             read_bag(path)
+
+
+def test_anchors_without_a_frame_are_in_the_map(tmp_path):
+    flight = small_flight(0.01)
+    write_bag(dataclasses.replace(flight, anchors=dataclasses.replace(flight.anchors, frame="")), tmp_path / "flight")
+    assert read_bag(tmp_path / "flight").anchors.frame == "map"
+
+
+def test_anchors_of_no_use_are_told_with_the_bag(tmp_path):
+    store = typestore()
+    with new_bag(tmp_path / "bad") as writer:
+        tdoa = writer.add_connection("/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", typestore=store)
+        ((stamp, message),) = tdoa_messages(Tdoas(np.ones(1), np.zeros(1, int), np.ones(1, int), np.ones(1)), store)
+        writer.write(tdoa, stamp, store.serialize_cdr(message, tdoa.msgtype))
+        anchors = writer.add_connection("/uwb/anchors", "uwb_tdoa_msgs/msg/AnchorArray", typestore=store)
+        empty = store.types["uwb_tdoa_msgs/msg/AnchorArray"](message.header, [])
+        writer.write(anchors, stamp, store.serialize_cdr(empty, anchors.msgtype))
+    with pytest.raises(InputError, match=r"bad: /uwb/anchors: anchors: the list is empty"):
+        read_bag(tmp_path / "bad")

@@ -8,10 +8,13 @@ import time
 
 import numpy as np
 import pytest
-from uwb_tdoa_tools.commands import bench
-from uwb_tdoa_tools.benchmark import usage
-from uwb_tdoa_tools.benchmark.figures import Figure, as_json, table
-from uwb_tdoa_tools.benchmark.flights import TDOA_RATE, make_flight
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+from uwb_tdoa_tools.benchmark import core, nodes, source, usage  # noqa: E402
+from uwb_tdoa_tools.benchmark.figures import Figure, as_json, table  # noqa: E402
+from uwb_tdoa_tools.benchmark.flights import TDOA_RATE, make_flight  # noqa: E402
+from uwb_tdoa_tools.commands import bench  # noqa: E402
 
 KEYS = {"section", "name", "unit", "median", "low", "high", "count", "target", "met"}
 
@@ -78,7 +81,6 @@ def test_what_others_use():
 
 
 def test_the_core_is_measured_per_event():
-    core = pytest.importorskip("uwb_tdoa_tools.benchmark.core")
     prediction, update = core.per_event(8, "innovation", 1, 5)
     assert prediction.shape == update.shape == (5,)
     assert 0.1 < np.median(prediction) < 100.0 and 0.1 < np.median(update) < 100.0
@@ -87,7 +89,6 @@ def test_the_core_is_measured_per_event():
 
 
 def test_latency_is_that_of_the_first_odometry_that_contains_a_tdoa():
-    source = pytest.importorskip("uwb_tdoa_tools.benchmark.source")
     ms = 1_000_000
     stamps = np.array([0, 10, 12, 20, 30, 90]) * ms
     sent = 1000 * ms + stamps
@@ -100,14 +101,12 @@ def test_latency_is_that_of_the_first_odometry_that_contains_a_tdoa():
 
 
 def test_ready_is_read_from_the_log():
-    nodes = pytest.importorskip("uwb_tdoa_tools.benchmark.nodes")
     log = "[INFO] [17.5] [tag1.ekf_node]: loading\nnot ready\n[INFO] [18.25] [tag1.ekf_node]: ready\n"
     assert nodes.READY.findall(log) == ["18.25"]
     assert not nodes.READY.findall(log[:-30])
 
 
 def test_bad_usage(tmp_path, capsys):
-    pytest.importorskip("uwb_tdoa_msgs.msg")
     assert bench.main(["--only", "cpu"]) == 2
     assert "core, offline, nodes, tags, replay" in capsys.readouterr().err.replace("'", "")
     assert bench.main(["--json", str(tmp_path / "no" / "bench.json"), "--out", str(tmp_path)]) == 2
@@ -123,7 +122,6 @@ def test_help_has_examples(capsys):
 
 @pytest.mark.slow
 def test_a_quick_run_of_the_real_nodes(tmp_path, capsys):
-    pytest.importorskip("uwb_tdoa_msgs.msg")
     report = tmp_path / "bench.json"
     before = dict(os.environ)
     only = ["core", "offline", "nodes", "replay"]

@@ -1,7 +1,8 @@
 import pytest
 
+from uwb_tdoa_tools.commands import study
 from uwb_tdoa_tools.studies.debiasing import measured
-from uwb_tdoa_tools.debiasing.report import measured_tables
+from uwb_tdoa_tools.studies.debiasing.report import measured_tables
 from uwb_tdoa_tools.studies.diagnosis.measured import SPLITS
 
 
@@ -14,8 +15,14 @@ def test_no_flight_is_fitted_to_and_judged():
 def test_a_map_of_some_flights_makes_others_better(shared_data, monkeypatch):
     to_fit, to_judge = SPLITS["0426 b"]
     monkeypatch.setattr(measured, "cases", lambda: {"0426": (None, to_fit[:3], to_judge[:2])})
-    (case,) = measured.run(shared_data, jobs=1)
+    (case,) = measured.judged(shared_data, jobs=1)
     before, after = (sum(row[name]["rmse"] for row in case["runs"]) for name in ("before", "thin plate"))
     assert after < 0.8 * before
     assert all(row["thin plate"]["rmse"] < row["before"]["rmse"] for row in case["runs"])
     assert "| 0426 | 2 |" in measured_tables([case])
+
+
+def test_without_diagnosed_effects_it_says_where_they_come_from(tmp_path, capsys):
+    arguments = ["--data", str(tmp_path), "--diagnosed", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert study.main(["debias-measured", *arguments]) == 2
+    assert "no */effects.yaml; run `study diagnosis measured --out" in capsys.readouterr().err

@@ -1,7 +1,7 @@
 import numpy as np
 
 from uwb_tdoa_tools.studies.debiasing import set_up
-from uwb_tdoa_tools.debiasing.report import set_up_tables
+from uwb_tdoa_tools.studies.debiasing.report import set_up_tables
 from uwb_tdoa_tools.simulation import SimulationConfig
 
 
@@ -34,7 +34,7 @@ def test_delays_belong_to_the_seed_and_noise_to_the_run():
 def test_all_of_it_on_a_coarser_grid(monkeypatch):
     for name, value in {"STEP": 1.0, "STAY": 2.0, "PASSES": 1, "RAILS": set_up.RAILS[::3]}.items():
         monkeypatch.setattr(set_up, name, value)
-    figures, found, maps = set_up.run(seed=3, jobs=1)
+    figures, found, maps = set_up.copied(seed=3, jobs=1)
     validation = figures["static"]["validation"]
     assert validation["static, thin_plate"]["both"] < 0.3 * validation["before"]["both"]
     for row in figures["square"].values():

@@ -5,8 +5,9 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet, true_samples
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.commands.inject import main, parse_effect
+from uwb_tdoa_tools.commands.inject import main
 from uwb_tdoa_tools.readers import read_flight
+from uwb_tdoa_tools.simulation.inject import parse_effect
 from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, SimulationConfig, simulate
 
 

@@ -17,10 +17,12 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_fields, write_bag
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="uwb_tdoa_msgs is not built and sourced")
 
+from geometry_msgs.msg import PoseStamped  # noqa: E402
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rosbags.rosbag2 import Reader  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
+from tf2_msgs.msg import TFMessage  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 from uwb_tdoa_tools.commands import record, replay  # noqa: E402
 
@@ -217,12 +219,30 @@ def test_clock_can_be_followed(tmp_path, start, node):
     assert len(set(stamps)) > 12  # 10 messages alone would not give as many
 
 
-def test_remapped_into_a_namespace(tmp_path, start, node):
+@pytest.mark.parametrize("remap", ["/uwb/tdoa:=/tag1/uwb/tdoa", "uwb/tdoa:=/tag1/uwb/tdoa"])
+def test_one_topic_can_be_moved(tmp_path, start, node, remap):
     write_bag(small_flight(seconds=0.2), tmp_path / "flight.bag")
     tdoa = subscribe(node, Tdoa, "/tag1/uwb/tdoa")
-    remap = ["--ros-args", "-r", "/uwb/tdoa:=/tag1/uwb/tdoa"]
-    start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", "uwb/tdoa", *remap)
+    options = ["--wait-matched", LIMIT, "--wait-topics", "uwb/tdoa", "--ros-args", "-r", remap]
+    start("replay", tmp_path / "flight.bag", *options)
     assert len(take(tdoa, lambda messages: len(messages) == 100)) == 100
+
+
+def test_the_recording_of_one_tag_in_the_namespace_of_another(tmp_path, start, node):
+    """As in the example of --help: all of the tag's topics, the anchors too, and the frames stay where they are."""
+    write_bag(small_flight(seconds=0.2), tmp_path / "flight.bag")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+    kinds = {"uwb/tdoa": Tdoa, "imu/data": Imu, "ground_truth/pose": PoseStamped}
+    streams = {topic: subscribe(node, kind, f"/tag1/{topic}") for topic, kind in kinds.items()}
+    anchors = subscribe(node, AnchorArray, "/tag1/uwb/anchors", latched)
+    frames = subscribe(node, TFMessage, "/tf_static", latched)
+    command = [line.split() for line in replay.parser().epilog.splitlines() if "__ns:=/tag1" in line][0]
+    options = ["--wait-matched", LIMIT, "--wait-topics", *kinds]
+    start("replay", tmp_path / "flight.bag", *options, *command[2:])
+    for topic, count in (("uwb/tdoa", 100), ("imu/data", 200), ("ground_truth/pose", 50)):
+        take(streams[topic], lambda messages, count=count: len(messages) == count)
+    take(anchors, lambda messages: messages)
+    take(frames, lambda messages: messages)
 
 
 def test_nobody_subscribes(tmp_path, start):

@@ -1,16 +1,20 @@
 """What the mains of all executables share: the look of --help, and how a failure is told and counted.
 
     def main(argv=None):
-        parser = cli.parser("convert", "Convert a log to a bag.", "convert flight.log --survey s.txt --out flight.bag")
-        parser.add_argument("log")
-        return cli.run(convert, parser, argv)          # convert(args) -> exit code, None for 0
+        return cli.run(_convert, parser(), argv)          # _convert(args) -> exit code, None for 0
+
+    def parser():
+        made = cli.parser("convert", "Convert a log to a bag.", "convert flight.log --survey s.txt --out flight.bag")
+        made.add_argument("log")
+        return made
 """
 
 import argparse
 import os
+from pathlib import Path
 import sys
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.errors import Failure, InputError
 
 
 def parser(name, description, *examples):
@@ -21,20 +25,27 @@ def parser(name, description, *examples):
     )
 
 
-def run(command, parser, argv=None):
+def run(command, parser, argv=None, ros=False):
     """Parse argv (default: sys.argv[1:]), call command(args), and return the exit code of the process.
 
-    0 or what command returned; 2 for bad usage, an InputError or a file that cannot be used, each told in one sentence
-    on stderr; 130 after Ctrl-C; 141 when whoever read our output has gone.
+    0 or what command returned; 1 for a Failure; 2 for bad usage, an InputError or a file that cannot be used, each told
+    in one sentence on stderr; 130 after Ctrl-C; 141 when whoever read our output has gone.
+    ros : --ros-args are for rclpy and not parsed; args.ros_arguments is the whole command line, with them.
     """
+    arguments = sys.argv[1:] if argv is None else list(argv)
     try:
-        code = command(parser.parse_args(argv)) or 0
+        args = parser.parse_args(without_ros_arguments(arguments) if ros else arguments)
+        if ros:
+            args.ros_arguments = arguments
+        code = command(args) or 0
         sys.stdout.flush()
         return code
     except SystemExit as stop:  # argparse has said it already: usage and error, or the help
         return stop.code or 0
     except InputError as error:
-        return _fail(parser.prog, error)
+        return _fail(parser.prog, error, 2)
+    except Failure as failure:
+        return _fail(parser.prog, failure, 1)
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -43,9 +54,34 @@ def run(command, parser, argv=None):
     except OSError as error:
         if error.filename is None:
             raise
-        return _fail(parser.prog, f"{error.filename}: {error.strerror}.")
+        return _fail(parser.prog, f"{error.filename}: {error.strerror}.", 2)
 
 
-def _fail(name, sentence):
-    print(f"{name}: error: {sentence}", file=sys.stderr)
-    return 2
+def without_ros_arguments(arguments):
+    """A command line without what is for ROS: from each --ros-args to the next -- or the end."""
+    own, ours = [], True
+    for argument in arguments:
+        if argument == "--ros-args":
+            ours = False
+        elif ours:
+            own.append(argument)
+        elif argument == "--":
+            ours = True
+    return own
+
+
+def check_folders(*paths):
+    """Raise InputError, before the work, unless the folder of each file to write is there; None is passed over."""
+    for path in paths:
+        if path is not None and not Path(path).absolute().parent.is_dir():
+            raise InputError(f"{path}: its directory does not exist; make it first.")
+
+
+def say(name, sentence):
+    """Tell what happens, on stderr: `name: sentence`."""
+    print(f"{name}: {sentence}", file=sys.stderr, flush=True)
+
+
+def _fail(name, sentence, code):
+    say(name, f"error: {sentence}")
+    return code

@@ -7,6 +7,7 @@ import numpy as np
 import yaml
 
 from ..foundation.errors import InputError
+from ..foundation.safe_yaml import read_yaml
 from .catalogue import EFFECTS
 from .imu_corrector import ImuCorrector
 from .smooth_term import SmoothTerm
@@ -71,10 +72,7 @@ class EffectSet:
     @classmethod
     def from_yaml(cls, path):
         """Read effects.yaml; raises InputError."""
-        try:
-            content = yaml.safe_load(Path(path).read_text())
-        except (OSError, yaml.YAMLError) as error:
-            raise InputError(f"{path}: cannot be read as YAML ({error}).") from error
+        content = read_yaml(path)
         entries = content.get("effects") if isinstance(content, dict) else None
         if not isinstance(entries, dict):
             raise InputError(f"{path}: expected a mapping 'effects' of effect name to values.")
@@ -86,7 +84,7 @@ class EffectSet:
                 raise InputError(f"{path}: effect {name!r} is not known; known are {known}.")
             allowed = (*ENTRY, *kind.settings)
             entry = entry or {}
-            unknown = set(entry) - set(allowed) if isinstance(entry, dict) else {"(not a mapping)"}
+            unknown = set(map(str, entry)) - set(allowed) if isinstance(entry, dict) else {"(not a mapping)"}
             if unknown:
                 raise InputError(f"{path}: {name}: {sorted(unknown)[0]!r} is not one of {', '.join(allowed)}.")
             try:

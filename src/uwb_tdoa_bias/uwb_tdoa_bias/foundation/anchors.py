@@ -7,6 +7,7 @@ import numpy as np
 import yaml
 
 from .errors import InputError
+from .safe_yaml import read_yaml
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Anchors:
     frame: str = "map"
 
     def __post_init__(self):
-        ids = np.array(self.ids, dtype=np.int64).reshape(-1)
+        ids = _whole(self.ids)
         positions = np.array(self.positions, dtype=float, order="C")
         orientations = np.array(self.orientations, dtype=float)
         n = len(ids)
@@ -42,11 +43,15 @@ class Anchors:
         values, counts = np.unique(ids, return_counts=True)
         if (counts > 1).any():
             raise InputError(f"anchors: id {values[counts > 1][0]} is given twice; every anchor needs its own id.")
-        if (ids < 0).any() or (ids > 65535).any():
-            raise InputError(f"anchors: id {ids[(ids < 0) | (ids > 65535)][0]} is outside 0 ... 65535.")
         bad = ~np.isfinite(positions).all(axis=1)
         if bad.any():
             raise InputError(f"anchors: position of anchor {ids[bad][0]} is {positions[bad][0]}; it must be finite metres.")
+        bad = ~np.isfinite(orientations).all(axis=1) & ~np.isnan(orientations).all(axis=1)
+        bad |= np.abs(np.nan_to_num(orientations)).max(axis=1) > 1e6
+        if bad.any():
+            raise InputError(
+                f"anchors: orientation of anchor {ids[bad][0]} is {orientations[bad][0]}; give a quaternion x, y, z, w."
+            )
         norm = np.linalg.norm(orientations, axis=1, keepdims=True)
         orientations = np.where(norm > 1e-9, orientations / np.where(norm > 1e-9, norm, 1.0), np.nan)
         for name, value in (("ids", ids), ("positions", positions), ("orientations", orientations)):
@@ -76,29 +81,43 @@ class Anchors:
         return cls(ids, positions, np.full((len(positions), 4), np.nan), frame)
 
     @classmethod
+    def from_message(cls, message):
+        """Anchors of a uwb_tdoa_msgs/AnchorArray, of rclpy or out of a bag. An orientation of (0, 0, 0, 0) is not
+        known; without a frame_id the frame is "map". Raises InputError."""
+        poses = [anchor.pose for anchor in message.anchors]
+        return cls(
+            [anchor.id for anchor in message.anchors],
+            np.array([_numbers(pose.position, "xyz") for pose in poses]).reshape(-1, 3),
+            np.array([_numbers(pose.orientation, "xyzw") for pose in poses]).reshape(-1, 4),
+            message.header.frame_id or "map",
+        )
+
+    @classmethod
     def from_yaml(cls, path):
         """Read `frame` and `anchors: {id: {position: [x, y, z], orientation: [x, y, z, w]}}`; raises InputError."""
-        path = Path(path)
-        try:
-            content = yaml.safe_load(path.read_text())
-        except (OSError, yaml.YAMLError) as error:
-            raise InputError(f"{path}: cannot be read as YAML ({error}).") from error
-        if not isinstance(content, dict) or not isinstance(content.get("anchors"), dict) or not content["anchors"]:
+        content = read_yaml(path)
+        entries = content.get("anchors") if isinstance(content, dict) else None
+        if not isinstance(entries, dict) or not entries:
             raise InputError(f"{path}: expected a mapping 'anchors' of id to position and orientation.")
+        frame = content.get("frame", "map")
+        if not isinstance(frame, str):
+            raise InputError(f"{path}: frame: {frame!r} is no name; write the name of the world frame, e.g. map.")
         ids, positions, orientations = [], [], []
-        for key, entry in content["anchors"].items():
+        for key, entry in entries.items():
             try:
-                ids.append(int(key))
-                positions.append([float(value) for value in entry["position"]])
-                orientations.append([float(value) for value in entry.get("orientation") or [np.nan] * 4])
-                if len(positions[-1]) != 3 or len(orientations[-1]) != 4:
-                    raise ValueError("wrong number of values")
-            except (TypeError, ValueError, KeyError, AttributeError) as error:
+                anchor, position, orientation = _entry(key, entry)
+            except ValueError as error:
                 raise InputError(
-                    f"{path}: anchors: {key}: {entry!r} is not an anchor; write it as "
+                    f"{path}: anchors: {key}: {error}; write it as "
                     "'0: {position: [x, y, z], orientation: [x, y, z, w]}' (orientation optional)."
                 ) from error
-        return cls(ids, positions, orientations, str(content.get("frame", "map")))
+            ids.append(anchor)
+            positions.append(position)
+            orientations.append(orientation)
+        try:
+            return cls(ids, positions, orientations, frame)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
 
     def to_yaml(self, path):
         """Write what `from_yaml` reads."""
@@ -107,3 +126,32 @@ class Anchors:
             entries[i] = {"position": p, **({"orientation": q} if np.isfinite(q).all() else {})}
         text = yaml.safe_dump({"frame": self.frame, "anchors": entries}, sort_keys=False, default_flow_style=None)
         Path(path).write_text(text)
+
+
+def _whole(ids):
+    """(N,) int64. Raises InputError for what is no whole number 0 ... 65535."""
+    values = np.asarray(ids).reshape(-1)
+    bad = [value for value in values.tolist() if isinstance(value, bool) or not (0 <= value <= 65535) or value % 1]
+    if bad:
+        raise InputError(f"anchors: id {bad[0]!r} is not a whole number 0 ... 65535.")
+    return values.astype(np.int64)
+
+
+def _numbers(message, names):
+    return [getattr(message, name) for name in names]
+
+
+def _entry(key, entry):
+    """(id, position, orientation) of one entry of a file. Raises ValueError with what is wrong."""
+    if isinstance(key, bool) or not str(key).isascii() or not str(key).isdigit():
+        raise ValueError(f"the id is {key!r}, not a whole number 0 ... 65535")
+    if not isinstance(entry, dict):
+        raise ValueError(f"{entry!r} is not an anchor")
+    if unknown := [name for name in entry if name not in ("position", "orientation")]:
+        raise ValueError(f"{unknown[0]!r} is not one of position, orientation")
+    position, orientation = entry.get("position"), entry.get("orientation")
+    for name, value, count in (("position", position, 3), ("orientation", orientation, 4)):
+        numbers = isinstance(value, list) and all(type(number) in (int, float) for number in value)
+        if not (numbers and len(value) == count) and not (name == "orientation" and value is None):
+            raise ValueError(f"{name} is {value!r}, not {count} numbers")
+    return int(key), position, [np.nan] * 4 if orientation is None else orientation

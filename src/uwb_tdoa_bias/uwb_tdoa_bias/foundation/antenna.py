@@ -18,6 +18,7 @@ from .errors import InputError
 DWM1000_AZIMUTH = (-2.0, -2.2, -3.0, -4.0, -3.6, -2.8, -3.0, -4.2, -5.0, -4.4, -3.2, -2.3)  # from +x through +y
 DWM1000_ELEVATION_1 = (-2.0, -2.5, -5.0, -11.0, -6.5, -3.5, -3.0, -4.5, -9.0, -20.0, -8.0, -3.0)  # from +x through +z
 DWM1000_ELEVATION_2 = (-4.0, -3.5, -5.5, -11.0, -7.0, -5.0, -4.4, -5.5, -10.0, -20.0, -9.0, -5.0)  # from +y through +z
+LARGEST_GAIN = 200.0  # dB, in magnitude; more is a mistake
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,17 @@ class Antenna:
 
     def __post_init__(self):
         cuts = []
+        for name, most in (("gain_offset", LARGEST_GAIN), ("delay_span", 10.0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
+                raise InputError(f"antenna: {name}: {value!r} must be a number between -{most:g} and {most:g}.")
         for name in ("azimuth", "elevation_1", "elevation_2"):
             gains = np.asarray(getattr(self, name), dtype=float)
-            if gains.ndim != 1 or len(gains) < 4 or len(gains) % 4 or not np.isfinite(gains).all():
-                raise InputError(f"antenna: {name} needs a multiple of 4 finite gains in dBi around the full circle.")
+            if gains.ndim != 1 or len(gains) < 4 or len(gains) % 4 or not (np.abs(gains) <= LARGEST_GAIN).all():
+                raise InputError(
+                    f"antenna: {name} needs a multiple of 4 gains between -{LARGEST_GAIN:g} and {LARGEST_GAIN:g} dBi "
+                    "around the full circle."
+                )
             angle = np.linspace(0.0, 2.0 * np.pi, len(gains) + 1)
             cuts.append(CubicSpline(angle, np.append(gains, gains[0]), bc_type="periodic"))
         azimuth, first, second = cuts

@@ -1,5 +1,10 @@
-"""The one exception that means: the user gave us something we cannot use."""
+"""The two exceptions that are told to the user in one sentence; every other one is a defect and keeps its traceback."""
 
 
 class InputError(ValueError):
-    """Bad input. The message is one sentence that names the field, the value and the remedy."""
+    """Bad input. The message is one sentence that names the field, the value and the remedy. Exit code 2."""
+
+
+class Failure(Exception):
+    """What was asked for could not be done with good input. The message says what failed and where to look. Exit
+    code 1."""

@@ -26,6 +26,7 @@ from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
 from .anchors import Anchors
 from .errors import InputError
+from .executable import interrupt
 
 try:  # not in rclpy before 7.1.4; takes a third of the CPU time
     from rclpy.experimental import EventsExecutor
@@ -83,17 +84,6 @@ def orientation_of(q):
     return values if any(values) else (np.nan,) * 4
 
 
-def anchors_from_message(message):
-    """Anchors of an AnchorArray; raises InputError."""
-    poses = [anchor.pose for anchor in message.anchors]
-    return Anchors(
-        [anchor.id for anchor in message.anchors],
-        np.array([(pose.position.x, pose.position.y, pose.position.z) for pose in poses]).reshape(-1, 3),
-        np.array([orientation_of(pose.orientation) for pose in poses]).reshape(-1, 4),
-        message.header.frame_id or "map",
-    )
-
-
 def anchors_to_message(anchors):
     """AnchorArray of Anchors, with a stamp of 0: anchors do not age."""
     message = AnchorArray()
@@ -126,7 +116,7 @@ class AnchorsInput:
 
     def _on_message(self, message):
         try:
-            anchors, self.refused = anchors_from_message(message), None
+            anchors, self.refused = Anchors.from_message(message), None
         except InputError as error:
             self.refused = str(error)
             return
@@ -193,7 +183,8 @@ class Rate:
 
 
 def run(node_class, description, argv=None):
-    """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, or 2 for bad usage or an InputError.
+    """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an InputError, or 128 and the
+    number of a signal that came before the node was ready.
 
     node_class() makes the node, in an initialised rclpy, and has the executable's NAME; description : for --help.
     """
@@ -204,10 +195,11 @@ def run(node_class, description, argv=None):
     )
     interruptible, stop = True, Future()
 
-    def on_signal(number, _):  # rclpy's own handler would end the context while a callback still publishes
+    def on_signal(number, frame):  # rclpy's own handler would end the context while a callback still publishes
+        if not stop.done():
+            stop.set_result(number)
         if interruptible:
-            raise KeyboardInterrupt
-        stop.set_result(number)
+            interrupt(number, frame)
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
@@ -220,6 +212,8 @@ def run(node_class, description, argv=None):
         gc.collect()
         gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
         interruptible = False
+        if stop.done():
+            raise KeyboardInterrupt
         while not stop.done() and rclpy.ok():  # a signal is seen after a callback, or after the time
             executor.spin_until_future_complete(stop, timeout_sec=LONGEST_WAIT)
     except SystemExit as ended:  # argparse has said it already
@@ -227,7 +221,9 @@ def run(node_class, description, argv=None):
     except InputError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
+        return 128 + stop.result()
+    except ExternalShutdownException:
         pass
     finally:
         interruptible = False

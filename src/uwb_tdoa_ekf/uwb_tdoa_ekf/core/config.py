@@ -3,13 +3,12 @@
 import math
 import warnings
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 
 import numpy as np
-import yaml
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.robust_loss import LOSSES
+from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 ROBUST = ("innovation", "gate", "m_estimation")
 CHOICES = {"robust": ROBUST, "loss": LOSSES}  # parameters that are one of a few names
@@ -106,13 +105,13 @@ class FilterConfig:
     @classmethod
     def from_yaml(cls, path):
         """Read the ros__parameters of a node's parameter file; those that do not tune the filter are passed over."""
+        content = read_yaml(path)
         try:
-            content = yaml.safe_load(Path(path).read_text())
             (node,) = content.values()
             return cls.from_parameters(node["ros__parameters"])
-        except (OSError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}: expected one node's 'ros__parameters' mapping, as in ekf_node.yaml.") from error
 
     def tuning(self):

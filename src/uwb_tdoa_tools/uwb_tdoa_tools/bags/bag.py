@@ -20,6 +20,7 @@ import yaml
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
 
@@ -42,7 +43,7 @@ def _qos(durability, depth):
 
 
 _STREAM_QOS = _qos(QosDurability.VOLATILE, 1000)
-_LATCHED_QOS = _qos(QosDurability.TRANSIENT_LOCAL, 1)
+LATCHED_QOS = _qos(QosDurability.TRANSIENT_LOCAL, 1)
 
 
 @dataclass(frozen=True)
@@ -82,12 +83,12 @@ def write_bag(flight, out, storage="mcap", force=False):
     topics = {  # at equal stamps this order holds: anchors before what needs them
         "/uwb/anchors": (
             "uwb_tdoa_msgs/msg/AnchorArray",
-            _LATCHED_QOS,
+            LATCHED_QOS,
             [bag_messages.anchors_message(flight.anchors, first, store)],
         ),
         "/tf_static": (
             "tf2_msgs/msg/TFMessage",
-            _LATCHED_QOS,
+            LATCHED_QOS,
             [bag_messages.transforms_message(flight.anchors, first, store)],
         ),
     }
@@ -238,7 +239,10 @@ def _read_anchors(path, reader, connections, namespace):
         raise InputError(
             f"{path}: has no message on {_absolute(namespace, 'uwb/anchors')}; give a survey file (--survey FILE)."
         )
-    return bag_messages.anchors_of(last)
+    try:
+        return Anchors.from_message(last)
+    except InputError as error:
+        raise InputError(f"{path}: {_absolute(namespace, 'uwb/anchors')}: {error}") from error
 
 
 def _others(connections, namespace):

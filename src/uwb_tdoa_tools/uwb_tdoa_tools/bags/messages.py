@@ -6,7 +6,6 @@ covariances of 0 for unknown.
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas, Truth
 
@@ -88,17 +87,6 @@ def anchors_message(anchors, stamp, store):
         for number, p, q in zip(anchors.ids.tolist(), anchors.positions.tolist(), q_or_zero.tolist())
     ]
     return stamp, store.types["uwb_tdoa_msgs/msg/AnchorArray"](_header(store, stamp, anchors.frame), array)
-
-
-def anchors_of(message):
-    """Anchors of an AnchorArray."""
-    poses = [anchor.pose for anchor in message.anchors]
-    return Anchors(
-        [anchor.id for anchor in message.anchors],
-        np.array([_point(pose.position) for pose in poses]).reshape(-1, 3),
-        np.array([_quaternion(pose.orientation) for pose in poses]).reshape(-1, 4),
-        message.header.frame_id,
-    )
 
 
 def transforms_message(anchors, stamp, store):

@@ -1,28 +1,83 @@
 """plan: where a tag can be located among given anchors, how precisely, and where the anchors had better be."""
 
 import json
+from pathlib import Path
 import sys
-from functools import partial
 
 import numpy as np
-from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli
-from ..readers import inputs
-from .. import parallel
-from ..planning import accuracy, layout, messages, options, plots, report
-from ..planning.check import brute_force
-from ..planning.maps import Grid, chart
-from ..readers import read_flight, read_survey
-
-_watched = partial(tqdm, disable=None, leave=False)
+from .. import cli, parallel
+from ..planning import messages, options, report, run
+from ..planning.goal import OBJECTIVES
+from ..planning.maps import FLYABLE, chart
+from ..planning.noise import RadioNoise
+from ..planning.pairing import OF_PROTOCOL, PAIRINGS
+from ..readers import inputs, read_survey
 
 
 def main(argv=None):
     """The executable. Returns the exit code."""
-    return cli.run(_plan, options.parser(), argv)
+    return cli.run(_plan, parser(), argv)
+
+
+def parser():
+    """Its options."""
+    made = cli.parser(
+        "plan",
+        "Precision (Cramer-Rao bound), failure (two solutions) and accuracy of TDOA positions among given anchors,\n"
+        "and better places for the anchors. Writes pictures, plan.json, flyable.npz (for the filter's node) and a bag\n"
+        "with the maps (OccupancyGrid, MarkerArray) for RViz and Foxglove.",
+        "plan anchors.yaml --height 1.2 --out plan/",
+        "plan survey.txt --volume --area -3 4 -4 4 0 3 --protocol tdoa3 --out plan/",
+        "plan square.yaml --planar --height 0.2 --check --out plan/",
+        "plan survey.txt --volume --flights flights/0425 --out plan/",
+        "plan survey.txt --volume --improve add --out plan/",
+    )
+    add, number, path, default = made.add_argument, {"type": float}, {"type": Path}, "(default: %(default)s)"
+    add("anchors", metavar="ANCHORS", help="anchors .yaml or survey (.txt, .csv)")
+    add("--out", metavar="DIR", **path, required=True, help="where to write; replaces what an earlier plan left there")
+    add("--json", metavar="FILE", **path, help="write the figures here too")
+    add("--publish", action="store_true", help="publish the maps on ROS topics plan/... until Ctrl-C")
+
+    where = made.add_argument_group("where")
+    add, either = where.add_argument, where.add_mutually_exclusive_group()
+    area = "X0 X1 Y0 Y1 [Z0 Z1] of the room, m (default: around the anchors)"
+    add("--area", metavar="M", nargs="+", **number, help=area)
+    either.add_argument("--height", metavar="M", **number, help="one slice there (default: at half the room's height)")
+    either.add_argument("--volume", action="store_true", help="the whole room")
+    add("--step", metavar="M", **number, help="size of a cell (default: 100 along a slice, 50 in a volume)")
+    add("--planar", action="store_true", help="the height of the tag is known: x and y only")
+
+    add, radio = made.add_argument_group("measurements").add_argument, RadioNoise
+    add("--protocol", choices=OF_PROTOCOL, default="tdoa2", help="which TDOAs a round holds (default: tdoa2)")
+    shared = "the TDOAs of a round and what they share (default: ring for tdoa2, all_pairs for tdoa3)"
+    add("--covariance", choices=PAIRINGS, help=shared)
+    add("--antenna", metavar="FILE", help="pattern, YAML: azimuth, elevation_1, elevation_2, gain_offset, in dBi")
+    add("--tx-power", metavar="DBM", **number, default=radio.tx_power_dbm, help=f"at 25 C, 3.3 V {default}")
+    add("--temperature", metavar="C", **number, default=radio.temperature, help=f"of the anchors {default}")
+    add("--voltage", metavar="V", **number, default=radio.voltage, help=f"supply of the anchors {default}")
+    add("--noise", metavar="M", **number, help="standard deviation of every reception, instead of the radio's")
+    own = "error that every TDOA has of its own besides (default: 0)"
+    add("--link-noise", metavar="M", **number, default=0.0, help=own)
+    unique = "one solution by every pairing alone or by a whole round (default: pairings)"
+    add("--flyable", choices=FLYABLE, default="pairings", help=unique)
+
+    more = made.add_argument_group("more")
+    add = more.add_argument
+    add("--check", action="store_true", help="compare the failure map with a solver started from many places")
+    add("--flights", metavar="FLIGHT", nargs="+", help=f"measured accuracy beside the bound; {inputs.HELP}")
+    parallel.add_options(more)
+    add("--improve", choices=("move", "add"), help="better places: move all anchors, or add one")
+    add("--count", metavar="N", type=int, help="with --improve move: how many anchors (default: as there are)")
+    add("--objective", choices=OBJECTIVES, default="worst", help="what to improve where it flies (default: worst)")
+    flown = "X0 X1 Y0 Y1 Z0 Z1 that is flown (default: the room less 0.8, 0.6 m)"
+    add("--fly", metavar="M", nargs=6, **number, help=flown)
+    allowed = "where anchors may be, YAML, places: [[x0, y0, z0, x1, y1, z1]] (default: the walls)"
+    add("--places", metavar="FILE", help=allowed)
+    add("--starts", metavar="N", type=int, default=16, help=f"layouts to search from {default}")
+    return made
 
 
 def _plan(args):
@@ -41,17 +96,17 @@ def _plan(args):
     found = chart(installation, grid, args.flyable)
     figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
     report.say_summary(figures["map"])
-    plots.plot_precision(installation, found, args.out / "precision.png")
-    plots.plot_failure(installation, found, args.out / "failure.png")
-    found.volume(installation).save(args.out / "flyable.npz")
-    outgoing = messages.messages(found, anchors)
-    messages.write(outgoing, args.out / "plan.bag")
+    outgoing = run.draw_map(found, installation, args.out)
     if args.check:
-        figures["check"] = _check(args, installation, grid)
+        figures["check"] = run.check(installation, grid, args.out)
+        report.say_check(figures["check"])
     if recordings:
-        figures["flights"] = _flights(args, installation, room, recordings)
+        flown = parallel.over(run.fly, recordings, args.jobs, args.dask)
+        figures["flights"] = run.judge_flights(flown, installation, room, args.step or 0.4, args.out)
+        report.say_flights(figures["flights"])
     if aim:
-        figures["improve"] = _improve(args, found, aim)
+        figures["improve"] = run.improve(found, aim, args.improve, args.starts, args.flyable, args.out)
+        report.say_improvement(figures["improve"])
     for path in (args.out / "plan.json", args.json):
         if path is not None:
             path.write_text(json.dumps(figures, indent=1) + "\n")
@@ -59,52 +114,6 @@ def _plan(args):
     if args.publish:
         print(f"publishing {', '.join(outgoing)} until Ctrl-C", flush=True)
         messages.publish(outgoing)
-    return 0
-
-
-def _check(args, installation, grid):
-    unique, agrees, points, arrows = brute_force(installation, grid, partial(_watched, desc="solving"))
-    plots.plot_flips(installation, points, unique, agrees, arrows, args.out / "flips.png")
-    print(f"check: {len(points)} places, agreement with the brute-force solver {np.mean(agrees):.2%}")
-    return {"places": len(points), "agreement": float(np.mean(agrees)), "unique_share": float(np.mean(unique))}
-
-
-def _flights(args, installation, room, recordings):
-    samples, rows = [], []
-    for name, flown in parallel.over(_fly, recordings, args.jobs, args.dask):
-        samples.append(flown)
-        rows.append({"flight": name, **accuracy.comparison(flown, installation)})
-    pooled = accuracy.together(samples)
-    rows.append({"flight": f"{len(samples)} pooled", **accuracy.comparison(pooled, installation)})
-    report.say_flights(rows)
-    found = accuracy.accuracy_map(pooled, installation, Grid.box(room.lower, room.upper, args.step or 0.4))
-    plots.plot_accuracy(installation, found, args.out / "accuracy.png")
-    return rows
-
-
-def _fly(recording):
-    """(name, Samples) of one (path, survey)."""
-    flight = read_flight(*recording)
-    return flight.name, accuracy.fly(flight)
-
-
-def _improve(args, before, aim):
-    goal, places, installation, candidates = aim.goal, aim.places, aim.goal.installation, None
-    anchors, search = installation.anchors, {"starts": args.starts, "progress": partial(_watched, desc="layouts")}
-    if args.improve == "add":
-        candidates = layout.one_more(goal, anchors, places)
-        start = candidates[0][[np.argmin(candidates[1])]]
-        better = layout.optimise(goal, places, 1, anchors, start, **search)
-    else:
-        start = anchors.positions if aim.count == len(anchors) else None
-        better = layout.optimise(goal, places, aim.count, None, start, **search)
-    better.to_yaml(args.out / "improved.yaml")
-    after = goal.installed(better)
-    charts = [("before, ", installation, before), ("after, ", after, chart(after, before.grid, args.flyable))]
-    plots.plot_layouts(charts, args.out / "layout.png", candidates)
-    found = {"points": len(aim.judge.points), "before": aim.judge.judge(anchors), "after": aim.judge.judge(better)}
-    report.say_improvement(found)
-    return found
 
 
 if __name__ == "__main__":

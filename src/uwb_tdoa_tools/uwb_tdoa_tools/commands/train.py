@@ -4,8 +4,7 @@ import json
 from pathlib import Path
 import sys
 
-
-from .. import cli
+from .. import cli, options
 from ..readers import inputs
 from ..training import labels as labelling, models
 from ..training.plots import plot_curve
@@ -13,7 +12,12 @@ from ..training.plots import plot_curve
 
 def main(argv=None):
     """The executable. Returns the exit code."""
-    parser = cli.parser(
+    return cli.run(_train, parser(), argv)
+
+
+def parser():
+    """Its options."""
+    made = cli.parser(
         "train",
         "Learn the systematic error of TDOAs from flights with ground truth. Writes to --out: model.onnx, for\n"
         "bias_node and evaluate --model (not for physics); effects.yaml, for both nodes and evaluate --effects (for\n"
@@ -29,14 +33,15 @@ def main(argv=None):
         "train flights/ util/ --survey surveys/ --model structured --out model/ --seed 1",
         "train a.bag b.bag c.bag --validation c --model paper --out model/",
     )
-    parser.add_argument("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
-    parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
-    parser.add_argument("--model", choices=models.KINDS, required=True, help="what to train")
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="where to write")
-    parser.add_argument("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
-    parser.add_argument("--name", help="of the model, goes into every corrected message (default: the kind)")
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
-    return cli.run(_train, parser, argv)
+    add = made.add_argument
+    add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
+    options.add_survey(made)
+    add("--model", choices=models.KINDS, required=True, help="what to train")
+    add("--out", metavar="DIR", type=Path, required=True, help="where to write")
+    add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
+    add("--name", help="of the model, goes into every corrected message (default: the kind)")
+    add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
+    return made
 
 
 def _train(args):
@@ -56,7 +61,6 @@ def _train(args):
     content = {**result.meta, "curve": curve, "validation": result.errors}
     (args.out / "training.json").write_text(json.dumps(content, indent=1) + "\n")
     print(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ class Follower:
 
     def __init__(self, node, topic):
         """Raises InputError if nobody publishes the topic, or its messages have no header."""
-        topic = f"/{topic.lstrip('/')}"
+        topic = node.resolve_topic_name(topic)
         types = dict(node.get_topic_names_and_types()).get(topic)
         if not types or not node.count_publishers(topic):
             raise InputError(f"--follow: nobody publishes {topic}; start the node that does first.")

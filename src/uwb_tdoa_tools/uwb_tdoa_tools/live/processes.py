@@ -12,10 +12,12 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from diagnostic_msgs.msg import DiagnosticArray
 from domain_coordinator import domain_id
 
+from uwb_tdoa_bias.foundation.errors import Failure
+
 STOP_LIMIT = 10.0  # s
 
 
-class LiveError(Exception):
+class LiveError(Failure):
     """A process of the run failed, or did not get where it should; the message says which and where its output is."""
 
 

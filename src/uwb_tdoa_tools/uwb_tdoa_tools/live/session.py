@@ -8,7 +8,6 @@ import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -53,14 +52,6 @@ def session(name, arguments):
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def own_arguments(name, arguments):
-    """The command line without what is for ROS (--ros-args ...)."""
-    try:
-        return remove_ros_args([name, *arguments])[1:]
-    except rclpy_implementation.UnknownROSArgsError:  # `session` will say it
-        return arguments[: arguments.index("--ros-args")]
 
 
 def message_class(msgtype):

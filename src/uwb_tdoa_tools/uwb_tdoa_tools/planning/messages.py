@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..bags.bag import _LATCHED_QOS
+from ..bags.bag import LATCHED_QOS
 from ..bags.files import new_bag
 from ..bags.messages import anchors_message
 from ..bags.message_types import typestore
@@ -42,7 +42,7 @@ def write(found, path):
     with new_bag(path, force=True) as writer:
         for topic, message in found.items():
             connection = writer.add_connection(
-                f"/{topic}", TOPICS[topic], typestore=store, offered_qos_profiles=[_LATCHED_QOS]
+                f"/{topic}", TOPICS[topic], typestore=store, offered_qos_profiles=[LATCHED_QOS]
             )
             writer.write(connection, 0, store.serialize_cdr(message, TOPICS[topic]))
 

@@ -1,13 +1,12 @@
 """How precisely one reception is timed: its variance over the places of tag and anchor."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
-import yaml
 
 from uwb_tdoa_bias.foundation.antenna import Antenna
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 from uwb_tdoa_bias.foundation.radio import SPEED_OF_LIGHT, RadioLink, received_power_dbm
 
 BOLTZMANN = 1.380649e-23  # J/K
@@ -120,13 +119,15 @@ def variance_gradient(noise, points, anchors, variance, dimensions):
 
 
 def antenna_from_yaml(path):
-    """Antenna of a YAML file with the fields of `uwb_tdoa_bias.foundation.antenna.Antenna`: azimuth, elevation_1, elevation_2 (dBi,
-    around the full circle), and optionally gain_offset. Raises InputError."""
+    """Antenna of a YAML file with the fields of `uwb_tdoa_bias.foundation.antenna.Antenna`: azimuth, elevation_1,
+    elevation_2 (dBi, around the full circle), and optionally gain_offset. Raises InputError."""
+    content = read_yaml(path)
     try:
-        content = yaml.safe_load(Path(path).read_text())
         cuts = {name: tuple(content.pop(name)) for name in ("azimuth", "elevation_1", "elevation_2")}
         return Antenna(**cuts, **content)
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError) as error:
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: is no antenna ({error!r}); give lists azimuth, elevation_1 and elevation_2 of gains in dBi."
         ) from error

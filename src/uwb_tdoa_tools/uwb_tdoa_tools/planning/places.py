@@ -1,11 +1,9 @@
 """Where anchors may be, and points that fill a volume."""
 
-from pathlib import Path
-
 import numpy as np
-import yaml
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 
 class Places:
@@ -48,11 +46,12 @@ class Places:
     @classmethod
     def from_yaml(cls, path):
         """Read `places: [[x0, y0, z0, x1, y1, z1], ...]`; raises InputError."""
+        content = read_yaml(path)
         try:
-            return cls(yaml.safe_load(Path(path).read_text())["places"])
-        except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
+            return cls(content["places"])
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"{path}: is no list of places ({error!r}); write 'places: [[x0, y0, z0, x1, y1, z1]]'."
             ) from error

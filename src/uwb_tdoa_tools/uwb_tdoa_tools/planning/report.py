@@ -46,6 +46,11 @@ def say_summary(about):
     print(f"of the hull, every pairing has one solution in {unique:.1%}; flyable is {flyable:.1%}")
 
 
+def say_check(found):
+    """Print what `run.check` found."""
+    print(f"check: {found['places']} places, agreement with the brute-force solver {found['agreement']:.2%}")
+
+
 def say_flights(rows):
     """Print the rows of accuracy.comparison, each with its "flight"."""
     print("3D, root mean square, m; efficiency: variance of the bound of one round over that of the estimate")

@@ -10,13 +10,14 @@ from . import read_flight
 
 HELP = "recordings: raw logs, UTIL CSV files, bags, or folders that hold them"
 SURVEY_HELP = (
-    "anchor survey (total station .txt, const .csv or anchors .yaml), or a folder of them: then anchor_KEY.* serves the "
-    "recordings whose path contains KEY; bags carry their own"
+    "anchor survey (total station .txt, const .csv or anchors .yaml), or a folder of them: then anchor_KEY.* serves "
+    "the recordings whose path contains KEY; bags carry their own"
 )
 
 
 def find_flights(paths, survey=None, absolute=False):
-    """Pairs (recording, survey or None), sorted within each folder. Raises InputError where nothing, or no one survey, fits.
+    """Pairs (recording, survey or None), sorted within each folder. Raises InputError where nothing, or no one survey,
+    fits.
 
     absolute : make them absolute paths, for processes that may have another working directory.
     """
@@ -65,7 +66,8 @@ def _recordings(path):
             yield from _recordings(inside)
 
 
-def read_flights(paths, survey):
-    """Flights of recordings, with a progress bar: list. Raises InputError."""
+def read_flights(paths, survey, namespace=""):
+    """Flights of recordings, with a progress bar: list. namespace : of the topics in bags. Raises InputError."""
     found = find_flights(paths, survey)
-    return [read_flight(*one) for one in tqdm(found, desc="reading", unit="flight", disable=None, leave=False)]
+    found = tqdm(found, desc="reading", unit="flight", disable=None, leave=False)
+    return [read_flight(*recording, namespace) for recording in found]

@@ -1,6 +1,8 @@
-"""Measured flights: a map fitted to some, judged on others, beside what `diagnose` reaches on the same flights."""
+"""debias-measured: a map fitted to some measured flights, judged on others, beside what `diagnose` reaches on them."""
 
 from functools import partial
+import json
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from ..diagnosis.measured import SPLITS
 from ...debiasing.judge import fly, judge
 from ...debiasing.parts import LEAST, part_of
 from ...debiasing.report import about_figures
+from .report import measured_tables
 
 STEP = 0.35  # m, chosen by leaving out one flight after the other among those to fit
 MAPS = {  # name: (interpolator, step in m, planar)
@@ -22,6 +25,23 @@ MAPS = {  # name: (interpolator, step in m, planar)
     "thin plate, planar": ("thin_plate", STEP, True),
     "network, planar": ("network", 0.5, True),
 }
+
+
+def add_options(add):
+    """The options of the study."""
+    add("--data", metavar="DIR", type=Path, required=True, help="the measured flights: flights/, util/, surveys/")
+    add("--diagnosed", metavar="DIR", type=Path, help="what `study diagnosis measured` wrote: its effects are compared")
+    add("--out", metavar="DIR", type=Path, required=True, help="where to write tables, figures and pictures")
+    add("--jobs", metavar="N", type=int, help="cases at once (default: as many as there are cores)")
+
+
+def run(args):
+    """Write measured.md and measured.json, and print the tables."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    figures = judged(args.data, args.diagnosed, args.jobs)
+    (args.out / "measured.md").write_text(measured_tables(figures))
+    (args.out / "measured.json").write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    print(measured_tables(figures))
 
 
 def cases():
@@ -40,15 +60,15 @@ def cases():
     return found
 
 
-def run(data, diagnosed=None, jobs=None):
+def judged(data, diagnosed=None, jobs=None):
     """[{"case", "fitted", "maps", "runs": [{"flight", name of the estimate: {"rmse": m, "rmse_xy": m, "nees": mean}}]}]
     of all cases.
 
-    data : folder of the flights; diagnosed : folder that `diagnose_bench measured` wrote, or None.
+    data : folder of the flights; diagnosed : folder that `study diagnosis measured` wrote, or None.
     """
     if diagnosed is not None and not any(_effects_file(diagnosed, name).is_file() for name in SPLITS):
         raise InputError(
-            f"--diagnosed: {diagnosed} holds no */effects.yaml; run `diagnose_bench measured --out {diagnosed}`."
+            f"--diagnosed: {diagnosed} holds no */effects.yaml; run `study diagnosis measured --out {diagnosed}`."
         )
     tasks = [(name, *case) for name, case in cases().items()]
     return list(parallel.over(partial(_case, data=data, diagnosed=diagnosed), tasks, jobs, unit="case"))

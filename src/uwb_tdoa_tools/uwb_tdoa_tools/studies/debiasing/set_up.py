@@ -1,9 +1,11 @@
-"""A simulated copy of the set-up of Grasso et al. (Sensors 2022, 22, 9136), sections 4 and 5: 4 x 4 m, four anchors at
-the height of the tag, 0.2 m, a calibration grid of 50 cm, a validation grid of 25 cm beside it, rails, and a square
-path."""
+"""debias-set-up: a simulated copy of the set-up of Grasso et al. (Sensors 2022, 22, 9136), sections 4 and 5. 4 x 4 m,
+four anchors at the height of the tag, 0.2 m, a calibration grid of 50 cm, a validation grid of 25 cm beside it, rails,
+and a square path."""
 
 from dataclasses import dataclass, replace
 from functools import partial
+import json
+from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from ... import parallel
 from ...scoring.metrics import position_at
 from ...simulation import SimulationConfig, simulate
+from .report import plot_set_up, set_up_tables
 
 STEP = 0.5  # m, of the calibration grid
 HEIGHT = 0.2  # m
@@ -45,6 +48,23 @@ class Measured:
     @property
     def part(self):
         return Part(self.p, self.true, self.covariance)
+
+
+def add_options(add):
+    """The options of the study."""
+    add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
+    add("--out", metavar="DIR", type=Path, required=True, help="where to write tables, figures and pictures")
+    add("--jobs", metavar="N", type=int, help="runs at once (default: as many as there are cores)")
+
+
+def run(args):
+    """Write set_up.md, set_up.json and set_up.png, and print the tables."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    figures, found, maps = copied(args.seed, args.jobs)
+    (args.out / "set_up.md").write_text(set_up_tables(figures))
+    (args.out / "set_up.json").write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    plot_set_up(found, maps, args.out / "set_up.png")
+    print(set_up_tables(figures))
 
 
 def grid(first, last, step):
@@ -99,7 +119,7 @@ def _rail(direction, at, speed, passes):
     return {"trajectory": f"line_{direction}", "place": place, "radius": HALF, "speed": speed, "duration": duration}
 
 
-def run(seed=0, jobs=None):
+def copied(seed=0, jobs=None):
     """All of it: (figures for JSON, {"calibration": [Measured], "validation": [Measured]}, {name: BiasMap})."""
     calibration, validation = grid(-2.0, 2.0, STEP), grid(-1.75, 1.75, STEP)
     lines = np.arange(-1.5, 1.6, STEP)

@@ -1,18 +1,12 @@
-"""Makes models/default.onnx of uwb_tdoa_bias, the model that bias_node corrects with if it is given no other.
+"""default-model: models/default.onnx of uwb_tdoa_bias, the model that bias_node corrects with if it is given no other.
 
 The structured model, trained on simulated flights: antennas and received power of DW1000 modules, nothing of any hall.
 How much of its prediction measured flights bear out, and how much remains that it does not know, is then taken from
-those: its mean is scaled by the one, its standard deviation is the other. Re-make it:
+those: its mean is scaled by the one, its standard deviation is the other. Prints what the model does on each day's
+flights when that day took no part."""
 
-    python -m uwb_tdoa_tools.studies.training.default DATA/flights --survey DATA/surveys --out default.onnx
-
-It prints what the model does on each day's flights when that day took no part.
-"""
-
-import argparse
 import copy
 from pathlib import Path
-import sys
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -31,13 +25,15 @@ OPTIONS = structured.Options(centres=10, link_centres=100)
 PLACES = simulated.TRAINING + simulated.UNSEEN
 
 
-def main(argv=None):
+def add_options(add):
+    """The options of the study."""
+    add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
+    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    add("--out", metavar="FILE", type=Path, required=True, help="where to write the model")
+
+
+def run(args):
     """Make, judge and write the model."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("flights", nargs="+", help=inputs.HELP)
-    parser.add_argument("--survey", help=inputs.SURVEY_HELP)
-    parser.add_argument("--out", type=Path, required=True, help="where to write the model")
-    args = parser.parse_args(argv)
     days = {}
     for path, survey in inputs.find_flights(args.flights, args.survey):
         days.setdefault(Path(survey).stem, []).append(read_flight(path, survey))
@@ -53,7 +49,6 @@ def main(argv=None):
     final = scaled(model, [one for some in known.values() for one in some])
     network = write(final, meta, args.out)
     print(f"wrote {args.out}: {network.name}, {args.out.stat().st_size / 1e3:.0f} kB, floor {final.floor:.3f} m")
-    return 0
 
 
 def learn(count, options=OPTIONS):
@@ -88,7 +83,3 @@ def write(model, meta, path):
     """Write the model; returns it as a Network."""
     path.write_bytes(model.onnx(meta).SerializeToString(deterministic=True))
     return Network(path)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

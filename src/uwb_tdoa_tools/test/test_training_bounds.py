@@ -3,7 +3,7 @@ from training_flights import flight
 
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.training.labels import labels
-from uwb_tdoa_tools.studies.training.study import oracle, repeatability, rmse
+from uwb_tdoa_tools.studies.training.bounds import oracle, repeatability, rmse
 
 PLAIN = {"bias": False, "outlier_probability": 0.0, "trajectory": "circle"}
 

@@ -1,4 +1,4 @@
-"""Several models beside each other, and what any of them could reach at most."""
+"""What any model of the pose could reach at most, and how much of the errors comes again at the same place."""
 
 from types import SimpleNamespace
 

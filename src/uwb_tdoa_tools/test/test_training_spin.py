@@ -1,10 +1,11 @@
 import numpy as np
 
-from uwb_tdoa_tools.commands import spin
+from uwb_tdoa_tools.commands import study
+from uwb_tdoa_tools.studies.training import spin
 
 
 def test_orientation_matters_and_the_specimen_hardly(tmp_path, capsys):
-    assert spin.main(["--out", str(tmp_path / "spin.png")]) == 0
+    assert study.main(["spin", "--out", str(tmp_path / "spin.png")]) == 0
     assert (tmp_path / "spin.png").stat().st_size > 10_000
     lines = capsys.readouterr().out.splitlines()[:2]
     turned, specimens = (float(line.split("between them")[1].split()[0]) for line in lines)

@@ -1,7 +1,7 @@
-"""spin: the error of one pair of anchors while a tag spins between them, simulated."""
+"""spin: simulate a tag that spins between two anchors, and draw the error of their TDOA over its yaw, for several
+orientations of anchor 0 and for five specimens of the tag. Counterpart of figure 4 of Zhao et al. (2021)."""
 
 from pathlib import Path
-import sys
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,9 +10,8 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
-from .. import cli
-from ..scoring.plots import plt
-from ..simulation import SimulationConfig, simulate
+from ...scoring.plots import plt
+from ...simulation import SimulationConfig, simulate
 
 POSITIONS = ((0.0, 0.0, 1.2), (5.0, 0.0, 1.2))  # m, of the anchors 0 and 1
 PLACE, HEIGHT = (2.2, 1.5), 1.3  # m, of the tag
@@ -21,20 +20,14 @@ TAGS = range(5)
 BIN = 10.0  # degrees
 
 
-def main(argv=None):
-    """The executable. Returns the exit code."""
-    parser = cli.parser(
-        "spin",
-        "Simulate a tag that spins between two anchors, and draw the error of their TDOA over its yaw: for several\n"
-        "orientations of anchor 0, and for five specimens of the tag. Counterpart of figure 4 of Zhao et al. (2021).",
-        "spin --out spin.png",
-    )
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="picture to write")
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the noise (default: 0)")
-    return cli.run(_spin, parser, argv)
+def add_options(add):
+    """The options of the study."""
+    add("--out", metavar="FILE", type=Path, required=True, help="picture to write")
+    add("--seed", metavar="N", type=int, default=0, help="of the noise (default: 0)")
 
 
-def _spin(args):
+def run(args):
+    """Draw the picture, and print how far the curves are apart."""
     anchors = {f"anchor 0 turned by {turn:g} deg": (turn, 0) for turn in TURNS}
     tags = {f"tag {unit}": (TURNS[0], unit) for unit in TAGS}
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.8), sharey=True, layout="constrained")
@@ -53,7 +46,6 @@ def _spin(args):
     figure.savefig(args.out, dpi=110)
     plt.close(figure)
     print(f"wrote {args.out}")
-    return 0
 
 
 def over_yaw(turn, unit, seed=0):
@@ -75,7 +67,3 @@ def over_yaw(turn, unit, seed=0):
     which = (yaw / BIN).astype(int)
     bins = np.arange(round(360.0 / BIN))
     return (bins + 0.5) * BIN, np.array([np.median(error[which == k]) for k in bins])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,45 +1,35 @@
-"""diagnose_bench: make the figures of docs/diagnosis.md anew."""
+"""diagnosis: the figures of docs/diagnosis.md. Every part prints its figures and writes them, with all cases, to
+PART.json in the output folder; the bank also draws its confusion matrix."""
 
 import importlib.util
 import json
 from pathlib import Path
-import sys
 import time
 
 import numpy as np
 from tqdm import tqdm
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli
-from ..diagnosis import diagnose
-from ..diagnosis.attribution import attribute
-from ..diagnosis.references import GroundTruth
-from ..studies.diagnosis import bank, measured, undeclared
+from ...diagnosis import diagnose
+from ...diagnosis.attribution import attribute
+from ...diagnosis.references import GroundTruth
+from ...scoring.plots import plt
+from . import bank, measured, undeclared
 
 PARTS = ("bank", "no-truth", "undeclared", "injected", "measured", "speed")
 
 
-def main(argv=None):
-    """The executable."""
-    parser = cli.parser(
-        "diagnose_bench",
-        "Make the figures of docs/diagnosis.md anew. Every part prints its figures and writes them, with all\n"
-        "cases, to PART.json in the output folder; the bank also draws its confusion matrix.",
-        "diagnose_bench bank --out bench/",
-        "diagnose_bench undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
-        "diagnose_bench measured --data DATA --out bench/",
-    )
-    parser.add_argument("part", choices=PARTS, help="what to run")
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="where to write")
-    parser.add_argument(
-        "--seeds", metavar="N", type=int, default=5, help="flights for each effect and size (default: 5)"
-    )
-    parser.add_argument("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
-    parser.add_argument("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
-    return cli.run(_bench, parser, argv)
+def add_options(add):
+    """The options of the study."""
+    add("part", choices=PARTS, help="what to run")
+    add("--out", metavar="DIR", type=Path, required=True, help="where to write")
+    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size (default: 5)")
+    add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
+    add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
 
 
-def _bench(args):
+def run(args):
+    """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
     for option in {"undeclared": ("cases",), "injected": ("data",), "measured": ("data",)}.get(args.part, ()):
         if getattr(args, option) is None:
@@ -125,8 +115,6 @@ def _speed(args):
 
 def _confusion(results, path):
     """Rows: what was put in; columns: the first thing found; small and large together."""
-    from ..scoring.plots import plt
-
     names = list(bank.SIZES)
     columns = [*names, "something without a name", "nothing"]
     count = np.zeros((len(names) + 1, len(columns)))
@@ -153,7 +141,3 @@ def _confusion(results, path):
     ax.set_yticklabels([*names, "nothing"])
     figure.savefig(path, dpi=80)
     plt.close(figure)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

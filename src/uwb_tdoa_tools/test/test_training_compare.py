@@ -3,7 +3,7 @@ import json
 import pytest
 
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_tools.commands import compare_models
+from uwb_tdoa_tools.commands import study
 from uwb_tdoa_tools.training import simulated, structured
 
 
@@ -17,8 +17,8 @@ def small(monkeypatch):
 
 @pytest.mark.slow
 def test_compares_on_constellations_never_seen(tmp_path, capsys):
-    arguments = ["--simulated", "2", "--models", "structured", "physics", "--bound", "--out", str(tmp_path)]
-    assert compare_models.main(arguments) == 0
+    arguments = ["compare-models", "--simulated", "2", "--models", "structured", "physics", "--bound", "--out", str(tmp_path)]
+    assert study.main(arguments) == 0
     report = json.loads((tmp_path / "comparison.json").read_text())
     assert [row["flight"] for row in report["runs"]] == ["low_ceiling-0", "low_ceiling-1"]
     means = report["groups"]["low_ceiling"]
@@ -42,5 +42,5 @@ def test_compares_on_constellations_never_seen(tmp_path, capsys):
     ],
 )
 def test_says_what_is_missing(tmp_path, capsys, arguments, message):
-    assert compare_models.main([*arguments, "--out", str(tmp_path)]) == 2
+    assert study.main(["compare-models", *arguments, "--out", str(tmp_path)]) == 2
     assert message in capsys.readouterr().err

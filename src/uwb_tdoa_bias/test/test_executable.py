@@ -1,0 +1,98 @@
+"""How executables start, and how they end when they are interrupted before they have begun."""
+
+import subprocess
+import sys
+import time
+from signal import SIGINT
+
+import pytest
+
+from uwb_tdoa_bias.foundation.executable import executable
+
+SLOW = """
+import time
+print("importing", flush=True)
+try:
+    time.sleep(60)
+except BaseException:  # as some libraries do
+    time.sleep(60)
+"""
+START = "import sys; from uwb_tdoa_bias.foundation.executable import executable; sys.exit(executable('{}')())"
+
+
+@pytest.fixture
+def write(tmp_path, monkeypatch):
+    """write(name, text): a module that can be imported here and by other processes."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", ":".join([str(tmp_path), *sys.path]))
+    return lambda name, text: (tmp_path / f"{name}.py").write_text(text)
+
+
+def start(module):
+    code = START.format(module)
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_what_main_returns_is_returned(write):
+    write("weigh", "def main(*arguments): return 3 + len(arguments)")
+    assert executable("weigh")() == 3 and executable("weigh")(["heavy"]) == 4
+
+
+def test_nothing_is_imported_before_it_is_called():
+    executable("no_such_module")
+
+
+def test_an_interrupt_while_it_imports_is_quiet_whatever_is_imported(write):
+    write("swallows", SLOW)
+    process = start("swallows")
+    assert process.stdout.readline() == "importing\n"
+    before = time.monotonic()
+    process.send_signal(SIGINT)
+    assert process.communicate(timeout=30) == ("", "") and process.returncode == 130
+    assert time.monotonic() - before < 20.0
+
+
+def test_an_interrupt_afterwards_is_the_affair_of_main(write):
+    write("careful", "import time\ndef main():\n    try:\n        print('in', flush=True)\n        time.sleep(60)\n"
+                     "    except KeyboardInterrupt:\n        return 7\n")  # fmt: skip
+    process = start("careful")
+    assert process.stdout.readline() == "in\n"
+    process.send_signal(SIGINT)
+    assert process.communicate(timeout=30) == ("", "") and process.returncode == 7
+
+
+def test_an_interrupt_that_c_code_loses_comes_again(write):
+    write(
+        "lossy",
+        "import ctypes, time\n"
+        "def work():\n"
+        "    print('in', flush=True)\n"
+        "    time.sleep(60)\n"
+        "def main():\n"
+        "    try:\n"
+        "        ctypes.CFUNCTYPE(None)(work)()\n"
+        "        time.sleep(60)\n"
+        "    except KeyboardInterrupt:\n"
+        "        return 7\n",
+    )
+    process = start("lossy")
+    assert process.stdout.readline() == "in\n"
+    process.send_signal(SIGINT)
+    assert process.communicate(timeout=30) == ("", "") and process.returncode == 7
+
+
+@pytest.mark.parametrize(
+    ("missing", "remedy"),
+    [("rclpy_is_gone_msgs", "source ROS 2 Jazzy and the built workspace"), ("nowhere", "install it with pip")],
+)
+def test_what_is_not_installed_is_told_in_one_sentence(write, capsys, missing, remedy):
+    write("needy", f"import {missing}.part")
+    assert executable("needy")() == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"needy: error: the Python package {missing} is missing; {remedy}")
+    assert error.count("\n") == 1
+
+
+def test_a_part_of_ours_that_is_missing_is_a_defect():
+    with pytest.raises(ModuleNotFoundError):
+        executable("uwb_tdoa_bias.nowhere")()

@@ -1,0 +1,71 @@
+"""How every executable starts: Ctrl-C ends it quietly, whenever it comes.
+
+    evaluate = executable("uwb_tdoa_tools.commands.evaluate")        # an entry point; the module has a main()
+
+Nothing but the standard library is imported here.
+"""
+
+from functools import partial
+from importlib import import_module
+import os
+import signal
+import sys
+
+INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
+SOON = 0.05  # s, until an interrupt that was lost comes again
+
+
+def executable(module):
+    """The entry point of a module with a main(): imports the module when it is called, and returns what main returns."""
+    return partial(_run, module)
+
+
+def interrupt(number, frame):
+    """Signal handler: raises KeyboardInterrupt, for good.
+
+    What C code calls back cannot raise, and a destructor cannot either: Python tells such an exception on stderr and
+    goes on (the compiler of numba has both). From now on nothing of that kind is told, objects that are half made
+    included, and where it was the KeyboardInterrupt that was lost, SIGINT comes again in a moment.
+    """
+
+    def on_lost(lost):
+        if lost.exc_type is KeyboardInterrupt:
+            signal.setitimer(signal.ITIMER_REAL, SOON)
+
+    sys.unraisablehook = on_lost
+    signal.signal(signal.SIGALRM, lambda number, frame: signal.raise_signal(signal.SIGINT))
+    raise KeyboardInterrupt
+
+
+def _run(module, *arguments):
+    name = module.rpartition(".")[2]
+    try:
+        main = _imported(module).main
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, interrupt)
+        return main(*arguments)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package.startswith("uwb_tdoa_") and package != "uwb_tdoa_msgs":
+            raise  # ours is not whole: a defect, which needs its traceback
+        print(f"{name}: error: the Python package {package} is missing; {_remedy(package)}.", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def _imported(module):
+    """Import a module. Meanwhile SIGINT ends the process at once: some of what is imported answers a KeyboardInterrupt
+    with a traceback or not at all, and there is nothing yet to clean up."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:  # as in a job that a shell script put in the background
+        signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
+    try:
+        return import_module(module)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _remedy(package):
+    ros = package.endswith("_msgs") or package in ("rclpy", "builtin_interfaces", "ament_index_python", "domain_coordinator")
+    return "source ROS 2 Jazzy and the built workspace, or use ./dev run" if ros else "install it with pip"

@@ -1,0 +1,119 @@
+"""YAML as our files need it, and nothing more: what could be misread is refused with the line.
+
+Mappings, lists, texts, finite numbers, true, false and null (YAML 1.2's core schema, with yes, no, on and off as ROS has
+them). No tags, no aliases (ROS refuses them too), no key twice, no second document, no number that is not finite.
+"""
+
+import math
+from pathlib import Path
+import re
+
+import yaml
+
+from .errors import InputError
+
+MOST_BYTES = 1_000_000  # ours have some kB
+MOST_NODES, DEEPEST = 100_000, 20
+
+
+def read_yaml(path):
+    """What a YAML file holds: dict, list, str, int, float, bool or None. Raises InputError that names file and line."""
+    try:
+        with open(path, "rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read as YAML ({error.strerror}); give the path of a YAML file.") from error
+    if len(data) > MOST_BYTES:
+        size = Path(path).stat().st_size
+        raise InputError(f"{path}: has {size} bytes, at most {MOST_BYTES} are read as YAML; is it the right file?")
+    return parse_yaml(data, path)
+
+
+def parse_yaml(data, name):
+    """The same of bytes or text; name : in messages."""
+    try:
+        text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
+    except UnicodeDecodeError as error:
+        raise InputError(f"{name}: byte {error.start} is not UTF-8; save the file as UTF-8 text.") from error
+    try:
+        loader = _Loader(text)
+        try:
+            return loader.get_single_data()
+        finally:
+            loader.dispose()
+    except _Refused as error:
+        raise InputError(f"{name}: line {error.line}: {error}") from error
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        said = " ".join(part for part in (error.context, error.problem) if part)
+        raise InputError(f"{name}: line {mark.line + 1}: is no YAML ({said}); correct it there.") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{name}: is no YAML ({' '.join(str(error).split())}); give a YAML file.") from error
+
+
+class _Refused(Exception):
+    def __init__(self, mark, sentence):
+        super().__init__(sentence)
+        self.line = mark.line + 1
+
+
+class _Loader(yaml.SafeLoader):
+    yaml_implicit_resolvers = {}  # those of YAML 1.1 take 1:30 for 90, and 1e-3 for a text
+
+    def __init__(self, text):
+        super().__init__(text)
+        self._nodes = self._depth = 0
+
+    def compose_node(self, parent, index):
+        event = self.peek_event()
+        self._nodes += 1
+        self._depth += 1
+        if isinstance(event, yaml.AliasEvent):
+            raise _Refused(event.start_mark, f"*{event.anchor} is an alias; write the value itself.")
+        if event.tag is not None:
+            raise _Refused(event.start_mark, f"{event.tag} is a tag; leave it out.")
+        if self._depth > DEEPEST or self._nodes > MOST_NODES:
+            limit = f"deeper than {DEEPEST} levels" if self._depth > DEEPEST else f"more than {MOST_NODES} entries"
+            raise _Refused(event.start_mark, f"it has {limit}; is it the right file?")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def construct_mapping(self, node, deep=False):
+        content = {}
+        for key_node, value_node in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise _Refused(key_node.start_mark, "a list or mapping is used as a key; use a text or a number.")
+            key = self.construct_object(key_node)
+            if key in content:
+                raise _Refused(key_node.start_mark, f"{key_node.value!r} is there twice; keep one.")
+            content[key] = self.construct_object(value_node, deep)
+        return content
+
+    def construct_yaml_int(self, node):
+        text = node.value.lstrip("+-0")
+        if len(text) > 19 or abs(int(node.value)) >= 2**63:
+            raise _Refused(node.start_mark, f"{node.value[:40]} does not fit into 64 bits; give a smaller number.")
+        return int(node.value)
+
+    def construct_yaml_float(self, node):
+        value = float(re.sub(r"\.(nan|inf)$", r"\1", node.value.lower()))
+        if not math.isfinite(value):
+            raise _Refused(node.start_mark, f"{node.value} is not finite; give a number.")
+        return value
+
+
+_TAG = "tag:yaml.org,2002:"
+_IMPLICIT = {
+    "bool": (r"yes|Yes|YES|no|No|NO|true|True|TRUE|false|False|FALSE|on|On|ON|off|Off|OFF", "yYnNtTfFoO"),
+    "int": (r"[-+]?(0|[1-9][0-9]*)", "-+0123456789"),  # 010 is a text, or it would be 8 to some and 10 to others
+    "float": (
+        r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
+    "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+}
+for _name, (_pattern, _first) in _IMPLICIT.items():
+    _Loader.add_implicit_resolver(_TAG + _name, re.compile(f"^(?:{_pattern})$"), list(_first))
+_Loader.add_constructor(_TAG + "int", _Loader.construct_yaml_int)
+_Loader.add_constructor(_TAG + "float", _Loader.construct_yaml_float)

@@ -1,0 +1,189 @@
+"""Every executable: its help, its examples, the commands that the documentation shows, and Ctrl-C while it starts."""
+
+import argparse
+from importlib import import_module
+import os
+from pathlib import Path
+import re
+import shlex
+import signal
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from documented import PAGES, ROOT, commands  # noqa: E402
+from uwb_tdoa_tools import cli  # noqa: E402
+from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
+from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
+
+NODES = {
+    "bias_node": "uwb_tdoa_bias.bias_node",
+    "debias_node": "uwb_tdoa_ekf.debias_node",
+    "ekf_node": "uwb_tdoa_ekf.ekf_node",
+}
+COMMANDS = {
+    path.stem: f"uwb_tdoa_tools.commands.{path.stem}"
+    for path in sorted((ROOT / "src/uwb_tdoa_tools/uwb_tdoa_tools/commands").glob("[a-z]*.py"))
+}
+EVERY = NODES | COMMANDS
+
+
+def parser_of(name):
+    return import_module(COMMANDS[name]).parser()
+
+
+def subcommands(parser):
+    """{name: parser} of a parser's own commands."""
+    found = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    return found[0].choices if found else {}
+
+
+def parses(name, words):
+    """Whether the words are a command line of an executable, to its own parser; prints what is wrong."""
+    try:
+        parser_of(name).parse_args(cli.without_ros_arguments(words))
+    except SystemExit as stop:
+        return stop.code in (0, None)  # --help, --version
+    return True
+
+
+# --- help ---
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_help(name, capsys):
+    assert import_module(EVERY[name]).main(["--help"]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith(f"usage: {name} ") and "Traceback" not in told
+    assert name in NODES or "examples:\n" in told
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_its_own_commands(name, capsys):
+    for part in subcommands(parser_of(name)):
+        assert import_module(COMMANDS[name]).main([part, "--help"]) == 0
+        assert capsys.readouterr().out.startswith(f"usage: {name} {part} ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EVERY)
+def test_help_as_a_process(name):
+    done = subprocess.run([sys.executable, "-m", EVERY[name], "--help"], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith(f"usage: {name} ")
+
+
+# --- examples and documentation ---
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_example_is_a_command_line(name):
+    examples = parser_of(name).epilog.splitlines()[1:]
+    assert examples
+    for example in examples:
+        words = shlex.split(example)
+        assert parses(name, words[words.index(name) + 1 :]), example
+
+
+def parameters(name):
+    """Names of a node's parameters, which its parameter file lists (see the tests of the nodes)."""
+    package = NODES[name].partition(".")[0]
+    (content,) = yaml.safe_load((ROOT / "src" / package / "config" / f"{name}.yaml").read_text()).values()
+    return set(content["ros__parameters"])
+
+
+@pytest.fixture(scope="module")
+def documented(tmp_path_factory):
+    """[(page, executable, its words)] of all commands in the documentation, ours alone."""
+    found = []
+    for page in PAGES:
+        for where, (first, *words) in commands(page, EVERY, tmp_path_factory.mktemp(page.stem)):
+            if first in ("./dev", "ros2"):
+                verb, *words = words
+                if (first, verb) == ("./dev", "demo"):
+                    found.append((where, "demo", words))
+                elif verb == "run":
+                    assert words[0] == EVERY[words[1]].partition(".")[0], (where, words)
+                    found.append((where, words[1], words[2:]))
+                else:
+                    assert verb in ("test", "build", "shell", "help", "launch", "bag"), (where, verb)
+            else:
+                found.append((where, first, words))
+    return found
+
+
+def test_the_documentation_shows_every_executable(documented):
+    assert {name for _, name, _ in documented} == set(EVERY)
+    assert {name for where, name, _ in documented if where == "README.md"} >= set(EVERY)
+    assert len(documented) > 60
+
+
+def test_every_documented_command_is_a_command_line(documented):
+    for where, name, words in documented:
+        if name in NODES:
+            given = re.findall(r"-p (\w+):=", " ".join(words))
+            assert words[:1] == ["--ros-args"] and given and set(given) <= parameters(name), (where, name, words)
+        elif words:  # without any, it is the name of the executable in a sentence
+            assert parses(name, words), (where, name, words)
+
+
+CHEAP = ("convert", "debias", "evaluate", "inject", "plan", "simulate")
+
+
+@pytest.fixture
+def hall(tmp_path, monkeypatch):
+    """A working directory with the recordings that the documentation speaks of, simulated."""
+    monkeypatch.chdir(tmp_path)
+    corners().to_yaml("anchors.yaml")
+    for seed, name in enumerate(("flight", "other")):
+        config = SimulationConfig(seed=seed, duration=18.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True)
+        write_bag(simulate(config), f"{name}.bag")
+    Path("FLIGHT.log").symlink_to("flight.bag")
+    Path("SURVEY.txt").symlink_to("anchors.yaml")
+    return tmp_path
+
+
+def test_the_cheap_ones_of_the_first_page_run(documented, hall, capsys):
+    ran = []
+    for where, name, words in documented:
+        if where == "README.md" and name in CHEAP and not any(word.startswith("flight3") for word in words):
+            written = Path(words[words.index("--out") + 1]) if "--out" in words else None
+            if written is not None and written.exists():
+                words = [*words, "--force"]
+            assert import_module(COMMANDS[name]).main(words) == 0, (name, words, capsys.readouterr().err)
+            ran.append(name)
+    assert set(ran) == set(CHEAP)
+    for name in ("simulate", "inject"):
+        assert import_module(COMMANDS[name]).main(["--list"]) == 0
+
+
+# --- interrupts ---
+
+
+def installed(name):
+    package = EVERY[name].partition(".")[0]
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        file = Path(prefix) / "lib" / package / name
+        if prefix and file.is_file():
+            return file
+    pytest.skip("the workspace is not built and sourced")
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_an_interrupt_while_it_imports_is_quiet(name):
+    """Python tells on stderr what it has imported; the interrupt comes in the middle of it."""
+    process = subprocess.Popen(
+        [sys.executable, "-X", "importtime", installed(name)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    for line in process.stderr:
+        if re.search(r"\| +(numpy\.version|yaml\.error|rclpy\.\w+)$", line.rstrip()):
+            break
+    process.send_signal(signal.SIGINT)
+    out, said = process.communicate(timeout=60)
+    assert process.returncode == 130 and out == ""
+    assert [line for line in said.splitlines() if not line.startswith("import time:")] == []

@@ -1,0 +1,222 @@
+"""The layout of the packages, read from their sources: who imports whom, and what is declared as a dependency."""
+
+import ast
+from functools import lru_cache
+from pathlib import Path
+import re
+import sys
+from xml.etree import ElementTree
+
+import pytest
+
+SRC = Path(__file__).resolve().parents[2]
+ORDER = ("uwb_tdoa_msgs", "uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")  # imports go to the left
+PACKAGES = ORDER[1:]
+# Who talks ROS. Everything else can be imported and tested without it.
+ROS = """
+    uwb_tdoa_bias.bias_node uwb_tdoa_bias.foundation.ros
+    uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.monitoring.health
+    uwb_tdoa_tools.benchmark.nodes uwb_tdoa_tools.benchmark.rates uwb_tdoa_tools.benchmark.source
+    uwb_tdoa_tools.benchmark.suite uwb_tdoa_tools.commands.bench uwb_tdoa_tools.commands.demo
+    uwb_tdoa_tools.commands.record uwb_tdoa_tools.commands.replay uwb_tdoa_tools.live.demo uwb_tdoa_tools.live.follow
+    uwb_tdoa_tools.live.player uwb_tdoa_tools.live.processes uwb_tdoa_tools.live.record uwb_tdoa_tools.live.replay
+    uwb_tdoa_tools.live.run uwb_tdoa_tools.live.session
+""".split()
+IS_ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces|domain_coordinator|ament_index_python")
+# import name: (rosdep key, name on the Python package index); ROS packages are imported under their own name
+KEYS = {
+    "PIL": ("python3-pil", "Pillow"),
+    "dask": (None, "distributed"),
+    "distributed": (None, "distributed"),
+    "hypothesis": ("python3-hypothesis", "hypothesis"),
+    "joblib": ("python3-joblib", "joblib"),
+    "matplotlib": ("python3-matplotlib", "matplotlib"),
+    "numba": ("python3-numba", "numba"),
+    "numpy": ("python3-numpy", "numpy"),
+    "onnx": (None, "onnx"),  # has no rosdep key: README
+    "onnxruntime": ("python3-onnxruntime-pip", "onnxruntime"),
+    "pytest": ("python3-pytest", "pytest"),
+    "rosbags": ("python3-rosbags-pip", "rosbags"),
+    "scipy": ("python3-scipy", "scipy"),
+    "sklearn": ("python3-sklearn", "scikit-learn"),
+    "tqdm": ("python3-tqdm", "tqdm"),
+    "yaml": ("python3-yaml", "PyYAML"),
+}
+RUNNERS = {"python3-pytest-xdist"}  # of the tests, which import it not
+
+
+@lru_cache(maxsize=None)
+def modules():
+    """{module: path} of all our packages."""
+    found = {}
+    for package in PACKAGES:
+        for path in (SRC / package / package).rglob("*.py"):
+            parts = path.relative_to(SRC / package).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+@lru_cache(maxsize=None)
+def imports(module, top_only=False):
+    """Full names of what a module imports: modules of ours, and top-level names of others."""
+    path = modules()[module]
+    tree = ast.parse(path.read_text())
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    found = set()
+    for node in tree.body if top_only else ast.walk(tree):
+        if isinstance(node, ast.Try) and top_only:  # optional parts are imported under try
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package.split(".")[: len(package.split(".")) + 1 - node.level]) if node.level else ""
+            base = ".".join(part for part in (base, node.module) if part)
+            for alias in node.names:
+                inner = f"{base}.{alias.name}"
+                found.add(inner if inner in modules() else base)
+    return frozenset(found)
+
+
+def ours(module, top_only=False):
+    return {name for name in imports(module, top_only) if name in modules()}
+
+
+def test_the_walk_sees_what_there_is():
+    assert "uwb_tdoa_bias.foundation.errors" in imports("uwb_tdoa_tools.cli")
+    assert "uwb_tdoa_tools.readers.inputs" in imports("uwb_tdoa_tools.commands.train")
+    assert "rclpy" in imports("uwb_tdoa_tools.planning.messages")
+    assert "rclpy" not in imports("uwb_tdoa_tools.planning.messages", True)
+    assert len(modules()) > 120
+
+
+def test_no_library_imports_a_command():
+    for module in modules():
+        if not module.startswith("uwb_tdoa_tools.commands."):
+            assert not {name for name in imports(module) if name.startswith("uwb_tdoa_tools.commands")}, module
+
+
+def test_no_command_imports_another():
+    for module in modules():
+        if module.startswith("uwb_tdoa_tools.commands."):
+            assert not {name for name in imports(module) if name.startswith("uwb_tdoa_tools.commands")}, module
+
+
+def test_no_package_imports_one_above():
+    for module in modules():
+        for name in imports(module):
+            package = name.partition(".")[0]
+            if package in ORDER:
+                assert ORDER.index(package) <= ORDER.index(module.partition(".")[0]), f"{module} imports {name}"
+
+
+def test_the_foundation_stands_alone():
+    for module in modules():
+        if module.startswith("uwb_tdoa_bias.foundation"):
+            for name in ours(module):
+                assert name.startswith("uwb_tdoa_bias.foundation"), f"{module} imports {name}"
+
+
+def test_studies_are_used_by_their_command_alone():
+    for module in modules():
+        if not module.startswith(("uwb_tdoa_tools.studies", "uwb_tdoa_tools.commands.study")):
+            assert not {name for name in imports(module) if name.startswith("uwb_tdoa_tools.studies")}, module
+
+
+def way_to_ros(module):
+    """The modules through which importing a module imports ROS: text; "" if it does not."""
+    seen, waiting = set(), [(module,)]
+    while waiting:
+        way = waiting.pop()
+        for name in imports(way[-1], True):
+            if IS_ROS.fullmatch(name.partition(".")[0]):
+                return " imports ".join((*way, name))
+            parents = {name.rsplit(".", k)[0] for k in range(name.count(".") + 1)}  # importing it runs their __init__
+            for other in (parents & modules().keys()) - seen:
+                seen.add(other)
+                waiting.append((*way, other))
+    return ""
+
+
+@pytest.mark.parametrize("module", modules())
+def test_ros_is_imported_by_those_who_talk_it_and_nobody_else(module):
+    assert bool(way_to_ros(module)) == (module in ROS), way_to_ros(module) or "needs no ROS"
+
+
+def names_of_messages(package):
+    """Packages of the message types that are named as text, and become classes when a program runs."""
+    texts = "".join(path.read_text() for path in modules().values() if path.is_relative_to(SRC / package))
+    return set(re.findall(r'"(\w+)/msg/\w+"', texts)) - {"pkg", package}  # in a docstring
+
+
+def needed(package, *folders):
+    """Top-level names, not of ours and not of Python, that the files in some folders of a package import."""
+    names = set()
+    for folder in folders:
+        local = {path.stem for path in (SRC / package / folder).glob("*.py")} if folder != package else set()
+        for path in (SRC / package / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Import):
+                    names |= {alias.name.partition(".")[0] for alias in node.names}
+                elif isinstance(node, ast.ImportFrom) and not node.level:
+                    names.add(node.module.partition(".")[0])
+        names -= local
+    beside = {path.stem for other in PACKAGES for path in (SRC / other / "test").glob("*.py")}  # helpers of tests
+    return names - set(sys.stdlib_module_names) - beside - {package, "setuptools"}
+
+
+def declared(package, *tags):
+    root = ElementTree.parse(SRC / package / "package.xml").getroot()
+    return {element.text for tag in tags for element in root.iter(tag)}
+
+
+def keys(names):
+    return {KEYS[name][0] if name in KEYS else name for name in names} - {None}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_xml_declares_what_is_imported_and_nothing_else(package):
+    used = keys(needed(package, package, "launch") | names_of_messages(package))
+    assert declared(package, "depend", "exec_depend") == used
+    tests = keys(needed(package, "test")) - used
+    assert declared(package, "test_depend") - RUNNERS == tests
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_setup_py_declares_what_is_imported_and_nothing_else(package):
+    tree = ast.parse((SRC / package / "setup.py").read_text())
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    (call,) = (node for node in calls if getattr(node.func, "id", "") == "setup")
+    given = {keyword.arg: keyword.value for keyword in call.keywords}
+    extras = ast.literal_eval(given["extras_require"]).values() if "extras_require" in given else []
+    required = [*ast.literal_eval(given["install_requires"]), *(text for some in extras for text in some)]
+    names = {re.match(r"[\w-]+", text)[0] for text in required} - {"setuptools"}
+    imported = needed(package, package)
+    assert names == {KEYS[name][1] for name in imported if name in KEYS} | (imported & set(PACKAGES))
+
+
+def test_messages_declare_what_they_are_made_of():
+    texts = "".join(path.read_text() for path in (SRC / "uwb_tdoa_msgs" / "msg").glob("*.msg"))
+    assert declared("uwb_tdoa_msgs", "depend") == set(re.findall(r"^(\w+)/\w+", texts, flags=re.MULTILINE))
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_executable_starts_behind_an_entry_point_of_its_name(package):
+    text = (SRC / package / "setup.py").read_text()
+    points = re.findall(r'"(\w+) = ([\w.]+):(\w+)"', text)
+    assert points
+    started = (SRC / package / package / "executables.py").read_text()
+    entries = dict(re.findall(r'^(\w+) = executable\("([\w.]+)"\)$', started, re.MULTILINE))
+    assert {name for name, _, _ in points} == set(entries)
+    for name, module, attribute in points:
+        assert (module, attribute) == (f"{package}.executables", name)
+        assert entries[name] in modules() and entries[name].rpartition(".")[2] == name
+    if package == "uwb_tdoa_tools":
+        assert set(entries.values()) == {name for name in modules() if name.startswith("uwb_tdoa_tools.commands.")}
+
+
+@pytest.mark.parametrize("module", [name for name in modules() if name.startswith("uwb_tdoa_tools.commands.")])
+def test_commands_are_thin(module):
+    text = modules()[module].read_text()
+    functions = {node.name for node in ast.parse(text).body if isinstance(node, ast.FunctionDef)}
+    assert {"main", "parser"} <= functions and 'if __name__ == "__main__":\n    sys.exit(main())' in text
+    assert len(text.splitlines()) <= 125

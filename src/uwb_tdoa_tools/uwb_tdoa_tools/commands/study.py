@@ -1,0 +1,59 @@
+"""study: make the figures of the documentation anew."""
+
+import argparse
+import sys
+
+from .. import cli
+from ..studies.debiasing import measured, set_up
+from ..studies.diagnosis import figures
+from ..studies.training import compare, default, spin
+
+STUDIES = {
+    "compare-models": compare,
+    "debias-measured": measured,
+    "debias-set-up": set_up,
+    "default-model": default,
+    "diagnosis": figures,
+    "spin": spin,
+}
+DESCRIPTION = """Make the figures of the documentation anew. Nothing here is needed to use the suite. DATA is a folder
+of measured flights: flights/, util/, surveys/.
+
+  compare-models   bias models side by side on flights that took no part in training (docs/bias.md)
+  debias-measured  bias maps of positions on measured flights (docs/debiasing.md)
+  debias-set-up    a simulated copy of the set-up of Grasso et al. (docs/debiasing.md)
+  default-model    the model that bias_node ships
+  diagnosis        effects put into flights, and found again (docs/diagnosis.md)
+  spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
+"""
+
+
+def main(argv=None):
+    """The executable. Returns the exit code."""
+    return cli.run(lambda args: STUDIES[args.study].run(args), parser(), argv)
+
+
+def parser():
+    """The studies, each with its options."""
+    made = cli.parser(
+        "study",
+        DESCRIPTION,
+        "study compare-models --train DATA/flights/0425 --test 0426 DATA/flights/0426 --survey DATA/surveys --out out/",
+        "study compare-models --simulated 20 --out out/",
+        "study debias-measured --data DATA --diagnosed bench/ --out measured/",
+        "study debias-set-up --out set_up/",
+        "study default-model DATA/flights --survey DATA/surveys --out default.onnx",
+        "study diagnosis bank --out bench/",
+        "study diagnosis measured --data DATA --out bench/",
+        "study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
+        "study spin --out spin.png",
+    )
+    names = made.add_subparsers(dest="study", required=True, metavar="NAME")
+    for name, study in STUDIES.items():
+        form = argparse.RawDescriptionHelpFormatter
+        study.add_options(names.add_parser(name, description=study.__doc__, formatter_class=form).add_argument)
+    return made
+
+
+if __name__ == "__main__":
+    sys.exit(main())

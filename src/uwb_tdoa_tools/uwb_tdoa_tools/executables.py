@@ -1,0 +1,17 @@
+"""The entry points that setup.py names: one for each file in commands/."""
+
+from uwb_tdoa_bias.foundation.executable import executable
+
+bench = executable("uwb_tdoa_tools.commands.bench")
+convert = executable("uwb_tdoa_tools.commands.convert")
+debias = executable("uwb_tdoa_tools.commands.debias")
+demo = executable("uwb_tdoa_tools.commands.demo")
+diagnose = executable("uwb_tdoa_tools.commands.diagnose")
+evaluate = executable("uwb_tdoa_tools.commands.evaluate")
+inject = executable("uwb_tdoa_tools.commands.inject")
+plan = executable("uwb_tdoa_tools.commands.plan")
+record = executable("uwb_tdoa_tools.commands.record")
+replay = executable("uwb_tdoa_tools.commands.replay")
+simulate = executable("uwb_tdoa_tools.commands.simulate")
+study = executable("uwb_tdoa_tools.commands.study")
+train = executable("uwb_tdoa_tools.commands.train")

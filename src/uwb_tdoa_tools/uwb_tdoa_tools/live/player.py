@@ -1,0 +1,107 @@
+"""Publishing recorded messages in the time between their stamps."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+import time
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from .follow import is_stamped, stamp_of
+
+RCLError = rclpy_implementation.RCLError
+LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all that follows, instead of a burst that a subscription cannot take
+LONGEST_SLEEP = 0.05  # s: how soon a signal is seen
+ACKNOWLEDGE_LIMIT = 30.0  # s; longer than the 20 s after which DDS forgets a subscription that died
+
+
+@dataclass
+class Played:
+    """What was published.
+
+    counts : messages by topic in the bag; behind : s, the latest that a message was; stretched : s, by how much the
+    time of the replay was stretched, so that a stall was not followed by a burst that nobody can take; waited : s, for
+    the topic that is followed.
+    """
+
+    counts: Counter = field(default_factory=Counter)
+    behind: float = 0.0
+    stretched: float = 0.0
+    waited: float = 0.0
+
+
+class Player:
+    """Publishes to {topic in the bag: publisher}, `rate` times as fast as recorded, with /clock if it has a rate, Hz.
+
+    stop : true once the process was asked to end; follower : Follower or None; played : Played.
+    """
+
+    def __init__(self, node, publishers, rate, clock_rate, stop):
+        self.played, self.follower = Played(), None
+        self._publishers, self._rate, self._stop = publishers, rate, stop
+        self._clock = node.create_publisher(Clock, "/clock", QoSProfile(depth=10)) if clock_rate else None
+        self._clock_period = 1.0 / clock_rate if clock_rate else None
+        self._stamped = {topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)}
+        self._start = self._began = self._next_tick = None
+
+    def play(self, recorded):
+        """Publish an iterable of (connection, stamp ns, bytes), from the beginning."""
+        self._start = None
+        for connection, stamp, data in recorded:
+            if self._start is None:
+                self._start, self._began = stamp, time.perf_counter()
+                self._next_tick = self._began
+            behind = self._sleep_until(self._began + (stamp - self._start) / (1e9 * self._rate))
+            if self._stop:
+                return
+            self._count_delay(behind)
+            if self.follower is not None and connection.topic in self._stamped:
+                waited = self.follower.wait(stamp_of(data), self._stop)
+                self.played.waited += waited
+                self._began += waited
+            if self._publish(self._publishers[connection.topic], data):
+                self.played.counts[connection.topic] += 1
+
+    def _sleep_until(self, due):
+        """Sleep, and publish the clock meanwhile. Returns the s by which it is later than due."""
+        while True:
+            now = time.perf_counter()
+            if self._clock is not None and now >= self._next_tick:
+                self._tick(min(now, due))
+                self._next_tick = max(self._next_tick + self._clock_period, now)
+            if now >= due or self._stop:
+                return now - due
+            wake = due if self._clock is None else min(due, self._next_tick)
+            time.sleep(min(max(wake - now, 0.0), LONGEST_SLEEP))
+
+    def _tick(self, now):
+        nanoseconds = self._start + int((now - self._began) * 1e9 * self._rate)
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 10**9)
+        self._clock.publish(message)
+
+    def _count_delay(self, behind):
+        self.played.behind = max(self.played.behind, behind)
+        if behind > LARGEST_CATCH_UP:
+            self._began += behind - LARGEST_CATCH_UP
+            self.played.stretched += behind - LARGEST_CATCH_UP
+
+    def _publish(self, publisher, data):
+        """Publish, after waiting until reliable subscriptions have acknowledged what the history is full of. Returns
+        False if stopped while it waited."""
+        until = time.monotonic() + ACKNOWLEDGE_LIMIT
+        while True:
+            try:
+                publisher.publish(data)
+                return True
+            except RCLError as error:  # full for longer than DDS waits by itself, 0.1 s
+                if self._stop:
+                    return False
+                if time.monotonic() > until:
+                    raise InputError(
+                        f"{publisher.topic_name}: a subscription has not acknowledged anything for "
+                        f"{ACKNOWLEDGE_LIMIT:g} s ({error}); stop it, or let it subscribe best effort."
+                    ) from error

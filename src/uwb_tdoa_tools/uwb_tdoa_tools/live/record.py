@@ -1,0 +1,124 @@
+"""Recording topics to a bag."""
+
+from dataclasses import dataclass
+import time
+
+from tqdm import tqdm
+
+from uwb_tdoa_bias.foundation.errors import Failure, InputError
+
+from ..bags.files import new_bag
+from ..bags.message_types import add_type, typestore
+from .session import message_class, recorded_qos, session, subscription_qos
+
+DISCOVERY_PERIOD = 0.1  # s between two looks for new topics
+POLL_PERIOD = 0.005  # s between two looks for messages; the subscriptions hold what comes in between
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """counts : {topic: messages}; missing : topics, asked for by name, that brought none; error : what ended the
+    recording, or None."""
+
+    counts: dict
+    missing: list
+    error: Exception | None
+
+
+def record(topics, output, storage="mcap", ros_arguments=(), say=print):
+    """Record topics, or all that are not hidden if the list is empty, until SIGINT or SIGTERM. Returns Recorded.
+
+    output : path of the bag, which appears when the recording ends; say(sentence) : told what happens.
+    Raises InputError, and Failure if no message came at all: then there is no bag.
+    """
+    with session("record", list(ros_arguments)) as (node, stop), new_bag(output, storage) as writer:
+        wanted = {node.resolve_topic_name(topic) for topic in topics} if topics else None
+        names = ", ".join(sorted(wanted)) if wanted else None
+        recorder = Recorder(node, writer, wanted, say)
+        say(f"waiting for {names or 'all topics'}")
+        error = None
+        try:
+            with tqdm(unit=" messages", disable=None) as progress:
+                _take_until(stop, recorder, progress)
+        except Exception as caught:  # what was recorded is worth keeping whatever happened
+            error = caught
+        if not any(recorder.counts.values()) and error is None:
+            raise Failure(f"no message came on {names or 'any topic'}; there is no bag")
+    return Recorded(recorder.counts, sorted(recorder.missing()), error)
+
+
+def _take_until(stop, recorder, progress):
+    look_again = 0.0
+    while not stop:
+        if time.monotonic() >= look_again:
+            recorder.discover()
+            look_again = time.monotonic() + DISCOVERY_PERIOD
+        progress.update(recorder.take())
+        time.sleep(POLL_PERIOD)
+    progress.update(recorder.take())
+
+
+class Recorder:
+    """Subscriptions, and the connections of the bag that they write to.
+
+    wanted : set of absolute topic names, or None for all. counts : {topic: messages recorded so far}.
+    """
+
+    def __init__(self, node, writer, wanted, say):
+        self.counts = {}
+        self._node, self._writer, self._wanted, self._say = node, writer, wanted, say
+        self._pairs = []  # (subscription, connection)
+        self._refused = set()
+
+    def discover(self):
+        """Subscribe to wanted topics that have a publisher by now."""
+        for topic, types in self._node.get_topic_names_and_types():
+            if topic in self.counts or topic in self._refused or not self._is_wanted(topic):
+                continue
+            publishers = self._node.get_publishers_info_by_topic(topic)
+            if publishers:
+                self._subscribe(topic, types[0], [publisher.qos_profile for publisher in publishers])
+
+    def take(self):
+        """Move all messages that have arrived to the bag; returns how many."""
+        taken = 0
+        for subscription, connection in self._pairs:
+            with subscription.handle:
+                while (message := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                    data, information = message
+                    stamp = information["received_timestamp"] or time.time_ns()
+                    self._writer.write(connection, stamp, data)
+                    self.counts[connection.topic] += 1
+                    taken += 1
+        return taken
+
+    def missing(self):
+        """Topics that were asked for by name and brought nothing."""
+        return {topic for topic in self._wanted or () if not self.counts.get(topic)}
+
+    def _is_wanted(self, topic):
+        if self._wanted is not None:
+            return topic in self._wanted
+        return not any(part.startswith("_") for part in topic.split("/"))
+
+    def _subscribe(self, topic, msgtype, offered):
+        cls = message_class(msgtype)
+        try:
+            if cls is None:
+                raise InputError(f"{msgtype} is not installed; build and source the workspace that has it.")
+            add_type(typestore(), msgtype)
+        except InputError as error:
+            if self._wanted is not None:
+                raise
+            self._say(f"leaving out {topic}: {error}")
+            self._refused.add(topic)
+            return
+        connection = self._writer.add_connection(
+            topic, msgtype, typestore=typestore(), offered_qos_profiles=[recorded_qos(qos) for qos in offered]
+        )
+        qos = subscription_qos(offered)
+        # Never spun, so the callback never runs: messages are taken from the subscription as bytes, many at a time.
+        subscription = self._node.create_subscription(cls, topic, lambda _: None, qos, raw=True)
+        self._pairs.append((subscription, connection))
+        self.counts[topic] = 0
+        self._say(f"recording {topic} ({msgtype}, {qos.reliability.name.lower()})")

@@ -1,0 +1,122 @@
+"""Replaying a bag over topics: publishers as recorded, somebody to listen, and everything acknowledged."""
+
+from contextlib import closing
+from dataclasses import dataclass, field
+import itertools
+import time
+
+from rclpy.duration import Duration
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from ..bags.files import messages, open_bag
+from .follow import Follower
+from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player
+from .read_ahead import read_ahead
+from .session import message_class, publisher_qos, session
+
+GLOBAL = ("/tf", "/tf_static", "/clock", "/diagnostics", "/rosout", "/parameter_events")  # in no robot's namespace
+SETTLE = 0.2  # s from the last match to the first message: a subscription learns of a match a little later than we do
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to replay.
+
+    rate : times as fast as recorded; loop : start again at the end; clock_rate : Hz of /clock, None for none;
+    wait : s until somebody must subscribe to every topic; wait_topics : to these only, and it is an error if nobody
+    does; follow : topic whose stamps may not fall behind, or None; ros_arguments : command line with --ros-args.
+    """
+
+    rate: float = 1.0
+    loop: bool = False
+    clock_rate: float | None = None
+    wait: float = 2.0
+    wait_topics: tuple = ()
+    follow: str | None = None
+    ros_arguments: tuple = ()
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """played : Played; took : s; acknowledged : whether every subscription has everything; stopped_by : number of the
+    signal that ended it early, or None."""
+
+    played: Played = field(default_factory=Played)
+    took: float = 0.0
+    acknowledged: bool = True
+    stopped_by: int | None = None
+
+
+def replay(bag, options=Options(), say=print):
+    """Replay a bag. Returns Replayed. Raises InputError. say(sentence) : told what happens."""
+    with open_bag(bag) as reader, session("replay", list(options.ros_arguments)) as (node, stop):
+        publishers = _publishers(node, bag, reader, say)
+        connections = [connection for connection in reader.connections if connection.topic in publishers]
+        count = sum(connection.msgcount for connection in connections)
+        if not count:
+            raise InputError(f"{bag}: has no message to replay.")
+        player = Player(node, publishers, options.rate, options.clock_rate, stop)
+        _wait_matched(publishers, options.wait, options.wait_topics, stop, say)
+        player.follower = Follower(node, options.follow) if options.follow else None
+        length = (reader.end_time - reader.start_time) / 1e9
+        say(f"playing {count} messages, {length:.1f} s at rate {options.rate:g}")
+        began = time.perf_counter()
+        while not stop:
+            with closing(read_ahead(messages(bag, reader, connections))) as recorded:
+                player.play(recorded)
+            if not options.loop:
+                break
+        took = time.perf_counter() - began
+        acknowledged = _wait_acknowledged(publishers.values(), stop)
+        return Replayed(player.played, took, acknowledged, stop.signal)
+
+
+def _publishers(node, bag, reader, say):
+    """{topic in the bag: publisher} of all topics whose type is installed. What belongs to one robot is published in
+    the namespace of the node (--ros-args -r __ns:=/tag1)."""
+    publishers = {}
+    by_topic = itertools.groupby(sorted(reader.connections, key=lambda c: c.topic), key=lambda c: c.topic)
+    for topic, connections in by_topic:
+        connections = list(connections)
+        cls = message_class(connections[0].msgtype)
+        if cls is None:
+            say(f"leaving out {topic}: its type {connections[0].msgtype} is not installed")
+            continue
+        recorded = [qos for connection in connections for qos in connection.ext.offered_qos_profiles]
+        qos = publisher_qos(recorded, sum(connection.msgcount for connection in connections))
+        publishers[topic] = node.create_publisher(cls, topic if topic in GLOBAL else topic.lstrip("/"), qos)
+    if not publishers:
+        raise InputError(f"{bag}: has no topic of an installed type; build and source the workspace first.")
+    return publishers
+
+
+def _wait_matched(publishers, limit, topics, stop, say):
+    """Return when every topic has a subscription, or after `limit` s; InputError if a named one has none then."""
+    wanted = [f"/{topic.lstrip('/')}" for topic in topics] or list(publishers)
+    if missing := [topic for topic in wanted if topic not in publishers]:
+        raise InputError(f"--wait-topics: {missing[0]} is not in the bag; it has {', '.join(publishers)}.")
+    say(f"waiting up to {limit:g} s for subscriptions to {', '.join(publishers[t].topic_name for t in wanted)}")
+    until = time.monotonic() + limit
+    missing = wanted
+    while not stop:
+        missing = [topic for topic in wanted if not publishers[topic].get_subscription_count()]
+        if not missing or time.monotonic() > until:
+            break
+        time.sleep(0.01)
+    names = [publishers[topic].topic_name for topic in missing]
+    if missing and topics and not stop:
+        raise InputError(f"nobody subscribes to {names[0]} within {limit:g} s; start the nodes first, or wait longer.")
+    if missing:
+        say(f"nobody subscribes to {', '.join(names)}")
+    time.sleep(SETTLE)
+
+
+def _wait_acknowledged(publishers, stop):
+    """Whether every subscription has everything; waits at most ACKNOWLEDGE_LIMIT, in slices that see a signal."""
+    until = time.monotonic() + ACKNOWLEDGE_LIMIT
+    for publisher in publishers:
+        while not publisher.wait_for_all_acked(Duration(seconds=LONGEST_SLEEP)):
+            if stop or time.monotonic() > until:
+                return False
+    return True

@@ -1,0 +1,68 @@
+"""The parts of plan: each writes its pictures to a folder and returns its figures, plain values."""
+
+from functools import partial
+
+import numpy as np
+from tqdm import tqdm
+
+from ..readers import read_flight
+from . import accuracy, layout, messages, plots
+from .check import brute_force
+from .maps import Grid, chart
+
+_watched = partial(tqdm, disable=None, leave=False)
+
+
+def draw_map(found, installation, out):
+    """Pictures, flyable volume and bag of a Chart. Returns {topic: message}, see `messages.messages`."""
+    plots.plot_precision(installation, found, out / "precision.png")
+    plots.plot_failure(installation, found, out / "failure.png")
+    found.volume(installation).save(out / "flyable.npz")
+    outgoing = messages.messages(found, installation.anchors)
+    messages.write(outgoing, out / "plan.bag")
+    return outgoing
+
+
+def check(installation, grid, out):
+    """The failure map against a solver that is started from many places."""
+    unique, agrees, points, arrows = brute_force(installation, grid, partial(_watched, desc="solving"))
+    plots.plot_flips(installation, points, unique, agrees, arrows, out / "flips.png")
+    return {"places": len(points), "agreement": float(np.mean(agrees)), "unique_share": float(np.mean(unique))}
+
+
+def fly(recording):
+    """(name, Samples) of one (path, survey)."""
+    flight = read_flight(*recording)
+    return flight.name, accuracy.fly(flight)
+
+
+def judge_flights(flown, installation, room, step, out):
+    """Rows of `accuracy.comparison`, one for each of what `fly` gave, and one for all. step : m, of the picture."""
+    samples, rows = [], []
+    for name, one in flown:
+        samples.append(one)
+        rows.append({"flight": name, **accuracy.comparison(one, installation)})
+    pooled = accuracy.together(samples)
+    rows.append({"flight": f"{len(samples)} pooled", **accuracy.comparison(pooled, installation)})
+    found = accuracy.accuracy_map(pooled, installation, Grid.box(room.lower, room.upper, step))
+    plots.plot_accuracy(installation, found, out / "accuracy.png")
+    return rows
+
+
+def improve(before, aim, how, starts, criterion, out):
+    """Better places for the anchors, improved.yaml. before : Chart as it is; aim : options.Aim; how : "move" or "add";
+    criterion : of what is flyable."""
+    goal, places, installation, candidates = aim.goal, aim.places, aim.goal.installation, None
+    anchors, search = installation.anchors, {"starts": starts, "progress": partial(_watched, desc="layouts")}
+    if how == "add":
+        candidates = layout.one_more(goal, anchors, places)
+        start = candidates[0][[np.argmin(candidates[1])]]
+        better = layout.optimise(goal, places, 1, anchors, start, **search)
+    else:
+        start = anchors.positions if aim.count == len(anchors) else None
+        better = layout.optimise(goal, places, aim.count, None, start, **search)
+    better.to_yaml(out / "improved.yaml")
+    after = goal.installed(better)
+    charts = [("before, ", installation, before), ("after, ", after, chart(after, before.grid, criterion))]
+    plots.plot_layouts(charts, out / "layout.png", candidates)
+    return {"points": len(aim.judge.points), "before": aim.judge.judge(anchors), "after": aim.judge.judge(better)}

@@ -1,0 +1,55 @@
+"""Recordings judged one by one, with a picture and trajectories for others."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.smoother import smooth
+
+from ..bags.bag import read_odometry
+from ..readers import read_flight
+from .evaluation import evaluate, need_truth
+from .metrics import Score
+from .plots import plot_error
+from .tum import write_tum
+
+
+@dataclass(frozen=True)
+class Judge:
+    """judge((path, survey)) is the Score of a recording: of the filter run over it, or of the odometry in a bag.
+
+    config : FilterConfig; effects, network : what the TDOAs are corrected with, or None; smoothed : use what came after
+    each estimate too; odometry : path of a bag whose odometry is judged instead, or None; namespace : of the topics in
+    bags; picture : file to draw the errors to, or None; trajectories : folder for TUM files, or None.
+    Raises InputError. Can be pickled.
+    """
+
+    config: FilterConfig | None = None
+    effects: EffectSet | None = None
+    network: Network | None = None
+    smoothed: bool = False
+    odometry: str | None = None
+    namespace: str = ""
+    picture: str | None = None
+    trajectories: Path | None = None
+
+    def __call__(self, recording):
+        flight = read_flight(*recording, self.namespace)
+        need_truth(flight)
+        if self.odometry:
+            odometry = read_odometry(self.odometry, namespace=self.namespace)
+            score = Score(flight.name, odometry, flight.truth)
+        else:
+            engine = smooth if self.smoothed else run_offline
+            score, run = evaluate(flight, self.config, self.effects, self.network, engine)
+            odometry = run.odometry
+        if self.picture:
+            plot_error(score, odometry, flight.truth, self.picture)
+        if self.trajectories:
+            truth, folder = flight.truth, self.trajectories
+            write_tum(folder / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
+            write_tum(folder / f"{flight.name}_truth.tum", truth.t, truth.p, truth.q)
+        return score

@@ -1,0 +1,38 @@
+"""Declared effects put into flights."""
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from ..bags.bag import check_output, write_bag
+from ..readers import inputs, read_flight
+
+
+def parse_effect(name, values):
+    """The Effect `name` with `values`, a list of texts "KEY=NUMBER", "KEY:NUMBER" or "NUMBER". Raises InputError."""
+    kind, parameters = EFFECTS[name], {}
+    for text in ",".join(values).split(","):
+        key, found, number = text.replace(":", "=").strip().rpartition("=")
+        key = key.strip() if found else kind.example
+        if key in parameters:
+            raise InputError(f"--value: {name}: {key} is given twice.")
+        parameters[key] = number
+    return kind(parameters, source="injected")
+
+
+def inject(effect, recording, out, survey=None, namespace="", seed=0, storage="mcap", force=False):
+    """Write the flight that would have been recorded with an Effect as a bag. Returns the name of the flight.
+
+    recording, survey, namespace : see `read_flight`; seed : of effects that are random. Raises InputError.
+    """
+    check_output(out, force)  # before the work, not after it
+    flight = read_flight(recording, inputs.survey_for(recording, survey), namespace)
+    write_bag(effect.inject(flight, np.random.default_rng(seed)), out, storage, force)
+    return flight.name
+
+
+def catalogue():
+    """All effects with a parameter, the unit and the physics of each: text."""
+    lines = [f"{name:20s} e.g. {e.example}=NUMBER ({e.unit}): {e.physics}" for name, e in EFFECTS.items()]
+    return "\n".join(lines)
