@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.stamps import StampGate
 
 from .core.config import FilterConfig
 from .core.engine import INVALID, LATE, REJECTED, STARTUP, USED, feed
-from .core.memory import IMU_SAMPLE, ODOMETRY, TDOA, Measurements, new_memory
+from .core.memory import IMU_SAMPLE, ODOMETRY, RESIDUAL, TDOA, Measurements, new_memory
 from .core.validity import MAX_ACCEL, MAX_RATE, usable
 
 VERDICTS = {USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup"}
@@ -80,7 +80,7 @@ class Estimator:
         self._waiting = [], []  # items of each stream in order of their stamps
         self._gates = [StampGate(), StampGate()]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
-        self._fed_imu = np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)  # lately, the one before them in front
+        self._fed_imu = [np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)]  # those before the last odometry, and lately
 
     @property
     def running(self):
@@ -131,8 +131,9 @@ class Estimator:
     def rates_at(self, t):
         """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample is
         near."""
-        place = np.searchsorted(self._fed_imu["t"], t, side="right") - 1
-        sample = self._fed_imu[np.maximum(place, 0)]
+        fed = np.concatenate(self._fed_imu)
+        place = np.searchsorted(fed["t"], t, side="right") - 1
+        sample = fed[np.maximum(place, 0)]
         near = (place >= 0) & (np.abs(t - sample["t"]) <= self.config.imu_timeout)
         return np.where(near[:, None], sample["gyro"], math.nan)
 
@@ -184,28 +185,23 @@ class Estimator:
         for part in (imu, tdoa):
             if len(part):
                 self._fed_until = max(self._fed_until, part["t"][-1])
-        self._fed_imu = np.concatenate([self._fed_imu[-1:], imu])
+        self._fed_imu = [self._fed_imu[-1][-1:], imu] if len(imu) else [self._fed_imu[-1][-1:]]
         self.counts["imu_used"] += len(imu)
         return Odometry.from_rows(odometry), self._residuals(tdoa, outcome)
 
     def _residuals(self, tdoa, outcome):
         """Residuals of (k,) of TDOA that were fed, with their (k,) of RESIDUAL, and of those that were refused."""
-        refused = np.array(self._refused, dtype=float).reshape(-1, 4)
-        self._refused = []
-        none = np.full(len(refused), np.nan)
-        ids = self.anchors.ids
-        verdict = np.concatenate([outcome["verdict"], refused[:, 3]]).astype(np.uint8)
-        for value in verdict.tolist():
-            self.counts[VERDICTS[value]] += 1
-        return Residuals(
-            np.concatenate([tdoa["t"], refused[:, 0]]),
-            np.concatenate([ids[tdoa["a"]], refused[:, 1].astype(np.int64)]),
-            np.concatenate([ids[tdoa["b"]], refused[:, 2].astype(np.int64)]),
-            np.concatenate([outcome["innovation"], none]),
-            np.concatenate([outcome["variance"], none]),
-            np.concatenate([outcome["weight"], np.zeros(len(refused))]),
-            verdict,
-        )
+        a, b = self.anchors.ids[tdoa["a"]], self.anchors.ids[tdoa["b"]]
+        columns = [tdoa["t"], a, b, *(outcome[name] for name in RESIDUAL.names)]
+        if self._refused:
+            t, a, b, verdict = zip(*self._refused)
+            unknown, none = np.full((2, len(t)), math.nan), np.zeros(len(t))
+            others = (t, a, b, *unknown, none, np.array(verdict, np.uint8))
+            columns = [np.concatenate(both) for both in zip(columns, others)]
+            self._refused = []
+        for verdict in columns[-1].tolist():
+            self.counts[VERDICTS[verdict]] += 1
+        return Residuals(*columns)
 
 
 NOTHING = Odometry.from_rows(np.empty(0, ODOMETRY)), Residuals(*(np.empty(0) for _ in range(7)))

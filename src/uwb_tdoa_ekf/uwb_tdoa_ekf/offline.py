@@ -51,6 +51,7 @@ def run_offline(flight, config=None, corrector=None, records=None):
     tdoa, positions = flight.tdoa, flight.anchors.positions
     raw = tdoa.t, flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b), tdoa.d
     imu = _imu_samples(flight.imu if config.use_imu else None)
+    imu_t = imu["t"].copy()  # side by side in memory, to be searched
     memory, tuning = new_memory(positions), config.tuning()
     bias, std, outcome, parts, fed = np.zeros(len(tdoa)), np.zeros(len(tdoa)), _not_fed(len(tdoa)), [], 0
     for batch, until in _batches(*raw, corrector, RECORDED_AT_ONCE if records is not None else len(tdoa)):
@@ -59,7 +60,7 @@ def run_offline(flight, config=None, corrector=None, records=None):
         bias[batch], std[batch] = correction.bias, correction.std
         sane = usable_all(a, b, correction.corrected, correction.std, positions)
         corrected = structured(TDOA, t, a, b, correction.corrected, correction.std)[sane]
-        last = len(imu) if until is None else int(np.searchsorted(imu["t"], until))
+        last = len(imu) if until is None else int(np.searchsorted(imu_t, until))
         odometry, outcome[batch[sane]] = feed(memory, tuning, Measurements(imu[fed:last], corrected), records)
         fed = last
         parts.append(odometry)
