@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..foundation.errors import InputError
-from ..foundation.geometry import tdoa
+from ..foundation.geometry import ranges, tdoa
 from .base import Effect, check_anchor, known_anchors, once_per_anchors
 from .marks import Shift
 from .wording import counted, listed, significant, size
@@ -59,7 +59,7 @@ class AnchorPosition(Effect):
 
     def regressors(self, samples, keys):
         moved, ids = self._moved(samples.anchors), samples.anchors.ids
-        unit_a, unit_b = (_unit(moved[rows] - samples.p) for rows in (samples.a, samples.b))
+        unit_a, unit_b = (-ranges(samples.p, moved[rows])[1] for rows in (samples.a, samples.b))
         out = np.empty((len(samples), len(keys)))
         for column, key in enumerate(keys):
             anchor, axis = key.split(".")
@@ -90,7 +90,3 @@ class AnchorPosition(Effect):
             by, std = each.setdefault(int(anchor), (np.zeros(3), np.full(3, np.nan)))
             by["xyz".index(axis)], std["xyz".index(axis)] = value, self.std.get(key, np.nan)
         return tuple(Shift(anchor, *shift) for anchor, shift in each.items())
-
-
-def _unit(v):
-    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)

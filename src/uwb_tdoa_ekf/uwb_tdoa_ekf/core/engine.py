@@ -85,13 +85,7 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
             _wait_for_start(ekf, anchors, tuning, t, records)
         return
     _update(ekf, anchors, tuning, tdoa, residual, records)
-    for h in range(HYPOTHESES):
-        for axis in range(3):
-            if not hypotheses.alive(ekf.hypotheses[h]):
-                continue
-            drawn = workspace.draw_back(ekf.hypotheses[h], ekf.innovation, ekf.workspace, axis)
-            if drawn and h == ekf.best:
-                history.add_update(ekf, t, records)
+    _stay_in_workspace(ekf, t, records)
     hypotheses.select(ekf, t)
     agrees = 1.0 if abs(residual.innovation) < INLIER else 0.0
     ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (agrees - ekf.consistency)
@@ -151,17 +145,9 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
         if not hypotheses.alive(hypothesis):
             continue
         _compare(hypothesis, a, b, tdoa.d, innovation)
-        hypotheses.add_log_likelihood(hypothesis, innovation, tuning.tdoa_correlation_length)
-        robust.update(hypothesis, innovation, tuning)
-        if h == ekf.best:
-            residual.innovation = innovation.value
-            residual.variance = innovation.prior_variance + innovation.noise_variance
-            residual.weight = innovation.weight
-            residual.verdict = USED if innovation.weight > 0.0 else REJECTED
-            if residual.verdict == USED:
-                history.add_update(ekf, tdoa.t, records)
-            if tuning.adapt_noise:
-                noise.learn(a, b, tdoa.t, innovation, tuning)
+        _assimilate(ekf, h, tuning, tdoa.t, residual, records)
+        if h == ekf.best and tuning.adapt_noise:
+            noise.learn(a, b, tdoa.t, innovation, tuning)
 
 
 @compiled
@@ -172,6 +158,33 @@ def _compare(hypothesis, a, b, d, innovation):
     for k in range(3):
         innovation.states[k] = k
     project(hypothesis.P, innovation)
+
+
+@compiled
+def _assimilate(ekf, h, tuning, t, residual, records):
+    """Hypothesis h with ekf.innovation, of whatever kind; that of the best one becomes the RESIDUAL."""
+    hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
+    hypotheses.add_log_likelihood(hypothesis, innovation, tuning.tdoa_correlation_length)
+    robust.update(hypothesis, innovation, tuning)
+    if h == ekf.best:
+        residual.innovation = innovation.value
+        residual.variance = innovation.prior_variance + innovation.noise_variance
+        residual.weight = innovation.weight
+        residual.verdict = USED if innovation.weight > 0.0 else REJECTED
+        if residual.verdict == USED:
+            history.add_update(ekf, t, records)
+
+
+@compiled
+def _stay_in_workspace(ekf, t, records):
+    """Soft constraints of every axis, for each hypothesis that is outside."""
+    for h in range(HYPOTHESES):
+        if not hypotheses.alive(ekf.hypotheses[h]):
+            continue
+        for axis in range(3):
+            outside = workspace.constrain(ekf.hypotheses[h], ekf.innovation, ekf.workspace, axis)
+            if outside and h == ekf.best:
+                history.add_update(ekf, t, records)
 
 
 @compiled

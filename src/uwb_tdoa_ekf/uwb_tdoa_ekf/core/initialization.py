@@ -37,7 +37,7 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    workspace.bounds(anchors, tuning.workspace_margin, ekf.workspace)
+    workspace.set_bounds(anchors, tuning.workspace_margin, ekf.workspace)
     x, covariance = np.empty(6), np.empty((6, 6))
     share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, x, covariance)
     if not anyhow and (share < AGREE or not workspace.contains(ekf.workspace, x)):

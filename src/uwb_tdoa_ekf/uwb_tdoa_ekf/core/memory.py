@@ -56,7 +56,7 @@ EKF = _record(
     ("hypotheses", HYPOTHESIS, HYPOTHESES),
     ("imu", IMU_STATE),
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
-    ("workspace", float, (2, 3)),  # m, lower and upper bounds of where a tag is expected
+    ("workspace", float, (2, 3)),  # m, lower and upper bounds, see workspace.py
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),
     ("first_tdoa", float),  # s, stamps: of the first TDOA since the filter stopped, and the last one
