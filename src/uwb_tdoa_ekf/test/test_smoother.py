@@ -91,7 +91,8 @@ def test_without_imu_it_is_the_least_squares_solution():
     """After the start, with white noise and a tag at rest, where nothing is non-linear."""
     flight = fly(3, 2.0, hover=True, tdoa_rate=50.0, tdoa_std=0.05)
     config = FilterConfig(
-        use_imu=False, tdoa_std=0.05, tdoa_correlation_length=1.0, robust="gate", gate=1e6, adapt_noise=False, recover=False,
+        use_imu=False, tdoa_std=0.05, tdoa_correlation_length=1.0, robust="gate", gate=1e6,
+        adapt_noise=False, recover=False,
         odometry_rate=1e4,
     )  # fmt: skip
     first = run_offline(flight, config)

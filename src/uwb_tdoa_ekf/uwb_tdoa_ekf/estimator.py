@@ -21,8 +21,8 @@ IMU_STREAM, TDOA_STREAM = range(2)  # places in STREAMS
 
 @dataclass(frozen=True)
 class Residuals:
-    """What became of each TDOA. t (n,) s; a, b (n,) anchor ids; innovation (n,) m and variance (n,) m^2, NaN unless used
-    or rejected by the filter; weight (n,) 0 to 1; verdict (n,) a key of VERDICTS."""
+    """What became of each TDOA. t (n,) s; a, b (n,) anchor ids; innovation (n,) m and variance (n,) m^2, NaN unless
+    used or rejected by the filter; weight (n,) 0 to 1; verdict (n,) a key of VERDICTS."""
 
     t: np.ndarray
     a: np.ndarray
@@ -35,8 +35,8 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Odometry:
-    """Estimates. t (n,) s; p (n, 3) m; v (n, 3) m/s, world; q (n, 4) x y z w, body to world; accel_bias (n, 3) m/s^2 and
-    gyro_bias (n, 3) rad/s, body; covariance (n, 9, 9) of [p, v, attitude], the attitude's in the body frame, rad."""
+    """Estimates. t (n,) s; p (n, 3) m; v (n, 3) m/s, world; q (n, 4) x y z w, body to world; accel_bias (n, 3) m/s^2
+    and gyro_bias (n, 3) rad/s, body; covariance (n, 9, 9) of [p, v, attitude], the attitude's in the body frame, rad."""
 
     t: np.ndarray
     p: np.ndarray
@@ -61,8 +61,8 @@ class Estimator:
 
     Messages wait until every stream has passed them and are used in stamp order. A stream that is silent is waited for
     for `lag` seconds of stamps; TDOAs wait `reorder` more for late siblings. What is older than what was used is late.
-    A stream that falls back in time starts the filter anew; a single stamp far from its neighbours only counts as late, or
-    as invalid if it lies ahead.
+    A stream that falls back in time starts the filter anew; a single stamp far from its neighbours only counts as late,
+    or as invalid if it lies ahead.
     """
 
     def __init__(self, anchors, config=None, reorder=0.003, lag=0.25):
@@ -80,7 +80,7 @@ class Estimator:
         self._waiting = [], []  # items of each stream in order of their stamps
         self._gates = [StampGate(), StampGate()]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
-        self._fed_imu = [np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)]  # those before the last odometry, and lately
+        self._fed_imu = [np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)]  # lately, after the one before them
 
     @property
     def running(self):
@@ -112,7 +112,7 @@ class Estimator:
         i, k = self.anchors.row(a), self.anchors.row(b)
         if not (math.isfinite(t) and usable(i, k, d, bias_std, self.anchors.positions)):
             self._refused.append((t, a, b, INVALID))
-            self._gates[TDOA_STREAM].note(t)  # or whoever waits for our pose of this time would wait for the next one
+            self._gates[TDOA_STREAM].note(t)  # or whoever waits for our pose of this time waits for the next one
             return
         self._take(TDOA_STREAM, t, (t, i, k, d, bias_std))
 
@@ -129,8 +129,8 @@ class Estimator:
         return self._feed(math.inf)
 
     def rates_at(self, t):
-        """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample is
-        near."""
+        """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample
+        is near."""
         fed = np.concatenate(self._fed_imu)
         place = np.searchsorted(fed["t"], t, side="right") - 1
         sample = fed[np.maximum(place, 0)]

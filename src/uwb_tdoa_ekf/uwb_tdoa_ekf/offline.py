@@ -21,8 +21,8 @@ RECORDED_AT_ONCE = 256  # TDOAs that are fed together while a history is recorde
 @dataclass(frozen=True)
 class Run:
     """Result of one recording. odometry : Odometry; residuals : Residuals, one per TDOA of the flight, in its order;
-    bias, bias_std : (n,) m, what was taken from each raw TDOA; recoveries : how often the filter lost and found the tag;
-    yaw_offset : rad, from initial_yaw to the start of the yaw hypothesis that was right."""
+    bias, bias_std : (n,) m, what was taken from each raw TDOA; recoveries : how often the filter lost and found the
+    tag; yaw_offset : rad, from initial_yaw to the start of the yaw hypothesis that was right."""
 
     odometry: Odometry
     residuals: Residuals

@@ -70,7 +70,7 @@ def share_of_inliers(window, anchors, x):
 
 @compiled
 def level(accel, yaw, x):
-    """Write to x the attitude in which `accel` (3,), the mean specific force, points up, and which has the given yaw."""
+    """Write to x the attitude in which `accel` (3,), the mean specific force, points up, and which has this yaw."""
     roll = math.atan2(accel[1], accel[2])
     pitch = math.atan2(-accel[0], math.hypot(accel[1], accel[2]))
     cr, sr, cp, sp = math.cos(roll / 2), math.sin(roll / 2), math.cos(pitch / 2), math.sin(pitch / 2)
@@ -83,7 +83,8 @@ def level(accel, yaw, x):
 
 @compiled
 def _correlation_length(window, anchors):
-    """TDOAs of the window that tell as much as one independent of the others: one for each anchor heard but the first."""
+    """TDOAs of the window that tell as much as one independent of the others, of which each anchor heard but the first
+    gives one."""
     heard = np.zeros(anchors)
     for i in range(len(window)):
         heard[window[i].a] = heard[window[i].b] = 1.0
