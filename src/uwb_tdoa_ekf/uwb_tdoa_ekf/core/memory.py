@@ -43,6 +43,7 @@ IMU_STATE = _record(
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
 )
 
+# What is known of an anchor.
 ANCHOR = _record(
     ("position", float, 3),  # m
     ("excess_variance", float),  # m^2, of what is received of it beyond tdoa_std, see noise.py
@@ -104,7 +105,7 @@ class Measurements(NamedTuple):
 
 class Output(NamedTuple):
     """Room for what it makes of that. odometry : at least (n + k,) of ODOMETRY; residuals : (k,) of RESIDUAL;
-    history : of history.RECORD, with room for history.most_records, or empty for no recording."""
+    history : of history.RECORD, with room for engine.most_records, or empty for no recording."""
 
     odometry: np.ndarray
     residuals: np.ndarray
