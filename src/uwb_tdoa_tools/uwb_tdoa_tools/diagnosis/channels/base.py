@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet, Track
-from uwb_tdoa_bias.foundation.flight import Flight, Truth
+from uwb_tdoa_bias.foundation.flight import Flight
 
 from ..references import Reference, View
 
