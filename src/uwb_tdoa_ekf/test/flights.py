@@ -1,5 +1,7 @@
 """Small simulated flights whose every error is known, for the tests of the filter."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -104,3 +106,16 @@ def measurements(flight):
 def position_at(flight, t):
     """True positions (n, 3) m at stamps t."""
     return np.stack([np.interp(t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
+
+
+WORKSPACE = np.array([[-1.0, -1.0, -1.5], [8.0, 9.0, 4.5]])  # m, its bounds with the anchors of corners()
+
+
+def leaving(flight):
+    """A hovering Flight with the TDOAs of a tag that leaves its workspace along all axes, level, at constant velocity,
+    until 3 s."""
+    t, anchors = flight.tdoa.t, flight.anchors
+    p = np.array([6.0, 7.0, 3.0]) + np.minimum(t, 3.0)[:, None] * [1.2, 1.2, 1.0]
+    a, b = (anchors.positions[anchors.index(ids)] for ids in (flight.tdoa.a, flight.tdoa.b))
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(t))
+    return replace(flight, tdoa=replace(flight.tdoa, d=tdoa(p, a, b) + noise))
