@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.poses import told_yaw_std
+from uwb_tdoa_bias.correction.poses import known_yaw_std
 
 from .core.config import FilterConfig
 from .core.engine import INVALID, feed
@@ -106,5 +106,5 @@ def _batches(t, a, b, d, corrector, longest):
 def _report_poses(odometry, corrector):
     """Give the Corrector the poses of an (n,) of ODOMETRY, as bias_node gets them."""
     x, covariance = odometry["x"], odometry["covariance"]
-    yaw_std = told_yaw_std(rotation_std(x[:, 6:10], covariance))
+    yaw_std = known_yaw_std(rotation_std(x[:, 6:10], covariance))
     corrector.add_pose(odometry["t"], x[:, :3], x[:, 6:10], yaw_std)
