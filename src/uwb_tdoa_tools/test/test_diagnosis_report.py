@@ -140,12 +140,24 @@ def test_nothing_found_and_nothing_added_are_told_apart(result):
 def test_without_ground_truth_no_error_is_claimed(without_truth):
     found = verdict(without_truth)
     text = " ".join(found.sentences)
-    assert found.kind == "unknown" and "Without ground truth" in text and "very flights that were fitted" in text
+    assert found.kind == "unknown" and "Without ground truth" in text and without_truth.judged_on in text
+    assert "because it explains at least 33 % of what is slow" in text
     assert "RMSE" not in text and "falls" not in text
     calm = replace(without_truth, findings=[])
     assert verdict(calm).kind == "nothing"
-    worse = replace(without_truth, after={"pooled": {"residual_spread": 9.0}})
-    assert "does not make measurements agree better" in verdict(worse).headline
+
+
+def test_without_ground_truth_what_is_not_borne_out_is_not_added_with_the_reason_in_one_place(without_truth):
+    findings = [
+        replace(item, added=False) for item in (finding(delay()), finding(EFFECTS["range_scale"]({"scale": 0.1})))
+    ]
+    why = Refused("anchor_delay + range_scale", "explain 20 % of what is slow")
+    refused = [*without_truth.attribution.refused, why]
+    doubted = replace(without_truth, findings=findings, refused=refused, effects=EffectSet())
+    found = verdict(doubted)
+    assert found.kind == "unknown" and found.headline.startswith("Nothing of what was found is added")
+    assert "Not added, anchor_delay + range_scale: explain 20 % of what is slow." in found.more
+    assert {entry.why_not for entry in entries(doubted)} == {"judged together with others: see the verdict"}
 
 
 # ---------------------------------------------------------------------------------------------------------- entries

@@ -80,7 +80,7 @@ class AnchorPosition(Effect):
         each = [f"{f'anchor {anchor}' if len(moved) > 1 else 'it'} seems off by {by}" for anchor, by in moved.items()]
         return (
             f"Survey {counted(sorted(shifts, key=int), 'anchor')} again: {'; '.join(each)}. If the survey proves "
-            "right, ranges to there are wrong by direction, which effects.yaml takes out.",
+            "right, ranges to there are wrong by direction.",
         )
 
     def marks(self, anchors):

@@ -43,7 +43,4 @@ class ImuMisalignment(ImuEffect):
         if not turns:
             return ()
         back = listed(turns[key] for key in sorted(turns))
-        return (
-            f"Turn the IMU by {back} (or leave it to effects.yaml): its axes are not those of the body as the ground "
-            "truth has it.",
-        )
+        return (f"Turn the IMU by {back}: its axes are not those of the body as the ground truth has it.",)

@@ -35,13 +35,13 @@ def to_do(found):
     nameless = [entry.title for entry in added if not entry.advice]
     parts = [listing([(entry.advice, _known_with(entry)) for entry in urgent], ordered=True)]
     if not urgent:
-        parts += paragraphs(["Nothing that the position would gain from."])
+        parts += paragraphs(["Nothing that the position is known to gain from."])
     if nameless:
         parts += paragraphs([f"Leave to effects.yaml what has no known cause in the hall: {'; '.join(nameless)}."])
     if rest:
         parts.append("<h3>Seen too, less urgent</h3>")
         parts += paragraphs(
-            ["Taking it out of the measurements gains nothing in position that could be measured, or cannot be done."],
+            ["Nobody has seen the position gain from taking it out of the measurements, or it cannot be taken out."],
             "note",
         )
         parts.append(listing([(entry.advice, ()) for entry in rest]))

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from ..judging import LEAST_EXPLAINED
+
 CM = 100.0  # in a metre
 ERROR = "The position error (3D RMSE)"
 
@@ -90,22 +92,24 @@ def _nothing_added(diagnosis):
 
 def _without_truth(diagnosis):
     before, after = (side["pooled"]["residual_spread"] for side in (diagnosis.before, diagnosis.after))
+    scatter = f"Innovations (measured minus predicted TDOAs) scatter by {centimetres(before)}"
     if not diagnosis.findings:
         headline = "Nothing was found: what the model leaves of the measurements looks like noise."
-        spread = f"Innovations (measured minus predicted TDOAs) scatter by {centimetres(before)}."
-        return Verdict(headline, (_UNKNOWN, spread), "nothing")
-    headline = "What was found makes measurements agree better; what that is worth for the position is unknown."
+        return Verdict(headline, (_UNKNOWN, f"{scatter}."), "nothing")
     if not any(finding.added for finding in diagnosis.findings):
-        headline = "What was found cannot be taken out of the measurements; nothing is added to the model."
-    elif after >= before:
         headline = (
-            "What was found does not make measurements agree better with the estimate; what it is worth is unknown."
+            "Nothing of what was found is added to the model: nobody can tell whether it would help the position."
         )
-    spread = (
-        f"Innovations (measured minus predicted TDOAs) scatter by {centimetres(before)} before and "
-        f"{centimetres(after)} after, on the very flights that were fitted."
+        decided = diagnosis.refused[len(diagnosis.attribution.refused) :]
+        why = tuple(f"Not added, {item.what}: {item.why}." for item in decided)
+        return Verdict(headline, (_UNKNOWN, *why, f"{scatter}."), "unknown")
+    headline = "What was found makes measurements agree better; what that is worth for the position is unknown."
+    borne_out = (
+        f"It is added because it explains at least {LEAST_EXPLAINED * 100:.0f} % of what is slow in the innovations of "
+        "flights, or halves of one, that it was not fitted to."
     )
-    return Verdict(headline, (_UNKNOWN, spread), "unknown")
+    change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
+    return Verdict(headline, (_UNKNOWN, borne_out, change), "unknown")
 
 
 _UNKNOWN = "Without ground truth nobody knows the position error, neither before nor after."

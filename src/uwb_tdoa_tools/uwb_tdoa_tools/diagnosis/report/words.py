@@ -8,6 +8,8 @@ TERMS = {
     "UWB": "ultra-wideband: the radio that anchors and tag speak.",
     "TDOA": "time difference of arrival: how much farther one anchor is from the tag than another, in metres.",
     "TDOAs": "time differences of arrival: how much farther one anchor is from the tag than another, in metres.",
+    "TDoA2": "a protocol in which each anchor is heard against the one before it in a fixed order.",
+    "TDoA3": "a protocol in which anchors send at random, and each is heard against many others.",
     "IMU": "inertial measurement unit: gyroscope and accelerometer.",
     "RMSE": "root mean square error: large errors count more than small ones.",
     "3D": "in space: x, y and z together.",
