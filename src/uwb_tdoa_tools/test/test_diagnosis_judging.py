@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ import pytest
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.rehearsal import RecordingCorrector, RehearsedCorrector
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.detectors import Detection
@@ -108,3 +109,10 @@ def test_without_truth_a_model_is_applied_only_if_it_explains_innovations_that_i
     clean = [reference.prepare(clean_flight(seed, 30.0)) for seed in (100, 101)]
     refused = borne_out(attribution, clean, NONE)
     assert refused.candidates == () and "nobody can tell whether they would help" in refused.refused[0].why
+
+
+def test_a_flight_that_the_filter_gives_no_estimate_of_ends_in_a_sentence(flights):
+    tdoa = flights[0].tdoa
+    few = replace(flights[0], imu=None, tdoa=replace(tdoa, **{f.name: getattr(tdoa, f.name)[:3] for f in fields(tdoa)}))
+    with pytest.raises(InputError, match=f"{few.name}: the filter gives no estimate"):
+        compare([Case(few, NONE)], NONE)

@@ -7,6 +7,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 
+from ..parallel import in_one_thread
 from .channels import CHANNELS, residuals
 from .detectors import DETECTORS
 from .findings import Finding, Refused
@@ -48,6 +49,7 @@ class Attribution:
         return [*_findings(self.selection, self.candidates), *map(_of_detection, self.detections)]
 
 
+@in_one_thread
 def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True, progress=lambda: None):
     """Attribution of the residuals of Flights, which the Reference has prepared, to effects beyond `base`.
 

@@ -9,6 +9,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 
+from ..parallel import in_one_thread
 from ..scoring.metrics import Score
 from . import judging, output
 from .attribution import Attribution, attribute
@@ -59,6 +60,7 @@ class Diagnosis:
         return html(self)
 
 
+@in_one_thread
 def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None, progress=lambda what: None):
     """Diagnosis of Flights.
 

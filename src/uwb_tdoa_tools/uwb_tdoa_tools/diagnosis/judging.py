@@ -8,6 +8,7 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.rehearsal import RecordingCorrector, RehearsedCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.stamp_error import shifted
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.estimator import VERDICTS
 from uwb_tdoa_ekf.offline import run_offline
@@ -210,12 +211,15 @@ def compare(cases, base, config=None, progress=lambda: None):
 
 
 def score(case, run):
-    """Score of a Run on a Case."""
+    """Score of a Run on a Case. Raises InputError where there is no estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
     if case.span is not None:
         inside = (truth.t >= case.span[0]) & (truth.t <= case.span[1])
         truth = Truth(truth.t[inside], truth.p[inside], truth.q[inside])
-    return Score(case.flight.name, run.odometry, truth, run.residuals)
+    out = Score(case.flight.name, run.odometry, truth, run.residuals)
+    if not len(out.t):
+        raise InputError(f"{case.flight.name}: the filter gives no estimate in the part to judge on; see what evaluate says.")
+    return out
 
 
 def _innovations(cases, base, config, progress):
