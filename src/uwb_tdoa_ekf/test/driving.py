@@ -16,7 +16,7 @@ def drive(flight, config=None, memory=None, cuts=()):
     edges = [-np.inf, *sorted(cuts), np.inf]
     for low, high in zip(edges, edges[1:]):
         piece = Measurements(*(part[(part["t"] > low) & (part["t"] <= high)] for part in whole))
-        parts.append(feed(memory, tuning, piece))
+        parts.append(feed(memory, tuning, piece)[:2])
     return tuple(np.concatenate(column).view(np.recarray) for column in zip(*parts))
 
 

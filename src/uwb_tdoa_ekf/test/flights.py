@@ -6,8 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth, Velocity
 from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.foundation.pressure import pressure_at
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, structured
 
 GRAVITY = 9.81
@@ -85,6 +86,24 @@ def fly(
         imu=Imu(imu_t + begin, rates, accel),
         truth=Truth(truth_t + begin, p, attitude.as_quat()),
         meta={"wave": wave},
+    )
+
+
+def with_aids(flight, seed=0, rate=25.0, height_std=0.01, pressure_std=0.05, drift=0.0, velocity_std=0.05):
+    """The flight of `fly` with a range finder over ground at z = 0, a barometer that drifts by `drift` m/s, and a
+    velocity; standard deviations in m, m and m/s, white."""
+    rng, begin = np.random.default_rng(seed), flight.truth.t[0]
+    since = (np.arange(int((flight.truth.t[-1] - begin) * rate)) + 0.37) / rate
+    t = since + begin
+    p, v, attitude, _, _ = flight.meta["wave"].motion(since)
+    n, up = len(t), attitude.as_matrix()[:, 2, 2]
+    return replace(
+        flight,
+        height=Height(t, (p[:, 2] + height_std * rng.standard_normal(n)) / up),
+        pressure=Pressure(t, pressure_at(100.0 + p[:, 2] + drift * since + pressure_std * rng.standard_normal(n))),
+        velocity=Velocity(
+            t, attitude.inv().apply(v) + velocity_std * rng.standard_normal((n, 3)), np.full((n, 3), velocity_std)
+        ),
     )
 
 

@@ -12,9 +12,9 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_ekf.core import engine
+from uwb_tdoa_ekf.core import verdicts
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.core.engine import STARTUP, USED
+from uwb_tdoa_ekf.core.verdicts import STARTUP, USED
 
 MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaResidual.msg"
 
@@ -22,7 +22,7 @@ MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaR
 @pytest.mark.skipif(not MESSAGE.is_file(), reason="the message definitions are not beside this package")
 def test_verdicts_are_those_of_the_message():
     declared = dict(re.findall(r"VERDICT_(\w+)=(\d)", MESSAGE.read_text()))
-    assert declared == {name: str(getattr(engine, name)) for name in ("USED", "REJECTED", "LATE", "INVALID", "STARTUP")}
+    assert declared == {name: str(getattr(verdicts, name)) for name in ("USED", "REJECTED", "LATE", "INVALID", "STARTUP")}
 
 
 def without_imu(flight, low=-np.inf, high=np.inf):

@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.engine import USED, feed, most_records, run
+from uwb_tdoa_ekf.core.engine import feed, most_records, run
 from uwb_tdoa_ekf.core.history import RECORD, RESET, UPDATE
 from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, Output, new_memory
+from uwb_tdoa_ekf.core.verdicts import USED
 
 
 def recorded(flight, config=None):
     """(records, residuals) of a flight that is fed at once."""
     records, fed = [], measurements(flight)
-    _, residuals = feed(new_memory(flight.anchors.positions), (config or FilterConfig()).tuning(), fed, records)
+    _, residuals, _ = feed(new_memory(flight.anchors.positions), (config or FilterConfig()).tuning(), fed, records)
     assert sum(map(len, records)) <= most_records(fed)
     return np.concatenate(records), residuals
 

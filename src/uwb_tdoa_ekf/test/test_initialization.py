@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.core.engine import REJECTED, STARTUP, USED
+from uwb_tdoa_ekf.core.verdicts import REJECTED, STARTUP, USED
 from uwb_tdoa_ekf.core.initialization import remember
 from uwb_tdoa_ekf.core.memory import TDOA, WINDOW, new_memory
 

@@ -41,7 +41,7 @@ def located(tdoas, positions, std=STD):
     x, covariance, workspace = np.empty(6), np.empty((6, 6)), np.empty((2, 3))
     anchors = new_memory(positions).anchors
     set_bounds(anchors, 1.0, workspace)
-    share = locate(window_of(*tdoas), anchors, workspace, std, x, covariance)
+    share = locate(window_of(*tdoas), anchors, workspace, std, np.nan, np.nan, x, covariance)
     return x, covariance, share
 
 

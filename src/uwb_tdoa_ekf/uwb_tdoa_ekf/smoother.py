@@ -24,10 +24,11 @@ def smooth(flight, config=None, corrector=None):
     """Run a Flight through bias correction, filter and smoother.
 
     Takes what run_offline takes and returns its Run with the odometry smoothed: at the stamps of updates, thinned to
-    odometry_rate. If the yaw is unknown, the direction that the filter follows in the end counts from the beginning.
+    odometry_rate. Pressures are not used. If the yaw is unknown, the direction that the filter follows in the end counts
+    from the beginning.
     Memory: 3.5 kB per update.
     """
-    config = config or FilterConfig()
+    config = replace(config or FilterConfig(), use_pressure=False)  # its offset is not among the states of the history
     if config.use_imu and config.initial_yaw_std > YAW_STD:
         offset = run_offline(flight, config, corrector).yaw_offset
         config = replace(config, initial_yaw=config.initial_yaw + offset, initial_yaw_std=YAW_STD)

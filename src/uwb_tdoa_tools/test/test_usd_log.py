@@ -37,10 +37,18 @@ def test_streams_units_and_stamps(read):
 
 def test_other_events_are_kept_sorted_and_empty_ones_are_not(read):
     flight = read(log_bytes())
-    assert set(flight.extra) == {"estBarometer"}  # estFlow is defined but never occurs
-    np.testing.assert_array_equal(flight.extra["estBarometer"]["t"], [1.0014, 1.0015])
-    np.testing.assert_array_equal(flight.extra["estBarometer"]["baro.asl"], [102.5, 101.5])
-    assert flight.meta["reordered"] == {"estBarometer": 1}
+    assert set(flight.extra) == {"estTemperature"}  # estFlow is defined but never occurs
+    np.testing.assert_array_equal(flight.extra["estTemperature"]["t"], [1.0014, 1.0015])
+    np.testing.assert_array_equal(flight.extra["estTemperature"]["baro.temp"], [20.5, 21.5])
+    assert flight.meta["reordered"] == {"estTemperature": 1, "baro": 1}
+
+
+def test_range_finder_and_barometer_in_si_units_one_row_for_each_reading(read):
+    flight = read(log_bytes())
+    np.testing.assert_array_equal(flight.height.t, [1.0012, 1.0013])
+    np.testing.assert_array_equal(flight.height.range, [1.25, np.inf])  # 32767 mm: nothing in sight
+    np.testing.assert_array_equal(flight.pressure.t, [1.0014, 1.0015])  # that of 1.00152 repeats the one before
+    np.testing.assert_allclose(flight.pressure.pressure, [101325.0, 101325.0 - 12.013 * 101.5], atol=6.0)  # 12 Pa/m
 
 
 def test_version_1_counts_milliseconds(read):

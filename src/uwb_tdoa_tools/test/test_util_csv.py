@@ -33,7 +33,8 @@ def test_full_schema(read, packed):
     np.testing.assert_allclose(flight.imu.accel[2:], 9.81 * np.array([[0, 0, 2], [1, 0, 1]]))
     np.testing.assert_array_equal(flight.truth.t, [0.005, 0.009])
     np.testing.assert_array_equal(flight.truth.q[1], [0, 0, 0.6, 0.8])
-    assert {name: len(columns["t"]) for name, columns in flight.extra.items()} == {"tof": 1, "flow": 2, "baro": 1}
+    assert {name: len(columns["t"]) for name, columns in flight.extra.items()} == {"flow": 2}
+    assert (len(flight.height), len(flight.pressure)) == (1, 1)
     np.testing.assert_array_equal(flight.extra["flow"]["deltaY"], [-2, 4])
 
 

@@ -4,6 +4,9 @@ Topic (in a bag always absolute)   type                              what
 /imu/data                          sensor_msgs/msg/Imu               Flight.imu, frame base_link
 /uwb/tdoa                          uwb_tdoa_msgs/msg/Tdoa            Flight.tdoa
 /uwb/anchors                       uwb_tdoa_msgs/msg/AnchorArray     Flight.anchors, once, transient local
+/height                            sensor_msgs/msg/Range             Flight.height, frame base_link
+/pressure                          sensor_msgs/msg/FluidPressure     Flight.pressure, frame base_link
+/velocity                          geometry_msgs/msg/TwistWithCovarianceStamped  Flight.velocity, frame base_link
 /ground_truth/pose                 geometry_msgs/msg/PoseStamped     Flight.truth
 /tf_static                         tf2_msgs/msg/TFMessage            frames anchor_<id>, once, transient local
 
@@ -30,6 +33,19 @@ from .message_types import typestore
 
 __all__ = ["RecordedOdometry", "check_output", "is_bag", "read_bag", "read_fields", "read_odometry", "write_bag"]
 
+_AIDS = {  # name of the topic and the field of Flight: its type, messages of it, a row of a message, it of rows
+    "height": (
+        "sensor_msgs/msg/Range", bag_messages.height_messages, bag_messages.height_row, bag_messages.height_of,
+    ),
+    "pressure": (
+        "sensor_msgs/msg/FluidPressure", bag_messages.pressure_messages, bag_messages.pressure_row,
+        bag_messages.pressure_of,
+    ),
+    "velocity": (
+        "geometry_msgs/msg/TwistWithCovarianceStamped", bag_messages.velocity_messages, bag_messages.velocity_row,
+        bag_messages.velocity_of,
+    ),
+}  # fmt: skip
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
 
 
@@ -75,7 +91,7 @@ def write_bag(flight, out, storage="mcap", force=False):
     Raises InputError; also for stamps that a ROS message cannot hold.
     """
     store = typestore()
-    present = [(name, getattr(flight, name)) for name in ("tdoa", "imu", "truth")]
+    present = [(name, getattr(flight, name)) for name in ("tdoa", "imu", "truth", *_AIDS)]
     starts = [bag_messages.nanoseconds(name, s.t[:1])[0] for name, s in present if s is not None and len(s)]
     if not starts:
         raise InputError(f"{flight.name}: holds no message; there is nothing to write.")
@@ -94,6 +110,9 @@ def write_bag(flight, out, storage="mcap", force=False):
     }
     if flight.imu is not None:
         topics["/imu/data"] = "sensor_msgs/msg/Imu", _STREAM_QOS, bag_messages.imu_messages(flight.imu, store)
+    for name, (msgtype, outgoing, _, _) in _AIDS.items():
+        if getattr(flight, name) is not None:
+            topics[f"/{name}"] = msgtype, _STREAM_QOS, outgoing(getattr(flight, name), store)
     topics["/uwb/tdoa"] = "uwb_tdoa_msgs/msg/Tdoa", _STREAM_QOS, bag_messages.tdoa_messages(flight.tdoa, store)
     if flight.truth is not None:
         poses = bag_messages.pose_messages(flight.truth, flight.anchors.frame, store)
@@ -145,9 +164,10 @@ def read_bag(path, namespace="", anchors=None):
         if anchors is None:
             anchors = _read_anchors(path, reader, connections, namespace)
         imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
+        aids = {name: stream(name, msgtype, row, make) for name, (msgtype, _, row, make) in _AIDS.items()}
         pose = "geometry_msgs/msg/PoseStamped"
         truth = stream("ground_truth/pose", pose, bag_messages.pose_row, bag_messages.truth_of)
-    return Flight(about.get("name", Path(path).stem), anchors, tdoa, imu, truth, {}, meta)
+    return Flight(about.get("name", Path(path).stem), anchors, tdoa, imu, truth, {}, meta, **aids)
 
 
 def read_odometry(path, topic="odometry", namespace=""):

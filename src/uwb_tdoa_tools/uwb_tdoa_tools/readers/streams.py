@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth
+from uwb_tdoa_bias.foundation.pressure import pressure_at
 
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
+NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
 
 
 def read_bytes(path):
@@ -26,6 +28,7 @@ def make_flight(name, anchors, streams, meta):
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
         "tdoa": a, b, d (m); "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw.
+        "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere).
         Every other name goes to `Flight.extra` as it is.
     meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps
         of each stream fell before they were sorted) and "imu_accel_interpolated".
@@ -53,7 +56,22 @@ def make_flight(name, anchors, streams, meta):
     if "pose" in streams:
         pose = streams.pop("pose")
         truth = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
-    return Flight(name, anchors, tdoas, imu, truth, streams, meta)
+    height = pressure = None
+    if "tof" in streams:
+        tof = streams.pop("tof")
+        ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(float)  # as a sensor_msgs/Range holds it
+        height = Height(tof["t"], np.where(ranges < NO_TARGET, ranges, np.inf))
+    if "baro" in streams:
+        baro = _readings(streams.pop("baro"), "baro")
+        pressure = Pressure(baro["t"], pressure_at(baro["baro"]))
+    return Flight(name, anchors, tdoas, imu, truth, streams, meta, height, pressure)
+
+
+def _readings(columns, name):
+    """The rows of a sensor that is logged more often than it measures: where its value differs from the one before."""
+    values = np.asarray(columns[name], dtype=float)
+    new = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    return {"t": columns["t"][new], name: values[new]}
 
 
 def protocol(tdoas):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.core.engine import REJECTED, USED
+from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 
 AIRBORNE = 0.3  # m; errors count from the first to the last instant above this height
 LOST = 1.0  # m; a larger error is no estimate
