@@ -9,6 +9,7 @@ from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.judging import Case, borne_out, compare, cross_fitted, useful
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
@@ -100,15 +101,15 @@ def test_before_and_after_with_intervals(flights):
     assert [row["flight"] for row in after["runs"]] == [flight.name for flight in flights]
 
 
-def test_without_truth_a_model_is_applied_only_if_it_explains_innovations_that_it_has_not_seen(flights):
-    reference = Nothing()
-    prepared = [reference.prepare(flight) for flight in flights]
+def test_without_truth_positions_and_delays_of_anchors_are_applied_if_they_explain_the_innovations():
+    reference, clean = Nothing(), [clean_flight(seed, 40.0) for seed in (100, 101)]
+    prepared = [reference.prepare(effect_of("anchor_delay", True, 1).inject(flight)) for flight in clean]
     attribution = attribute(prepared, reference, undeclared=False)
     kept = borne_out(attribution, prepared, NONE)
-    assert kept.candidates == attribution.selection.chosen and len(kept.candidates)
-    clean = [reference.prepare(clean_flight(seed, 30.0)) for seed in (100, 101)]
-    refused = borne_out(attribution, clean, NONE)
-    assert refused.candidates == () and "nobody can tell whether they would help" in refused.refused[0].why
+    assert [candidate.name for candidate in kept.candidates] == ["anchor_position", "anchor_delay"] and not kept.refused
+    calm = [residuals(reference.prepare(flight), reference, NONE) for flight in clean]
+    refused = borne_out(replace(attribution, residuals=calm), clean, NONE)
+    assert refused.candidates == () and "of what is slow in the innovations" in refused.refused[0].why
 
 
 def test_a_flight_that_the_filter_gives_no_estimate_of_ends_in_a_sentence(flights):

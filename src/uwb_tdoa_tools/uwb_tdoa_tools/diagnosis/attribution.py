@@ -40,9 +40,9 @@ class Attribution:
         """All Effects found: tuple."""
         return (*effects_of(self.selection), *(detection.effect for detection in self.detections))
 
-    def only(self, candidates, detections):
-        """The Attribution with some of its chosen Candidates, fitted anew, and of its detections."""
-        return replace(self, selection=self.selection.only(candidates), detections=tuple(detections))
+    def of(self, kept):
+        """The Attribution of what was Kept."""
+        return replace(self, selection=kept.selection, detections=kept.detections)
 
     def findings(self):
         """[Finding], those by regression first."""

@@ -79,15 +79,15 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     decide = judging.useful if reference.judges else judging.borne_out
     # A finding stays one even if the filter does without it; it is only not added.
     kept = decide(attribution, flights, base, config, saying("running the filter without each"))
-    model = attribution.only(kept.candidates, kept.detections)
+    model = attribution.of(kept)
     effects = EffectSet((*base.effects, *usable(model.effects).effects))
     judged = judging.judge(model, flights, holdout, base, effects, reference, config, saying("judging"))
     before, after, judged_on = judged
     refused = [*attribution.refused, *kept.refused]
     if reference.judges and after["pooled"]["rmse_3d"] >= before["pooled"]["rmse_3d"] and len(effects) > len(base):
         refused.append(Refused("all", "together they do not make the error smaller on held-out data"))
-        effects, after, kept = base, before, judging.Kept((), (), (), {})
-        model = attribution.only((), ())
+        effects, after, kept = base, before, judging.nothing(attribution)
+        model = attribution.of(kept)
     remaining = [residuals(flight, reference, effects) for flight in flights]
     progress("judging")
     runs = [run_offline(flight, config, Corrector(flight.anchors, base)) for flight in flights]

@@ -15,16 +15,16 @@ from uwb_tdoa_ekf.offline import run_offline
 
 from ..scoring.metrics import Score, as_json, pooled
 from .attribution import effects_of
+from .calibration import calibrate
 from .findings import Refused, usable
 from .regression.fit import refit
+from .regression.select import Selection
 from .regression.terms import columns_of
 
 BOOTSTRAPS = 400
 BLOCK = 5.0  # s
 JUDGES = 3  # flights, or halves of one, on which trials are judged
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
-LEAST_EXPLAINED = 1.0 / 3.0  # share of the slow innovations, for a model that no position can judge
-CELL, FEWEST, OUTLIER = 0.5, 4, 1.0  # s and TDOAs that are averaged; m that one counts as at most
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
 
@@ -39,13 +39,23 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What makes the filter no worse: candidates, detections; refused : (Refused, ...) of the others; worth : {candidate or
-    detection: m by which the mean 3D RMSE is larger without it}."""
+    """What makes the filter no worse: selection : Selection; detections; refused : (Refused, ...) of the others; worth :
+    {candidate or detection: m by which the mean 3D RMSE is larger without it}."""
 
-    candidates: tuple
+    selection: Selection
     detections: tuple
     refused: tuple
     worth: dict
+
+    @property
+    def candidates(self):
+        """Those that are kept."""
+        return self.selection.chosen
+
+
+def nothing(attribution, refused=()):
+    """Kept of an Attribution of which nothing is."""
+    return Kept(attribution.selection.only(()), (), tuple(refused), {})
 
 
 def cross_fitted(attribution, flights, base, candidates, detections):
@@ -98,45 +108,24 @@ def useful(attribution, flights, base, config=None, progress=lambda: None):
         else:
             why = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
             refused.append(Refused(detection.effect.label, why))
-    return Kept(tuple(candidates), tuple(detections), tuple(refused), worth)
+    return Kept(attribution.selection.only(candidates), tuple(detections), tuple(refused), worth)
 
 
 def borne_out(attribution, flights, base, config=None, progress=lambda: None):
-    """Kept, where the reference tells no errors: everything or nothing.
+    """Kept, where the reference tells no errors: positions and delays of anchors together, or nothing.
 
-    A model that is wrong makes innovations smaller too, by pushing the path to where they are. It is applied only if it
-    explains LEAST_EXPLAINED of what is slow in the innovations of flights, or halves of one, that it was not fitted to.
+    A model that is wrong makes innovations smaller too, by pushing the path to where they are. On measured flights
+    functions of the place, fitted to some, made innovations of others smaller and doubled the error of the position.
     """
-    chosen = attribution.selection.chosen
-    before, after = [], []
-    for case in cross_fitted(attribution, flights, base, chosen, ()) if chosen else ():
-        before.append(_slow(case, base, config))
-        after.append(_slow(case, case.effects, config))
-        progress()
-    if not chosen:
-        return Kept((), (), (), {})
-    share = 1.0 - np.mean(np.concatenate(after) ** 2) / np.mean(np.concatenate(before) ** 2)
-    if share >= LEAST_EXPLAINED:
-        return Kept(chosen, (), (), {})
-    why = (
-        f"explain {max(share, 0.0):.0%} of what is slow in innovations that they were not fitted to, less than "
-        f"{LEAST_EXPLAINED:.0%}: nobody can tell whether they would help the position; fly where the position is known"
-    )
-    return Kept((), (), (Refused(" + ".join(candidate.label for candidate in chosen), why),), {})
-
-
-def _slow(case, effects, config):
-    """Means of the innovations of every pair over CELL, m, without outliers."""
-    residuals = run_offline(case.flight, config, Corrector(case.flight.anchors, effects)).residuals
-    chosen = np.isfinite(residuals.innovation)
-    if case.span is not None:
-        chosen &= (residuals.t >= case.span[0]) & (residuals.t <= case.span[1])
-    cell = ((residuals.t[chosen] - case.flight.tdoa.t[0]) / CELL).astype(int)
-    pair = residuals.a[chosen].astype(np.int64) * 100000 + residuals.b[chosen]
-    label = np.unique(np.stack([cell, pair]), axis=1, return_inverse=True)[1].reshape(-1)
-    count = np.bincount(label)
-    mean = np.bincount(label, np.clip(residuals.innovation[chosen], -OUTLIER, OUTLIER)) / count
-    return mean[count >= FEWEST]
+    selection = attribution.selection
+    if not selection.chosen:
+        return nothing(attribution)
+    calibration = calibrate(attribution.residuals, attribution.candidates)
+    progress()
+    if calibration.why_not is None:
+        return Kept(calibration.selection, (), (), {})
+    label = " + ".join(candidate.label for candidate in selection.chosen)
+    return nothing(attribution, [Refused(label, calibration.why_not)])
 
 
 class _Trials:

@@ -72,5 +72,5 @@ def find(flights, progress=lambda: None):
     kinds = PORTABLE if len(constellations(flights)) > 1 else None
     attribution = attribute(flights, reference, kinds=kinds, undeclared=False, progress=progress)
     kept = useful(attribution, flights, EffectSet(), progress=progress)
-    model = attribution.only(kept.candidates, kept.detections)
+    model = attribution.of(kept)
     return Physics(usable(model.effects), model)

@@ -56,9 +56,10 @@ def prior_sizes(columns):
     return np.array([column.typical for column in columns])
 
 
-def fit(table, columns, inflation=None):
-    """Fit of some Columns of a Table. inflation : (channels,), measured on this very fit if None."""
-    x, channel, sizes = table.matrix(columns), table.channel, prior_sizes(columns)
+def fit(table, columns, inflation=None, sizes=None):
+    """Fit of some Columns of a Table. inflation : (channels,), measured on this very fit if None; sizes : (k,) standard
+    deviations of the prior, plausible ones if None."""
+    x, channel, sizes = table.matrix(columns), table.channel, prior_sizes(columns) if sizes is None else sizes
     size = np.maximum(np.bincount(channel, minlength=len(table.channels)), 1).astype(float)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
     residual, scale = table.y.copy(), np.ones(len(table.channels))

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ..judging import LEAST_EXPLAINED
+from ..calibration import LEFT
 
 CM = 100.0  # in a metre
 ERROR = "The position error (3D RMSE)"
@@ -105,8 +105,8 @@ def _without_truth(diagnosis):
         return Verdict(headline, (_UNKNOWN, *why, f"{scatter}."), "unknown")
     headline = "What was found makes measurements agree better; what that is worth for the position is unknown."
     borne_out = (
-        f"It is added because it explains at least {LEAST_EXPLAINED * 100:.0f} % of what is slow in the innovations of "
-        "flights, or halves of one, that it was not fitted to."
+        "It is added because what is slow in the innovations becomes small: what it leaves is not above "
+        f"{100 * LEFT:.1f} cm. On measured flights a correction that left more made the position worse."
     )
     change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
     return Verdict(headline, (_UNKNOWN, borne_out, change), "unknown")
