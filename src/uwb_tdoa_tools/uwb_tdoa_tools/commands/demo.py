@@ -6,9 +6,8 @@ import time
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli
+from .. import cli, options
 from ..live import demo
-from ..readers import inputs
 from ..scoring.plots import plot_comparison
 from ..scoring.table import lines_of_errors
 
@@ -38,7 +37,7 @@ def parser():
     )
     add = made.add_argument
     add("--flight", metavar="LOG", help="a recording: micro-SD log, UTIL CSV or bag (default: simulate one)")
-    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    options.add_reading(made)
     add("--rate", metavar="R", type=float, default=1.0, help="replay R times as fast as flown (default 1)")
     add("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="for all files (default out/demo)")
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
@@ -54,7 +53,7 @@ def _demo(args):
     started = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
     if args.flight:
-        case = demo.measured(args.flight, args.survey, args.effects, args.model)
+        case = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
     else:
         case = demo.simulated(args.out, args.effects, args.model)
     flight = case.flight

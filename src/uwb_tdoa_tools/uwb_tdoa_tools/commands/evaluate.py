@@ -10,7 +10,6 @@ from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
-from ..readers import inputs
 from ..scoring import table
 from ..scoring.judge import Judge
 from ..scoring.metrics import as_json, pooled
@@ -61,12 +60,13 @@ def _evaluate(args):
     config, effects = options.filter_of(args)
     config = options.with_parameters(config, args.parameters)
     network = None if args.no_bias else load_network(args.model)
-    found = inputs.find_flights(args.flights, args.survey, absolute=bool(args.dask))
+    reading = options.reading_of(args)
+    found = reading.find(args.flights, bool(args.dask))
     for option in ("odometry", "plot"):
         if getattr(args, option) and len(found) != 1:
             raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
     judge = Judge(
-        config, None if args.no_bias else effects, network, args.smooth, args.odometry, args.namespace, args.plot,
+        reading, config, None if args.no_bias else effects, network, args.smooth, args.odometry, args.plot,
         Path(args.tum).absolute() if args.tum else None,
     )  # fmt: skip
     scores = []
