@@ -29,7 +29,7 @@ def parser():
         "convert const1-trial1-tdoa2.csv.gz --survey anchor_const1.csv --out const1.bag --storage sqlite3",
         "convert flight.log --survey anchors.yaml --out flight.bag --force --json",
         "convert cut.log --survey anchors.yaml --salvage --out flight.bag",
-        "convert theirs.bag --topic uwb/tdoa=/dwm/tdoa --topic imu/data=/mavros/imu --survey anchors.yaml --out our.bag",
+        "convert theirs.bag --topic uwb/tdoa=/dwm/tdoa --topic imu/data=/fcu/imu --survey anchors.yaml --out our.bag",
     )
     made.add_argument("input", metavar="IN", help="the recording; its kind is found by its content")
     options.add_reading(made)

@@ -65,7 +65,7 @@ def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, s
         wait(READY_LIMIT, "the nodes to find each other", processes, node, lambda: _is_ready(node, diagnostics))
         say(f"replaying {bag} at rate {rate:g}")
         options = ("--rate", rate, "--follow", "odometry", "--wait-matched", MATCH_LIMIT, "--wait-topics", *inputs)
-        replay = processes.start("uwb_tdoa_tools", "replay", bag, *options, may_end=True)
+        replay = processes.start("uwb_tdoa_tools", "replay", bag, *options, may_end_with=(0, 1))
         wait(None, None, processes, node, lambda: replay.poll() is not None)
         diagnostics.forget()
         wait(SETTLE_LIMIT, "the nodes to finish", processes, node, diagnostics.is_settled)
