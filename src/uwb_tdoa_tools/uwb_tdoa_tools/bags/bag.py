@@ -30,7 +30,9 @@ from .integrity import metadata
 from .mcap import Damaged
 from .message_types import check_type, typestore
 
-__all__ = ["RecordedOdometry", "check_output", "is_bag", "read_bag", "read_fields", "read_odometry", "write_bag"]
+__all__ = [
+    "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry", "write_bag",
+]  # fmt: skip
 
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
 
@@ -170,14 +172,27 @@ def read_odometry(path, namespace="", salvage=False, topics=None):
     """
     with open_bag(path, salvage) as reader:
         topic = _Names(namespace, topics)("odometry")
-        found = _find(path, _connections(reader), topic, "nav_msgs/msg/Odometry")
+        names = _connections(reader)
+        found = _find(path, names, topic, "nav_msgs/msg/Odometry")
         t, rows, _ = _table(path, reader, found, bag_messages.odometry_row)
     if not len(t):
-        raise InputError(f"{path}: has no message on {topic}; record the output of the filter.")
+        others = ", ".join(name for name in names if name.endswith("/odometry"))
+        remedy = f"say which to take (--topic odometry={others})" if others else "record the output of the filter"
+        raise InputError(f"{path}: has no message on {topic}; {remedy}.")
     p, v, q = rows[:, 0:3], rows[:, 3:6], rows[:, 6:10]
     known = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0.0)
     v = np.where(known[:, None], Rotation.from_quat(np.where(known[:, None], q, [0.0, 0.0, 0.0, 1.0])).apply(v), np.nan)
     return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6))
+
+
+def late_tdoas(path, namespace="", salvage=False, topics=None):
+    """How many TDOAs came too late for the filter that made the odometry of a bag, by the uwb/residual beside it; 0 where
+    that was not recorded. Raises InputError."""
+    beside = _Names(namespace, topics)("odometry").rpartition("/")[0]
+    with open_bag(path, salvage) as reader:
+        found = _find(path, _connections(reader), f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual")
+        residuals = (deserialize(path, c, data) for c, _, data in messages(path, reader, found))
+        return sum(residual.verdict == residual.VERDICT_LATE for residual in residuals)
 
 
 def read_fields(path, topic, namespace=""):

@@ -25,11 +25,13 @@ def parser():
     made = cli.parser(
         "evaluate",
         "Errors of the estimate against ground truth over the airborne part (truth z > 0.3 m), in metres.\n"
-        "Runs bias correction and filter here, as the nodes would, or takes a recorded odometry.",
+        "Runs bias correction and filter here, as the nodes would, or takes a recorded odometry (exit code 1 if TDOAs were\n"
+        "late for it, as far as uwb/residual was recorded too).",
         "evaluate flight.bag",
         "evaluate 0425-traj2 --survey anchor_0425.txt --plot error.png",
         "evaluate flights/ --survey surveys/ --no-bias --json errors.json",
         "evaluate flight.bag --odometry recorded.bag --tum out/",
+        "evaluate flight.bag --odometry tags.bag --topic odometry=/tag1/odometry",
         "evaluate flights/ --survey surveys/ -p adapt_noise:=false -p loss:=huber",
         "evaluate flights/ --survey surveys/ --dask tcp://10.0.0.1:8786",
     )
@@ -86,6 +88,10 @@ def _evaluate(args):
         rows += [together] * (len(scores) > 1)
         others = table.read_others(args.beside) if args.beside else {}
         Path(args.markdown).write_text(table.markdown(rows, others))
+    if late := judge.late_tdoas():
+        cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
+                "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip
+    return int(late > 0)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
-from ..bags.bag import read_odometry
+from ..bags.bag import late_tdoas, read_odometry
 from ..readers.inputs import Reading
 from .evaluation import evaluate, need_truth
 from .metrics import Score
@@ -40,9 +40,7 @@ class Judge:
         flight = self.reading.read(recording)
         need_truth(flight)
         if self.odometry:
-            odometry = read_odometry(
-                self.odometry, self.reading.namespace, self.reading.salvage, self.reading.topics
-            )
+            odometry = read_odometry(self.odometry, *self._where)
             score = Score(flight.name, odometry, flight.truth)
         else:
             engine = smooth if self.smoothed else run_offline
@@ -55,3 +53,11 @@ class Judge:
             write_tum(folder / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
             write_tum(folder / f"{flight.name}_truth.tum", truth.t, truth.p, truth.q)
         return score
+
+    def late_tdoas(self):
+        """How many TDOAs were late for the odometry that is judged."""
+        return late_tdoas(self.odometry, *self._where) if self.odometry else 0
+
+    @property
+    def _where(self):
+        return self.reading.namespace, self.reading.salvage, self.reading.topics
