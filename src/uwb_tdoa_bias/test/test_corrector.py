@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
-from uwb_tdoa_bias.correction.poses import told_yaw_std, turned
+from uwb_tdoa_bias.correction.poses import known_yaw_std, rotated_in_yaw
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
 DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))
@@ -183,14 +183,14 @@ def test_effects_are_those_of_the_mean_heading_while_the_yaw_is_unknown():
 
 def test_without_an_estimated_attitude_the_yaw_is_what_everybody_assumes():
     std = np.array([[0.1, 0.1, 2.0], [1.2, 1.2, 2.5], [0.1, 0.1, 0.3]])
-    np.testing.assert_array_equal(told_yaw_std(std), [2.0, 0.0, 0.3])
+    np.testing.assert_array_equal(known_yaw_std(std), [2.0, 0.0, 0.3])
 
 
 @given(st.integers(-4, 4), st.integers(0, 1000))
-def test_turned_turns_about_the_vertical(quarters, seed):
+def test_rotated_in_yaw_turns_about_the_vertical(quarters, seed):
     q = Rotation.random(3, random_state=seed)
     expected = Rotation.from_euler("z", quarters * np.pi / 2) * q
-    assert np.abs((Rotation.from_quat(turned(q.as_quat(), quarters)) * expected.inv()).magnitude()).max() < 1e-9
+    assert np.abs((Rotation.from_quat(rotated_in_yaw(q.as_quat(), quarters)) * expected.inv()).magnitude()).max() < 1e-9
 
 
 def test_empty_batch():

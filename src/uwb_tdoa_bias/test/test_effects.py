@@ -257,3 +257,13 @@ def test_a_covariate_keeps_working_under_its_old_name():
     with pytest.warns(FutureWarning, match="force_x is now accel_x"):
         old = SmoothTerm(channel="gyro.x", covariate="force_x", knots=(0.0, 1.0))
     assert old == SmoothTerm(channel="gyro.x", covariate="accel_x", knots=(0.0, 1.0))
+
+
+def test_several_effects_of_one_name_are_all_kept(tmp_path):
+    curves = [SmoothTerm({"c0": value}, knots=(0.0, 1.0)) for value in (0.1, 0.2)]
+    written = EffectSet((AnchorDelay({"0": 0.2}), *curves, AnchorDelay({"0": 0.1})))
+    written.to_yaml(tmp_path / "effects.yaml")
+    read = EffectSet.from_yaml(tmp_path / "effects.yaml")
+    assert read == written
+    samples = random_samples(3)
+    np.testing.assert_array_equal(read.bias(samples), written.bias(samples))

@@ -20,9 +20,9 @@ from .foundation.anchors import Anchors
 from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
 from .effects import EffectSet
 from .foundation.errors import InputError
-from .correction.hold import Hold
+from .correction.pose_queue import PoseQueue
 from .correction.network import SHIPPED, load_network
-from .correction.poses import told_yaw_std
+from .correction.poses import known_yaw_std
 from .foundation.stamps import StampGate
 
 ROTATIONS = [21, 28, 35]  # places of the variances about the axes in the covariance of a pose
@@ -53,7 +53,7 @@ class BiasNode(Node):
         self._idle = self._model[NETWORK] == "none"
         self._corrector = None
         self._epoch, self._counts, self._rate = ros.Epoch(), Counter(), ros.Rate()
-        self._early, self._hold = deque(), Hold(self._limit)
+        self._early, self._hold = deque(), PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = 0
         self._message = TdoaCorrected()  # one for all: what is published is copied
@@ -77,7 +77,7 @@ class BiasNode(Node):
     def _start_over(self):
         """Forget poses and whatever waits for one."""
         self._counts["dropped"] += len(self._hold)
-        self._hold = Hold(self._limit)
+        self._hold = PoseQueue(self._limit)
         self._corrector = Corrector(self._anchors.anchors, self._effects, self._network, self._lag)
 
     def _on_anchors(self, _):
@@ -109,7 +109,7 @@ class BiasNode(Node):
         for t, pose in accepted:
             position, turns = pose.pose.position, np.sqrt(np.maximum(pose.covariance[ROTATIONS], 0.0))
             at, orientation = (position.x, position.y, position.z), ros.orientation_of(pose.pose.orientation)
-            self._corrector.add_pose(t, at, orientation, told_yaw_std(turns[None])[0])
+            self._corrector.add_pose(t, at, orientation, known_yaw_std(turns[None])[0])
 
     def _on_tdoa(self, message):
         self._counts["received"] += 1

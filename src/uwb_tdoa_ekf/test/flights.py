@@ -1,11 +1,14 @@
 """Small simulated flights whose every error is known, for the tests of the filter."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth, Velocity
 from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.foundation.pressure import pressure_at
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, structured
 
 GRAVITY = 9.81
@@ -86,6 +89,24 @@ def fly(
     )
 
 
+def with_aids(flight, seed=0, rate=25.0, height_std=0.01, pressure_std=0.05, drift=0.0, velocity_std=0.05):
+    """The flight of `fly` with a range finder over ground at z = 0, a barometer that drifts by `drift` m/s, and a
+    velocity; standard deviations in m, m and m/s, white."""
+    rng, begin = np.random.default_rng(seed), flight.truth.t[0]
+    since = (np.arange(int((flight.truth.t[-1] - begin) * rate)) + 0.37) / rate
+    t = since + begin
+    p, v, attitude, _, _ = flight.meta["wave"].motion(since)
+    n, up = len(t), attitude.as_matrix()[:, 2, 2]
+    return replace(
+        flight,
+        height=Height(t, (p[:, 2] + height_std * rng.standard_normal(n)) / up),
+        pressure=Pressure(t, pressure_at(100.0 + p[:, 2] + drift * since + pressure_std * rng.standard_normal(n))),
+        velocity=Velocity(
+            t, attitude.inv().apply(v) + velocity_std * rng.standard_normal((n, 3)), np.full((n, 3), velocity_std)
+        ),
+    )
+
+
 def _inertial_error(rng, n, rate, noise, bias, walk):
     steps = walk / np.sqrt(rate) * rng.standard_normal((n, 3))
     white = noise * np.sqrt(rate) * rng.standard_normal((n, 3))
@@ -104,3 +125,16 @@ def measurements(flight):
 def position_at(flight, t):
     """True positions (n, 3) m at stamps t."""
     return np.stack([np.interp(t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
+
+
+WORKSPACE = np.array([[-1.0, -1.0, -1.5], [8.0, 9.0, 4.5]])  # m, its bounds with the anchors of corners()
+
+
+def leaving(flight):
+    """A hovering Flight with the TDOAs of a tag that leaves its workspace along all axes, level, at constant velocity,
+    until 3 s."""
+    t, anchors = flight.tdoa.t, flight.anchors
+    p = np.array([6.0, 7.0, 3.0]) + np.minimum(t, 3.0)[:, None] * [1.2, 1.2, 1.0]
+    a, b = (anchors.positions[anchors.index(ids)] for ids in (flight.tdoa.a, flight.tdoa.b))
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(t))
+    return replace(flight, tdoa=replace(flight.tdoa, d=tdoa(p, a, b) + noise))

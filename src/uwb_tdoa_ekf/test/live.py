@@ -4,18 +4,36 @@ from dataclasses import fields
 
 import numpy as np
 
-IMU, TDOA = 0, 1
+from uwb_tdoa_ekf.core.aids import STREAMS
+
+IMU, TDOA, HEIGHT, PRESSURE, VELOCITY = range(5)
 
 
 def messages(flight):
     """All (stamp, stream, place in the stream) of a flight in stamp order, inertial samples first."""
-    streams = ((IMU, flight.imu.t if flight.imu is not None else ()), (TDOA, flight.tdoa.t))
+    parts = [flight.imu, flight.tdoa, *(getattr(flight, name) for name in STREAMS)]
+    streams = enumerate(part.t if part is not None else () for part in parts)
     return sorted((t, stream, i) for stream, stamps in streams for i, t in enumerate(stamps))
+
+
+def send(estimator, flight, stream, i):
+    """Give one message to the estimator."""
+    imu, tdoa, height, pressure, velocity = (getattr(flight, name) for name in ("imu", "tdoa", *STREAMS))
+    if stream == IMU:
+        estimator.add_imu(imu.t[i], imu.gyro[i], imu.accel[i])
+    elif stream == TDOA:
+        estimator.add_tdoa(tdoa.t[i], int(tdoa.a[i]), int(tdoa.b[i]), tdoa.d[i])
+    elif stream == HEIGHT:
+        estimator.add_height(height.t[i], height.range[i])
+    elif stream == PRESSURE:
+        estimator.add_pressure(pressure.t[i], pressure.pressure[i])
+    else:
+        estimator.add_velocity(velocity.t[i], velocity.v[i], velocity.std[i])
 
 
 def arriving(flight, rng, imu_delay=0.0, tdoa_delay=0.0, imu_jitter=0.0, tdoa_jitter=0.0):
     """The messages in the order in which they come in after such delays: constant, and uniform from 0 to jitter, s."""
-    delay, jitter = (imu_delay, tdoa_delay), (imu_jitter, tdoa_jitter)
+    delay, jitter = (imu_delay, tdoa_delay, 0.0, 0.0, 0.0), (imu_jitter, tdoa_jitter, 0.0, 0.0, 0.0)
     return sorted(messages(flight), key=lambda m: m[0] + delay[m[1]] + jitter[m[1]] * rng.random())
 
 
@@ -24,10 +42,7 @@ def feed(estimator, flight, order=None, advance=None):
     advance(): whether to advance after a message (default: always)."""
     parts = []
     for t, stream, i in messages(flight) if order is None else order:
-        if stream == IMU:
-            estimator.add_imu(t, flight.imu.gyro[i], flight.imu.accel[i])
-        else:
-            estimator.add_tdoa(t, int(flight.tdoa.a[i]), int(flight.tdoa.b[i]), flight.tdoa.d[i])
+        send(estimator, flight, stream, i)
         if advance is None or advance():
             parts.append(estimator.advance())
     parts.append(estimator.finish())

@@ -11,13 +11,14 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from flights import fly
+from geometry_msgs.msg import TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import ReliabilityPolicy
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
@@ -46,6 +47,10 @@ STREAMS = {
     "odometry": Odometry,
     "odometry/debiased": Odometry,
     "uwb/residual": TdoaResidual,
+    "height": Range,
+    "pressure": FluidPressure,
+    "velocity": TwistWithCovarianceStamped,
+    "velocity/odometry": Odometry,
 }
 
 
@@ -187,6 +192,11 @@ class Rig:
         self.wait(all_matched, "all to have found each other")
         return [self._processes[name] for name in names]
 
+    def add_publisher(self, topic):
+        """Play a topic that a node can do without."""
+        publisher = self._publishers[topic] = self.node.create_publisher(STREAMS[topic], topic, self._qos)
+        self.wait(publisher.get_subscription_count, f"{topic} to be heard")
+
     def close(self):
         """End what was started."""
         for process in self._processes.values():
@@ -271,18 +281,36 @@ class Rig:
         message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.position.z = map(float, p)
         self.send("odometry", message, t, "map", epoch)
 
-    def play(self, flight, epoch=EPOCH, ahead=0.025, send_tdoa=None):
+    def send_aid(self, topic, flight, i, epoch=EPOCH):
+        """Measurement i of a Flight's height, pressure or velocity, on one of their topics."""
+        part = getattr(flight, topic.partition("/")[0])
+        message = STREAMS[topic]()
+        if topic == "height":
+            message.range, message.max_range = float(part.range[i]), 10.0
+        elif topic == "pressure":
+            message.fluid_pressure = float(part.pressure[i])
+        else:
+            linear = message.twist.twist.linear
+            linear.x, linear.y, linear.z = part.v[i].tolist()
+            message.twist.covariance = np.diag([*part.std[i] ** 2, 0.0, 0.0, 0.0]).ravel()
+        self.send(topic, message, part.t[i], epoch=epoch)
+
+    def play(self, flight, epoch=EPOCH, ahead=0.025, send_tdoa=None, aids=()):
         """Send a Flight in stamp order, never more than `ahead` s of stamps beyond what the nodes have made of it.
 
         Returns when every TDOA but those of the last `ahead` s has its residual. (Much further ahead than that, the
         result would depend on timing while the filter starts: bias_node cannot know yet that there will be poses.)
+        aids : topics of height, pressure or velocity to play too.
         """
         imu, tdoa = flight.imu, flight.tdoa
+        of_aids = sorted((t, topic, i) for topic in aids for i, t in enumerate(getattr(flight, topic.partition("/")[0]).t))
         before, i = len(self.residuals), 0
         for k, t in enumerate(tdoa.t):
             while i < len(imu) and imu.t[i] <= t:
                 self.send_imu(imu.t[i], imu.gyro[i], imu.accel[i], epoch)
                 i += 1
+            while of_aids and of_aids[0][0] <= t:
+                self.send_aid(*of_aids[0][1:2], flight, of_aids.pop(0)[2], epoch)
             (send_tdoa or self.send_tdoa)(t, tdoa.a[k], tdoa.b[k], tdoa.d[k], epoch)
             due = before + np.searchsorted(tdoa.t, t - ahead)
             self.wait(lambda due=due: len(self.residuals) >= due, f"{due} residuals", 60.0)

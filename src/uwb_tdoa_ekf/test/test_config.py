@@ -10,8 +10,9 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import CHOICES, RENAMED, TUNING, FilterConfig, current_names
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"
-SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover")
-OTHERS = (*CHOICES, "initial_yaw", *SWITCHES)
+SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover", "use_height", "use_pressure", "use_velocity")
+SIGNED = "initial_yaw", "height_arm", "ground_height", "fixed_height", "velocity_yaw", "velocity_delay"
+OTHERS = (*CHOICES, *SIGNED, *SWITCHES)
 NUMBERS = [field.name for field in fields(FilterConfig) if field.name not in OTHERS]
 
 
@@ -74,7 +75,7 @@ def test_a_number_must_be_above_zero(value):
             accepted.append(name)
         except InputError as error:
             assert name in str(error)
-    assert accepted == (["vibration_gain"] if value == 0.0 else [])  # 0: it does not vibrate
+    assert accepted == (["vibration_gain", "fixed_height_std"] if value == 0.0 else [])  # 0: it does not vibrate, or stay on a floor
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "north"])

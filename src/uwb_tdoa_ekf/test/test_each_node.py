@@ -11,12 +11,13 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
-from flights import corners  # noqa: E402
+from flights import corners, with_aids  # noqa: E402
 from rig import MODULES, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from sensor_msgs.msg import Imu  # noqa: E402
 from uwb_tdoa_bias.foundation import ros  # noqa: E402
 from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
+from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
 ANCHORS = corners()  # ids 10 ... 17
@@ -166,6 +167,31 @@ def test_every_measurement_is_accounted_for(make_rig):
     assert sum(counts[name] for name in verdicts) == len(rig.residuals)
     imu = sum(counts[f"imu_{name}"] for name in ("used", "late", "invalid", "waiting"))
     assert imu == counts["IMU samples received"] == len(flight.imu) + 1
+
+
+@pytest.mark.parametrize("topic", ["velocity", "velocity/odometry"])
+def test_height_pressure_and_velocity_are_used_where_they_are_there(make_rig, topic):
+    rig = make_rig()
+    rig.start("ekf_node")
+    flight = recording(3.0)
+    flight = with_aids(flight, rate=50.0)
+    flight.height.range[:] = np.float32(flight.height.range)  # a sensor_msgs/Range is not more precise
+    flight.height.range[20] = np.inf
+    topics = ["height", "pressure", topic]
+    for each in topics:
+        rig.add_publisher(each)
+    rig.send_anchors(flight.anchors)
+    rig.play(flight, send_tdoa=rig.send_corrected, ahead=0.1, aids=topics)
+    counts = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa))
+    verdicts = ("used", "rejected", "late", "invalid", "startup", "waiting")
+    for aid in ("height", "pressure", "velocity"):
+        assert sum(counts[f"{aid}_{verdict}"] for verdict in verdicts) == counts[f"{aid}_received"] > 100
+        assert counts[f"{aid}_used"] > 50
+    assert counts["height_invalid"] == 1
+    expected = run_offline(flight).odometry
+    place = np.searchsorted(expected.t, [seconds_of(m.header.stamp) for m in rig.odometry])
+    p = [(m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z) for m in rig.odometry]
+    np.testing.assert_allclose(p, expected.p[place], atol=1e-3)
 
 
 def test_an_imu_without_accelerometer_is_not_believed(make_rig):

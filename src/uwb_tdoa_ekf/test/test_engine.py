@@ -4,35 +4,25 @@ import re
 import time
 
 from covariances import assert_covariance
-from flights import fly, measurements, position_at
+from driving import assert_equal, assert_sound, cut, drive, errors, memory_for
+from flights import fly, position_at
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_ekf.core import engine
+from uwb_tdoa_ekf.core import verdicts
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.core.engine import REJECTED, STARTUP, USED, feed
-from uwb_tdoa_ekf.core.memory import Measurements, new_memory
+from uwb_tdoa_ekf.core.verdicts import STARTUP, USED
 
 MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaResidual.msg"
 
 
-def drive(flight, config=None, memory=None, cuts=()):
-    """Odometry and residuals of the engine, fed in the pieces between the stamps `cuts`: fields by attribute."""
-    memory = memory_for(flight) if memory is None else memory
-    tuning, whole, parts = (config or FilterConfig()).tuning(), measurements(flight), []
-    edges = [-np.inf, *sorted(cuts), np.inf]
-    for low, high in zip(edges, edges[1:]):
-        piece = Measurements(*(part[(part["t"] > low) & (part["t"] <= high)] for part in whole))
-        parts.append(feed(memory, tuning, piece))
-    return tuple(np.concatenate(column).view(np.recarray) for column in zip(*parts))
-
-
-def memory_for(flight):
-    return new_memory(flight.anchors.positions)
+@pytest.mark.skipif(not MESSAGE.is_file(), reason="the message definitions are not beside this package")
+def test_verdicts_are_those_of_the_message():
+    declared = dict(re.findall(r"VERDICT_(\w+)=(\d)", MESSAGE.read_text()))
+    assert declared == {name: str(getattr(verdicts, name)) for name in ("USED", "REJECTED", "LATE", "INVALID", "STARTUP")}
 
 
 def without_imu(flight, low=-np.inf, high=np.inf):
@@ -41,93 +31,11 @@ def without_imu(flight, low=-np.inf, high=np.inf):
     return replace(flight, imu=Imu(flight.imu.t[kept], flight.imu.gyro[kept], flight.imu.accel[kept]))
 
 
-def errors(flight, odometry):
-    return np.linalg.norm(odometry.x[:, :3] - position_at(flight, odometry.t), axis=1)
-
-
-def assert_equal(left, right):
-    """Two pairs of odometry and residuals, to the bit."""
-    for one, other in zip(left, right):
-        for name in one.dtype.names:
-            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
-
-
-def assert_sound(memory, odometry):
-    assert np.isfinite(odometry.x).all()
-    np.testing.assert_allclose(np.linalg.norm(odometry.x[:, 6:10], axis=1), 1.0, atol=1e-9)
-    assert (np.diff(odometry.t) >= 0.0).all()
-    if len(odometry):
-        assert_covariance(odometry.covariance)
-    hypotheses = memory.record.hypotheses
-    assert np.isfinite(hypotheses["x"]).all()
-    for P in hypotheses["P"][np.isfinite(hypotheses["log_weight"])]:
-        assert_covariance(P)
-        np.testing.assert_array_equal(P, P.T)
-
-
-@pytest.mark.skipif(not MESSAGE.is_file(), reason="the message definitions are not beside this package")
-def test_verdicts_are_those_of_the_message():
-    declared = dict(re.findall(r"VERDICT_(\w+)=(\d)", MESSAGE.read_text()))
-    assert declared == {name: str(getattr(engine, name)) for name in ("USED", "REJECTED", "LATE", "INVALID", "STARTUP")}
-
-
 @settings(max_examples=20)
 @given(st.lists(st.floats(0.0, 3.0), max_size=8))
 def test_feeding_in_pieces_changes_nothing(cuts):
     flight = fly(1, 3.0)
     assert_equal(drive(flight), drive(flight, cuts=cuts))
-
-
-def test_a_copy_of_the_memory_is_a_copy_of_the_filter():
-    flight = fly(2, 4.0)
-    memory = memory_for(flight)
-    early = replace(flight, imu=cut(flight.imu, 0.0, 2.0), tdoa=cut(flight.tdoa, 0.0, 2.0))
-    late = replace(flight, imu=cut(flight.imu, 2.0, 4.0), tdoa=cut(flight.tdoa, 2.0, 4.0))
-    drive(early, memory=memory)
-    twin = memory.copy()
-    assert_equal(drive(late, memory=memory), drive(late, memory=twin))
-
-
-def cut(stream, low, high):
-    kept = (stream.t >= low) & (stream.t < high)
-    return type(stream)(*(getattr(stream, name)[kept] for name in stream.__dataclass_fields__))
-
-
-def test_starts_by_itself_within_its_window_and_knows_where_it_is():
-    for seed in range(5):
-        flight = fly(seed, 2.0, outliers=0.1)
-        odometry, residuals = drive(flight)
-        assert 0.4 < odometry.t[0] < 0.6
-        assert errors(flight, odometry)[0] < 0.3
-        startup = residuals.verdict == STARTUP
-        np.testing.assert_array_equal(startup, flight.tdoa.t <= flight.tdoa.t[startup][-1])
-        for name in ("innovation", "variance"):
-            np.testing.assert_array_equal(np.isnan(residuals[name]), startup)
-        assert (residuals.weight[startup] == 0.0).all() and np.isfinite(residuals.weight).all()
-        assert np.isin(residuals.verdict[~startup], (USED, REJECTED)).all()
-
-
-def test_starts_level_with_the_yaw_it_was_told():
-    flight = fly(3, 2.0, hover=True)
-    turned = Rotation.from_euler("ZYX", [0.7, 0.2, -0.3])
-    flight = replace(flight, imu=replace(flight.imu, accel=turned.inv().apply(flight.imu.accel)))
-    odometry, _ = drive(flight, FilterConfig(initial_yaw=0.7, initial_yaw_std=0.5))
-    assert (Rotation.from_quat(odometry.x[0, 6:10]).inv() * turned).magnitude() < 0.02
-    assert odometry.covariance[0, 8, 8] == pytest.approx(0.25, rel=0.05)
-
-
-def test_contradicting_tdoas_start_only_after_the_timeout():
-    flight = fly(4, 3.0, outliers=0.6)
-    odometry, _ = drive(flight, FilterConfig(start_timeout=1.5))
-    assert 1.5 < odometry.t[0] < 1.75
-
-
-def test_one_tdoa_long_before_the_others_does_not_use_up_the_timeout():
-    flight = fly(4, 3.0, outliers=0.6, begin=30.0)
-    early = np.concatenate([[1.0], flight.tdoa.t])
-    first = [np.concatenate([column[:1], column]) for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)]
-    odometry, _ = drive(replace(flight, tdoa=Tdoas(early, *first)))
-    assert odometry.t[0] > 30.4  # a window of start_window, not a dozen TDOAs
 
 
 def test_tracks_a_flight_with_outliers():
@@ -196,29 +104,6 @@ def test_bridges_seconds_without_imu_or_tdoas():
 def _columns(flight, low, high):
     part = cut(flight.tdoa, low, high)
     return np.stack([part.t, part.a, part.b, part.d])
-
-
-@pytest.mark.parametrize("robust", ROBUST)
-def test_finds_a_tag_again_that_was_carried_away(robust):
-    near, far = fly(10, 12.0, hover=True), fly(10, 12.0, hover=True)
-    there = np.array([1.0, 6.5, 0.8])
-    p = np.where(far.tdoa.t[:, None] < 5.0, near.truth.p[0], there)
-    positions = far.anchors.positions
-    d = tdoa(p, positions[far.anchors.index(far.tdoa.a)], positions[far.anchors.index(far.tdoa.b)])
-    d += 0.1 * np.random.default_rng(0).standard_normal(len(d))
-    memory = memory_for(far)
-    odometry, _ = drive(replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), memory)
-    assert memory.record.recoveries <= 2
-    assert np.linalg.norm(odometry.x[odometry.t > 7.0, :3] - there, axis=1).max() < 0.3
-    assert_sound(memory, odometry)
-
-
-def test_a_good_flight_needs_no_recovery():
-    for seed in range(3):
-        flight = fly(seed, 10.0, outliers=0.1)
-        memory = memory_for(flight)
-        drive(flight, memory=memory)
-        assert memory.record.recoveries == 0
 
 
 def nasty(seed, imu_size):

@@ -1,8 +1,8 @@
 from dataclasses import fields, replace
 
-from flights import corners, fly, position_at
+from flights import corners, fly, position_at, with_aids
 from hypothesis import given, settings, strategies as st
-from live import IMU, TDOA, arriving, assert_same, feed, joined, messages
+from live import HEIGHT, IMU, TDOA, arriving, assert_same, feed, joined, messages, send
 import numpy as np
 import pytest
 
@@ -10,7 +10,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.engine import INVALID, LATE, STARTUP, USED
+from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, STARTUP, USED
 from uwb_tdoa_ekf.estimator import VERDICTS, Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -35,7 +35,7 @@ def by_stamp(residuals):
 
 def received(estimator):
     """(IMU, TDOA) messages that the accounts and the buffers tell of."""
-    counts, (imu, tdoa) = estimator.counts, estimator.waiting
+    counts, (imu, tdoa, *_) = estimator.counts, estimator.waiting
     return sum(counts[name] for name in ("imu_used", "imu_late", "imu_invalid")) + imu, sum(
         counts[name] for name in VERDICTS.values()
     ) + tdoa
@@ -43,6 +43,71 @@ def received(estimator):
 
 def test_in_order_it_is_the_offline_engine():
     assert_same_as_offline(fly(1, 4.0, outliers=0.05))
+
+
+AIDS = "height", "pressure", "velocity"
+
+
+def assert_aids_as_offline(flight, config=None, **feeding):
+    estimator = Estimator(flight.anchors, config)
+    odometry, _ = feed(estimator, flight, **feeding)
+    expected = run_offline(flight, config)
+    assert_same(odometry, expected.odometry)
+    for name in AIDS:
+        verdicts = expected.aids[name]["verdict"].tolist()
+        counts = {said: estimator.counts[f"{name}_{said}"] for said in VERDICTS.values()}
+        assert counts == {said: verdicts.count(value) for value, said in VERDICTS.items()} and counts["used"] > 0
+    return estimator
+
+
+def spoiled(flight):
+    """Some of every aid cannot be measurements."""
+    height, pressure, velocity = flight.height, flight.pressure, flight.velocity
+    height.range[10:13], pressure.pressure[10:12], velocity.v[10] = [np.nan, np.inf, -1.0], [0.0, np.nan], np.nan
+    return flight
+
+
+def test_with_height_pressure_and_velocity_it_is_the_offline_engine():
+    estimator = assert_aids_as_offline(spoiled(with_aids(fly(1, 4.0))))
+    assert [estimator.counts[f"{name}_invalid"] for name in AIDS] == [3, 2, 1]
+
+
+@settings(max_examples=5)
+@given(seeds, st.floats(0.0, 0.2))
+def test_with_aids_too_skew_changes_nothing(seed, delay):
+    flight, rng = with_aids(fly(2, 2.0)), np.random.default_rng(seed)
+    order = arriving(flight, rng, imu_delay=delay)
+    assert_aids_as_offline(flight, order=order, advance=lambda: rng.random() < 0.3)
+
+
+def test_mounting_of_the_velocity_is_undone_alike():
+    """The very first velocity may be late: nobody knows of the stream before it. The filter is not running then."""
+    flight, config = with_aids(fly(1, 3.0)), FilterConfig(velocity_yaw=0.1, velocity_scale=1.1, velocity_delay=0.02)
+    estimator, expected = Estimator(flight.anchors, config), run_offline(flight, config)
+    assert_same(feed(estimator, flight)[0], expected.odometry)
+    assert estimator.counts["velocity_late"] <= 1
+    assert estimator.counts["velocity_used"] == np.sum(expected.aids["velocity"]["verdict"] == USED)
+
+
+def test_an_aid_that_stops_is_waited_for_for_a_second_and_then_done_without():
+    flight = with_aids(fly(3, 6.0))
+    estimator, behind = Estimator(flight.anchors), {}
+    for t, stream, i in messages(flight):
+        if stream in (IMU, TDOA) or (stream == HEIGHT and t < 2.0):
+            send(estimator, flight, stream, i)
+            odometry, _ = estimator.advance()
+            if len(odometry):
+                behind[t] = t - odometry.t[-1]
+    late = np.array(list(behind.values()))
+    at = np.array(list(behind))
+    assert late[(at > 2.5) & (at < 2.9)].min() > 0.2 and late[at > 3.2].max() < 0.05
+    assert estimator.counts["height_used"] + estimator.counts["height_startup"] == np.sum(flight.height.t < 2.0)
+
+
+def test_an_aid_that_is_not_used_changes_nothing():
+    flight = with_aids(fly(1, 3.0))
+    odometry, _ = feed(Estimator(flight.anchors, FilterConfig(**{f"use_{name}": False for name in AIDS})), flight)
+    assert_same(odometry, run_offline(fly(1, 3.0)).odometry)
 
 
 @settings(max_examples=10)
@@ -99,7 +164,7 @@ def test_a_silent_stream_is_waited_for_no_longer_than_the_lag():
         estimator.add_tdoa(0.01 * k, FIRST, SECOND, 0.0)
     _, residuals = estimator.advance()
     assert residuals.t[-1] == pytest.approx(0.39 - 0.25)
-    assert estimator.waiting == (0, 25)
+    assert estimator.waiting[:2] == (0, 25)
     estimator = Estimator(corners(), lag=0.25)
     for k in range(40):
         estimator.add_imu(0.01 * k, *REST)
@@ -201,7 +266,7 @@ def test_every_message_is_accounted_for_once(seed, use_imu):
         told = sum(len(residuals.t) for _, residuals in parts)
         assert told == sum(estimator.counts[name] for name in VERDICTS.values())
     parts.append(estimator.finish())
-    assert estimator.waiting == (0, 0) and received(estimator) == tuple(sent)
+    assert not any(estimator.waiting) and received(estimator) == tuple(sent)
     residuals = joined([part[1] for part in parts])
     for value, name in VERDICTS.items():
         assert np.sum(residuals.verdict == value) == estimator.counts[name]
@@ -218,7 +283,7 @@ def test_a_clock_that_falls_back_starts_anew_and_keeps_the_accounts():
             estimator.add_tdoa(t, int(first.tdoa.a[i]), int(first.tdoa.b[i]), first.tdoa.d[i])
     estimator.advance()
     waiting = estimator.waiting
-    assert estimator.running and min(waiting) > 0
+    assert estimator.running and min(waiting[:2]) > 0
     odometry, residuals = feed(estimator, again)
     assert estimator.counts["restarts"] >= 1
     dropped = residuals.t > 900.0
@@ -290,7 +355,7 @@ def test_finish_leaves_nothing_behind():
     flight = fly(9, 2.0)
     estimator = Estimator(flight.anchors)
     feed(estimator, flight, advance=lambda: False)
-    assert estimator.waiting == (0, 0)
+    assert not any(estimator.waiting)
     odometry, residuals = estimator.finish()
     assert len(odometry) == len(residuals.t) == 0
 

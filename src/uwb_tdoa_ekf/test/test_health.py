@@ -110,3 +110,17 @@ def test_a_tag_outside_of_the_flyable_volume_is_a_warning(clock):
     assert level == WARN and "contradict" in text and values["flyable"] == "no"
     judge.last_position = np.array([0.5, 0.5, 0.5]), np.eye(3)
     assert second(clock, judge, running, used=500, rejected=99)[0] == OK  # it has come back
+
+
+def test_an_aid_that_stops_is_told_and_so_is_one_that_contradicts(clock):
+    judge, counts = health.Health(FilterConfig(), 0.25), Counter(used=1)
+    for _ in range(3):
+        judge.aids["height"] += 25
+        counts.update(used=400, height_used=25)
+        assert second(clock, judge, RUNNING, **counts)[:2] == (OK, "running")
+    said = [second(clock, judge, RUNNING, **counts) for _ in range(3)]
+    assert said[-1][0] == WARN and "no messages on height any more" in said[-1][1]
+    judge.aids["height"] += 25
+    counts.update(used=400, height_rejected=25)
+    level, text, _ = second(clock, judge, RUNNING, **counts)
+    assert level == WARN and "more than half of the messages on height" in text

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_ekf.core.engine import INVALID, USED
+from uwb_tdoa_ekf.core.verdicts import INVALID, USED
 from uwb_tdoa_ekf.estimator import Odometry, Residuals
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
 

@@ -10,9 +10,9 @@ from scipy.stats import chi2
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
-from uwb_tdoa_bias.correction.poses import told_yaw_std
+from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.engine import INVALID, STARTUP, USED
+from uwb_tdoa_ekf.core.verdicts import INVALID, STARTUP, USED
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import to_odometry
 from uwb_tdoa_ekf.offline import run_offline
@@ -29,7 +29,7 @@ def live(flight, corrector, config=None):
     def advance():
         odometry, residuals = estimator.advance()
         told = to_odometry(odometry.q, odometry.v, odometry.covariance)[1] if len(odometry) else np.empty((0, 9, 9))
-        yaw_std = told_yaw_std(np.sqrt(told[:, [3, 4, 5], [3, 4, 5]]))
+        yaw_std = known_yaw_std(np.sqrt(told[:, [3, 4, 5], [3, 4, 5]]))
         for pose in zip(odometry.t, odometry.p, odometry.q, yaw_std):
             corrector.add_pose(*pose)
         parts.append((odometry, residuals))

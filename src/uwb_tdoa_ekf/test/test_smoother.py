@@ -1,17 +1,13 @@
 from dataclasses import replace
 
 from covariances import assert_covariance
-from flights import fly, measurements, position_at
+from flights import WORKSPACE, fly, leaving, position_at
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.core.engine import most_records, run
-from uwb_tdoa_ekf.core.history import RECORD
-from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, Output, new_memory
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
@@ -91,7 +87,8 @@ def test_without_imu_it_is_the_least_squares_solution():
     """After the start, with white noise and a tag at rest, where nothing is non-linear."""
     flight = fly(3, 2.0, hover=True, tdoa_rate=50.0, tdoa_std=0.05)
     config = FilterConfig(
-        use_imu=False, tdoa_std=0.05, tdoa_correlation_length=1.0, robust="gate", gate=1e6, adapt_noise=False, recover=False,
+        use_imu=False, tdoa_std=0.05, tdoa_correlation_length=1.0, robust="gate", gate=1e6,
+        adapt_noise=False, recover=False,
         odometry_rate=1e4,
     )  # fmt: skip
     first = run_offline(flight, config)
@@ -143,29 +140,7 @@ def test_a_tag_outside_of_its_workspace_is_smoothed_to_the_end(use_imu):
     assert odometry.t[-1] > flight.tdoa.t[-1] - 0.01
     assert np.diff(odometry.t).max() < 0.05
     outside = odometry.t > 2.0
-    assert (odometry.p[outside] > WALL).all(axis=1).mean() > 0.5
-
-
-WALL = np.array([8.0, 9.0, 4.5])  # m, upper bounds of the workspace that the corners have
-
-
-def leaving(flight):
-    """The TDOAs of a tag that moves out of the workspace along all axes, at constant velocity, level."""
-    t, anchors = flight.tdoa.t, flight.anchors
-    p = np.array([6.0, 7.0, 3.0]) + np.minimum(t, 3.0)[:, None] * [1.2, 1.2, 1.0]
-    a, b = (anchors.positions[anchors.index(ids)] for ids in (flight.tdoa.a, flight.tdoa.b))
-    noise = 0.02 * np.random.default_rng(0).standard_normal(len(t))
-    return replace(flight, tdoa=replace(flight.tdoa, d=tdoa(p, a, b) + noise))
-
-
-def test_a_history_that_is_full_is_an_error_and_no_silence():
-    flight = fly(7, 2.0)
-    memory, fed = new_memory(flight.anchors.positions), measurements(flight)
-    n, k = len(fed.imu), len(fed.tdoa)
-    assert most_records(fed) >= k
-    output = Output(np.empty(n + k, ODOMETRY), np.empty(k, RESIDUAL), np.empty(k // 2, RECORD))
-    with pytest.raises(IndexError, match="history is full"):
-        run(memory, FilterConfig().tuning(), fed, output)
+    assert (odometry.p[outside] > WORKSPACE[1]).all(axis=1).mean() > 0.5
 
 
 def test_a_flight_too_short_to_start():

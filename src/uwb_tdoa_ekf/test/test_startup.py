@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
 from uwb_tdoa_ekf.core.startup import INLIER, level, locate, share_of_inliers
-from uwb_tdoa_ekf.core.workspace import bounds
+from uwb_tdoa_ekf.core.workspace import set_bounds
 
 SIZE = np.array([7.0, 8.0, 3.0])
 STD = 0.25  # m, what locate is told of one TDOA
@@ -40,8 +40,8 @@ def window_of(t, a, b, d):
 def located(tdoas, positions, std=STD):
     x, covariance, workspace = np.empty(6), np.empty((6, 6)), np.empty((2, 3))
     anchors = new_memory(positions).anchors
-    bounds(anchors, 1.0, workspace)
-    share = locate(window_of(*tdoas), anchors, workspace, std, x, covariance)
+    set_bounds(anchors, 1.0, workspace)
+    share = locate(window_of(*tdoas), anchors, workspace, std, np.nan, np.nan, x, covariance)
     return x, covariance, share
 
 

@@ -3,40 +3,40 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.core.memory import new_memory
-from uwb_tdoa_ekf.core.workspace import SMALLEST, STD, bounds, contains, draw_back
+from uwb_tdoa_ekf.core.workspace import SMALLEST, STD, constrain, contains, set_bounds
 
 MARGIN = 1.0  # m
 
 
-def box_of(positions):
-    box = np.empty((2, 3))
-    bounds(new_memory(positions).anchors, MARGIN, box)
-    return box
+def bounds_of(positions):
+    bounds = np.empty((2, 3))
+    set_bounds(new_memory(positions).anchors, MARGIN, bounds)
+    return bounds
 
 
 def test_it_ends_a_margin_beyond_the_anchors_and_is_never_flat():
     positions = np.array(corners().positions)
-    box = box_of(positions)
+    bounds = bounds_of(positions)
     middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
     half = np.array([3.5 + MARGIN, 4.0 + MARGIN, SMALLEST])
-    np.testing.assert_allclose(box, [middle - half, middle + half])
+    np.testing.assert_allclose(bounds, [middle - half, middle + half])
     for k in range(3):
         x = middle.copy()
         x[k] += half[k] - 0.01
-        assert contains(box, x)
+        assert contains(bounds, x)
         x[k] += 0.02
-        assert not contains(box, x)
+        assert not contains(bounds, x)
 
 
 @pytest.mark.parametrize("axis, off", [(0, -2.0), (1, 0.7), (2, 5.0)])
 def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off):
-    box, ekf = box_of(np.array(corners().positions)), new_memory(np.array(corners().positions)).record
+    bounds, ekf = bounds_of(np.array(corners().positions)), new_memory(np.array(corners().positions)).record
     hypothesis = ekf.hypotheses[0]
-    hypothesis.x[:3] = 0.5 * (box[0] + box[1])
-    hypothesis.x[axis] = box[int(off > 0.0), axis] + off
+    hypothesis.x[:3] = 0.5 * (bounds[0] + bounds[1])
+    hypothesis.x[axis] = bounds[int(off > 0.0), axis] + off
     hypothesis.P[axis, axis] = 3.0
     before = hypothesis.x.copy()
-    assert [draw_back(hypothesis, ekf.innovation, box, k) for k in range(3)] == [k == axis for k in range(3)]
+    assert [constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3)] == [k == axis for k in range(3)]
     gain = 3.0 / (3.0 + STD**2)
     assert hypothesis.x[axis] == pytest.approx(before[axis] - gain * off)
     assert hypothesis.P[axis, axis] == pytest.approx((1.0 - gain) * 3.0)
@@ -44,9 +44,9 @@ def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off):
 
 
 def test_a_tag_inside_is_left_alone():
-    box, ekf = box_of(np.array(corners().positions)), new_memory(np.array(corners().positions)).record
+    bounds, ekf = bounds_of(np.array(corners().positions)), new_memory(np.array(corners().positions)).record
     hypothesis = ekf.hypotheses[0]
-    hypothesis.x[:3] = box[1]
+    hypothesis.x[:3] = bounds[1]
     before = hypothesis.copy()
-    assert not any(draw_back(hypothesis, ekf.innovation, box, k) for k in range(3))
+    assert not any(constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3))
     assert hypothesis == before

@@ -1,6 +1,8 @@
 """ekf_node: inertial samples and corrected TDOAs in, odometry out.
 
-imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray)
+imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray); if they are there: height
+(sensor_msgs/Range, REP 117), pressure (sensor_msgs/FluidPressure), velocity (geometry_msgs/TwistWithCovarianceStamped, in the
+body frame), velocity/odometry (the twist of another nav_msgs/Odometry)
   -> odometry (nav_msgs/Odometry), /tf (tf2_msgs/TFMessage), uwb/residual (TdoaResidual: one for each TdoaCorrected),
      /diagnostics (diagnostic_msgs/DiagnosticArray).
 Every parameter is documented in config/ekf_node.yaml.
@@ -8,17 +10,18 @@ Every parameter is documented in config/ekf_node.yaml.
 
 from collections import Counter, deque
 from dataclasses import fields
+from functools import partial
 import math
 import sys
 import time
 
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import TransformStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.time import Time
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -27,9 +30,10 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
 
+from .core import aids
 from .core.config import RENAMED, FilterConfig, current_names
-from .core.engine import INVALID
-from .estimator import VERDICTS, Estimator
+from .core.verdicts import INVALID
+from .estimator import STREAMS, VERDICTS, Estimator
 from .frames import to_odometry
 from .monitoring.health import OK, WARN, Health
 from .monitoring.monitor import Monitor
@@ -50,6 +54,7 @@ PARAMETERS = {  # beside those of FilterConfig: default and meaning, as in confi
     "lag": (0.25, "s of stamps; how long a silent stream is waited for; what comes later than that is late"),
 }  # fmt: skip
 EARLY = 5000  # messages kept while there are no anchors
+UNKNOWN_VARIANCE = 1e6  # (m/s)^2, at which and above a velocity is not measured
 UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
 
 
@@ -70,6 +75,10 @@ class EkfNode(Node):
         self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute")
         _warm_up(self._config)
 
+        self._invalid = {  # how a message counts that none has received
+            self._take_imu: "imu_invalid", self._take_tdoa: "invalid", self._take_height: "height_invalid",
+            self._take_pressure: "pressure_invalid", self._take_velocity: "velocity_invalid",
+        }  # fmt: skip
         self._estimator = None
         self._epoch = ros.Epoch()
         self._early = deque()
@@ -88,6 +97,17 @@ class EkfNode(Node):
             "imu/data": ros.subscribe_stream(self, Imu, "imu/data", self._on_imu),
             "uwb/tdoa_corrected": ros.subscribe_stream(self, TdoaCorrected, "uwb/tdoa_corrected", self._on_tdoa),
         }
+        topics = {  # of each aid: topic, type, what takes its messages
+            "height": [("height", Range, self._take_height)],
+            "pressure": [("pressure", FluidPressure, self._take_pressure)],
+            "velocity": [
+                ("velocity", TwistWithCovarianceStamped, self._take_velocity),
+                ("velocity/odometry", Odometry, self._take_velocity),
+            ],
+        }
+        for aid in aids.STREAMS:
+            for topic, kind, take in topics[aid] if getattr(self._config, f"use_{aid}") else ():
+                self._inputs[topic] = ros.subscribe_stream(self, kind, topic, partial(self._on_aid, aid, take))
         self._diagnostics = ros.Diagnostics(self, self._report)
         self.get_logger().info("ready")
 
@@ -113,6 +133,10 @@ class EkfNode(Node):
         self._health.tdoa += 1
         self._receive(self._take_tdoa, message)
 
+    def _on_aid(self, aid, take, message):
+        self._health.aids[aid] += 1
+        self._receive(take, message)
+
     def _receive(self, take, message):
         if self._estimator is not None:
             take(message)
@@ -121,7 +145,7 @@ class EkfNode(Node):
         self._early.append((take, message))
         if len(self._early) > EARLY:
             take, message = self._early.popleft()
-            self._past["imu_invalid" if take == self._take_imu else "invalid"] += 1
+            self._past[self._invalid[take]] += 1
             if take == self._take_tdoa:
                 t = self._epoch.seconds(message.header.stamp)
                 self._publish_residual(t, message.anchor_a, message.anchor_b, math.nan, math.nan, 0.0, INVALID)
@@ -144,6 +168,21 @@ class EkfNode(Node):
     def _take_tdoa(self, message):
         t = self._epoch.seconds(message.header.stamp)
         self._estimator.add_tdoa(t, message.anchor_a, message.anchor_b, message.corrected, message.bias_std)
+
+    def _take_height(self, message):
+        distance = message.range
+        if not message.min_range <= distance <= message.max_range:  # out of range, says REP 117
+            distance = math.inf
+        self._estimator.add_height(self._epoch.seconds(message.header.stamp), distance)
+
+    def _take_pressure(self, message):
+        self._estimator.add_pressure(self._epoch.seconds(message.header.stamp), message.fluid_pressure)
+
+    def _take_velocity(self, message):
+        v, covariance = message.twist.twist.linear, message.twist.covariance
+        variance = [float(covariance[place]) for place in (0, 7, 14)]
+        std = [math.sqrt(x) if 0.0 <= x < UNKNOWN_VARIANCE else math.inf for x in variance]
+        self._estimator.add_velocity(self._epoch.seconds(message.header.stamp), (v.x, v.y, v.z), std)
 
     def _publish(self, odometry, residuals):
         if len(odometry.t):
@@ -205,11 +244,11 @@ class EkfNode(Node):
 
     def _report(self):
         counts, estimator = Counter(self._past), self._estimator
-        imu_waiting = sum(take == self._take_imu for take, _ in self._early)
-        tdoa_waiting = len(self._early) - imu_waiting
+        early = Counter(self._invalid[take].rpartition("_")[0] for take, _ in self._early)
+        waiting = {stream: early["" if stream == "tdoa" else stream] for stream in STREAMS}
         if estimator is not None:
             counts.update(estimator.counts, recoveries=estimator.recoveries)
-            imu_waiting, tdoa_waiting = estimator.waiting
+            waiting = dict(zip(STREAMS, estimator.waiting))
         self._health.behind = self._behind()
         level, text, values = self._health.report(self._anchors.refused, estimator, counts)
         alarms = self._monitor.alarms if estimator is not None else []
@@ -217,10 +256,13 @@ class EkfNode(Node):
             level, text = WARN, alarms[0]
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
         values |= {"TDOAs received": self._health.tdoa} | {name: counts[name] for name in VERDICTS.values()}
-        values |= {"waiting": tdoa_waiting, "IMU samples received": self._health.imu}
+        values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.imu}
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
-        values |= {"imu_waiting": imu_waiting, "odometry published": self._health.odometry}
+        values |= {"imu_waiting": waiting["imu"], "odometry published": self._health.odometry}
         values |= {name: counts[name] for name in ("recoveries", "restarts")}
+        for aid, received in self._health.aids.items():
+            values |= {f"{aid}_received": received, f"{aid}_waiting": waiting[aid]}
+            values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}
         values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._inputs.items()}
         values |= {"subscribers of odometry": self._odometry_publisher.get_subscription_count()}
         values |= {"subscribers of uwb/residual": self._residual_publisher.get_subscription_count()}
@@ -250,6 +292,9 @@ def _warm_up(config):
     for step in range(200):
         estimator.add_imu(0.01 * step, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
         estimator.add_tdoa(0.01 * step, step % 4, (step + 1) % 4, 0.0)
+        estimator.add_height(0.01 * step, 1.0)
+        estimator.add_pressure(0.01 * step, 1e5)
+        estimator.add_velocity(0.01 * step, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
         odometry, _ = estimator.advance()
     to_odometry(odometry.q, odometry.v, odometry.covariance)
 

@@ -9,20 +9,25 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.stamps import StampGate
 
+from .aid_rows import ROWS
+from .core import aids
 from .core.config import FilterConfig
-from .core.engine import INVALID, LATE, REJECTED, STARTUP, USED, feed
-from .core.memory import IMU_SAMPLE, ODOMETRY, TDOA, Measurements, new_memory
+from .core.engine import feed
+from .core.memory import AID, IMU_SAMPLE, ODOMETRY, RESIDUAL, TDOA, Measurements, new_memory
 from .core.validity import MAX_ACCEL, MAX_RATE, usable
+from .core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
 
 VERDICTS = {USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup"}
-STREAMS = IMU_SAMPLE, TDOA
-IMU_STREAM, TDOA_STREAM = range(2)  # places in STREAMS
+STREAMS = "imu", "tdoa", *aids.STREAMS
+KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
+IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
+SILENT = 1.0  # s of stamps after which height, pressure or velocity is not waited for any more, until it is back
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """What became of each TDOA. t (n,) s; a, b (n,) anchor ids; innovation (n,) m and variance (n,) m^2, NaN unless used
-    or rejected by the filter; weight (n,) 0 to 1; verdict (n,) a key of VERDICTS."""
+    """What became of each TDOA. t (n,) s; a, b (n,) anchor ids; innovation (n,) m and variance (n,) m^2, NaN unless
+    used or rejected by the filter; weight (n,) 0 to 1; verdict (n,) a key of VERDICTS."""
 
     t: np.ndarray
     a: np.ndarray
@@ -35,8 +40,8 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Odometry:
-    """Estimates. t (n,) s; p (n, 3) m; v (n, 3) m/s, world; q (n, 4) x y z w, body to world; accel_bias (n, 3) m/s^2 and
-    gyro_bias (n, 3) rad/s, body; covariance (n, 9, 9) of [p, v, attitude], the attitude's in the body frame, rad."""
+    """Estimates. t (n,) s; p (n, 3) m; v (n, 3) m/s, world; q (n, 4) x y z w, body to world; accel_bias (n, 3) m/s^2
+    and gyro_bias (n, 3) rad/s, body; covariance (n, 9, 9) of [p, v, attitude], the attitude's in the body frame, rad."""
 
     t: np.ndarray
     p: np.ndarray
@@ -60,9 +65,9 @@ class Estimator:
     """Time-ordered buffer, filter and accounts.
 
     Messages wait until every stream has passed them and are used in stamp order. A stream that is silent is waited for
-    for `lag` seconds of stamps; TDOAs wait `reorder` more for late siblings. What is older than what was used is late.
-    A stream that falls back in time starts the filter anew; a single stamp far from its neighbours only counts as late, or
-    as invalid if it lies ahead.
+    for `lag` seconds of stamps, an aid (height, pressure, velocity) only if it was there a second ago; TDOAs wait `reorder`
+    more for late siblings. What is older than what was used is late. A stream that falls back in time starts the filter
+    anew; a single stamp far from its neighbours only counts as late, or as invalid if it lies ahead.
     """
 
     def __init__(self, anchors, config=None, reorder=0.003, lag=0.25):
@@ -71,16 +76,18 @@ class Estimator:
         self.config = config or FilterConfig()
         self.reorder, self.lag = reorder, lag
         self._tuning = self.config.tuning()
-        self.counts = dict.fromkeys([*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts"], 0)
+        of_aids = [f"{stream}_{verdict}" for stream in aids.STREAMS for verdict in VERDICTS.values()]
+        names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_aids]
+        self.counts = dict.fromkeys(names, 0)
         self._refused = []
         self._clear()
 
     def _clear(self):
         self._memory = new_memory(self.anchors.positions)
-        self._waiting = [], []  # items of each stream in order of their stamps
-        self._gates = [StampGate(), StampGate()]
+        self._waiting = [[] for _ in STREAMS]  # items of each stream in order of their stamps
+        self._gates = [StampGate() for _ in STREAMS]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
-        self._fed_imu = np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)  # lately, the one before them in front
+        self._fed_imu = [np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)]  # lately, after the one before them
 
     @property
     def running(self):
@@ -94,7 +101,7 @@ class Estimator:
 
     @property
     def waiting(self):
-        """Messages received and neither used nor refused yet: (imu, tdoa)."""
+        """Messages received and neither used nor refused yet, for each of STREAMS."""
         return tuple(len(stream) + len(gate) for stream, gate in zip(self._waiting, self._gates))
 
     def add_imu(self, t, gyro, accel):
@@ -112,15 +119,42 @@ class Estimator:
         i, k = self.anchors.row(a), self.anchors.row(b)
         if not (math.isfinite(t) and usable(i, k, d, bias_std, self.anchors.positions)):
             self._refused.append((t, a, b, INVALID))
-            self._gates[TDOA_STREAM].note(t)  # or whoever waits for our pose of this time would wait for the next one
+            self._gates[TDOA_STREAM].note(t)  # or whoever waits for our pose of this time waits for the next one
             return
         self._take(TDOA_STREAM, t, (t, i, k, d, bias_std))
 
+    def add_height(self, t, distance):
+        """Take one range along the body's -z: t s; distance m, inf or NaN where nothing was in range (REP 117)."""
+        self._add_aid(aids.HEIGHT, t, [distance])
+
+    def add_pressure(self, t, pressure):
+        """Take one static air pressure: t s; pressure Pa."""
+        self._add_aid(aids.PRESSURE, t, [pressure])
+
+    def add_velocity(self, t, v, std):
+        """Take one velocity in the body frame: t s; v (3,) m/s; std (3,) m/s, inf for a component that is not measured."""
+        self._add_aid(aids.VELOCITY, t, [v], [std])
+
+    def _add_aid(self, kind, t, *columns):
+        name = aids.STREAMS[kind]
+        if not getattr(self.config, f"use_{name}"):
+            return
+        rows, usable = ROWS[name](self.config, np.array([t]), *columns)
+        if usable[0]:
+            t, kind, value, std = rows[0].tolist()
+            self._take(FIRST_AID + kind, t, (t, kind, tuple(value), tuple(std)))
+        else:
+            self.counts[f"{name}_invalid"] += 1
+            self._gates[FIRST_AID + kind].note(t)
+
     def advance(self):
         """Use every message that nothing earlier can precede any more. Returns (Odometry, Residuals), possibly empty."""
-        imu, tdoa = (gate.newest for gate in self._gates)
-        both = min(imu, tdoa) if self.config.use_imu else tdoa
-        return self._feed(max(both - self.reorder, max(imu, tdoa) - self.lag))
+        imu, tdoa, *others = (gate.newest for gate in self._gates)
+        newest = max(imu, tdoa)
+        awaited = [tdoa, *(t for t in others if newest - SILENT < t < newest)]
+        if self.config.use_imu:
+            awaited.append(imu)
+        return self._feed(max(min(awaited) - self.reorder, newest - self.lag))
 
     def finish(self):
         """Use everything that still waits. Returns (Odometry, Residuals)."""
@@ -129,10 +163,11 @@ class Estimator:
         return self._feed(math.inf)
 
     def rates_at(self, t):
-        """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample is
-        near."""
-        place = np.searchsorted(self._fed_imu["t"], t, side="right") - 1
-        sample = self._fed_imu[np.maximum(place, 0)]
+        """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample
+        is near."""
+        fed = np.concatenate(self._fed_imu)
+        place = np.searchsorted(fed["t"], t, side="right") - 1
+        sample = fed[np.maximum(place, 0)]
         near = (place >= 0) & (np.abs(t - sample["t"]) <= self.config.imu_timeout)
         return np.where(near[:, None], sample["gyro"], math.nan)
 
@@ -154,8 +189,8 @@ class Estimator:
             self._refuse(stream, item, INVALID if t > self._gates[stream].newest else LATE)
 
     def _refuse(self, stream, item, verdict):
-        if stream == IMU_STREAM:
-            self.counts["imu_invalid" if verdict == INVALID else "imu_late"] += 1
+        if stream != TDOA_STREAM:
+            self.counts[f"{STREAMS[stream]}_{VERDICTS[verdict]}"] += 1
         else:
             t, i, k, _, _ = item
             self._refused.append((t, *self.anchors.ids[[i, k]].tolist(), verdict))
@@ -166,48 +201,50 @@ class Estimator:
             for item in waiting:
                 self._refuse(k, item, LATE)
         self.counts["restarts"] += 1
-        other, gate, held = 1 - stream, self._gates[stream], self._gates[1 - stream].finish()
+        held = [(k, *one) for k, gate in enumerate(self._gates) if k != stream for one in gate.finish()]
+        gate = self._gates[stream]
         self._clear()
         self._gates[stream] = gate
-        for t, item in held:  # was not plausible in the time that is over
+        for other, t, item in held:  # was not plausible in the time that is over
             self._take(other, t, item)
 
     def _feed(self, until):
         counts = [bisect_right(waiting, until, key=itemgetter(0)) for waiting in self._waiting]
         if not (any(counts) or self._refused):
             return NOTHING
-        imu, tdoa = (np.array(waiting[:n], kind) for waiting, n, kind in zip(self._waiting, counts, STREAMS))
+        imu, tdoa, *felt = (np.array(waiting[:n], kind) for waiting, n, kind in zip(self._waiting, counts, KINDS))
         for waiting, n in zip(self._waiting, counts):
             del waiting[:n]
-        fed = Measurements(imu if self.config.use_imu else imu[:0], tdoa)
-        odometry, outcome = feed(self._memory, self._tuning, fed)
-        for part in (imu, tdoa):
+        felt = np.concatenate(felt) if any(counts[FIRST_AID:]) else NO_AIDS
+        felt = felt[np.lexsort((felt["kind"], felt["t"]))] if len(felt) > 1 else felt
+        odometry, outcome, of_aids = feed(
+            self._memory, self._tuning, Measurements(imu if self.config.use_imu else imu[:0], tdoa, felt)
+        )
+        for kind, verdict in zip(felt["kind"].tolist(), of_aids["verdict"].tolist()):
+            self.counts[f"{aids.STREAMS[kind]}_{VERDICTS[verdict]}"] += 1
+        for part in (imu, tdoa, felt):
             if len(part):
                 self._fed_until = max(self._fed_until, part["t"][-1])
-        self._fed_imu = np.concatenate([self._fed_imu[-1:], imu])
+        self._fed_imu = [self._fed_imu[-1][-1:], imu] if len(imu) else [self._fed_imu[-1][-1:]]
         self.counts["imu_used"] += len(imu)
         return Odometry.from_rows(odometry), self._residuals(tdoa, outcome)
 
     def _residuals(self, tdoa, outcome):
         """Residuals of (k,) of TDOA that were fed, with their (k,) of RESIDUAL, and of those that were refused."""
-        refused = np.array(self._refused, dtype=float).reshape(-1, 4)
-        self._refused = []
-        none = np.full(len(refused), np.nan)
-        ids = self.anchors.ids
-        verdict = np.concatenate([outcome["verdict"], refused[:, 3]]).astype(np.uint8)
-        for value in verdict.tolist():
-            self.counts[VERDICTS[value]] += 1
-        return Residuals(
-            np.concatenate([tdoa["t"], refused[:, 0]]),
-            np.concatenate([ids[tdoa["a"]], refused[:, 1].astype(np.int64)]),
-            np.concatenate([ids[tdoa["b"]], refused[:, 2].astype(np.int64)]),
-            np.concatenate([outcome["innovation"], none]),
-            np.concatenate([outcome["variance"], none]),
-            np.concatenate([outcome["weight"], np.zeros(len(refused))]),
-            verdict,
-        )
+        a, b = self.anchors.ids[tdoa["a"]], self.anchors.ids[tdoa["b"]]
+        columns = [tdoa["t"], a, b, *(outcome[name] for name in RESIDUAL.names)]
+        if self._refused:
+            t, a, b, verdict = zip(*self._refused)
+            unknown, none = np.full((2, len(t)), math.nan), np.zeros(len(t))
+            others = (t, a, b, *unknown, none, np.array(verdict, np.uint8))
+            columns = [np.concatenate(both) for both in zip(columns, others)]
+            self._refused = []
+        for verdict in columns[-1].tolist():
+            self.counts[VERDICTS[verdict]] += 1
+        return Residuals(*columns)
 
 
+NO_AIDS = np.empty(0, AID)
 NOTHING = Odometry.from_rows(np.empty(0, ODOMETRY)), Residuals(*(np.empty(0) for _ in range(7)))
 
 

@@ -5,13 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.poses import told_yaw_std
+from uwb_tdoa_bias.correction.poses import known_yaw_std
 
+from .aid_rows import rows_of
 from .core.config import FilterConfig
-from .core.engine import INVALID, feed
+from .core.engine import feed
 from .core.hypotheses import yaw_offset
 from .core.memory import IMU_SAMPLE, RESIDUAL, TDOA, Measurements, new_memory, structured
 from .core.validity import usable_all, usable_imu
+from .core.verdicts import INVALID
 from .estimator import VERDICTS, Odometry, Residuals
 from .frames import rotation_std
 
@@ -21,8 +23,9 @@ RECORDED_AT_ONCE = 256  # TDOAs that are fed together while a history is recorde
 @dataclass(frozen=True)
 class Run:
     """Result of one recording. odometry : Odometry; residuals : Residuals, one per TDOA of the flight, in its order;
-    bias, bias_std : (n,) m, what was taken from each raw TDOA; recoveries : how often the filter lost and found the tag;
-    yaw_offset : rad, from initial_yaw to the start of the yaw hypothesis that was right."""
+    bias, bias_std : (n,) m, what was taken from each raw TDOA; recoveries : how often the filter lost and found the
+    tag; yaw_offset : rad, from initial_yaw to the start of the yaw hypothesis that was right; aids : {stream: (m,) of
+    RESIDUAL, one per measurement}, for height, pressure and velocity where the flight has them."""
 
     odometry: Odometry
     residuals: Residuals
@@ -30,6 +33,7 @@ class Run:
     bias_std: np.ndarray
     recoveries: int
     yaw_offset: float
+    aids: dict
 
     @property
     def counts(self):
@@ -51,23 +55,30 @@ def run_offline(flight, config=None, corrector=None, records=None):
     tdoa, positions = flight.tdoa, flight.anchors.positions
     raw = tdoa.t, flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b), tdoa.d
     imu = _imu_samples(flight.imu if config.use_imu else None)
+    imu_t = imu["t"].copy()  # side by side in memory, to be searched
+    (aids, places), outcome_of_aids = rows_of(flight, config), []
     memory, tuning = new_memory(positions), config.tuning()
-    bias, std, outcome, parts, fed = np.zeros(len(tdoa)), np.zeros(len(tdoa)), _not_fed(len(tdoa)), [], 0
+    bias, std, outcome, parts, fed, felt = np.zeros(len(tdoa)), np.zeros(len(tdoa)), _not_fed(len(tdoa)), [], 0, 0
     for batch, until in _batches(*raw, corrector, RECORDED_AT_ONCE if records is not None else len(tdoa)):
         t, a, b, d = (column[batch] for column in raw)
         correction = corrector.correct(t, a, b, d)
         bias[batch], std[batch] = correction.bias, correction.std
         sane = usable_all(a, b, correction.corrected, correction.std, positions)
         corrected = structured(TDOA, t, a, b, correction.corrected, correction.std)[sane]
-        last = len(imu) if until is None else int(np.searchsorted(imu["t"], until))
-        odometry, outcome[batch[sane]] = feed(memory, tuning, Measurements(imu[fed:last], corrected), records)
-        fed = last
+        last = len(imu) if until is None else int(np.searchsorted(imu_t, until))
+        last_aid = len(aids) if until is None else int(np.searchsorted(aids["t"], until))
+        measured = Measurements(imu[fed:last], corrected, aids[felt:last_aid])
+        odometry, outcome[batch[sane]], of_aids = feed(memory, tuning, measured, records)
+        fed, felt = last, last_aid
+        outcome_of_aids.append(of_aids)
         parts.append(odometry)
         if not corrector.idle and len(odometry):
             _report_poses(odometry, corrector)
     residuals = Residuals(tdoa.t, tdoa.a, tdoa.b, *(outcome[name] for name in RESIDUAL.names))
+    of_aids = np.concatenate([*outcome_of_aids, _not_fed(1)])  # the last one for those that could not be fed
+    of_aids = {stream: of_aids[place] for stream, place in places.items()}
     ekf, odometry = memory.record, Odometry.from_rows(np.concatenate(parts))
-    return Run(odometry, residuals, bias, std, int(ekf.recoveries), yaw_offset(int(ekf.best)))
+    return Run(odometry, residuals, bias, std, int(ekf.recoveries), yaw_offset(int(ekf.best)), of_aids)
 
 
 def _imu_samples(imu):
@@ -105,5 +116,5 @@ def _batches(t, a, b, d, corrector, longest):
 def _report_poses(odometry, corrector):
     """Give the Corrector the poses of an (n,) of ODOMETRY, as bias_node gets them."""
     x, covariance = odometry["x"], odometry["covariance"]
-    yaw_std = told_yaw_std(rotation_std(x[:, 6:10], covariance))
+    yaw_std = known_yaw_std(rotation_std(x[:, 6:10], covariance))
     corrector.add_pose(odometry["t"], x[:, :3], x[:, 6:10], yaw_std)

@@ -24,17 +24,18 @@ def smooth(flight, config=None, corrector=None):
     """Run a Flight through bias correction, filter and smoother.
 
     Takes what run_offline takes and returns its Run with the odometry smoothed: at the stamps of updates, thinned to
-    odometry_rate. If the yaw is unknown, the direction that the filter believes in the end counts from the beginning.
+    odometry_rate. Pressures are not used. If the yaw is unknown, the direction that the filter follows in the end counts
+    from the beginning.
     Memory: 3.5 kB per update.
     """
-    config = config or FilterConfig()
+    config = replace(config or FilterConfig(), use_pressure=False)  # its offset is not among the states of the history
     if config.use_imu and config.initial_yaw_std > YAW_STD:
         offset = run_offline(flight, config, corrector).yaw_offset
         config = replace(config, initial_yaw=config.initial_yaw + offset, initial_yaw_std=YAW_STD)
     records = []
     result = run_offline(flight, config, corrector, records)
-    records = [some for some in records if len(some)]
-    before = [-math.inf] + [some["t"][-1] for some in records]  # stamp of the record before each array of them
+    records = [part for part in records if len(part)]
+    before = [-math.inf] + [part["t"][-1] for part in records]  # stamp of the record before each array of them
     adjoint, information = np.zeros(ERROR_STATES), np.zeros((ERROR_STATES, ERROR_STATES))
     rows = [np.empty(0, ODOMETRY)]
     for k in reversed(range(len(records))):
@@ -51,50 +52,49 @@ def _backward(records, before, rate, adjoint, information, rows):
     adjoint (15,), information (15, 15): Bierman's lambda and Lambda, those behind the records, which become those in
     front of them. Fills (n,) of ODOMETRY from the end on, and returns how many.
     """
-    count, work = 0, np.empty((ERROR_STATES, ERROR_STATES))
+    count = 0
     for i in range(len(records) - 1, -1, -1):
         record = records[i]
         earlier = records[i - 1].t if i > 0 else before
-        if math.floor(record.t * rate) != math.floor(earlier * rate):
+        if np.floor(record.t * rate) != np.floor(earlier * rate):
             count += 1
-            _smoothed(record, adjoint, information, rows[len(rows) - count], work)
+            _smoothed(record, adjoint, information, rows[len(rows) - count])
         if record.kind == RESET:
             adjoint[:] = 0.0
             information[:, :] = 0.0
         else:
             _through_update(record, adjoint, information)
-            _through_prediction(record.transition, adjoint, information, work)
+            _through_prediction(record.transition, adjoint, information)
     return count
 
 
 @compiled
-def _smoothed(record, adjoint, information, row, work):
-    """Write x - P lambda and P - P Lambda P to one of ODOMETRY. work (15, 15): scratch."""
+def _smoothed(record, adjoint, information, row):
+    """Write x - P lambda and P - P Lambda P to one of ODOMETRY."""
     P = record.P
-    shift = work[0]
+    correction = np.zeros(ERROR_STATES)  # -P lambda
+    product = np.zeros((9, ERROR_STATES))  # upper rows of P Lambda
     for j in range(ERROR_STATES):
-        shift[j] = 0.0
         for k in range(ERROR_STATES):
-            shift[j] -= P[j, k] * adjoint[k]
+            correction[j] -= P[j, k] * adjoint[k]
     row.t = record.t
     row.x[:] = record.x
-    inject(row.x, shift, 1.0)
+    inject(row.x, correction, 1.0)
     for i in range(9):
-        for j in range(ERROR_STATES):
-            work[i, j] = 0.0
-            for k in range(ERROR_STATES):
-                work[i, j] += P[i, k] * information[k, j]
+        for k in range(ERROR_STATES):
+            for j in range(ERROR_STATES):
+                product[i, j] += P[i, k] * information[k, j]
     for i in range(9):
         for j in range(i, 9):
             reduction = 0.0
             for k in range(ERROR_STATES):
-                reduction += work[i, k] * P[k, j]
+                reduction += product[i, k] * P[k, j]
             row.covariance[i, j] = row.covariance[j, i] = P[i, j] - reduction
 
 
 @compiled
 def _through_update(record, adjoint, information):
-    """lambda <- C' lambda - h' y / S,  Lambda <- C' Lambda C + h' h / S, with C = I - K h, innovation y of variance S."""
+    """lambda <- C' lambda - h' y / S, Lambda <- C' Lambda C + h' h / S; C = I - K h, innovation y of variance S."""
     h, gain = record.row, record.gain
     information_gain = np.zeros(ERROR_STATES)  # Lambda K
     for j in range(ERROR_STATES):
@@ -111,24 +111,20 @@ def _through_update(record, adjoint, information):
 
 
 @compiled
-def _through_prediction(transition, adjoint, information, work):
-    """lambda <- Phi' lambda,  Lambda <- Phi' Lambda Phi; the lower rows of Phi are those of the identity."""
-    for j in range(ERROR_STATES):
-        work[0, j] = adjoint[j] if j >= MOVING_STATES else 0.0
-    for i in range(MOVING_STATES):
-        for j in range(ERROR_STATES):
-            work[0, j] += transition[i, j] * adjoint[i]
-    adjoint[:] = work[0]
-    for i in range(ERROR_STATES):  # Lambda Phi
-        for j in range(ERROR_STATES):
-            work[i, j] = information[i, j] if j >= MOVING_STATES else 0.0
+def _through_prediction(transition, adjoint, information):
+    """lambda <- Phi' lambda, Lambda <- Phi' Lambda Phi; the lower rows of Phi are those of the identity."""
+    before = adjoint.copy()
+    product = np.zeros((ERROR_STATES, ERROR_STATES))  # Lambda Phi
+    for i in range(ERROR_STATES):
+        product[i, MOVING_STATES:] = information[i, MOVING_STATES:]
         for k in range(MOVING_STATES):
             for j in range(ERROR_STATES):
-                work[i, j] += information[i, k] * transition[k, j]
-    for i in range(ERROR_STATES):
-        for j in range(ERROR_STATES):
-            information[i, j] = work[i, j] if i >= MOVING_STATES else 0.0
+                product[i, j] += information[i, k] * transition[k, j]
+    adjoint[:MOVING_STATES] = 0.0
+    information[:MOVING_STATES] = 0.0
+    information[MOVING_STATES:] = product[MOVING_STATES:]
     for k in range(MOVING_STATES):
         for i in range(ERROR_STATES):
+            adjoint[i] += transition[k, i] * before[k]
             for j in range(ERROR_STATES):
-                information[i, j] += transition[k, i] * work[k, j]
+                information[i, j] += transition[k, i] * product[k, j]

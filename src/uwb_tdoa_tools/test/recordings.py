@@ -20,9 +20,11 @@ EVENTS = {  # name: (id, [(variable, struct code)])
     "estAcceleration": (8, [(f"acc.{axis}", "f") for axis in XYZ]),
     "estPose": (300, [(f"locSrv.{axis}", "f") for axis in (*XYZ, "qx", "qy", "qz", "qw")]),
     "estBarometer": (9, [("baro.asl", "f")]),
+    "estTemperature": (11, [("baro.temp", "f")]),
+    "estTOF": (12, [("range.zrange", "H")]),
     "estFlow": (10, [("motion.deltaX", "h"), ("motion.deltaY", "h")]),
 }
-ROWS = [  # name, ticks, values: not in order of time within estBarometer
+ROWS = [  # name, ticks, values: not in order of time within estBarometer and estTemperature
     ("estGyroscope", 1_000_000, (180.0, 0.0, -90.0)),
     ("estAcceleration", 1_000_020, (0.0, 0.5, 1.0)),
     ("estTDOA", 1_000_500, (0, 1, 1.25)),
@@ -31,7 +33,12 @@ ROWS = [  # name, ticks, values: not in order of time within estBarometer
     ("estGyroscope", 1_001_000, (0.0, 90.0, 0.0)),
     ("estAcceleration", 1_001_020, (0.0, 0.0, 2.0)),
     ("estTDOA", 1_002_500, (1, 5, -0.5)),
-    ("estBarometer", 1_001_400, (102.5,)),
+    ("estBarometer", 1_001_400, (0.0,)),
+    ("estBarometer", 1_001_520, (101.5,)),
+    ("estTemperature", 1_001_500, (21.5,)),
+    ("estTemperature", 1_001_400, (20.5,)),
+    ("estTOF", 1_001_200, (1250,)),
+    ("estTOF", 1_001_300, (32767,)),
     ("estGyroscope", 1_002_000, (0.0, 0.0, 45.0)),
     ("estAcceleration", 1_002_020, (1.0, 0.0, 1.0)),
 ]
@@ -88,7 +95,7 @@ def small_flight(seconds=2.0, rate=1000, name="small"):
 def differences(one, other):
     """Names of the arrays that are not exactly equal in two flights."""
     found = []
-    for part in ("anchors", "tdoa", "imu", "truth"):
+    for part in ("anchors", "tdoa", "imu", "truth", "height", "pressure", "velocity"):
         first, second = getattr(one, part), getattr(other, part)
         if (first is None) != (second is None):
             found.append(part)

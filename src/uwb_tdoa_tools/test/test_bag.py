@@ -14,7 +14,7 @@ from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader, Writer
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth, Velocity
 from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import new_bag
 from uwb_tdoa_tools.bags.messages import tdoa_messages
@@ -71,7 +71,15 @@ def flights(draw):
     q = np.array(draw(st.lists(unit, min_size=len(t), max_size=len(t))))
     truth = draw(st.sampled_from([None, Truth(t, values(len(t), 3), q)]))
     name = draw(st.text(st.characters(codec="utf-8", exclude_characters="/\0\n\r"), min_size=1, max_size=5))
-    return Flight(name, anchors, tdoas, imu, truth)
+    t, ranges = stamps(1), st.sampled_from([0.0, 1.25, 1000.0, np.inf, np.nan])
+    height = draw(st.sampled_from([None, Height(t, draw(arrays(float, len(t), elements=ranges)))]))
+    t = stamps(1)
+    pressure = draw(st.sampled_from([None, Pressure(t, values(len(t)))]))
+    t = stamps(1)
+    std = draw(arrays(float, (len(t), 3), elements=st.sampled_from([0.5, 2.0, np.inf])))
+    velocity = draw(st.sampled_from([None, Velocity(t, values(len(t), 3), std)]))
+    aids = dict(height=height, pressure=pressure, velocity=velocity)
+    return Flight(name, anchors, tdoas, imu, truth, **aids)
 
 
 @settings(deadline=None, max_examples=15)

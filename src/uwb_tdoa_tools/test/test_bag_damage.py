@@ -1,5 +1,6 @@
 """Bags that are cut, damaged or forged: refused with what is wrong, or read as far as they are sound."""
 
+from dataclasses import replace
 import json
 from pathlib import Path
 import shutil
@@ -14,6 +15,7 @@ import pytest
 from recordings import differences, small_flight
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Height, Pressure, Velocity
 from uwb_tdoa_tools.bags import mcap
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import messages, open_bag
@@ -166,6 +168,30 @@ def test_numbers_that_are_not_finite(tmp_path, storage):
         read_bag(tmp_path / "bag")
     back = read_bag(tmp_path / "bag", salvage=True)
     assert (len(back.tdoa), len(back.truth), len(back.imu)) == (49, 24, 99) and len(back.meta["remarks"]) == 3
+
+
+@BOTH
+def test_heights_and_velocities_say_what_was_not_measured(tmp_path, storage):
+    height = Height(np.array([10.0, 10.1, 10.2]), np.array([1.25, np.inf, np.nan]))
+    velocity = Velocity(np.array([10.0]), np.array([[0.5, 0.0, np.nan]]), np.array([[0.1, 0.1, np.inf]]))
+    flight = replace(small_flight(0.1), height=height, velocity=velocity)
+    write_bag(flight, tmp_path / "bag", storage)
+    assert differences(flight, read_bag(tmp_path / "bag")) == []
+
+
+@BOTH
+def test_pressures_and_velocities_that_are_not_finite(tmp_path, storage):
+    t = np.array([10.0, 10.1])
+    pressure = Pressure(t, np.array([101325.0, np.nan]))
+    velocity = Velocity(t, np.array([[0.5, 0.0, 0.0], [0.0, np.inf, 0.0]]), np.full((2, 3), 0.1))
+    for aid, said in (({"pressure": pressure}, "/pressure, message 2 of 2 at 10.100 s: its number 1 is nan"),
+                      ({"velocity": velocity}, "/velocity, message 2 of 2 at 10.100 s: its number 2 is inf")):  # fmt: skip
+        write_bag(replace(small_flight(0.1), **aid), tmp_path / "bag", storage, force=True)
+        with pytest.raises(InputError, match=said):
+            read_bag(tmp_path / "bag")
+        back = read_bag(tmp_path / "bag", salvage=True)
+        (name,) = aid
+        assert len(getattr(back, name)) == 1 and len(back.meta["remarks"]) == 1
 
 
 @BOTH

@@ -20,9 +20,9 @@ def test_bag_is_the_flight(files, capsys, storage):
     assert main(argv) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["messages"] == {
-        "/uwb/anchors": 1, "/tf_static": 1, "/imu/data": 3, "/uwb/tdoa": 2, "/ground_truth/pose": 1,
+        "/uwb/anchors": 1, "/tf_static": 1, "/imu/data": 3, "/height": 2, "/pressure": 2, "/uwb/tdoa": 2, "/ground_truth/pose": 1,
     }  # fmt: skip
-    assert summary["left_out"] == {"estBarometer": 2} and summary["tdoa_unknown_anchor"] == 0
+    assert summary["left_out"] == {"estTemperature": 2} and summary["tdoa_unknown_anchor"] == 0
     assert (summary["start"], summary["end"]) == (1.0, 1.0025)
     assert differences(read_flight("flight.log", "survey.csv"), read_flight("made/flight.bag")) == []
 
@@ -31,7 +31,7 @@ def test_says_what_it_did(files, capsys):
     (files / "two.csv").write_text("id,x,y,z\n0,0,0,0\n1,4,0,3\n")
     assert main(["flight.log", "--survey", "two.csv", "--out", "flight.bag"]) == 0
     out = capsys.readouterr().out
-    assert "/uwb/tdoa: 2" in out and "estBarometer: 2 events left out" in out
+    assert "/uwb/tdoa: 2" in out and "estTemperature: 2 events left out" in out
     assert "1 measurements name an anchor that the survey does not have" in out
 
 

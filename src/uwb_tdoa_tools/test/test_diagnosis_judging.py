@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -6,11 +6,12 @@ import pytest
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.rehearsal import RecordingCorrector, RehearsedCorrector
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.detectors import Detection
-from uwb_tdoa_tools.diagnosis.judging import Case, compare, cross_fitted, useful
-from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.judging import Case, borne_out, compare, cross_fitted, useful
+from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
 
 TRUTH = GroundTruth()
@@ -97,3 +98,21 @@ def test_before_and_after_with_intervals(flights):
     low, high = after["pooled"]["rmse_3d_gain_ci"]
     assert 0.4 < low < high < 1.0
     assert [row["flight"] for row in after["runs"]] == [flight.name for flight in flights]
+
+
+def test_without_truth_a_model_is_applied_only_if_it_explains_innovations_that_it_has_not_seen(flights):
+    reference = Nothing()
+    prepared = [reference.prepare(flight) for flight in flights]
+    attribution = attribute(prepared, reference, undeclared=False)
+    kept = borne_out(attribution, prepared, NONE)
+    assert kept.candidates == attribution.selection.chosen and len(kept.candidates)
+    clean = [reference.prepare(clean_flight(seed, 30.0)) for seed in (100, 101)]
+    refused = borne_out(attribution, clean, NONE)
+    assert refused.candidates == () and "nobody can tell whether they would help" in refused.refused[0].why
+
+
+def test_a_flight_that_the_filter_gives_no_estimate_of_ends_in_a_sentence(flights):
+    tdoa = flights[0].tdoa
+    few = replace(flights[0], imu=None, tdoa=replace(tdoa, **{f.name: getattr(tdoa, f.name)[:3] for f in fields(tdoa)}))
+    with pytest.raises(InputError, match=f"{few.name}: the filter gives no estimate"):
+        compare([Case(few, NONE)], NONE)

@@ -11,7 +11,7 @@ from uwb_tdoa_tools.diagnosis.channels import CHANNELS
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
 
 FOLDER = Path(diagnosis.__file__).parent
-ROOMS = ("channels", "detectors", "report.py")  # where files may know their own subject
+ROOMS = ("channels", "detectors")  # where files may know their own subject
 DRIVER = [path for path in FOLDER.rglob("*.py") if path.relative_to(FOLDER).parts[0] not in ROOMS]
 CLASSES = {effect.__name__ for effect in EFFECTS.values()}
 

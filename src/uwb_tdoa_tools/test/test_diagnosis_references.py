@@ -48,5 +48,5 @@ def test_the_truth_that_is_missing_is_asked_for(flight):
 
 def test_residuals_are_taken_where_the_corrected_stamps_of_the_truth_say(flight):
     late = TruthTimeOffset({"offset": 0.1})
-    poses = GroundTruth().poses(late.inject(flight), EffectSet((late,)))
+    poses = GroundTruth().view(late.inject(flight), EffectSet((late,))).poses
     np.testing.assert_allclose(poses.t, flight.truth.t)

@@ -42,6 +42,7 @@ KEYS = {
     "rosbags": ("python3-rosbags-pip", "rosbags"),
     "scipy": ("python3-scipy", "scipy"),
     "sklearn": ("python3-sklearn", "scikit-learn"),
+    "threadpoolctl": ("python3-sklearn", "scikit-learn"),  # which needs it itself
     "tqdm": ("python3-tqdm", "tqdm"),
     "yaml": ("python3-yaml", "PyYAML"),
 }

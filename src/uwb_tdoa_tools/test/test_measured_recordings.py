@@ -56,6 +56,9 @@ def test_log(path):
     assert len(flight.tdoa) == counts.pop("estTDOA") > 5000
     assert len(flight.imu) == counts.pop("estGyroscope") == counts.pop("estAcceleration") > 30_000
     assert len(flight.truth) == counts.pop("estPose") > 8000
+    assert len(flight.height or ()) == counts.pop("estTOF", 0)
+    readings = len(flight.pressure or ())  # the log repeats each of them, up to a thousand times a second
+    assert (readings > 500) == (counts.pop("estBarometer", 0) > 0)
     assert {name: len(columns["t"]) for name, columns in flight.extra.items()} == dict(counts)
     assert "reordered" not in flight.meta and "imu_accel_interpolated" not in flight.meta
     assert set(flight.tdoa.a) == set(flight.tdoa.b) == set(range(8)) == set(flight.anchors.ids)

@@ -42,7 +42,7 @@ def drive(flight, memory):
     samples = structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
     rows = anchors.index(tdoa.a), anchors.index(tdoa.b)
     tdoas = structured(TDOA, tdoa.t, *rows, tdoa.d, np.zeros(len(tdoa)))
-    odometry, _ = feed(memory, FilterConfig().tuning(), Measurements(samples, tdoas))
+    odometry, *_ = feed(memory, FilterConfig().tuning(), Measurements(samples, tdoas))
     return odometry["t"], odometry["x"][:, :3]
 
 

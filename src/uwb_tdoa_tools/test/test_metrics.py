@@ -5,7 +5,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
-from uwb_tdoa_ekf.core.engine import INVALID, LATE, REJECTED, STARTUP, USED
+from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.scoring.metrics import Score, airborne, coverage, nees, nis, pooled, position_errors, summary
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]

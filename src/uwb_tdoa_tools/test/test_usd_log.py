@@ -39,10 +39,18 @@ def test_streams_units_and_stamps(read):
 
 def test_other_events_are_kept_sorted_and_empty_ones_are_not(read):
     flight = read(log_bytes())
-    assert set(flight.extra) == {"estBarometer"}  # estFlow is defined but never occurs
-    np.testing.assert_array_equal(flight.extra["estBarometer"]["t"], [1.0014, 1.0015])
-    np.testing.assert_array_equal(flight.extra["estBarometer"]["baro.asl"], [102.5, 101.5])
-    assert flight.meta["reordered"] == {"estBarometer": 1}
+    assert set(flight.extra) == {"estTemperature"}  # estFlow is defined but never occurs
+    np.testing.assert_array_equal(flight.extra["estTemperature"]["t"], [1.0014, 1.0015])
+    np.testing.assert_array_equal(flight.extra["estTemperature"]["baro.temp"], [20.5, 21.5])
+    assert flight.meta["reordered"] == {"estTemperature": 1, "baro": 1}
+
+
+def test_range_finder_and_barometer_in_si_units_one_row_for_each_reading(read):
+    flight = read(log_bytes())
+    np.testing.assert_array_equal(flight.height.t, [1.0012, 1.0013])
+    np.testing.assert_array_equal(flight.height.range, [1.25, np.inf])  # 32767 mm: nothing in sight
+    np.testing.assert_array_equal(flight.pressure.t, [1.0014, 1.0015])  # that of 1.00152 repeats the one before
+    np.testing.assert_allclose(flight.pressure.pressure, [101325.0, 101325.0 - 12.013 * 101.5], atol=6.0)  # 12 Pa/m
 
 
 def test_version_1_counts_milliseconds(read):
@@ -123,6 +131,7 @@ def with_number(name, column, value):
         ("estAcceleration", 0, "acc, record 1 of 3 at 1.000 s: x is"),
         ("estPose", 2, "pose, record 1 of 2 at 1.001 s: z is"),
         ("estPose", 5, "pose, record 1 of 2 at 1.001 s: qz is"),
+        ("estBarometer", 0, "baro, record 1 of 3 at 1.002 s: baro is"),
     ],
 )
 def test_a_number_that_is_not_finite_is_refused_or_left_out(read, name, column, said, value):
@@ -134,8 +143,16 @@ def test_a_number_that_is_not_finite_is_refused_or_left_out(read, name, column, 
     assert "1 of " in remark and "left out" in remark
     whole = read(log_bytes([*ROWS, rows[-1]]))
     assert sum(map(len, (flight.tdoa, flight.truth))) >= sum(map(len, (whole.tdoa, whole.truth))) - 1
-    for array in (flight.tdoa.d, flight.imu.gyro, flight.imu.accel, flight.truth.p, flight.truth.q):
+    numbers = (flight.tdoa.d, flight.imu.gyro, flight.imu.accel, flight.truth.p, flight.truth.q, flight.pressure.pressure)
+    for array in numbers:
         assert np.isfinite(array).all()
+
+
+def test_an_altitude_above_the_air_is_refused_or_left_out(read):
+    content = log_bytes(with_number("estBarometer", 0, 45_000.0))
+    with pytest.raises(InputError, match="baro is 45000.0; it must be within \\+-40000: leave"):
+        read(content)
+    assert np.isfinite(read(content, salvage=True).pressure.pressure).all()
 
 
 def test_a_cut_log_is_read_up_to_the_cut(read):
@@ -167,7 +184,7 @@ def test_a_damaged_log_is_read_up_to_the_damage(read):
 def test_names_of_our_streams_are_no_events(read):
     rows = [*ROWS, ("tdoa", 1_000_000, (1.0,)), ("pose", 1_000_000, (1.0,))]
     flight = read(log_bytes(rows, events=EVENTS | {"tdoa": (50, [("x", "f")]), "pose": (51, [("t", "f")])}))
-    assert len(flight.tdoa) == 2 and set(flight.extra) == {"estBarometer", "tdoa", "pose"}
+    assert len(flight.tdoa) == 2 and set(flight.extra) == {"estTemperature", "tdoa", "pose"}
 
 
 def test_a_header_of_many_types_takes_no_time(read):

@@ -34,7 +34,8 @@ def test_full_schema(read, packed):
     np.testing.assert_allclose(flight.imu.accel[2:], 9.81 * np.array([[0, 0, 2], [1, 0, 1]]))
     np.testing.assert_array_equal(flight.truth.t, [0.005, 0.009])
     np.testing.assert_array_equal(flight.truth.q[1], [0, 0, 0.6, 0.8])
-    assert {name: len(columns["t"]) for name, columns in flight.extra.items()} == {"tof": 1, "flow": 2, "baro": 1}
+    assert {name: len(columns["t"]) for name, columns in flight.extra.items()} == {"flow": 2}
+    assert (len(flight.height), len(flight.pressure)) == (1, 1)
     np.testing.assert_array_equal(flight.extra["flow"]["deltaY"], [-2, 4])
 
 
@@ -130,6 +131,8 @@ def test_every_kind_of_line_end(read, end):
         (csv_text(TDOA, ["1,0,1,1", "2,0", "3,0,1,1"]), 1, "line 3 has 2 cells"),
         (csv_text(TDOA, ["1,0,1,1", "2,0,1,nan", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
         (csv_text(TDOA, ["1,0,1,1", "2,0,1,one", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
+        (csv_text(TDOA + ",t_baro,baro", ["1,0,1,1,1,99.5", "2,0,1,2,2,nan"]), 2, "baro: 1 of 2 records left out"),
+        (csv_text(TDOA + ",t_tof,tof", ["1,0,1,1,1,31", "2,0,1,2,2,-1e12"]), 2, "tof: 1 of 2 records left out"),
     ],
 )
 def test_what_is_sound_can_be_read(read, text, count, said):

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..effects import EffectSet, Samples
 from ..effects.motion import POSE_LAG, motion_at, preceding
-from .poses import Poses, turned
+from .poses import Poses, rotated_in_yaw
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
@@ -94,7 +94,7 @@ class Corrector:
         unknown = samples.yaw_std > LARGEST_YAW_STD
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
-            each = np.stack([turning.bias(replace(samples, q=turned(samples.q, k))) for k in range(4)])
+            each = np.stack([turning.bias(replace(samples, q=rotated_in_yaw(samples.q, k))) for k in range(4)])
             bias = np.where(unknown, bias - turning.bias(samples) + each.mean(axis=0), bias)
             noise = np.where(unknown, np.hypot(noise, each.std(axis=0)), noise)
         return bias, noise

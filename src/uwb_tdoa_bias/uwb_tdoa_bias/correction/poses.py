@@ -75,7 +75,7 @@ def _look_up(t, count, stamps, p, q, yaw_std, places, p_out, q_out, yaw_std_out)
             p_out[i], q_out[i], yaw_std_out[i] = np.nan, np.nan, np.nan
 
 
-def told_yaw_std(std):
+def known_yaw_std(std):
     """Standard deviation of the yaw, (n,) rad, of attitudes with deviations std (n, 3) rad about the axes of the world.
 
     It is 0 where the tilt is not known either: then no attitude is estimated, and level at yaw 0 is what is meant.
@@ -83,7 +83,7 @@ def told_yaw_std(std):
     return np.where(std[:, :2].max(axis=1) < TILT, std[:, 2], 0.0)
 
 
-def turned(q, quarters):
+def rotated_in_yaw(q, quarters):
     """Attitudes q (n, 4) x y z w, turned about the vertical by some quarters of a turn."""
     s, c = np.sin(0.25 * np.pi * quarters), np.cos(0.25 * np.pi * quarters)
     x, y, z, w = q.T

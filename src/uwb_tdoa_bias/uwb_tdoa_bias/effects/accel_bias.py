@@ -3,7 +3,7 @@
 import numpy as np
 
 from .affine import Affine
-from .imu_error import ImuEffect
+from .imu_error import ImuEffect, readings
 
 
 class AccelBias(ImuEffect):
@@ -22,3 +22,11 @@ class AccelBias(ImuEffect):
 
     def accel(self):
         return Affine(np.eye(3), self.vector())
+
+    def advice(self):
+        found = readings(self, "along")
+        return (
+            (f"Calibrate the accelerometer at rest and damp the vibration of its mount: it reads {found}.",)
+            if found
+            else ()
+        )

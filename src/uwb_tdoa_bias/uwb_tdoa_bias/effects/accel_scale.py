@@ -3,7 +3,7 @@
 import numpy as np
 
 from .affine import Affine
-from .imu_error import ImuEffect
+from .imu_error import ImuEffect, readings
 
 
 class AccelScale(ImuEffect):
@@ -25,3 +25,7 @@ class AccelScale(ImuEffect):
 
     def accel(self):
         return Affine(np.eye(3) + np.diag(self.vector()), np.zeros(3))
+
+    def advice(self):
+        found = readings(self, "along", "%", 100.0)
+        return (f"Calibrate the accelerometer, each axis up and down: it reads {found}.",) if found else ()

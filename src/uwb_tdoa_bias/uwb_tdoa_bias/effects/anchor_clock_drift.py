@@ -1,6 +1,7 @@
 """The clock of one anchor runs away."""
 
 from .base import AnchorEffect
+from .wording import counted, listed, significant, size
 
 
 class AnchorClockDrift(AnchorEffect):
@@ -23,3 +24,13 @@ class AnchorClockDrift(AnchorEffect):
 
     def delay_per_unit(self, samples):
         return samples.t - samples.start
+
+    def advice(self):
+        drifts = [
+            f"anchor {key} by {size(self, key, 'm')} a second {'later' if value > 0.0 else 'earlier'}"
+            for key, value in significant(self).items()
+        ]
+        if not drifts:
+            return ()
+        which = counted(sorted(significant(self), key=int), "anchor")
+        return (f"Let {which} warm up before flights, or check the clock: heard {listed(drifts)}.",)

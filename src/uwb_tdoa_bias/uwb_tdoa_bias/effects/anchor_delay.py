@@ -1,6 +1,7 @@
 """A constant delay of one anchor."""
 
 from .base import AnchorEffect
+from .wording import counted, listed, significant, size
 
 
 class AnchorDelay(AnchorEffect):
@@ -22,3 +23,17 @@ class AnchorDelay(AnchorEffect):
         "anchor_position": "a flight that passes the anchor on several sides, near and far",
     }
     reference = "DW1000 user manual, antenna delay calibration: 10 - 50 cm from module to module"
+
+    def advice(self):
+        late = {
+            key: f"{size(self, key)} {'late' if value > 0.0 else 'early'}" for key, value in significant(self).items()
+        }
+        if not late:
+            return ()
+        each = (
+            listed(f"anchor {key} {how}" for key, how in late.items())
+            if len(late) > 1
+            else f"it {next(iter(late.values()))}"
+        )
+        which = counted(sorted(late, key=int), "anchor")
+        return (f"Calibrate the antenna delay of {which}: the tag hears {each}, against the other anchors.",)

@@ -3,8 +3,10 @@
 import numpy as np
 
 from ..foundation.errors import InputError
-from ..foundation.geometry import tdoa
+from ..foundation.geometry import ranges, tdoa
 from .base import Effect, check_anchor, known_anchors, once_per_anchors
+from .marks import Shift
+from .wording import counted, listed, significant, size
 
 
 class AnchorPosition(Effect):
@@ -57,7 +59,7 @@ class AnchorPosition(Effect):
 
     def regressors(self, samples, keys):
         moved, ids = self._moved(samples.anchors), samples.anchors.ids
-        unit_a, unit_b = (_unit(moved[rows] - samples.p) for rows in (samples.a, samples.b))
+        unit_a, unit_b = (-ranges(samples.p, moved[rows])[1] for rows in (samples.a, samples.b))
         out = np.empty((len(samples), len(keys)))
         for column, key in enumerate(keys):
             anchor, axis = key.split(".")
@@ -67,6 +69,24 @@ class AnchorPosition(Effect):
             ]
         return out
 
+    def advice(self):
+        shifts = {}
+        for key, value in significant(self).items():
+            anchor, axis = key.split(".")
+            shifts.setdefault(anchor, {})[axis] = f"{size(self, key)} towards {'+' if value > 0.0 else '-'}{axis}"
+        if not shifts:
+            return ()
+        moved = {anchor: listed(by[axis] for axis in sorted(by)) for anchor, by in shifts.items()}
+        each = [f"{f'anchor {anchor}' if len(moved) > 1 else 'it'} seems off by {by}" for anchor, by in moved.items()]
+        return (
+            f"Survey {counted(sorted(shifts, key=int), 'anchor')} again: {'; '.join(each)}. If the survey proves "
+            "right, ranges to there are wrong by direction.",
+        )
 
-def _unit(v):
-    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)
+    def marks(self, anchors):
+        each = {}
+        for key, value in self.values.items():
+            anchor, axis = key.split(".")
+            by, std = each.setdefault(int(anchor), (np.zeros(3), np.full(3, np.nan)))
+            by["xyz".index(axis)], std["xyz".index(axis)] = value, self.std.get(key, np.nan)
+        return tuple(Shift(anchor, *shift) for anchor, shift in each.items())

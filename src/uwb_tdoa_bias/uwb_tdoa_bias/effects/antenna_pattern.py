@@ -5,6 +5,7 @@ import numpy as np
 from ..foundation.antenna import Antenna
 from ..foundation.radio import FLAT_MOUNT, into_frame
 from .base import ArrivalEffect, tile
+from .wording import listed, significant, size
 
 UNIT = Antenna(delay_span=1.0)
 
@@ -46,3 +47,12 @@ class AntennaPattern(ArrivalEffect):
                 known = np.isfinite(samples.anchors.orientations[rows]).all(axis=1)
                 out[:, column] = np.where(known, UNIT.group_delay(seen), 0.0)
         return out
+
+    def advice(self):
+        spans = [
+            f"{size(self, key)} {'later' if value > 0.0 else 'earlier'} in the nulls of the {key}'s antenna"
+            for key, value in significant(self).items()
+        ]
+        if not spans:
+            return ()
+        return (f"Turn antennas so that their nulls point at nothing that is heard: arrivals are {listed(spans)}.",)

@@ -9,6 +9,7 @@ import numpy as np
 from ..foundation.errors import InputError
 from .affine import IDENTITY
 from .samples import Samples, true_samples
+from .wording import LARGEST, listed, measured, significant
 
 __all__ = ["ArrivalEffect", "Effect", "Samples"]
 
@@ -44,6 +45,7 @@ class Effect:
     price: ClassVar[float] = 0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
     distinguished_by: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
     usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
+    needs_reference: ClassVar[bool] = False  # cannot be told from the filter's innovations alone
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
     uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
 
@@ -130,6 +132,19 @@ class Effect:
         d = flight.tdoa.d.copy()
         d[rows] += bias
         return replace(flight, tdoa=replace(flight.tdoa, d=d))
+
+    def advice(self):
+        """What a person can do about it in the hall: imperative sentences, the most important first; () if nothing but
+        taking it out of the measurements helps. They name `significant` values alone."""
+        largest = list(significant(self).items())[:LARGEST]
+        if not largest:
+            return ()
+        values = listed(f"{key} = {measured(value, self.std.get(key))}" for key, value in largest)
+        return (f"Look for the cause of {self.name}: {self.physics} (found: {values}, in {self.unit}).",)
+
+    def marks(self, anchors):
+        """Shifts and Regions (`marks.py`) that show it on a map of some Anchors: tuple."""
+        return ()
 
     def stamp_offset(self, stream):
         """Seconds by which the stamps of the stream "tdoa", "imu" or "truth" are late."""

@@ -60,6 +60,14 @@ OF_ARRIVAL = {
 OF_IMU = (
     "time", "vibration", "turning_rate", "rate_x", "rate_y", "rate_z", "accel", "accel_x", "accel_y", "accel_z",
 )  # fmt: skip
+
+UNITS = {
+    "time": "s", "x": "m", "y": "m", "height": "m", "speed": "m/s", "climb_rate": "m/s", "acceleration": "m/s^2",
+    "turning_rate": "rad/s", "interval": "s", "previous_anchor": "id", "vibration": "m/s^2", "range": "m",
+    **dict.fromkeys((name for name in OF_ARRIVAL if name != "range"), "rad"),
+    **dict.fromkeys((name for name in OF_IMU if name.startswith("rate_")), "rad/s"),
+    **dict.fromkeys((name for name in OF_IMU if name.startswith("accel")), "m/s^2"),
+}  # fmt: skip
 OF_ACCEL = ("accel", "accel_x", "accel_y", "accel_z")  # specific force, m/s^2
 
 

@@ -98,9 +98,8 @@ class EffectSet:
         entries = {}
         for effect in self.effects:
             entry = {name: _plain(getattr(effect, name)) for name in (*effect.settings, *ENTRY)}
-            name = effect.name
-            if effect.settings:  # there may be several
-                name = f"{name}_{1 + sum(known.startswith(f'{name}_') for known in entries)}"
+            number = 1 + sum(other.name == effect.name for other in self.effects[: len(entries)])
+            name = effect.name if number == 1 and not effect.settings else f"{effect.name}_{number}"
             entries[name] = {key: value for key, value in entry.items() if value}
         Path(path).write_text(yaml.safe_dump({"effects": entries}, sort_keys=False))
 
@@ -110,8 +109,7 @@ def _plain(value):
 
 
 def _kind(name):
-    """Class of an entry: a declared effect, or smooth_term with an optional _NUMBER; None if there is none."""
+    """Class of an entry: a declared effect or smooth_term, with an optional _NUMBER; None if there is none."""
     head, _, number = name.rpartition("_")
-    if name == SmoothTerm.name or (head == SmoothTerm.name and number.isdigit()):
-        return SmoothTerm
-    return EFFECTS.get(name)
+    kinds = {**EFFECTS, SmoothTerm.name: SmoothTerm}
+    return kinds.get(name) or (kinds.get(head) if number.isdigit() else None)

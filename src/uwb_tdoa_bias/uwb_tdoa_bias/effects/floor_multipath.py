@@ -3,6 +3,7 @@
 import numpy as np
 
 from .base import ArrivalEffect, tile
+from .wording import significant, size
 
 LOW, HIGH = 0.1, 0.4  # m, full strength below the first, none above the second
 
@@ -44,3 +45,11 @@ class FloorMultipath(ArrivalEffect):
 
     def noise_std(self, samples):
         return abs(self.values.get("size", 0.0)) * np.nan_to_num(self.strength(samples.p[:, 2]))
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        return (
+            f"Count on no position below {HIGH:g} m, or hang the lowest anchors higher: on the floor TDOAs are wrong "
+            f"by about {size(self, 'size')}.",
+        )

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .affine import Affine
-from .imu_error import ImuEffect
+from .imu_error import ImuEffect, readings
 
 
 class GyroBias(ImuEffect):
@@ -21,3 +21,7 @@ class GyroBias(ImuEffect):
 
     def gyro(self):
         return Affine(np.eye(3), self.vector())
+
+    def advice(self):
+        found = readings(self, "about")
+        return (f"Let the gyroscope find its zero at rest before take-off: it reads {found}.",) if found else ()

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .affine import Affine
-from .imu_error import ImuEffect
+from .imu_error import ImuEffect, readings
 
 
 class GyroScale(ImuEffect):
@@ -22,3 +22,7 @@ class GyroScale(ImuEffect):
 
     def gyro(self):
         return Affine(np.eye(3) + np.diag(self.vector()), np.zeros(3))
+
+    def advice(self):
+        found = readings(self, "about", "%", 100.0)
+        return (f"Calibrate the gyroscope on a turntable: it reads {found}.",) if found else ()

@@ -7,6 +7,7 @@ import numpy as np
 from ..foundation.errors import InputError
 from .affine import IDENTITY
 from .base import Effect
+from .wording import listed, significant, size
 
 
 class ImuEffect(Effect):
@@ -47,6 +48,16 @@ class ImuEffect(Effect):
         need_imu(self, flight)
         imu = flight.imu
         return replace(flight, imu=replace(imu, gyro=self.gyro()(imu.gyro), accel=self.accel()(imu.accel)))
+
+
+def readings(effect, along, unit=None, factor=1.0):
+    """Significant values of an ImuEffect that adds to what a sensor reads: "0.20 ± 0.01 m/s^2 too much along x"; ""
+    without any. along : "along" or "about" the axes."""
+    parts = {
+        key: f"{size(effect, key, unit, factor)} too {'much' if value > 0.0 else 'little'} {along} {key}"
+        for key, value in significant(effect).items()
+    }
+    return listed(parts[key] for key in sorted(parts)) if parts else ""
 
 
 def need_imu(effect, flight):

@@ -9,6 +9,7 @@ from .base import need_truth
 from .affine import Affine
 from .imu_error import ImuEffect, need_imu
 from .samples import Track
+from .wording import significant, size
 
 
 class ImuGravity(ImuEffect):
@@ -59,3 +60,12 @@ class ImuGravity(ImuEffect):
             else [0.0, 0.0, self.excess]
         )
         return replace(flight, imu=replace(imu, accel=imu.accel + up))
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        sign = "much" if self.excess > 0.0 else "little"
+        return (
+            f"Check the accelerometer's factor from g to m/s^2, and local gravity: it reads {size(self, 'excess')} "
+            f"too {sign} upwards.",
+        )

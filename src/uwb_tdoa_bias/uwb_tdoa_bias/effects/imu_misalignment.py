@@ -5,6 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from .affine import Affine
 from .imu_error import ImuEffect
+from .wording import listed, measured, significant
 
 
 class ImuMisalignment(ImuEffect):
@@ -33,3 +34,13 @@ class ImuMisalignment(ImuEffect):
 
     def accel(self):
         return self._turn()
+
+    def advice(self):
+        turns = {
+            key: f"{measured(-np.degrees(value), np.degrees(self.std.get(key, 0.0)), 'degrees')} about {key}"
+            for key, value in significant(self).items()
+        }
+        if not turns:
+            return ()
+        back = listed(turns[key] for key in sorted(turns))
+        return (f"Turn the IMU by {back}: its axes are not those of the body as the ground truth has it.",)

@@ -4,6 +4,8 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from .base import ArrivalEffect, check_anchor, tile
+from .marks import Region
+from .wording import measured, significant
 
 PARTS = ("delay", "start", "end", "x", "y", "z", "radius")
 
@@ -57,8 +59,9 @@ class Nlos(ArrivalEffect):
         blocked = samples.anchors.ids[rows] == int(anchor)
         blocked &= (since >= get(f"{anchor}.start", -np.inf)) & (since <= get(f"{anchor}.end", np.inf))
         if f"{anchor}.radius" in self.values:
-            centre = np.array([get(f"{anchor}.{axis}", 0.0) for axis in "xyz"])
-            near = np.linalg.norm(samples.p - centre, axis=1) <= self.values[f"{anchor}.radius"]  # False where NaN
+            near = (
+                np.linalg.norm(samples.p - self._centre(anchor), axis=1) <= self.values[f"{anchor}.radius"]
+            )  # False where NaN
             blocked &= tile(samples, near)
         return blocked
 
@@ -71,3 +74,49 @@ class Nlos(ArrivalEffect):
         for column, key in enumerate(keys):
             out[:, column] = self._blocked(samples, rows, key.partition(".")[0])
         return out
+
+    def advice(self):
+        out = []
+        for anchor, delay in sorted(self._significant_delays().items(), key=lambda item: -item[1]):
+            late = measured(delay, self.std.get(f"{anchor}.delay"), "m")
+            place, when = self._place(anchor), self._time(anchor)
+            if place:
+                out.append(
+                    f"Look what stands between anchor {anchor} and {place}: the anchor is heard {late} late while "
+                    f"the tag is within {self.values[f'{anchor}.radius']:.1f} m of there{when}."
+                )
+            else:
+                out.append(f"Look what stood between anchor {anchor} and the tag{when}: it was heard {late} late.")
+        return tuple(out)
+
+    def marks(self, anchors):
+        return tuple(
+            Region(int(anchor), self._centre(anchor), self.values[f"{anchor}.radius"])
+            for anchor in self._significant_delays()
+            if f"{anchor}.radius" in self.values
+        )
+
+    def _significant_delays(self):
+        """{anchor: delay}, m."""
+        delays = {key: value for key, value in significant(self).items() if key.endswith(".delay")}
+        return {key.partition(".")[0]: value for key, value in delays.items()}
+
+    def _centre(self, anchor):
+        """(3,) m"""
+        return np.array([self.values.get(f"{anchor}.{axis}", 0.0) for axis in "xyz"])
+
+    def _place(self, anchor):
+        if f"{anchor}.radius" not in self.values:
+            return ""
+        return "({:.1f}, {:.1f}, {:.1f}) m".format(*self._centre(anchor))
+
+    def _time(self, anchor):
+        """In words, with a space before them; "" without limits."""
+        start, end = (self.values.get(f"{anchor}.{part}") for part in ("start", "end"))
+        limits = [
+            f"from {start:.0f} s on" if start is not None else "",
+            f"until {end:.0f} s" if end is not None else "",
+        ]
+        if start is not None and end is not None:
+            limits = [f"from {start:.0f} to {end:.0f} s"]
+        return f", {' '.join(filter(None, limits))} after the first TDOA" if any(limits) else ""

@@ -45,3 +45,6 @@ class NoiseCorrelation(Effect):
         a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
         error = np.where((a >= 0) & (b >= 0), std * (process[rows, b] - process[rows, a]), 0.0)
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + error))
+
+    def advice(self):
+        return ()  # multipath is everywhere; the filter is told

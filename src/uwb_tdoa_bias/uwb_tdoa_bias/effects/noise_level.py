@@ -6,6 +6,7 @@ import numpy as np
 
 from .base import Effect
 from .pair_offset import PairOffset, link_keys
+from .wording import listed, significant, size
 
 
 class NoiseLevel(Effect):
@@ -46,3 +47,12 @@ class NoiseLevel(Effect):
         samples = Samples(tdoa.t, a, b, np.zeros((n, 3)), np.full((n, 4), np.nan), flight.anchors)
         rng = rng or np.random.default_rng()
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + self.noise_std(samples) * rng.standard_normal(n)))
+
+    def advice(self):
+        noisy = [f"those of {key} by {size(self, key)}" for key in significant(self)]
+        if not noisy:
+            return ()
+        links = listed(key.replace("-", " and ") for key in significant(self))
+        return (
+            f"Check the antennas of anchors {links} and the sight between them: TDOAs scatter more, {listed(noisy)}.",
+        )

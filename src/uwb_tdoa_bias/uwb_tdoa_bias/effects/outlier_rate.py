@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from .base import Effect
+from .wording import significant, size
 
 
 class OutlierRate(Effect):
@@ -33,3 +34,9 @@ class OutlierRate(Effect):
         hit = rng.random(len(tdoa)) < self.values.get("share", 0.0)
         size = np.copysign(rng.uniform(0.5, 5.0, len(tdoa)), rng.uniform(-1.0, 1.0, len(tdoa)))
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + np.where(hit, size, 0.0)))
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        share = size(self, "share", "%", 100.0)
+        return (f"Look for lost or mixed-up packets and for reflections: {share} of the TDOAs are plainly wrong.",)

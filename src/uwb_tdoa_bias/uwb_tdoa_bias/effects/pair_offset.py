@@ -4,6 +4,7 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from .base import Effect
+from .wording import listed, significant, size
 
 
 class PairOffset(Effect):
@@ -50,6 +51,16 @@ class PairOffset(Effect):
         a, b = samples.anchors.ids[samples.a], samples.anchors.ids[samples.b]
         links = [tuple(map(int, key.split("-"))) for key in keys]
         return np.stack([1.0 * ((a == i) & (b == k)) - ((a == k) & (b == i)) for i, k in links], axis=1)
+
+    def advice(self):
+        off = [
+            f"the TDOA of {key} is {size(self, key)} too {'large' if value > 0.0 else 'small'}"
+            for key, value in significant(self).items()
+        ]
+        if not off:
+            return ()
+        links = listed(f"{key.replace('-', ' and ')}" for key in significant(self))
+        return (f"Let anchors {links} measure the time of flight between them again: {listed(off)}.",)
 
 
 def link_keys(pairs):

@@ -3,6 +3,9 @@
 import numpy as np
 
 from .base import ArrivalEffect, tile
+from .wording import significant, size
+
+EXAMPLES = 4.0, 8.0  # m, distances that advice names
 
 
 class RangeBias(ArrivalEffect):
@@ -32,3 +35,10 @@ class RangeBias(ArrivalEffect):
     def delay_regressors(self, samples, rows, keys):
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
         return np.repeat(np.sum(to_anchor**2, axis=1)[:, None], len(keys), axis=1)
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        sign = "far" if self.values["quadratic"] > 0.0 else "near"
+        near, far = (f"{size(self, 'quadratic', 'm', r * r)} at {r:g} m" for r in EXAMPLES)
+        return (f"Calibrate ranges over distance: an anchor seems too {sign} by {near} and by {far}.",)

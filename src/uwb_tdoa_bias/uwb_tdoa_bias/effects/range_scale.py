@@ -4,6 +4,7 @@ import numpy as np
 
 from ..foundation.geometry import tdoa
 from .base import Effect
+from .wording import significant, size
 
 
 class RangeScale(Effect):
@@ -30,3 +31,11 @@ class RangeScale(Effect):
 
     def regressors(self, samples, keys):
         return np.repeat(tdoa(samples.p, samples.position_a, samples.position_b)[:, None], len(keys), axis=1)
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        sign = "large" if self.values["scale"] > 0.0 else "small"
+        return (
+            f"Check how the tag turns ticks into metres: every TDOA is {size(self, 'scale', '%', 100.0)} too {sign}.",
+        )

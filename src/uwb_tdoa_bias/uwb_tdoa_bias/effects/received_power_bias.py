@@ -4,6 +4,7 @@ import numpy as np
 
 from ..foundation.radio import NOMINAL_GAIN, RadioLink, power_bias, received_power_dbm
 from .base import ArrivalEffect, tile
+from .wording import measured, significant
 
 LINK = RadioLink()
 
@@ -48,3 +49,11 @@ class ReceivedPowerBias(ArrivalEffect):
             power = np.where(unknown, free, power)
         late = np.where(np.isfinite(power), power_bias(power), np.nan)
         return np.repeat(late[:, None], len(keys), axis=1)
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        scale = measured(self.values["scale"], self.std.get("scale"))
+        return (
+            f"Correct ranges for received power in the tag: they err by {scale} times the table of Decawave APS011.",
+        )

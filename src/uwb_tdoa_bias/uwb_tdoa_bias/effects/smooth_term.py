@@ -194,6 +194,9 @@ class SmoothTerm(Effect):
         alone = [tuple(key for key in keys if key.rpartition(".")[0] == name) for name in each]
         return [keys, *alone] if self.form == "anchor" else [keys]
 
+    def advice(self):
+        return ()  # without a name there is nothing to look for
+
 
 @compiled
 def _pieces(knots, value):

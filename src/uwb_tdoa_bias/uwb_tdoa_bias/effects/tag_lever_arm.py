@@ -5,6 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from ..foundation.geometry import tdoa, tdoa_jacobian
 from .base import Effect
+from .wording import listed, significant, size
 
 
 class TagLeverArm(Effect):
@@ -40,6 +41,15 @@ class TagLeverArm(Effect):
         jacobian = tdoa_jacobian(antenna, samples.position_a, samples.position_b)
         axes = np.eye(3)[["xyz".index(key) for key in keys]]
         return np.stack([np.sum(jacobian * _rotate(samples.q, axis), axis=1) for axis in axes], axis=1)
+
+    def advice(self):
+        arm = {key: f"{size(self, key)} towards {'+' if v > 0.0 else '-'}{key}" for key, v in significant(self).items()}
+        if not arm:
+            return ()
+        parts = listed(arm[key] for key in sorted(arm))
+        return (
+            f"Measure where the tag's antenna sits on the vehicle: it is {parts} from the origin of the body frame.",
+        )
 
 
 def _rotate(q, v):

@@ -4,6 +4,7 @@ import numpy as np
 
 from ..foundation.geometry import tdoa_jacobian
 from .stamp_error import StampEffect
+from .wording import significant, size
 
 
 class TdoaTimeOffset(StampEffect):
@@ -22,7 +23,16 @@ class TdoaTimeOffset(StampEffect):
         "truth_time_offset": "a flight with IMU: its stamps belong to neither",
     }
     reference = "UTIL web page: about 10 ms of radio latency"
+    needs_reference = True
 
     def regressors(self, samples, keys):
         jacobian = tdoa_jacobian(samples.p, samples.position_a, samples.position_b)
         return np.repeat(-np.sum(jacobian * samples.velocity, axis=1)[:, None], len(keys), axis=1)
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        sign = "late" if self.values["offset"] > 0.0 else "early"
+        return (
+            f"Stamp TDOAs at the instant they are taken: their stamps are {size(self, 'offset', 'ms', 1e3)} {sign}.",
+        )

@@ -5,8 +5,11 @@ from scipy.spatial.transform import Rotation
 
 from ..foundation.geometry import tdoa
 from .base import Effect
+from .marks import Shift
+from .wording import listed, measured, significant
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+DEGREES = 180.0 / np.pi
 
 
 class TruthFrame(Effect):
@@ -22,6 +25,7 @@ class TruthFrame(Effect):
     physics = "survey and motion capture do not share one frame: all anchors are shifted and turned together"
     confounded_with = ("tag_lever_arm", "anchor_position")
     reference = "rigid alignment of two coordinate frames"
+    needs_reference = True
     portable = False
 
     @classmethod
@@ -52,3 +56,19 @@ class TruthFrame(Effect):
             ends = [TruthFrame({**self.values, key: here + s}).bias(samples) for s in (-step, step)]
             out[:, column] = (ends[1] - ends[0]) / (2.0 * step)
         return out
+
+    def advice(self):
+        parts = []
+        for key in (key for key in KEYS if key in significant(self)):
+            factor, unit = (1.0, "m") if key in "xyz" else (DEGREES, "degrees")
+            parts.append(f"{key} {measured(self.values[key] * factor, self.std.get(key, 0.0) * factor, unit)}")
+        if not parts:
+            return ()
+        return (
+            "Align the frames of the survey and of the ground truth anew: seen from the ground truth, all anchors are "
+            f"shifted and turned together by {listed(parts)}.",
+        )
+
+    def marks(self, anchors):
+        by = self._moved(anchors) - anchors.positions
+        return tuple(Shift(int(anchor), shift, np.full(3, np.nan)) for anchor, shift in zip(anchors.ids, by))

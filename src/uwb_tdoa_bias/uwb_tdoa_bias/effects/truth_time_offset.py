@@ -5,6 +5,7 @@ import numpy as np
 from ..foundation.geometry import tdoa_jacobian
 from .base import need_truth
 from .stamp_error import StampEffect
+from .wording import significant, size
 
 
 class TruthTimeOffset(StampEffect):
@@ -21,6 +22,7 @@ class TruthTimeOffset(StampEffect):
     physics = "motion-capture poses reach the log late, over a radio link"
     confounded_with = ("tdoa_time_offset",)
     reference = "UTIL web page: motion-capture poses logged on board have about 10 ms of radio latency"
+    needs_reference = True
     portable = False
     channels = ("tdoa", "gyro")  # on the accelerometer it is less than its vibration
 
@@ -34,3 +36,12 @@ class TruthTimeOffset(StampEffect):
     def inject(self, flight, rng=None):
         need_truth(self, flight)
         return super().inject(flight, rng)
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        sign = "late" if self.values["offset"] > 0.0 else "early"
+        return (
+            f"Correct the stamps of the ground truth, which are {size(self, 'offset', 'ms', 1e3)} {sign}: that "
+            "changes what the estimate is compared with, not the estimate.",
+        )

@@ -13,7 +13,7 @@ from numba import config, njit
 
 
 def compiled(function):
-    """Decorator: compile `function` (which may call other compiled ones below its folder and of the foundation) and cache it."""
+    """Decorator: compile `function`, which may call others below its folder and of the foundation, and cache it."""
     before = config.CACHE_DIR
     config.CACHE_DIR = str(_base() / _digest(Path(function.__code__.co_filename).parent))
     try:

@@ -48,6 +48,40 @@ class Truth:
 
 
 @dataclass(frozen=True)
+class Height:
+    """Ranges along the body's -z. t : (n,) s; range : (n,) m; inf or NaN where there was none (REP 117)."""
+
+    t: np.ndarray
+    range: np.ndarray
+
+    def __len__(self):
+        return len(self.t)
+
+
+@dataclass(frozen=True)
+class Pressure:
+    """Static air pressure. t : (n,) s; pressure : (n,) Pa."""
+
+    t: np.ndarray
+    pressure: np.ndarray
+
+    def __len__(self):
+        return len(self.t)
+
+
+@dataclass(frozen=True)
+class Velocity:
+    """Velocities in the body frame. t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not measured."""
+
+    t: np.ndarray
+    v: np.ndarray
+    std: np.ndarray
+
+    def __len__(self):
+        return len(self.t)
+
+
+@dataclass(frozen=True)
 class Flight:
     """One recording. All stamps are of one clock, in s; every stream keeps its own; within a stream stamps never fall.
 
@@ -58,6 +92,9 @@ class Flight:
     truth : Truth or None
     extra : other streams of the log by name, each a dict of column name to (n,) array with a "t" among them, file units
     meta : where it came from: source file, format, protocol ("tdoa2", "tdoa3"), ...
+    height : Height or None
+    pressure : Pressure or None
+    velocity : Velocity or None
     """
 
     name: str
@@ -67,3 +104,6 @@ class Flight:
     truth: Truth | None = None
     extra: dict = field(default_factory=dict)
     meta: dict = field(default_factory=dict)
+    height: Height | None = None
+    pressure: Pressure | None = None
+    velocity: Velocity | None = None

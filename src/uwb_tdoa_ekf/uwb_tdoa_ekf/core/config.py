@@ -80,6 +80,22 @@ class FilterConfig:
     start_window: float = _parameter(0.5, "s of TDOAs from which the start position is found")
     start_timeout: float = _parameter(1.0, "s after which a start from contradicting TDOAs is better than none")
 
+    # What else the tag feels
+    use_height: bool = _parameter(True, "use ranges of a range finder that looks down along the body's -z, if there are any")
+    height_std: float = _parameter(0.02, "m; of a range: unevenness of the ground and offset of the sensor, alike for 0.5 s")
+    height_arm: float = _parameter(0.0, "m; from the range finder up to the origin of the body, along the body's z", low=-1e9)
+    ground_height: float = _parameter(0.0, "m; height of the ground in the world, but for steps", low=-1e9)
+    use_pressure: bool = _parameter(True, "use pressures of a barometer, if there are any")
+    pressure_std: float = _parameter(0.1, "m; noise of one pressure, as altitude")
+    pressure_walk: float = _parameter(0.1, "m/sqrt(s); how fast the offset of the altitude wanders: weather, prop wash, warming up")
+    pressure_drift: float = _parameter(0.02, "m/s; how fast it drifts, as is known before it is measured")
+    use_velocity: bool = _parameter(True, "use velocities in the body frame, if there are any")
+    velocity_scale: float = _parameter(1.0, "measured over true velocity")
+    velocity_yaw: float = _parameter(0.0, "rad; yaw of the axes of the velocity in the body frame", low=-1e9)
+    velocity_delay: float = _parameter(0.0, "s; by which the stamps of the velocity are late", low=-1e9)
+    fixed_height: float = _parameter(0.0, "m; height of a tag that stays on its floor", low=-1e9)
+    fixed_height_std: float = _parameter(0.0, "m; its standard deviation; 0.0: the tag does not stay there", with_low=True)
+
     # The output
     odometry_rate: float = _parameter(200.0, "Hz of stamps; at most this often")
 

@@ -7,14 +7,12 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
-from . import history, hypotheses, inertial, initialization, noise, robust, workspace
+from . import aids, barometer, height, history, hypotheses, inertial, initialization, noise, robust, workspace
 from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, Output
 from .startup import INLIER
 from .state import coast, predict
 from .update import project, update_state
-
-# verdict on one TDOA; the values of TdoaResidual.VERDICT_*
-USED, REJECTED, LATE, INVALID, STARTUP = range(5)
+from .verdicts import REJECTED, STARTUP, USED
 
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged
 INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
@@ -24,8 +22,9 @@ STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 REST_PERIOD, REST_STD = 0.05, 0.02  # s between, and m/s of, zero-velocity updates at rest
 REST_SPEED = 0.05  # m/s; a quiet tag stands still if it is known to be slower: it might also glide
 
-RECORDS_OF_TDOA = 1 + 3 + 1  # in a history, at most: its update, bounds of the workspace, a start or a recovery
+RECORDS_OF_TDOA = 1 + 3 + 1 + 1  # in a history, at most: its update, workspace, fixed height, a start or a recovery
 RECORDS_OF_REST = 3  # one per axis
+RECORDS_OF_AID = 3  # one per component of a velocity
 
 
 @compiled
@@ -36,17 +35,22 @@ def run(memory, tuning, measurements, output):
     rows. Raises IndexError if a history has less room than `most_records`.
     """
     ekf, anchors, parameters = memory.ekf[0], memory.anchors, tuning[0]
-    imu, tdoa = measurements.imu, measurements.tdoa
-    i = k = rows = 0
-    while i < len(imu) or k < len(tdoa):
-        if k == len(tdoa) or (i < len(imu) and imu[i].t <= tdoa[k].t):
-            t = imu[i].t
+    imu, tdoa, aid = measurements.imu, measurements.tdoa, measurements.aids
+    i = k = m = rows = 0
+    while i < len(imu) or k < len(tdoa) or m < len(aid):
+        of_imu = imu[i].t if i < len(imu) else np.inf
+        of_tdoa = tdoa[k].t if k < len(tdoa) else np.inf
+        of_aid = aid[m].t if m < len(aid) else np.inf
+        t = min(of_imu, of_tdoa, of_aid)
+        if of_imu == t and i < len(imu):
             _on_imu(ekf, parameters, imu[i], output.history)
             i += 1
-        else:
-            t = tdoa[k].t
+        elif of_tdoa == t and k < len(tdoa):
             _on_tdoa(ekf, anchors, parameters, tdoa[k], output.residuals[k], output.history)
             k += 1
+        else:
+            _on_aid(ekf, parameters, aid[m], output.aids[m], output.history)
+            m += 1
         if ekf.running and t >= ekf.next_odometry:
             ekf.next_odometry = (math.floor(t * parameters.odometry_rate + 1e-6) + 1.0) / parameters.odometry_rate
             _report(ekf, t, output.odometry[rows])
@@ -56,11 +60,11 @@ def run(memory, tuning, measurements, output):
 
 def most_records(measurements):
     """Room that a history needs for Measurements that are fed at once."""
-    imu, tdoa = measurements
+    imu, tdoa, aid = measurements
     rests = len(imu)
     if rests:
         rests = min(rests, 2 + (imu["t"][-1] - imu["t"][0]) / REST_PERIOD)
-    return RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_REST * int(rests)
+    return RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_REST * int(rests) + RECORDS_OF_AID * len(aid)
 
 
 @compiled
@@ -85,19 +89,26 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
             _wait_for_start(ekf, anchors, tuning, t, records)
         return
     _update(ekf, anchors, tuning, tdoa, residual, records)
-    for h in range(HYPOTHESES):
-        for axis in range(3):
-            if not hypotheses.alive(ekf.hypotheses[h]):
-                continue
-            drawn = workspace.draw_back(ekf.hypotheses[h], ekf.innovation, ekf.workspace, axis)
-            if drawn and h == ekf.best:
-                history.add_update(ekf, t, records)
+    _stay_in_workspace(ekf, t, records)
+    if tuning.fixed_height_std > 0.0 and t >= ekf.next_floor:
+        ekf.next_floor = t + REST_PERIOD
+        _stay_on_floor(ekf, tuning, t, records)
     hypotheses.select(ekf, t)
     agrees = 1.0 if abs(residual.innovation) < INLIER else 0.0
     ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (agrees - ekf.consistency)
     ekf.last_tdoa = t
     if tuning.recover and ekf.consistency < INCONSISTENT and t >= ekf.next_search:
         initialization.recover(ekf, anchors, tuning, t, records)
+
+
+@compiled
+def _on_aid(ekf, tuning, aid, residual, records):
+    residual.innovation = residual.variance = np.nan
+    residual.weight, residual.verdict = 0.0, STARTUP
+    if ekf.running and _advance(ekf, tuning, aid.t, records):
+        aids.observe(ekf, tuning, aid, residual, records)
+    else:
+        aids.note(ekf, aid)
 
 
 @compiled
@@ -129,10 +140,14 @@ def _advance(ekf, tuning, t, records):
                 continue
             if sensed:
                 predict(hypothesis, ekf.imu, tuning, dt, ekf.transition)
+                if hypothesis.offset_P[0, 0] > 0.0:
+                    barometer.predict(hypothesis, ekf.transition)
                 if h == ekf.best:
                     history.add_prediction(ekf, records)
             else:
                 coast(hypothesis, dt, tuning.motion_noise**2, STALE_TURN_PSD if tuning.use_imu else 0.0)
+                if hypothesis.offset_P[0, 0] > 0.0:
+                    barometer.coast(hypothesis, dt)
                 if h == ekf.best:
                     history.add_coasting(ekf, dt, records)
         ekf.t = t if t - ekf.t <= MAX_STEP else ekf.t + dt
@@ -151,15 +166,9 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
         if not hypotheses.alive(hypothesis):
             continue
         _compare(hypothesis, a, b, tdoa.d, innovation)
-        hypotheses.add_log_likelihood(hypothesis, innovation, tuning.tdoa_correlation_length)
-        robust.update(hypothesis, innovation, tuning)
+        _assimilate(ekf, h, tuning, tdoa.t, residual, records)
         if h == ekf.best:
-            residual.innovation = innovation.value
-            residual.variance = innovation.prior_variance + innovation.noise_variance
-            residual.weight = innovation.weight
-            residual.verdict = USED if innovation.weight > 0.0 else REJECTED
-            if residual.verdict == USED:
-                history.add_update(ekf, tdoa.t, records)
+            height.judge(ekf.height, tuning, innovation, tdoa.t)
             if tuning.adapt_noise:
                 noise.learn(a, b, tdoa.t, innovation, tuning)
 
@@ -172,6 +181,33 @@ def _compare(hypothesis, a, b, d, innovation):
     for k in range(3):
         innovation.states[k] = k
     project(hypothesis.P, innovation)
+
+
+@compiled
+def _assimilate(ekf, h, tuning, t, residual, records):
+    """Hypothesis h with ekf.innovation, of whatever kind; that of the best one becomes the RESIDUAL."""
+    hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
+    hypotheses.add_log_likelihood(hypothesis, innovation, tuning.tdoa_correlation_length)
+    robust.update(hypothesis, innovation, tuning)
+    if h == ekf.best:
+        residual.innovation = innovation.value
+        residual.variance = innovation.prior_variance + innovation.noise_variance
+        residual.weight = innovation.weight
+        residual.verdict = USED if innovation.weight > 0.0 else REJECTED
+        if residual.verdict == USED:
+            history.add_update(ekf, t, records)
+
+
+@compiled
+def _stay_in_workspace(ekf, t, records):
+    """Soft constraints of every axis, for each hypothesis that is outside."""
+    for h in range(HYPOTHESES):
+        if not hypotheses.alive(ekf.hypotheses[h]):
+            continue
+        for axis in range(3):
+            outside = workspace.constrain(ekf.hypotheses[h], ekf.innovation, ekf.workspace, axis)
+            if outside and h == ekf.best:
+                history.add_update(ekf, t, records)
 
 
 @compiled
@@ -192,6 +228,17 @@ def _rest(ekf, t, records):
 
 
 @compiled
+def _stay_on_floor(ekf, tuning, t, records):
+    """The fixed height, where a hypothesis knows less of it: what is told once is not told better by being repeated."""
+    for h in range(HYPOTHESES):
+        hypothesis = ekf.hypotheses[h]
+        if hypotheses.alive(hypothesis) and hypothesis.P[2, 2] > tuning.fixed_height_std**2:
+            update_state(hypothesis, ekf.innovation, 2, tuning.fixed_height, tuning.fixed_height_std)
+            if h == ekf.best:
+                history.add_update(ekf, t, records)
+
+
+@compiled
 def _report(ekf, t, row):
     """Write the best hypothesis to one of ODOMETRY."""
     best = ekf.hypotheses[ekf.best]
@@ -202,15 +249,16 @@ def _report(ekf, t, row):
 
 
 def feed(memory, tuning, measurements, records=None):
-    """`run`, with room for what it gives: (odometry (m,) of ODOMETRY, residuals (k,) of RESIDUAL).
+    """`run`, with room for what it gives: (odometry of ODOMETRY, residuals of TDOAs and those of aids, of RESIDUAL).
 
     records : list to which the records of the history are appended, an array for each call; None: nothing is recorded.
     """
-    imu, tdoa = measurements
+    imu, tdoa, aid = measurements
     room = history.NOTHING if records is None else np.empty(most_records(measurements), history.RECORD)
-    output = Output(np.empty(len(imu) + len(tdoa), ODOMETRY), np.empty(len(tdoa), RESIDUAL), room)
+    n = len(imu) + len(tdoa) + len(aid)
+    output = Output(np.empty(n, ODOMETRY), np.empty(len(tdoa), RESIDUAL), room, np.empty(len(aid), RESIDUAL))
     rows = run(memory, tuning, measurements, output)
     if records is not None:
         records.append(room[: memory.record.recorded].copy())
         memory.record.recorded = 0
-    return output.odometry[:rows], output.residuals
+    return output.odometry[:rows], output.residuals, output.aids

@@ -43,7 +43,7 @@ def add_log_likelihood(hypothesis, innovation, correlation_length):
 
 @compiled
 def select(ekf, t):
-    """Follow the most probable hypothesis at stamp t; prune those that are improbable, or have become the same as it."""
+    """Follow the most probable hypothesis at stamp t; prune those that are improbable, or have become the same."""
     best = 0
     for h in range(HYPOTHESES):
         if ekf.hypotheses[h].log_weight > ekf.hypotheses[best].log_weight:

@@ -6,7 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from . import hypotheses, inertial, workspace
+from . import height, hypotheses, inertial, workspace
 from .history import add_reset
 from .memory import HYPOTHESES, WINDOW
 from .startup import level, locate, share_of_inliers
@@ -17,6 +17,7 @@ AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a recovery, m
 CLEARLY_MORE = 0.2  # share by which a recovery must explain more than the filter does
 SEARCH_PERIOD = 0.1  # s between two searches
 TILT_STD = 0.1  # rad, at the start
+SMALLEST_STD = 0.03  # m, of a height that is known at the start
 
 
 @compiled
@@ -37,12 +38,13 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    workspace.bounds(anchors, tuning.workspace_margin, ekf.workspace)
+    workspace.set_bounds(anchors, tuning.workspace_margin, ekf.workspace)
     x, covariance = np.empty(6), np.empty((6, 6))
-    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, x, covariance)
+    accel = _mean_accel(ekf.imu, tuning)
+    z, z_std = _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
+    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance)
     if not anyhow and (share < AGREE or not workspace.contains(ekf.workspace, x)):
         return
-    accel = _mean_accel(ekf.imu, tuning)
     unknown = tuning.use_imu and tuning.initial_yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):
         hypothesis, offset = ekf.hypotheses[h], hypotheses.yaw_offset(h)
@@ -68,7 +70,9 @@ def recover(ekf, anchors, tuning, t, history):
         return
     ekf.next_search = t + SEARCH_PERIOD
     x, covariance = np.empty(6), np.empty((6, 6))
-    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, x, covariance)
+    q = ekf.hypotheses[ekf.best].x[6:10]
+    z, z_std = _known_height(ekf, tuning, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
+    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance)
     explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
     if not workspace.contains(ekf.workspace, x) or share < AGREE_ANYHOW or share < CLEARLY_MORE + explained:
         return
@@ -80,6 +84,14 @@ def recover(ekf, anchors, tuning, t, history):
     ekf.consistency = 1.0
     ekf.recoveries += 1
     add_reset(ekf, t, history)
+
+
+@compiled
+def _known_height(ekf, tuning, up, t):
+    """z (m) of a tag with cos(tilt) `up` and its standard deviation, as told by something else than TDOAs, or NaN."""
+    if tuning.fixed_height_std > 0.0:
+        return tuning.fixed_height, tuning.fixed_height_std
+    return height.at_start(ekf, tuning, up, t), max(tuning.height_std, SMALLEST_STD)
 
 
 @compiled
@@ -107,6 +119,7 @@ def _mean_accel(imu, tuning):
 def _put(hypothesis, x, covariance):
     """Position and velocity x (6,) and their covariance (6, 6)."""
     hypothesis.x[:6] = x
+    hypothesis.offset_P[:] = 0.0  # of a barometer: to be found anew
     hypothesis.P[:6, :6] = covariance
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
-from .update import INNOVATION
+from .update import INNOVATION, OFFSET_STATES
 
 HYPOTHESES = 4  # starts in as many directions while the yaw is unknown
 WINDOW = 512  # TDOAs kept for a start
@@ -22,12 +22,16 @@ def _record(*columns):
 # What is measured. Rows of an anchor, not ids; both in the order of their stamps.
 IMU_SAMPLE = _record(("t", float), ("gyro", float, 3), ("accel", float, 3))  # s, rad/s, m/s^2 (specific force); body
 TDOA = _record(("t", float), ("a", int), ("b", int), ("d", float), ("bias_std", float))  # s, rows, m (corrected), m
+AID = _record(("t", float), ("kind", int), ("value", float, 3), ("std", float, 3))  # see aids.py
 
 # One estimate of the state, for one direction that the tag may have started in.
 HYPOTHESIS = _record(
     ("log_weight", float),  # log probability relative to the best; -inf: pruned
     ("x", float, NOMINAL_STATES),  # see state.py
     ("P", float, (ERROR_STATES, ERROR_STATES)),  # symmetric to the bit
+    ("offset", float, OFFSET_STATES),  # m and m/s, of the barometer, and its drift;
+    ("offset_cross", float, (OFFSET_STATES, ERROR_STATES)),  # covariance with the error state, and
+    ("offset_P", float, (OFFSET_STATES, OFFSET_STATES)),  # their own; 0: there is no barometer
 )
 
 # What is known of the inertial sensor.
@@ -43,10 +47,41 @@ IMU_STATE = _record(
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
 )
 
+# What is known of an anchor.
 ANCHOR = _record(
     ("position", float, 3),  # m
     ("excess_variance", float),  # m^2, of what is received of it beyond tdoa_std, see noise.py
     ("learned", float),  # s, stamp of the last change
+)
+
+HEIGHT = _record(
+    ("range", float),  # m, the last that was received,
+    ("heard", float),  # s, its stamp,
+    ("changed", float),  # that of the last one that differed from the one before,
+    ("used", float),  # and of the last one that was used
+    ("level", float),  # m, of the ground below
+    ("agreed", float),  # s for which the range finder has agreed with the filter
+    ("disagreeing", int),  # ranges in a row that do not, but with each other,
+    ("disagreement", float),  # m, their mean innovation,
+    ("disagrees_since", float),  # s, and the stamp of the first
+    ("pull", float),  # m and 1, what the TDOAs of late say of z, see height.judge,
+    ("pull_information", float),
+    ("judged", float),  # s, stamps: of the last of them,
+    ("pulls_since", float),  # and since when they disagree
+    ("ignored_until", float),  # s, stamp until which no range is used, and
+    ("ignore_time", float),  # s, for how long
+)
+
+BAROMETER = _record(
+    ("heard", float),  # s, stamps: of the last altitude,
+    ("agreed", float),  # and of the last one that was used
+    ("nis", float),  # mean normalised innovation squared of late, on the scale that is told
+)
+
+VELOCITY = _record(
+    ("heard", float),  # s, stamp of the last one
+    ("nis", float),  # mean normalised innovation squared of late, of the worst component
+    ("refused", bool),  # it disagrees with everything else
 )
 
 EKF = _record(
@@ -55,8 +90,12 @@ EKF = _record(
     ("best", int),  # the most probable hypothesis
     ("hypotheses", HYPOTHESIS, HYPOTHESES),
     ("imu", IMU_STATE),
+    ("height", HEIGHT),
+    ("barometer", BAROMETER),
+    ("velocity", VELOCITY),
+    ("next_floor", float),  # s, stamp before which not to say again that the tag is at its fixed height
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
-    ("workspace", float, (2, 3)),  # m, lower and upper bounds of where a tag is expected
+    ("workspace", float, (2, 3)),  # m, lower and upper bounds, see workspace.py
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),
     ("first_tdoa", float),  # s, stamps: of the first TDOA since the filter stopped, and the last one
@@ -96,19 +135,21 @@ class Memory(NamedTuple):
 
 
 class Measurements(NamedTuple):
-    """What a filter is fed with at once. imu : (n,) of IMU_SAMPLE; tdoa : (k,) of TDOA."""
+    """What a filter is fed with at once. imu : (n,) of IMU_SAMPLE; tdoa : (k,) of TDOA; aids : (m,) of AID."""
 
     imu: np.ndarray
     tdoa: np.ndarray
+    aids: np.ndarray = np.empty(0, AID)
 
 
 class Output(NamedTuple):
-    """Room for what it makes of that. odometry : at least (n + k,) of ODOMETRY; residuals : (k,) of RESIDUAL;
-    history : of history.RECORD, with room for history.most_records, or empty for no recording."""
+    """Room for what it makes of that. odometry : at least (n + k + m,) of ODOMETRY; residuals : (k,) of RESIDUAL;
+    history : of history.RECORD, with room for engine.most_records, or empty for no recording; aids : (m,) of RESIDUAL."""
 
     odometry: np.ndarray
     residuals: np.ndarray
     history: np.ndarray
+    aids: np.ndarray = np.empty(0, RESIDUAL)
 
 
 def new_memory(positions):
@@ -119,6 +160,9 @@ def new_memory(positions):
     for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge"):
         ekf[stamp] = -np.inf
     ekf.imu.t = -np.inf
+    for stamp in ("heard", "changed", "used", "judged", "pulls_since", "ignored_until"):
+        ekf.height[stamp] = -np.inf
+    ekf.barometer.heard = ekf.barometer.agreed = ekf.velocity.heard = ekf.next_floor = -np.inf
     for name in ("accel", "slow_accel", "mean_accel"):
         ekf.imu[name][2] = GRAVITY
     ekf.hypotheses["log_weight"][1:] = -np.inf

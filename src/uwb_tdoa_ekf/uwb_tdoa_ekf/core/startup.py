@@ -18,11 +18,11 @@ NO_SCALE = 1e6  # m, of a loss that is quadratic
 
 
 @compiled
-def locate(window, anchors, workspace, std, x, covariance):
+def locate(window, anchors, workspace, std, z, z_std, x, covariance):
     """Robust multilateration over a window, with constant velocity.
 
     window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see workspace.py; std : m, of
-    one TDOA. Writes position and velocity at the last stamp to x (6,) and their covariance to `covariance` (6, 6).
+    one TDOA; z, z_std : m, a height that is known otherwise and its standard deviation, or NaN. Writes position and velocity at the last stamp to x (6,) and their covariance to `covariance` (6, 6).
     Returns the share of TDOAs that agree with it, 0 to 1.
 
     Graduated Geman-McClure: Gauss-Newton from several starts while the loss narrows; the start with the least final
@@ -33,6 +33,8 @@ def locate(window, anchors, workspace, std, x, covariance):
     mean, prior_std = np.zeros(6), np.full(6, SPEED)
     for k in range(3):
         mean[k], prior_std[k] = 0.5 * (workspace[0, k] + workspace[1, k]), 0.5 * (workspace[1, k] - workspace[0, k])
+    if not math.isnan(z):
+        mean[2], prior_std[2], prior_std[5] = z, z_std, SPEED
     prior_information = 1.0 / prior_std**2
     correlation_length = _correlation_length(window, len(anchors))
     least = np.inf
@@ -70,7 +72,7 @@ def share_of_inliers(window, anchors, x):
 
 @compiled
 def level(accel, yaw, x):
-    """Write to x the attitude in which `accel` (3,), the mean specific force, points up, and which has the given yaw."""
+    """Write to x the attitude in which `accel` (3,), the mean specific force, points up, and which has this yaw."""
     roll = math.atan2(accel[1], accel[2])
     pitch = math.atan2(-accel[0], math.hypot(accel[1], accel[2]))
     cr, sr, cp, sp = math.cos(roll / 2), math.sin(roll / 2), math.cos(pitch / 2), math.sin(pitch / 2)
@@ -83,7 +85,8 @@ def level(accel, yaw, x):
 
 @compiled
 def _correlation_length(window, anchors):
-    """TDOAs of the window that tell as much as one independent of the others: one for each anchor heard but the first."""
+    """TDOAs of the window that tell as much as one independent of the others, of which each anchor heard but the first
+    gives one."""
     heard = np.zeros(anchors)
     for i in range(len(window)):
         heard[window[i].a] = heard[window[i].b] = 1.0

@@ -94,8 +94,8 @@ def predict(hypothesis, imu, tuning, dt, transition):
                 by_bias = B[r, 0] * T[i, 9] + B[r, 1] * T[i, 10] + B[r, 2] * T[i, 11]
                 P[i, 3 + r] = P[3 + r, i] = T[i, 3 + r] + by_attitude + by_bias
             if i <= 6 + r:
-                turned = E[r, 0] * T[i, 6] + E[r, 1] * T[i, 7] + E[r, 2] * T[i, 8]
-                P[i, 6 + r] = P[6 + r, i] = turned - dt * T[i, 12 + r]
+                by_rotation = E[r, 0] * T[i, 6] + E[r, 1] * T[i, 7] + E[r, 2] * T[i, 8]
+                P[i, 6 + r] = P[6 + r, i] = by_rotation - dt * T[i, 12 + r]
     _add_noise(P, transition.rotation, imu.accel_psd, tuning, dt)
 
 

@@ -11,6 +11,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .state import ERROR_STATES, inject
 
+OFFSET_STATES = 2  # of a barometer, beside the error states, see barometer.py
 LONGEST_ROW = 6  # error states that one measurement may depend on
 
 INNOVATION = np.dtype(
@@ -26,6 +27,7 @@ INNOVATION = np.dtype(
             float,
             ERROR_STATES,
         ),  # P h', of state and prediction; the gain is this over total_variance
+        ("on_offset", float),  # entry of the Jacobian row for the offset of the barometer: 0, but for its own altitudes
         ("weight", float),  # 0 to 1, given by robust.update
         ("total_variance", float),  # of the value, as the update took it
         ("factor", float, (ERROR_STATES, 3)),  # scratch of the M-estimation
@@ -47,19 +49,40 @@ def project(P, innovation):
     variance = 0.0
     for n in range(innovation.entries):
         variance += innovation.row[n] * covariance[innovation.states[n]]
-    innovation.prior_variance = variance
+    innovation.prior_variance, innovation.on_offset = variance, 0.0
 
 
 @compiled
 def kalman(hypothesis, innovation):
     """Kalman update of a HYPOTHESIS with an INNOVATION of value, cross_covariance and total_variance."""
     P, covariance, total = hypothesis.P, innovation.cross_covariance, innovation.total_variance
+    if hypothesis.offset_P[0, 0] > 0.0:
+        _correct_offset(hypothesis, innovation)
     inject(hypothesis.x, covariance, innovation.value / total)
     for i in range(ERROR_STATES):
         gain = covariance[i] / total
         for j in range(i, ERROR_STATES):
             P[i, j] -= gain * covariance[j]
             P[j, i] = P[i, j]
+
+
+@compiled
+def _correct_offset(hypothesis, innovation):
+    """The part of `kalman` for the offset of the barometer and its drift."""
+    cross, P, total = hypothesis.offset_cross, hypothesis.offset_P, innovation.total_variance
+    first, second = innovation.on_offset * P[0, 0], innovation.on_offset * P[0, 1]  # covariance with the prediction
+    for n in range(innovation.entries):
+        first += innovation.row[n] * cross[0, innovation.states[n]]
+        second += innovation.row[n] * cross[1, innovation.states[n]]
+    hypothesis.offset[0] += first / total * innovation.value
+    hypothesis.offset[1] += second / total * innovation.value
+    for j in range(ERROR_STATES):
+        cross[0, j] -= first / total * innovation.cross_covariance[j]
+        cross[1, j] -= second / total * innovation.cross_covariance[j]
+    P[0, 0] -= first / total * first
+    P[0, 1] -= first / total * second
+    P[1, 0] = P[0, 1]
+    P[1, 1] -= second / total * second
 
 
 @compiled

@@ -12,7 +12,7 @@ LARGEST_ERROR = 1.0  # m by which |d_ab| may exceed the distance between a and b
 
 @compiled
 def usable(a, b, d, bias_std, positions):
-    """False for an unknown anchor (row -1), a pair of one anchor, a value that is not finite or longer than the baseline.
+    """False for an unknown anchor (row -1), a pair of one anchor, a value not finite or longer than the baseline.
 
     a, b : anchor rows; d, bias_std : m; positions : (N, 3) m.
     """

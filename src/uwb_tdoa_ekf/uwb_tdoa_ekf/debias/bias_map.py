@@ -89,8 +89,7 @@ class BiasMap:
         return self.at.shape[1] == 2
 
     def validity(self, p):
-        """How far the map is valid at positions p (m, 3), m: (m,), 1 inside of the known region to 0 from FADE beyond it
-        on."""
+        """How far the map is valid at positions p (m, 3), m: (m,), 1 inside of the known region, 0 from FADE beyond it."""
         p = p[:, : self.at.shape[1]]
         normals, offsets = self._hull
         outside = (p @ normals.T + offsets).max(axis=1)
@@ -112,8 +111,8 @@ class BiasMap:
     def correct(self, p, covariance):
         """Positions without their bias (eq. 21) and the covariance of what is left.
 
-        p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, validity). With validity w, what is added to the
-        covariance is w^2 `added` for what the map does not know, and (1 - w)^2 of the mean square of all biases, for
+        p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, validity). With validity w, what is added to
+        the covariance is w^2 `added` for what the map does not know, and (1 - w)^2 of the mean square of all biases, for
         one that was not taken out.
         """
         validity, d = self.validity(p), self.at.shape[1]

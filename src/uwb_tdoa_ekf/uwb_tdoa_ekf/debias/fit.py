@@ -84,7 +84,7 @@ def _bias_errors(bias_map, parts, options):
 
 
 def _position_errors(bias_map, part):
-    """What a map of others leaves of the errors of a Part where it is valid, (n, d) m, and their covariances or None."""
+    """What a map of others leaves of the errors of a Part where it is valid, (n, d) m; their covariances or None."""
     d, valid = bias_map.at.shape[1], bias_map.validity(part.measured) == 1.0
     p = part.measured[valid]
     error = (p - bias_map.bias_at(p) - part.true[valid])[:, :d]

@@ -5,10 +5,12 @@ import time
 from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_tdoa_bias.foundation.ros import Rate
 
+from ..core import aids
 from .volume import VolumeCheck
 
 START_TIMEOUT = 5.0  # s of data without a start position before it becomes a warning
 BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is a recording
+STOPPED = 2.0  # s without a message of an aid that was there, before it becomes a warning
 LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it becomes a warning
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -20,12 +22,15 @@ class Health:
     def __init__(self, config, lag, volume=None):
         """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
         self.imu = self.tdoa = self.odometry = 0  # messages received, and published
+        self.aids = dict.fromkeys(aids.STREAMS, 0)  # messages received of each
         self.last_odometry = None  # time.monotonic(), s
         self.last_position = None  # (3,) m and its covariance (3, 3) m^2
         self.behind = None  # s from the stamp of the newest odometry to the present time of ROS
         self._use_imu, self._lag = config.use_imu, lag
         self._volume = VolumeCheck(volume)
         self._imu_rate, self._tdoa_rate = Rate(), Rate()
+        self._aids_before = {}  # messages of each, received and not used, by the last report
+        self._aids_heard = {}  # messages of each so far, and since when no more of them, time.monotonic(), s
         self._starting = None
         self._counts = {}
 
@@ -56,6 +61,8 @@ class Health:
             judgement = WARN, "no start position found: check ids and positions of the anchors, and that four are heard"
         else:
             judgement = OK, "looking for the start position"
+        if judgement == (OK, "running"):
+            judgement = self._judge_aids(now, counts)
         at_position = {}
         if running and self.last_position is not None:
             trouble, at_position = self._volume.judge(estimator.anchors, *self.last_position)
@@ -69,6 +76,23 @@ class Health:
         values |= {"odometry behind the clock": "unknown" if self.behind is None else f"{self.behind:.3f} s"}
         values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
         return *judgement, values | at_position
+
+    def _judge_aids(self, now, counts):
+        """Whether height, pressure and velocity that were there still are, and are used."""
+        judgement = OK, "running"
+        for aid, received in self.aids.items():
+            before, since = self._aids_heard.get(aid, (0, now))
+            if received != before:
+                since = now
+            self._aids_heard[aid] = received, since
+            unused = counts[f"{aid}_rejected"] + counts[f"{aid}_late"] + counts[f"{aid}_invalid"]
+            recent = [n - m for n, m in zip((received, unused), self._aids_before.get(aid, (0, 0)))]
+            self._aids_before[aid] = received, unused
+            if received and now - since > STOPPED:
+                judgement = WARN, f"no messages on {aid} any more: done without; check the sensor and its driver"
+            elif recent[1] > LARGEST_UNUSED * recent[0]:
+                judgement = WARN, f"more than half of the messages on {aid} are not used: they contradict everything else, or are late or invalid"
+        return judgement
 
     def _judge_use(self, counts):
         """What became of the TDOAs since the last time."""

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from ..core.engine import REJECTED, USED
+from ..core.verdicts import REJECTED, USED
 
 FORGETTING_TIME = 3.0  # s of innovations that one estimate rests on
 MOVING = 0.3  # m/s; on the floor, residuals are not those of the air

@@ -1,5 +1,6 @@
 """Makes the corpus that fuzzing starts from, of simulated and made-up recordings:  python make_corpus.py"""
 
+from dataclasses import replace
 import gzip
 from pathlib import Path
 import shutil
@@ -14,6 +15,7 @@ from targets import CORPUS, MESSAGES  # noqa: E402
 from test_survey import survey_lines  # noqa: E402
 from uwb_tdoa_bias.correction.network import MODELS  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
+from uwb_tdoa_bias.foundation.flight import Height, Pressure, Velocity  # noqa: E402
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
@@ -29,6 +31,11 @@ TEXTS = {
     "survey": [SURVEY, "\n".join(survey_lines()[0]) + "\nlandmark,1,2,3\n", "anchors: {0: {position: [1, 2, 3]}}\n"],
     "table": ["true_x,x\n0.5,0.6\n1,1.1\n", 'x,note,true_x\r\n1,"a, b",2\r\n'],
     "csv": [csv_text(), csv_text("t_tdoa,idA,idB,tdoa_meas", ["0.1,0,1,0.5", "0.2,1,5,-1e-1"])],
+}
+AIDS = {  # streams of a Flight
+    "height": Height(np.array([10.0, 10.1]), np.array([1.25, np.inf])),
+    "pressure": Pressure(np.array([10.0]), np.array([101325.0])),
+    "velocity": Velocity(np.array([10.0]), np.array([[0.5, -0.5, 0.0]]), np.array([[0.1, 0.1, np.inf]])),
 }
 
 
@@ -66,7 +73,8 @@ def _bags(folder):
     text = (folder / "small" / "metadata.yaml").read_text()
     write("bag_metadata", 0, text.replace(metadata(folder / "small")["custom_data"][SUM_KEY], NO_SUM))
     write_bag(small_flight(0.008), folder / "tables", "sqlite3")
-    with open_bag(folder / "small") as reader:
+    write_bag(replace(small_flight(0.008), **AIDS), folder / "aided")
+    with open_bag(folder / "aided") as reader:
         for topic, _, data in {c.topic: (c.topic, t, d) for c, t, d in reader.messages()}.values():
             if topic in MESSAGES:
                 write("bag_message", topic.strip("/").replace("/", "_"), bytes([list(MESSAGES).index(topic)]) + data)

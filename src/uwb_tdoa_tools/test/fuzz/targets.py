@@ -43,6 +43,9 @@ MESSAGES = {
     "/ground_truth/pose": "geometry_msgs/msg/PoseStamped",
     "/uwb/anchors": "uwb_tdoa_msgs/msg/AnchorArray",
     "/odometry": "nav_msgs/msg/Odometry",
+    "/height": "sensor_msgs/msg/Range",
+    "/pressure": "sensor_msgs/msg/FluidPressure",
+    "/velocity": "geometry_msgs/msg/TwistWithCovarianceStamped",
 }
 _FOLDER = Path(tempfile.mkdtemp(prefix="fuzz_", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))
 
@@ -177,11 +180,14 @@ def model(data):
 
 
 def _finite(flight):
-    """What is read is finite: AssertionError otherwise."""
-    for stream, names in (("tdoa", "tabd"), ("imu", ("t", "gyro", "accel")), ("truth", "tp")):
+    """What is read is finite: AssertionError otherwise. (A height of inf or NaN says that nothing was in range.)"""
+    finite = dict(tdoa="tabd", imu=("t", "gyro", "accel"), truth="tp", height="t", pressure=("t", "pressure"), velocity="t")
+    for stream, names in finite.items():
         part = getattr(flight, stream)
         for name in names if part is not None else ():
             assert np.isfinite(getattr(part, name)).all(), (stream, name)
+    if flight.velocity is not None:
+        assert (flight.velocity.std >= 0.0).all() and np.isfinite(flight.velocity.v[np.isfinite(flight.velocity.std)]).all()
 
 
 def _repacked(data):

@@ -4,6 +4,9 @@ Topic (in a bag always absolute)   type                              what
 /imu/data                          sensor_msgs/msg/Imu               Flight.imu, frame base_link
 /uwb/tdoa                          uwb_tdoa_msgs/msg/Tdoa            Flight.tdoa
 /uwb/anchors                       uwb_tdoa_msgs/msg/AnchorArray     Flight.anchors, once, transient local
+/height                            sensor_msgs/msg/Range             Flight.height, frame base_link
+/pressure                          sensor_msgs/msg/FluidPressure     Flight.pressure, frame base_link
+/velocity                          geometry_msgs/msg/TwistWithCovarianceStamped  Flight.velocity, frame base_link
 /ground_truth/pose                 geometry_msgs/msg/PoseStamped     Flight.truth
 /tf_static                         tf2_msgs/msg/TFMessage            frames anchor_<id>, once, transient local
 
@@ -34,6 +37,20 @@ __all__ = [
     "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry", "write_bag",
 ]  # fmt: skip
 
+_AIDS = {  # topic and field of Flight: its type, messages of it, a row of a message, which numbers of rows may be, it of rows
+    "height": (
+        "sensor_msgs/msg/Range", bag_messages.height_messages, bag_messages.height_row, bag_messages.height_sound,
+        bag_messages.height_of,
+    ),
+    "pressure": (
+        "sensor_msgs/msg/FluidPressure", bag_messages.pressure_messages, bag_messages.pressure_row, np.isfinite,
+        bag_messages.pressure_of,
+    ),
+    "velocity": (
+        "geometry_msgs/msg/TwistWithCovarianceStamped", bag_messages.velocity_messages, bag_messages.velocity_row,
+        bag_messages.velocity_sound, bag_messages.velocity_of,
+    ),
+}  # fmt: skip
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
 
 
@@ -79,7 +96,7 @@ def write_bag(flight, out, storage="mcap", force=False):
     Raises InputError; also for stamps that a ROS message cannot hold.
     """
     store = typestore()
-    present = [(name, getattr(flight, name)) for name in ("tdoa", "imu", "truth")]
+    present = [(name, getattr(flight, name)) for name in ("tdoa", "imu", "truth", *_AIDS)]
     starts = [bag_messages.nanoseconds(name, s.t[:1])[0] for name, s in present if s is not None and len(s)]
     if not starts:
         raise InputError(f"{flight.name}: holds no message; there is nothing to write.")
@@ -98,6 +115,9 @@ def write_bag(flight, out, storage="mcap", force=False):
     }
     if flight.imu is not None:
         topics["/imu/data"] = "sensor_msgs/msg/Imu", _STREAM_QOS, bag_messages.imu_messages(flight.imu, store)
+    for name, (msgtype, outgoing, *_) in _AIDS.items():
+        if getattr(flight, name) is not None:
+            topics[f"/{name}"] = msgtype, _STREAM_QOS, outgoing(getattr(flight, name), store)
     topics["/uwb/tdoa"] = "uwb_tdoa_msgs/msg/Tdoa", _STREAM_QOS, bag_messages.tdoa_messages(flight.tdoa, store)
     if flight.truth is not None:
         poses = bag_messages.pose_messages(flight.truth, flight.anchors.frame, store)
@@ -138,17 +158,17 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):
         meta = {**about["meta"], "bag": str(path)}
         remarks, name_of = list(reader.remarks), _Names(namespace, topics)
 
-        def stream(topic, msgtype, row, make):
+        def stream(topic, msgtype, row, make, sound=np.isfinite):
             found = _find(path, connections, name_of(topic), msgtype)
             stamps, rows, falls = _table(path, reader, found, row)
             if falls:
                 meta.setdefault("reordered", {})[topic] = falls
-            finite = np.isfinite(rows).all(axis=1)
-            if not finite.all():
+            whole = sound(rows).all(axis=1)
+            if not whole.all():
                 if not salvage:
-                    raise _not_finite(path, name_of(topic), stamps, rows)
-                remarks.append(f"{topic}: {np.count_nonzero(~finite)} messages left out, they are no numbers.")
-                stamps, rows = stamps[finite], rows[finite]
+                    raise _not_finite(path, name_of(topic), stamps, rows, sound)
+                remarks.append(f"{topic}: {np.count_nonzero(~whole)} messages left out, they are no numbers.")
+                stamps, rows = stamps[whole], rows[whole]
             return make(stamps, rows) if len(stamps) else None
 
         tdoa = stream("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of)
@@ -157,11 +177,12 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):
         if anchors is None:
             anchors = _read_anchors(path, reader, connections, name_of("uwb/anchors"))
         imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
+        aids = {name: stream(name, msgtype, row, make, sound) for name, (msgtype, _, row, sound, make) in _AIDS.items()}
         pose = "geometry_msgs/msg/PoseStamped"
         truth = stream("ground_truth/pose", pose, bag_messages.pose_row, bag_messages.truth_of)
     if remarks:
         meta["remarks"] = remarks
-    return Flight(about["name"], anchors, tdoa, imu, truth, {}, meta)
+    return Flight(about["name"], anchors, tdoa, imu, truth, {}, meta, **aids)
 
 
 def read_odometry(path, namespace="", salvage=False, topics=None):
@@ -186,8 +207,9 @@ def read_odometry(path, namespace="", salvage=False, topics=None):
 
 
 def late_tdoas(path, namespace="", salvage=False, topics=None):
-    """How many TDOAs came too late for the filter that made the odometry of a bag, by the uwb/residual beside it; 0 where
-    that was not recorded. Raises InputError."""
+    """How many TDOAs came too late for the filter that made the odometry of a bag, by the uwb/residual beside it.
+
+    0 where that was not recorded. Arguments as of `read_odometry`. Raises InputError."""
     beside = _Names(namespace, topics)("odometry").rpartition("/")[0]
     with open_bag(path, salvage) as reader:
         found = _find(path, _connections(reader), f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual")
@@ -239,8 +261,8 @@ def _about(path):
     return out
 
 
-def _not_finite(path, topic, stamps, rows):
-    row, column = np.argwhere(~np.isfinite(rows))[0]
+def _not_finite(path, topic, stamps, rows, sound):
+    row, column = np.argwhere(~sound(rows))[0]
     return InputError(
         f"{path}: {topic}, message {row + 1} of {len(rows)} at {stamps[row]:.3f} s: its number {column + 1} is "
         f"{rows[row, column]}; it must be finite: leave such messages out with --salvage."

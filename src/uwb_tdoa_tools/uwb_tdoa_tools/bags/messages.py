@@ -1,15 +1,20 @@
 """The arrays of a Flight as ROS messages (of a rosbags typestore), and back.
 
+`<stream>_sound` tells which numbers of rows (n, k) may be there: (n, k) bool; without it, those that are finite.
 What was not measured is marked as the messages say: an orientation of (0, 0, 0, 0), an orientation_covariance[0] of -1,
 covariances of 0 for unknown.
 """
 
+import math
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.flight import Height, Imu, Pressure, Tdoas, Truth, Velocity
 
 BODY_FRAME = "base_link"
+FIELD_OF_VIEW, LONGEST_RANGE = 0.47, 1000.0  # rad, m, of a sensor_msgs/Range: typical, and a bound that bounds nothing
+UNKNOWN_VARIANCE = 1e12  # of what is not measured: covariances of messages are to be finite
 
 
 def nanoseconds(name, t):
@@ -43,6 +48,71 @@ def imu_row(message):
 
 def imu_of(stamps, rows):
     return Imu(stamps, rows[:, 0:3], rows[:, 3:6])
+
+
+def height_messages(height, store):
+    """Yield (stamp ns, sensor_msgs/Range); what was out of range is +inf, NaN stays (REP 117)."""
+    Message = store.types["sensor_msgs/msg/Range"]
+    for stamp, value in zip(nanoseconds("height", height.t).tolist(), height.range.tolist()):
+        header = _header(store, stamp, BODY_FRAME)
+        yield stamp, Message(header, Message.INFRARED, FIELD_OF_VIEW, 0.0, LONGEST_RANGE, value, 0.0)
+
+
+def height_row(message):
+    value = message.range
+    if math.isfinite(value) and not message.min_range <= value <= message.max_range:  # says REP 117
+        value = math.inf
+    return stamp_of(message.header), value
+
+
+def height_sound(rows):
+    return np.ones(rows.shape, dtype=bool)  # REP 117: what is not finite says that nothing was in range
+
+
+def height_of(stamps, rows):
+    return Height(stamps, rows[:, 0])
+
+
+def pressure_messages(pressure, store):
+    """Yield (stamp ns, sensor_msgs/FluidPressure)."""
+    Message = store.types["sensor_msgs/msg/FluidPressure"]
+    for stamp, value in zip(nanoseconds("pressure", pressure.t).tolist(), pressure.pressure.tolist()):
+        yield stamp, Message(_header(store, stamp, BODY_FRAME), value, 0.0)
+
+
+def pressure_row(message):
+    return stamp_of(message.header), message.fluid_pressure
+
+
+def pressure_of(stamps, rows):
+    return Pressure(stamps, rows[:, 0])
+
+
+def velocity_messages(velocity, store):
+    """Yield (stamp ns, geometry_msgs/TwistWithCovarianceStamped); rates are not measured."""
+    types = store.types
+    Message, Vector3 = types["geometry_msgs/msg/TwistWithCovarianceStamped"], types["geometry_msgs/msg/Vector3"]
+    Twist, Stamped = types["geometry_msgs/msg/Twist"], types["geometry_msgs/msg/TwistWithCovariance"]
+    variance = np.full((len(velocity), 6), UNKNOWN_VARIANCE)
+    variance[:, :3] = np.minimum(velocity.std**2, UNKNOWN_VARIANCE)
+    for stamp, v, row in zip(nanoseconds("velocity", velocity.t).tolist(), velocity.v.tolist(), variance):
+        twist = Twist(Vector3(*v), Vector3(0.0, 0.0, 0.0))
+        yield stamp, Message(_header(store, stamp, BODY_FRAME), Stamped(twist, np.diag(row).ravel()))
+
+
+def velocity_row(message):
+    v, variance = message.twist.twist.linear, message.twist.covariance[[0, 7, 14]].tolist()
+    std = [math.sqrt(value) if 0.0 <= value < UNKNOWN_VARIANCE else math.inf for value in variance]
+    return stamp_of(message.header), v.x, v.y, v.z, *std
+
+
+def velocity_sound(rows):
+    unknown = np.isinf(rows[:, 3:6])
+    return np.hstack([np.isfinite(rows[:, 0:3]) | unknown, np.ones(unknown.shape, dtype=bool)])
+
+
+def velocity_of(stamps, rows):
+    return Velocity(stamps, rows[:, 0:3], rows[:, 3:6])
 
 
 def tdoa_messages(tdoa, store):

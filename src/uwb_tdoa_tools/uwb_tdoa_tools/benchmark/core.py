@@ -14,7 +14,7 @@ from .flights import make_flight
 ANCHORS = (4, 8, 16, 32, 64)
 BEFORE, MEASURED = 3.0, 4.0  # s of a flight: until it is measured, and measured
 RARELY = 1e-3  # Hz of odometry: the core alone is measured
-TARGET = 3.5  # us of one prediction and one robust update
+TARGET = 2.5  # us of one prediction and one robust update
 SECTION = "compiled core, one core"
 
 

@@ -14,7 +14,7 @@ from .figures import Figure
 from .flights import make_flight
 
 SECONDS = 45.0
-TARGET = 0.5  # s for such a flight
+TARGET = 0.35  # s for such a flight
 ANCHORS = (4, 16, 32, 64)
 PREDICTION_TARGET = 30.0  # us
 BATCHES = (1, 4, 16)  # TDOAs that arrive together

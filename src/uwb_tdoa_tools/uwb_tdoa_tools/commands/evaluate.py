@@ -8,6 +8,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.aids import STREAMS
 
 from .. import cli, options, parallel
 from ..scoring import table
@@ -33,6 +34,7 @@ def parser():
         "evaluate flight.bag --odometry recorded.bag --tum out/",
         "evaluate flight.bag --odometry tags.bag --topic odometry=/tag1/odometry",
         "evaluate flights/ --survey surveys/ -p adapt_noise:=false -p loss:=huber",
+        "evaluate flights/ --survey surveys/ --without height --without pressure",
         "evaluate flights/ --survey surveys/ --dask tcp://10.0.0.1:8786",
     )
     add = made.add_argument
@@ -43,6 +45,10 @@ def parser():
     add(
         "-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[],
         help="one filter parameter, before --config",
+    )  # fmt: skip
+    add(
+        "--without", metavar="AID", action="append", default=[], choices=STREAMS,
+        help=f"not to be used though it is there: {', '.join(STREAMS)}; may be repeated",
     )  # fmt: skip
     add("--smooth", action="store_true", help="smooth: use what came after each estimate too")
     add("--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT")
@@ -60,7 +66,8 @@ def parser():
 
 def _evaluate(args):
     config, effects = options.filter_of(args)
-    config = options.with_parameters(config, args.parameters)
+    without = [f"use_{aid}:=false" for aid in args.without]
+    config = options.with_parameters(config, args.parameters + without)
     network = None if args.no_bias else load_network(args.model)
     reading = options.reading_of(args)
     found = reading.find(args.flights, bool(args.dask))

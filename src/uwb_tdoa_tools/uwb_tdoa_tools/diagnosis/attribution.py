@@ -7,6 +7,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 
+from ..parallel import in_one_thread
 from .channels import CHANNELS, residuals
 from .detectors import DETECTORS
 from .findings import Finding, Refused
@@ -48,6 +49,7 @@ class Attribution:
         return [*_findings(self.selection, self.candidates), *map(_of_detection, self.detections)]
 
 
+@in_one_thread
 def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True, progress=lambda: None):
     """Attribution of the residuals of Flights, which the Reference has prepared, to effects beyond `base`.
 
@@ -64,7 +66,7 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
 
     under_base = at(())
     installation = _installation(flights)
-    declared = _declared(under_base, kinds, installation)
+    declared = _declared(under_base, reference, kinds, installation)
     current, model, inflation = under_base, (), None
     for last in (number == ROUNDS - 1 for number in range(ROUNDS)):
         table = _linearised(current, declared, model)
@@ -136,11 +138,15 @@ def _installation(flights):
     return anchors, pairs[np.argsort(-count, kind="stable")]
 
 
-def _declared(found, kinds, installation):
-    """[Candidate] of the catalogue, of effects that a channel shows."""
+def _declared(found, reference, kinds, installation):
+    """[Candidate] of the catalogue, of effects that a channel shows, and that the reference can tell."""
     shown = {name for flight in found for name in flight}
     effects = [effect for effect in EFFECTS.values() if effect.fitted and shown & set(effect.channels)]
-    chosen = [effect for effect in effects if kinds is None or effect.name in kinds]
+    chosen = [
+        effect
+        for effect in effects
+        if (kinds is None or effect.name in kinds) and (reference.judges or not effect.needs_reference)
+    ]
     return [candidate for effect in chosen for candidate in candidates_of(effect(), *installation)]
 
 

@@ -9,6 +9,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 
+from ..parallel import in_one_thread
 from ..scoring.metrics import Score
 from . import judging, output
 from .attribution import Attribution, attribute
@@ -54,11 +55,12 @@ class Diagnosis:
 
     def as_html(self):
         """One self-contained page."""
-        from . import report  # here, because drawing takes a second to import
+        from .report.page import html  # here, because drawing takes a second to import
 
-        return report.html(self)
+        return html(self)
 
 
+@in_one_thread
 def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None, progress=lambda what: None):
     """Diagnosis of Flights.
 
@@ -74,9 +76,9 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         return lambda: progress(what)
 
     attribution = attribute(flights, reference, base, progress=saying("tracing residuals to effects"))
-    kept = judging.Kept(attribution.selection.chosen, (), (), {})
-    if reference.judges:  # a finding stays one even if the filter does without it; it is only not added
-        kept = judging.useful(attribution, flights, base, config, saying("running the filter without each"))
+    decide = judging.useful if reference.judges else judging.borne_out
+    # A finding stays one even if the filter does without it; it is only not added.
+    kept = decide(attribution, flights, base, config, saying("running the filter without each"))
     model = attribution.only(kept.candidates, kept.detections)
     effects = EffectSet((*base.effects, *usable(model.effects).effects))
     judged = judging.judge(model, flights, holdout, base, effects, reference, config, saying("judging"))

@@ -8,11 +8,12 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.rehearsal import RecordingCorrector, RehearsedCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.stamp_error import shifted
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.estimator import VERDICTS
 from uwb_tdoa_ekf.offline import run_offline
 
-from ..scoring.metrics import Score, airborne, as_json, pooled
+from ..scoring.metrics import Score, as_json, pooled
 from .attribution import effects_of
 from .findings import Refused, usable
 from .regression.fit import refit
@@ -22,6 +23,8 @@ BOOTSTRAPS = 400
 BLOCK = 5.0  # s
 JUDGES = 3  # flights, or halves of one, on which trials are judged
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
+LEAST_EXPLAINED = 1.0 / 3.0  # share of the slow innovations, for a model that no position can judge
+CELL, FEWEST, OUTLIER = 0.5, 4, 1.0  # s and TDOAs that are averaged; m that one counts as at most
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
 
@@ -51,10 +54,10 @@ def cross_fitted(attribution, flights, base, candidates, detections):
     if len(flights) > 1:
         parts = [(k, table.flight != k, None) for k in range(len(flights))]
     else:
-        first, last = airborne(flights[0].truth)
-        middle, start = 0.5 * (first + last), float(flights[0].tdoa.t[0])
-        early = table.t + start < middle
-        parts = [(0, ~early, (first, middle)), (0, early, (middle, last))]
+        start, middle = float(flights[0].tdoa.t[0]), 0.5 * (table.t.min() + table.t.max())
+        early = table.t < middle
+        spans = [(start + table.t.min(), start + middle), (start + middle, start + table.t.max())]
+        parts = [(0, ~early, spans[0]), (0, early, spans[1])]
     out, columns = [], columns_of(candidates)
     for k, rows, span in parts:
         others = replace(selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows))
@@ -96,6 +99,44 @@ def useful(attribution, flights, base, config=None, progress=lambda: None):
             why = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
             refused.append(Refused(detection.effect.label, why))
     return Kept(tuple(candidates), tuple(detections), tuple(refused), worth)
+
+
+def borne_out(attribution, flights, base, config=None, progress=lambda: None):
+    """Kept, where the reference tells no errors: everything or nothing.
+
+    A model that is wrong makes innovations smaller too, by pushing the path to where they are. It is applied only if it
+    explains LEAST_EXPLAINED of what is slow in the innovations of flights, or halves of one, that it was not fitted to.
+    """
+    chosen = attribution.selection.chosen
+    before, after = [], []
+    for case in cross_fitted(attribution, flights, base, chosen, ()) if chosen else ():
+        before.append(_slow(case, base, config))
+        after.append(_slow(case, case.effects, config))
+        progress()
+    if not chosen:
+        return Kept((), (), (), {})
+    share = 1.0 - np.mean(np.concatenate(after) ** 2) / np.mean(np.concatenate(before) ** 2)
+    if share >= LEAST_EXPLAINED:
+        return Kept(chosen, (), (), {})
+    why = (
+        f"explain {max(share, 0.0):.0%} of what is slow in innovations that they were not fitted to, less than "
+        f"{LEAST_EXPLAINED:.0%}: nobody can tell whether they would help the position; fly where the position is known"
+    )
+    return Kept((), (), (Refused(" + ".join(candidate.label for candidate in chosen), why),), {})
+
+
+def _slow(case, effects, config):
+    """Means of the innovations of every pair over CELL, m, without outliers."""
+    residuals = run_offline(case.flight, config, Corrector(case.flight.anchors, effects)).residuals
+    chosen = np.isfinite(residuals.innovation)
+    if case.span is not None:
+        chosen &= (residuals.t >= case.span[0]) & (residuals.t <= case.span[1])
+    cell = ((residuals.t[chosen] - case.flight.tdoa.t[0]) / CELL).astype(int)
+    pair = residuals.a[chosen].astype(np.int64) * 100000 + residuals.b[chosen]
+    label = np.unique(np.stack([cell, pair]), axis=1, return_inverse=True)[1].reshape(-1)
+    count = np.bincount(label)
+    mean = np.bincount(label, np.clip(residuals.innovation[chosen], -OUTLIER, OUTLIER)) / count
+    return mean[count >= FEWEST]
 
 
 class _Trials:
@@ -170,12 +211,15 @@ def compare(cases, base, config=None, progress=lambda: None):
 
 
 def score(case, run):
-    """Score of a Run on a Case."""
+    """Score of a Run on a Case. Raises InputError where there is no estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
     if case.span is not None:
         inside = (truth.t >= case.span[0]) & (truth.t <= case.span[1])
         truth = Truth(truth.t[inside], truth.p[inside], truth.q[inside])
-    return Score(case.flight.name, run.odometry, truth, run.residuals)
+    out = Score(case.flight.name, run.odometry, truth, run.residuals)
+    if not len(out.t):
+        raise InputError(f"{case.flight.name}: the filter gives no estimate in the part to judge on; see what evaluate says.")
+    return out
 
 
 def _innovations(cases, base, config, progress):

@@ -1,20 +1,36 @@
-"""A diagnosis for machines, and in a few lines."""
+"""A diagnosis for machines, and in a few lines. Both say what the report says, in its order."""
+
+import textwrap
 
 import numpy as np
 
+from uwb_tdoa_bias.effects.wording import listed
+
+from .report.apply import APPLY
+from .report.entries import doubt_in_words, entries, worth_in_words
+from .report.unclear import by_remedy, untold
+from .report.verdict import verdict
+
+WIDTH, LABEL = 120, 10  # columns of the screen, and of them for what a line is
+
 
 def as_json(diagnosis):
-    """What diagnosis.json holds: plain values."""
+    """What diagnosis.json holds: plain values. Its keys are described in docs/diagnosis.md."""
     return _plain(
         {
+            "verdict": verdict(diagnosis).sentences,
             "flights": [flight.name for flight in diagnosis.flights],
             "rests_on": diagnosis.reference.words,
             "findings": [_finding(finding) for finding in diagnosis.findings if finding.declared],
             "unattributed": [_function(finding) for finding in diagnosis.findings if not finding.declared],
             "ambiguous": _ambiguous(diagnosis),
             "unobservable": [
-                {"effect": item.effect, "direction": item.direction or "the flights lack the channel that shows it"}
-                for item in diagnosis.unobservable
+                {
+                    "effect": item.effect,
+                    "direction": item.direction or "the flights lack the channel, or the reference, that shows it",
+                    "told_by": words.told_by,
+                }
+                for item, words in zip(diagnosis.unobservable, untold(diagnosis))
             ],
             "refused": [{"what": item.what, "why": item.why} for item in diagnosis.refused],
             "before": {key: diagnosis.before[key] for key in ("runs", "pooled")},
@@ -26,50 +42,29 @@ def as_json(diagnosis):
 
 
 def as_text(diagnosis):
-    """Lines for the screen: findings, what has no name, what is unclear, before and after."""
-    lines = []
-    for finding in diagnosis.findings:
-        if finding.declared:
-            what = f"found     {finding.effect.name}: {parameters_of(finding)}{_share(finding)}"
-        else:
-            effect = finding.effect
-            what = f"no name   {effect.channel} over {effect.covariate} ({effect.form}){_share(finding)}"
-        lines.append(what + _worth(finding))
-    if not lines:
-        lines.append("nothing found: the residuals look like noise")
-    for case in _ambiguous(diagnosis):
-        others = ", ".join(other["effect"] for other in case["alternatives"])
-        tell = case["alternatives"][0]["tell_apart"]
-        lines.append(f"unclear   {case['found']} could as well be {others}; to tell: {tell}")
-    before, after = diagnosis.before["pooled"], diagnosis.after["pooled"]
-    if before.get("rmse_3d") is not None:
-        lines.append(f"3D RMSE   {before['rmse_3d']:.3f} -> {after['rmse_3d']:.3f} m, on {diagnosis.judged_on}")
-    else:
-        lines.append(f"innovations' spread {before['residual_spread']:.3f} -> {after['residual_spread']:.3f} m")
-    return "\n".join(lines)
+    """Lines for the screen: verdict, what to do, what was found and its worth, what could not be told, what to run."""
+    found = entries(diagnosis)
+    lines = [("" if k else "verdict", sentence) for k, sentence in enumerate(verdict(diagnosis).sentences)]
+    lines += [("do", sentence) for entry in found if entry.matters for sentence in entry.advice]
+    for entry in found:
+        judged = f"not added: {entry.why_not}" if entry.why_not else f"worth {worth_in_words(entry)}"
+        what = (
+            f"{entry.title}: {entry.values}; {judged}." if entry.findings[0].declared else f"{entry.title}; {judged}."
+        )
+        lines.append(("found" if entry.findings[0].declared else "no name", what))
+        lines += [("", sentence) for sentence in doubt_in_words(entry)]
+    for told_by, what in by_remedy(untold(diagnosis)).items():
+        lines.append(("not told", f"{listed(what)}; what would tell: {told_by}."))
+    if any(entry.added for entry in found):
+        lines += [("apply", command) for command, _ in APPLY]
+    return "\n".join(_wrapped(*line) for line in lines)
 
 
-def parameters_of(finding, most=6):
-    """Values of a Finding with their standard deviations: text."""
-    effect = finding.effect
-    values = [
-        f"{key} = {value:.4g}" + (f" +- {effect.std[key]:.2g}" if key in effect.std else "")
-        for key, value in list(effect.values.items())[:most]
-    ]
-    more = len(effect.values) - len(values)
-    return ", ".join(values) + (f", and {more} more" if more > 0 else "") + f" ({effect.unit})"
-
-
-def _share(finding):
-    """Of the variance of a channel that it alone explains; what others explain as well, and noise, is no share."""
-    return f", alone explains {finding.explained:.0%} of {finding.channel}" if finding.explained >= 0.005 else ""
-
-
-def _worth(finding):
-    if not finding.added:
-        reason = "the filter does as well without it" if finding.effect.usable else "nodes cannot take it out"
-        return f", not added: {reason}"
-    return "" if finding.worth is None else f", worth {100.0 * finding.worth:.1f} cm"
+def _wrapped(label, text):
+    return textwrap.fill(
+        text, WIDTH, initial_indent=label.ljust(LABEL), subsequent_indent=" " * LABEL, break_on_hyphens=False,
+        break_long_words=False,
+    )  # fmt: skip
 
 
 def _finding(finding):
@@ -80,9 +75,11 @@ def _finding(finding):
         "std": dict(effect.std),
         "unit": effect.unit,
         "channel": finding.channel,
+        "advice": effect.advice(),
+        "worth": finding.worth,
+        "alternatives": _alternatives(finding),
         "evidence": finding.evidence,
         "variance_explained": finding.explained,
-        "worth": finding.worth,
         "confounded_with": [
             {"effect": other.effect, "share": other.share, "tell_apart": other.tell_apart}
             for other in finding.alternatives
@@ -102,7 +99,9 @@ def _function(finding):
         "covariate": effect.covariate,
         "form": effect.form,
         "strength": finding.explained,
+        "advice": effect.advice(),
         "worth": finding.worth,
+        "alternatives": _alternatives(finding),
         "evidence": finding.evidence,
         "together_with": list(finding.together_with),
         "shape": {"at": at, "values": {prefix.rstrip("."): effect.curve(at, prefix) for prefix in prefixes}},
@@ -111,22 +110,26 @@ def _function(finding):
     }
 
 
+def _alternatives(finding):
+    return [
+        {"effect": other.effect, "share": other.share, "criterion_gap": other.gap, "tell_apart": other.tell_apart}
+        for other in finding.alternatives
+    ]
+
+
 def _ambiguous(diagnosis):
     """Findings that another effect would explain nearly as well."""
-    out = []
-    for finding in diagnosis.findings:
-        near = [other for other in finding.alternatives if other.gap is not None]
-        if finding.declared and near:
-            out.append(
-                {
-                    "found": finding.effect.name,
-                    "alternatives": [
-                        {"effect": other.effect, "criterion_gap": other.gap, "tell_apart": other.tell_apart}
-                        for other in sorted(near, key=lambda other: other.gap)
-                    ],
-                }
-            )
-    return out
+    return [
+        {
+            "found": entry.title,
+            "alternatives": [
+                {"effect": other.effect, "criterion_gap": other.gap, "tell_apart": other.tell_apart}
+                for other in entry.undecided
+            ],
+        }
+        for entry in entries(diagnosis)
+        if entry.findings[0].declared and entry.undecided
+    ]
 
 
 def _plain(value):

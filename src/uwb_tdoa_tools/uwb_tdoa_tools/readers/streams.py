@@ -3,11 +3,12 @@
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth
+from uwb_tdoa_bias.foundation.pressure import pressure_at
 
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
-
-
+NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
+LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
 MOST_BYTES = 1 << 30  # of a file; a flight of an hour has 300 MB
 SALVAGE = "read what is sound of it with --salvage"
 DAY = 86400.0  # s
@@ -45,6 +46,7 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
         "tdoa": a, b, d (m); "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw.
+        "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere).
     extra : the same of everything else, for `Flight.extra`.
     meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps
         of each stream fell before they were sorted), "imu_accel_interpolated" and "remarks" (list of sentences).
@@ -76,9 +78,17 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
     if "pose" in streams:
         pose = streams["pose"]
         truth = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
+    height = pressure = None
+    if "tof" in streams:
+        tof = streams["tof"]
+        ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(float)  # as a sensor_msgs/Range holds it
+        height = Height(tof["t"], np.where(ranges < NO_TARGET, ranges, np.inf))
+    if "baro" in streams:
+        baro = _readings(streams["baro"], "baro")
+        pressure = Pressure(baro["t"], pressure_at(baro["baro"]))
     if not meta["remarks"]:
         del meta["remarks"]
-    return Flight(name, anchors, tdoas, imu, truth, extra, meta)
+    return Flight(name, anchors, tdoas, imu, truth, extra, meta, height, pressure)
 
 
 def _sound(key, columns, meta, salvage):
@@ -89,12 +99,14 @@ def _sound(key, columns, meta, salvage):
         judged = {name: values for name, values in columns.items() if not name.startswith("q")}  # not recorded
     bad = np.zeros(len(columns["t"]), dtype=bool)
     for name, values in judged.items():
-        wrong = ~np.isfinite(values.astype(float))
+        values, largest = values.astype(float), LARGEST.get(name)
+        wrong = ~np.isfinite(values) if largest is None else ~(np.abs(values) <= largest)
         if wrong.any() and not salvage:
             row = int(np.flatnonzero(wrong)[0])
+            wanted = "finite" if largest is None else f"within +-{largest:g}"
             raise InputError(
                 f"{meta['source']}: {key}, record {row + 1} of {len(bad)} at {columns['t'][row]:.3f} s: {name} is "
-                f"{values[row]}; it must be finite: leave such records out with --salvage."
+                f"{columns[name][row]}; it must be {wanted}: leave such records out with --salvage."
             )
         bad |= wrong
     if salvage and not bad.all():
@@ -104,6 +116,13 @@ def _sound(key, columns, meta, salvage):
         return columns
     meta["remarks"].append(f"{key}: {np.count_nonzero(bad)} of {len(bad)} records left out, they are no numbers.")
     return {name: values[~bad] for name, values in columns.items()}
+
+
+def _readings(columns, name):
+    """The rows of a sensor that is logged more often than it measures: where its value differs from the one before."""
+    values = np.asarray(columns[name], dtype=float)
+    new = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    return {"t": columns["t"][new], name: values[new]}
 
 
 def protocol(tdoas):

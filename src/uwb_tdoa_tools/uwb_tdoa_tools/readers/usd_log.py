@@ -23,6 +23,8 @@ _STREAMS = {  # event name: our stream, {column in the log: column of the stream
     "estGyroscope": ("gyro", {"gyro.x": "x", "gyro.y": "y", "gyro.z": "z"}),
     "estAcceleration": ("acc", {"acc.x": "x", "acc.y": "y", "acc.z": "z"}),
     "estPose": ("pose", {f"locSrv.{axis}": axis for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")}),
+    "estTOF": ("tof", {"range.zrange": "tof"}),
+    "estBarometer": ("baro", {"baro.asl": "baro"}),
 }
 
 
@@ -30,7 +32,8 @@ def read_usd_log(path, anchors, salvage=False):
     """Flight of a micro-SD event log.
 
     TDOAs come from estTDOA, the IMU from estGyroscope (deg/s to rad/s) and estAcceleration (g to m/s^2), the ground
-    truth from estPose. Other events that occur are in `Flight.extra` under the names and in the units of the log.
+    truth from estPose, the height from estTOF (mm to m) and the pressure from estBarometer (altitude to Pa). Other
+    events that occur are in `Flight.extra` under the names and in the units of the log.
     Raises InputError for a file that is empty, foreign, cut or damaged (the checksum is always verified), and for
     records that are not finite.
     salvage : read a cut or damaged log up to there, as the power of a vehicle that fell leaves it; `meta["remarks"]`

@@ -27,15 +27,16 @@ _STREAMS = {  # our stream: {column of the file: column of the stream}, the time
     "pose": {"t_pose": "t", "pose_x": "x", "pose_y": "y", "pose_z": "z"},
 }
 _QUATERNION = {"pose_qx": "qx", "pose_qy": "qy", "pose_qz": "qz", "pose_qw": "qw"}
-_EXTRA = ("tof", "flow", "baro")
+_EXTRA = ("flow",)
 TDOA_COLUMNS = tuple(_STREAMS["tdoa"])
 
 
 def read_util_csv(path, anchors, salvage=False):
     """Flight of a CSV file in the UTIL schema; it must hold at least t_tdoa, idA, idB and tdoa_meas.
 
-    Acceleration g to m/s^2, rates deg/s to rad/s. Ground truth without quaternion columns has NaN for q. tof, flow and
-    baro are in `Flight.extra` as they are; `meta["ignored_columns"]` names columns that the schema does not know.
+    Acceleration g to m/s^2, rates deg/s to rad/s, tof mm to m, baro m of altitude to Pa. Ground truth without quaternion
+    columns has NaN for q. flow is in `Flight.extra` as it is; `meta["ignored_columns"]` names columns that the schema
+    does not know.
     Raises InputError with the line for a file that is empty, foreign or cut and for a cell that is not a finite number.
     A plain file that was cut exactly between two lines cannot be told from a shorter one; a gzip file can.
     salvage : read a cut or damaged file up to there, and leave out records that are no numbers; `meta["remarks"]`

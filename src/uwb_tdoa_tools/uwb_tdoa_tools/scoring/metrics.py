@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.core.engine import REJECTED, USED
+from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 
 AIRBORNE = 0.3  # m; errors count from the first to the last instant above this height
 LOST = 1.0  # m; a larger error is no estimate
@@ -75,12 +75,16 @@ def coverage(error, covariance, sigmas=3.0):
 
 
 class Score:
-    """Errors of one run against its ground truth."""
+    """Errors of one run against its ground truth.
+
+    t (n,) s; p (n, 3) m, true positions; error (n, 3) m; covariance (n, 3, 3) m^2; first, last : s, in the air.
+    """
 
     def __init__(self, name, odometry, truth, residuals=None):
         """name : of the flight; odometry : Odometry; truth : Truth; residuals : Residuals or None."""
         self.name = name
         self.t, self.error, self.covariance = position_errors(odometry, truth)
+        self.p = position_at(self.t, truth)
         self.first, self.last = airborne(truth)
         self.nees = nees(self.error, self.covariance)
         self.nis = nis(residuals) if residuals is not None else np.empty(0)

@@ -9,6 +9,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.correction.features import columns
 
+from ..parallel import in_one_thread
 from . import labels as labelling, linear, paper, physics, structured
 
 KINDS = ("paper", "paper_no_orientation", "structured", "physics", "physics+structured")
@@ -38,6 +39,7 @@ class Trained:
         return self.model.onnx(self.meta) if self.model else None
 
 
+@in_one_thread
 def train(kind, training, validation, seed, name, options=structured.Options(), progress=lambda text: None, found=None):
     """Train a model of `kind` (of KINDS) on lists of Flights. Returns Trained. Raises InputError.
 

@@ -7,29 +7,34 @@ from typing import ClassVar
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet, Track
-from uwb_tdoa_bias.foundation.flight import Flight, Truth
+from uwb_tdoa_bias.foundation.flight import Flight
 
-from ..references import Reference
+from ..references import Reference, View
 
 
 @dataclass(frozen=True)
 class Comparison:
     """A flight beside its reference.
 
-    flight : Flight, its streams corrected by `effects`; poses : Truth; span : (first, last) s of what counts."""
+    flight : Flight, its streams corrected by `effects`; view : View; span : (first, last) s of what counts."""
 
     flight: Flight
     reference: Reference
     effects: EffectSet
-    poses: Truth
+    view: View
     span: tuple
 
     @classmethod
     def of(cls, flight, reference, effects):
         """Comparison of a prepared Flight with a Reference."""
-        poses = reference.poses(flight, effects)
+        view = reference.view(flight, effects)
         corrected = effects.correct_streams(replace(flight, truth=None))
-        return cls(corrected, reference, effects, poses, reference.span(flight, poses))
+        return cls(corrected, reference, effects, view, reference.span(flight, view.poses))
+
+    @property
+    def poses(self):
+        """Truth: where the flight was, or is believed to have been."""
+        return self.view.poses
 
     @cached_property
     def track(self):
@@ -82,6 +87,7 @@ class Channel:
     name: ClassVar[str]
     unit: ClassVar[str]
     negligible: ClassVar[float]  # root mean square, in `unit`, of a contribution that is not worth a term
+    needs: ClassVar[str]  # what a recording must hold for it, in words
     maps: ClassVar[tuple] = ()  # covariates whose functions, each too weak alone, are tried together
 
     def residual(self, comparison):

@@ -18,6 +18,7 @@ class Gyro(Inertial):
 
     name = "gyro"
     unit = "rad/s"
+    needs = "a gyroscope, and ground truth of the attitude or some seconds at rest before take-off"
     negligible = 5e-4
 
     def residual(self, comparison):

@@ -11,27 +11,29 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
-from uwb_tdoa_bias.foundation.geometry import tdoa, tdoa_jacobian
+from uwb_tdoa_bias.foundation.geometry import tdoa
+
+from uwb_tdoa_ekf.sensitivity import Innovations
 
 from . import pairs
 from .base import Channel, ChannelResidual, Rows
 from .knots import knots_of
 
-CELL = 0.5  # s, of TDOAs at known places
-FREE_CELL = 0.25  # s, within which an unknown position error is taken as constant
+CELL = 0.5  # s
 OUTLIER = 4.0  # spreads within a cell
 WILD = 20.0  # m; a larger residual is no measurement
 
 
 @dataclass(frozen=True)
 class TdoaResidual(ChannelResidual):
-    """samples : Samples, of the whole recording; residual (n,) m; jacobian (n, 3) of the TDOA by the position; airborne
-    (n,) bool, False for those near the floor before and after; free (n, k) directions of an unknown position error."""
+    """samples : Samples, of the whole recording; residual (n,) m; airborne (n,) bool, False for those near the floor before
+    and after; innovations : Innovations where the path is only an estimate: these are the residual, and what the path
+    follows is taken out of regressors."""
 
     samples: Samples
     residual: np.ndarray
     airborne: np.ndarray
-    free: np.ndarray
+    innovations: Innovations | None = None
 
     @cached_property
     def cells(self):
@@ -41,11 +43,13 @@ class TdoaResidual(ChannelResidual):
     def rows(self):
         cells, samples = self.cells, self.samples
         place = np.stack([cells.mean(column) for column in samples.p.T], axis=1)
-        y = cells.means(self.residual[:, None])[:, 0]
-        return Rows(y, cells.pair, cells.t - samples.start, cells.size, place)
+        return Rows(cells.mean(self.residual), cells.pair, cells.t - samples.start, cells.size, place)
 
     def columns(self, effect, keys):
-        return self.cells.means(effect.regressors(self.samples, list(keys)))
+        values = np.nan_to_num(effect.regressors(self.samples, list(keys)))
+        if self.innovations is not None:
+            values = self.innovations.by_bias(values)
+        return np.stack([self.cells.mean(column) for column in values.T], axis=1)
 
     def series(self):
         return {"TDOA [m]": (self.samples.t[self.airborne], self.residual[self.airborne])}
@@ -60,9 +64,9 @@ class Cells:
 
     def __init__(self, part):
         samples, chosen = part.samples, np.flatnonzero(part.airborne)
-        n, width = len(samples.anchors), FREE_CELL if part.free.shape[1] else CELL
+        n = len(samples.anchors)
         t = samples.t[chosen]
-        cell = ((t - t[0]) / width).astype(np.int64)
+        cell = ((t - t[0]) / CELL).astype(np.int64)
         pair = samples.a[chosen].astype(np.int64) * n + samples.b[chosen]
         label = cell * n * n + pair
         y = part.residual[chosen]
@@ -79,24 +83,10 @@ class Cells:
         self.t = self.mean(samples.t)
         start = np.searchsorted(self.group, np.arange(len(self.size)))
         self.pair = samples.a[self.chosen][start] * n + samples.b[self.chosen][start]
-        self._bases = []
-        if part.free.shape[1]:
-            free = np.stack([self.mean(column) for column in part.free.T], axis=1)
-            cell, root = ((self.t - t[0]) / width).astype(np.int64), np.sqrt(self.size)[:, None]
-            for places in (np.flatnonzero(cell == c) for c in np.unique(cell)):
-                self._bases.append((places, root[places], np.linalg.qr(root[places] * free[places])[0]))
 
     def mean(self, values):
         """Means of values of all TDOAs (n,) over the cells: (m,)."""
         return np.bincount(self.group, values[self.chosen]) / self.size
-
-    def means(self, values):
-        """Columns (n, k) averaged, without what an unknown position error would explain: (m, k)."""
-        out = np.stack([self.mean(np.nan_to_num(column)) for column in values.T], axis=1)
-        for places, root, basis in self._bases:
-            scaled = root * out[places]
-            out[places] = (scaled - basis @ (basis.T @ scaled)) / root
-        return out
 
 
 class Tdoa(Channel):
@@ -104,6 +94,7 @@ class Tdoa(Channel):
 
     name = "tdoa"
     unit = "m"
+    needs = "TDOAs"
     negligible = 0.004
     maps = ("x", "y", "height", "range")
 
@@ -111,8 +102,12 @@ class Tdoa(Channel):
         flight, anchors, poses = comparison.flight, comparison.flight.anchors, comparison.poses
         raw = flight.tdoa
         a, b = anchors.index(raw.a), anchors.index(raw.b)
-        inside = (raw.t >= poses.t[0]) & (raw.t <= poses.t[-1])
-        usable = np.flatnonzero((a >= 0) & (b >= 0) & (a != b) & np.isfinite(raw.d) & inside)
+        innovations = comparison.view.innovations
+        if innovations is None:
+            inside = (raw.t >= poses.t[0]) & (raw.t <= poses.t[-1])
+            usable = np.flatnonzero((a >= 0) & (b >= 0) & (a != b) & np.isfinite(raw.d) & inside)
+        else:
+            usable = innovations.rows
         t, a, b = raw.t[usable], a[usable], b[usable]
         samples = replace(
             samples_at(t, a, b, poses, anchors, comparison.start),
@@ -122,11 +117,12 @@ class Tdoa(Channel):
             extra=_extra(flight, t),
         )
         at_a, at_b = samples.position_a, samples.position_b
-        residual = raw.d[usable] - tdoa(samples.p, at_a, at_b) - comparison.effects.bias(samples)
+        if innovations is None:
+            residual = raw.d[usable] - tdoa(samples.p, at_a, at_b) - comparison.effects.bias(samples)
+        else:
+            residual = innovations.value
         first, last = comparison.span
-        unknown = ~np.array(comparison.reference.positions_known)
-        free = tdoa_jacobian(samples.p, at_a, at_b)[:, unknown]
-        return TdoaResidual(samples, residual, (t >= first) & (t <= last), free)
+        return TdoaResidual(samples, residual, (t >= first) & (t <= last), innovations)
 
     def smooth_terms(self, residuals):
         out, chosen = [], [part.airborne for part in residuals]

@@ -26,7 +26,7 @@ class FloorMultipathDetector(Detector):
             samples, r = part.samples, np.clip(part.residual, -WILD, WILD)
             strength = self.effect.strength(samples.p[:, 2])
             near = strength > NEAR
-            if part.free.shape[1] or near.sum() < FEWEST or part.airborne.sum() < FEWEST:
+            if part.innovations is not None or near.sum() < FEWEST or part.airborne.sum() < FEWEST:
                 continue  # where it stands is not known, or it was not there
             x = self.effect().regressors(samples, ("size",))[near, 0]
             bins = np.unique(((samples.t[near] - samples.start) / BIN).astype(int), return_inverse=True)[1]

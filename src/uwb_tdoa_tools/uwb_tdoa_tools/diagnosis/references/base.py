@@ -1,13 +1,24 @@
 """What a reference is."""
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Truth
 
 from ...scoring.metrics import airborne
 
 MARGIN = 0.5  # s left out at both ends of the airborne part
 SHORTEST = 5.0  # s in the air that can be diagnosed
+
+
+@dataclass(frozen=True)
+class View:
+    """Where a flight was, as far as a reference tells. poses : Truth, known or estimated; innovations : Innovations of the
+    run that estimated them, None where they are known."""
+
+    poses: Truth
+    innovations: object = None
 
 
 class Reference:
@@ -16,7 +27,7 @@ class Reference:
     Nothing that a reference does without is read: `prepare` takes it out of a recording before anything else sees it.
     """
 
-    positions_known: ClassVar[tuple] = (True, True, True)  # x, y, z, world: False is estimated, and its error projected out
+    positions_known: ClassVar[tuple] = (True, True, True)  # x, y, z, world
     attitude_known: ClassVar[bool] = True
     judges: ClassVar[bool] = True  # errors of the filter's positions can be told with it
     words: ClassVar[str]  # what a report says the figures rest on
@@ -25,8 +36,8 @@ class Reference:
         """The Flight without what must not be used. Raises InputError where it lacks what the reference is."""
         return flight
 
-    def poses(self, flight, effects):
-        """Poses, as of a Truth, at which the residuals of a prepared Flight are taken under the EffectSet `effects`."""
+    def view(self, flight, effects):
+        """View of a prepared Flight under the EffectSet `effects`."""
         raise NotImplementedError
 
     def span(self, flight, poses):

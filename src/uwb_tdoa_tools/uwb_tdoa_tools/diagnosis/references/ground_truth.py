@@ -3,7 +3,7 @@
 from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .base import Reference
+from .base import Reference, View
 
 
 class GroundTruth(Reference):
@@ -16,5 +16,5 @@ class GroundTruth(Reference):
             raise InputError(f"{flight.name}: holds no ground truth to compare with; give --no-truth.")
         return flight
 
-    def poses(self, flight, effects):
-        return shifted(flight, "truth", -effects.stamp_offset("truth")).truth
+    def view(self, flight, effects):
+        return View(shifted(flight, "truth", -effects.stamp_offset("truth")).truth)

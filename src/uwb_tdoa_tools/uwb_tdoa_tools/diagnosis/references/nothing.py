@@ -4,15 +4,16 @@ from dataclasses import replace
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.flight import Truth
-from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.sensitivity import record_innovations
 
-from .base import Reference
+from .base import Reference, View
 
 TRUTHS = "_truth"  # how streams are called in which a simulation tells what was true
 
 
 class Nothing(Reference):
-    """Residuals are taken at the estimate; what an error of its position would explain is projected out of them."""
+    """Residuals are the innovations of the filter; what the path follows of an effect is taken out of its regressors, with all
+    that the filter knows of the path."""
 
     positions_known = (False, False, False)
     attitude_known = False
@@ -27,6 +28,7 @@ class Nothing(Reference):
         extra = {name: stream for name, stream in flight.extra.items() if not name.endswith(TRUTHS)}
         return replace(flight, truth=None, extra=extra)
 
-    def poses(self, flight, effects):
-        estimate = run_offline(flight, self._config, Corrector(flight.anchors, effects)).odometry
-        return Truth(estimate.t, estimate.p, estimate.q)
+    def view(self, flight, effects):
+        innovations = record_innovations(flight, self._config, Corrector(flight.anchors, effects))
+        estimate = innovations.run.odometry
+        return View(Truth(estimate.t, estimate.p, estimate.q), innovations)

@@ -1,10 +1,10 @@
 from hypothesis import given
 from hypothesis import strategies as st
-from uwb_tdoa_bias.correction.hold import Hold
+from uwb_tdoa_bias.correction.pose_queue import PoseQueue
 
 
 def test_leaves_when_ready_in_order_of_arrival():
-    hold = Hold(limit=1.0)
+    hold = PoseQueue(limit=1.0)
     for t, item in ((0.3, "a"), (0.1, "b"), (0.4, "c")):
         hold.add(t, item)
     assert hold.take(lambda before: before < 0.2) == []  # b is ready but waits behind a
@@ -13,7 +13,7 @@ def test_leaves_when_ready_in_order_of_arrival():
 
 
 def test_after_a_gap_what_counts_is_the_item_before_it():
-    hold = Hold(limit=10.0)
+    hold = PoseQueue(limit=10.0)
     hold.add(1.0, "a")
     hold.add(5.0, "b")
     assert hold.take(lambda before: before < 2.0) == [(1.0, "a", True), (5.0, "b", True)]
@@ -22,7 +22,7 @@ def test_after_a_gap_what_counts_is_the_item_before_it():
 
 
 def test_leaves_unready_when_a_newer_one_is_too_far_ahead():
-    hold = Hold(limit=0.25)
+    hold = PoseQueue(limit=0.25)
     hold.add(1.0, "a")
     hold.add(1.25, "b")
     assert hold.take(lambda t: False) == []
@@ -32,7 +32,7 @@ def test_leaves_unready_when_a_newer_one_is_too_far_ahead():
 
 @given(st.lists(st.tuples(st.floats(0, 2), st.floats(0, 2)), max_size=40))
 def test_every_item_leaves_once_in_order_and_not_before_its_time(steps):
-    hold, out, before = Hold(limit=0.2), [], []
+    hold, out, before = PoseQueue(limit=0.2), [], []
     for number, (t, progress) in enumerate(steps):
         hold.add(t, number)
         newest = max([t, *before])

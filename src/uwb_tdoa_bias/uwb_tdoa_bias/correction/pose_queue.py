@@ -3,7 +3,7 @@
 from collections import deque
 
 
-class Hold:
+class PoseQueue:
     """A queue in order of arrival. Its first item leaves when it is ready, or when it has been waited for too long.
 
     What makes an item ready depends on the stamp of the item before it. Too long is counted in stamps: a newer item is

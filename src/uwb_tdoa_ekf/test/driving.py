@@ -1,0 +1,57 @@
+"""Feed a flight to the core, and judge what comes out."""
+
+from covariances import assert_covariance
+from flights import measurements, position_at
+import numpy as np
+
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.engine import feed
+from uwb_tdoa_ekf.core.memory import Measurements, new_memory
+
+
+def drive(flight, config=None, memory=None, cuts=()):
+    """Odometry and residuals of the engine, fed in the pieces between the stamps `cuts`: fields by attribute."""
+    memory = memory_for(flight) if memory is None else memory
+    tuning, whole, parts = (config or FilterConfig()).tuning(), measurements(flight), []
+    edges = [-np.inf, *sorted(cuts), np.inf]
+    for low, high in zip(edges, edges[1:]):
+        piece = Measurements(*(part[(part["t"] > low) & (part["t"] <= high)] for part in whole))
+        parts.append(feed(memory, tuning, piece)[:2])
+    return tuple(np.concatenate(column).view(np.recarray) for column in zip(*parts))
+
+
+def memory_for(flight):
+    """Memory of a filter that has seen nothing of a Flight."""
+    return new_memory(flight.anchors.positions)
+
+
+def errors(flight, odometry):
+    """Distances to the true positions, (n,) m."""
+    return np.linalg.norm(odometry.x[:, :3] - position_at(flight, odometry.t), axis=1)
+
+
+def assert_equal(left, right):
+    """Two pairs of odometry and residuals, to the bit."""
+    for one, other in zip(left, right):
+        for name in one.dtype.names:
+            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def assert_sound(memory, odometry):
+    """Finite states, unit quaternions, covariances."""
+    assert np.isfinite(odometry.x).all()
+    np.testing.assert_allclose(np.linalg.norm(odometry.x[:, 6:10], axis=1), 1.0, atol=1e-9)
+    assert (np.diff(odometry.t) >= 0.0).all()
+    if len(odometry):
+        assert_covariance(odometry.covariance)
+    hypotheses = memory.record.hypotheses
+    assert np.isfinite(hypotheses["x"]).all()
+    for P in hypotheses["P"][np.isfinite(hypotheses["log_weight"])]:
+        assert_covariance(P)
+        np.testing.assert_array_equal(P, P.T)
+
+
+def cut(stream, low, high):
+    """The part of an Imu or Tdoas between two stamps."""
+    kept = (stream.t >= low) & (stream.t < high)
+    return type(stream)(*(getattr(stream, name)[kept] for name in stream.__dataclass_fields__))

@@ -1,0 +1,82 @@
+from dataclasses import replace
+
+from driving import assert_sound, drive, errors, memory_for
+from flights import fly
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
+from uwb_tdoa_ekf.core.verdicts import REJECTED, STARTUP, USED
+from uwb_tdoa_ekf.core.initialization import remember
+from uwb_tdoa_ekf.core.memory import TDOA, WINDOW, new_memory
+
+
+def test_starts_by_itself_within_its_window_and_knows_where_it_is():
+    for seed in range(5):
+        flight = fly(seed, 2.0, outliers=0.1)
+        odometry, residuals = drive(flight)
+        assert 0.4 < odometry.t[0] < 0.6
+        assert errors(flight, odometry)[0] < 0.3
+        startup = residuals.verdict == STARTUP
+        np.testing.assert_array_equal(startup, flight.tdoa.t <= flight.tdoa.t[startup][-1])
+        for name in ("innovation", "variance"):
+            np.testing.assert_array_equal(np.isnan(residuals[name]), startup)
+        assert (residuals.weight[startup] == 0.0).all() and np.isfinite(residuals.weight).all()
+        assert np.isin(residuals.verdict[~startup], (USED, REJECTED)).all()
+
+
+def test_starts_level_with_the_yaw_it_was_told():
+    flight = fly(3, 2.0, hover=True)
+    turned = Rotation.from_euler("ZYX", [0.7, 0.2, -0.3])
+    flight = replace(flight, imu=replace(flight.imu, accel=turned.inv().apply(flight.imu.accel)))
+    odometry, _ = drive(flight, FilterConfig(initial_yaw=0.7, initial_yaw_std=0.5))
+    assert (Rotation.from_quat(odometry.x[0, 6:10]).inv() * turned).magnitude() < 0.02
+    assert odometry.covariance[0, 8, 8] == pytest.approx(0.25, rel=0.05)
+
+
+def test_contradicting_tdoas_start_only_after_the_timeout():
+    flight = fly(4, 3.0, outliers=0.6)
+    odometry, _ = drive(flight, FilterConfig(start_timeout=1.5))
+    assert 1.5 < odometry.t[0] < 1.75
+
+
+def test_one_tdoa_long_before_the_others_does_not_use_up_the_timeout():
+    flight = fly(4, 3.0, outliers=0.6, begin=30.0)
+    early = np.concatenate([[1.0], flight.tdoa.t])
+    first = [np.concatenate([column[:1], column]) for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)]
+    odometry, _ = drive(replace(flight, tdoa=Tdoas(early, *first)))
+    assert odometry.t[0] > 30.4  # a window of start_window, not a dozen TDOAs
+
+
+@pytest.mark.parametrize("robust", ROBUST)
+def test_finds_a_tag_again_that_was_carried_away(robust):
+    near, far = fly(10, 12.0, hover=True), fly(10, 12.0, hover=True)
+    there = np.array([1.0, 6.5, 0.8])
+    p = np.where(far.tdoa.t[:, None] < 5.0, near.truth.p[0], there)
+    positions = far.anchors.positions
+    d = tdoa(p, positions[far.anchors.index(far.tdoa.a)], positions[far.anchors.index(far.tdoa.b)])
+    d += 0.1 * np.random.default_rng(0).standard_normal(len(d))
+    memory = memory_for(far)
+    odometry, _ = drive(replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), memory)
+    assert memory.record.recoveries <= 2
+    assert np.linalg.norm(odometry.x[odometry.t > 7.0, :3] - there, axis=1).max() < 0.3
+    assert_sound(memory, odometry)
+
+
+def test_a_good_flight_needs_no_recovery():
+    for seed in range(3):
+        flight = fly(seed, 10.0, outliers=0.1)
+        memory = memory_for(flight)
+        drive(flight, memory=memory)
+        assert memory.record.recoveries == 0
+
+
+def test_the_window_keeps_the_latest_tdoas_in_order():
+    ekf, fed = new_memory(np.zeros((4, 3))).record, 5 * WINDOW + 7
+    for k in range(fed):
+        remember(ekf, np.array([(0.01 * k, k % 4, 0, 1.0 * k, 0.0)], TDOA)[0])
+    assert WINDOW <= ekf.kept <= 2 * WINDOW
+    np.testing.assert_array_equal(ekf.window["d"][: ekf.kept], np.arange(fed - ekf.kept, fed))

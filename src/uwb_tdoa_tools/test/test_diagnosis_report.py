@@ -1,0 +1,460 @@
+from dataclasses import replace
+from html.parser import HTMLParser
+import json
+from pathlib import Path
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
+from uwb_tdoa_bias.effects.wording import measured
+from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis.findings import Finding, Refused
+from uwb_tdoa_tools.diagnosis.references import Nothing
+from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative, Unobservable
+from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
+from uwb_tdoa_tools.diagnosis.report import curves, maps, pictures, room, sections
+from uwb_tdoa_tools.diagnosis.report.entries import doubt_in_words, entries, worth_in_words
+from uwb_tdoa_tools.diagnosis.report.style import STYLE
+from uwb_tdoa_tools.diagnosis.report.unclear import by_remedy, untold
+from uwb_tdoa_tools.diagnosis.report.verdict import verdict
+from uwb_tdoa_tools.diagnosis.report.words import TERMS, abbreviations
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+ELSEWHERE = Alternative("pair_offset", 0.95, None, "TDoA3")
+AS_WELL = Alternative("anchor_position", 1.0, 2.0, "a flight on several sides")
+# Keys of diagnosis.json that are names of something: of parameters, anchors, lags.
+NAMES_BELOW = {"parameters", "std", "direction", "values", "autocorrelation"}
+
+
+@pytest.fixture(scope="module")
+def result():
+    """Diagnosis of a short flight with a late anchor and an anchor that stands elsewhere, judged on another one."""
+    effects = EFFECTS["anchor_delay"]({"3": 0.3}), EFFECTS["anchor_position"]({"6.x": 0.25, "6.z": -0.2})
+    flights = [clean_flight(100, 24.0), clean_flight(101, 18.0)]
+    for effect in effects:
+        flights = [effect.inject(flight) for flight in flights]
+    return diagnose(flights[:1], flights[1:])
+
+
+@pytest.fixture(scope="module")
+def without_truth():
+    return diagnose([EFFECTS["anchor_delay"]({"3": 0.4}).inject(clean_flight(100, 24.0))], reference=Nothing())
+
+
+@pytest.fixture(scope="module")
+def page(result):
+    return result.as_html()
+
+
+def said(page):
+    """The words of a page, without markup."""
+    text = re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.S)
+    for code, sign in (
+        ("&lt;", "<"),
+        ("&gt;", ">"),
+        ("&quot;", '"'),
+        ("&#x27;", "'"),
+        ("&amp;", "&"),
+        ("m/s²", "m/s^2"),
+    ):
+        text = text.replace(code, sign)
+    return " ".join(text.split())
+
+
+def finding(effect, added=True, worth=0.02, alternatives=(), tried=True, channel="tdoa"):
+    candidates = (Candidate((Term(effect, tuple(effect.std)),)),) if tried else ()
+    return Finding(effect, channel, {}, 0.1, tuple(alternatives), candidates, added, worth)
+
+
+def delay(value=0.3, std=0.01):
+    return EFFECTS["anchor_delay"]({"3": value}, {"3": std})
+
+
+def run(name, error, diverged=False):
+    return {"flight": name, "rmse_3d": error, "diverged": diverged, "rmse_3d_ci": [0.9 * error, 1.1 * error]}
+
+
+def judged(result, before, after, gain, **changes):
+    """The Diagnosis with other errors: {flight: m}, and the interval of the gain."""
+    sides = []
+    for errors in (before, after):
+        runs = [run(name, *(value if isinstance(value, tuple) else (value,))) for name, value in errors.items()]
+        pooled = {"rmse_3d": float(np.sqrt(np.mean([item["rmse_3d"] ** 2 for item in runs])))}
+        pooled["rmse_3d_ci"] = [0.9 * pooled["rmse_3d"], 1.1 * pooled["rmse_3d"]]
+        sides.append({"runs": runs, "pooled": pooled, "scores": result.before["scores"]})
+    sides[1]["pooled"]["rmse_3d_gain_ci"] = gain
+    return replace(result, before=sides[0], after=sides[1], **changes)
+
+
+# ---------------------------------------------------------------------------------------------------------- verdict
+
+
+def test_the_verdict_has_the_error_before_and_after_its_interval_and_how_many_flights(result):
+    found = verdict(judged(result, {"one": 0.3, "two": 0.3}, {"one": 0.2, "two": 0.2}, [0.24, 0.44]))
+    assert found.kind == "better"
+    assert found.headline == "The position error (3D RMSE) falls from 30.0 cm to 20.0 cm: 33 % of it is gone."
+    assert "95 % intervals: 27.0 to 33.0 cm before, 18.0 to 22.0 cm after; gain 33 % (24 to 44 %)." in found.more
+    assert any("flights that took no part in the fit: 2 flights" in sentence for sentence in found.more)
+
+
+@pytest.mark.parametrize("gain", [[-0.1, 0.4], [0.0, 0.4], None])
+def test_a_gain_that_may_be_chance_is_not_called_one(result, gain):
+    found = verdict(judged(result, {"one": 0.3}, {"one": 0.25}, gain))
+    assert found.kind == "unsure" and "not certain" in found.headline and "is gone" not in " ".join(found.sentences)
+
+
+def test_the_verdict_says_where_it_became_worse_and_what_diverged(result):
+    before, after = {"one": 0.3, "two": 0.2, "three": (0.9, True)}, {"one": 0.1, "two": 0.25, "three": 0.3}
+    text = " ".join(verdict(judged(result, before, after, [0.1, 0.5])).sentences)
+    assert "On 1 of 3 runs the error grows, most on two, from 20.0 cm to 25.0 cm." in text
+    assert "Of 3 runs, 1 diverged before and 0 after." in text
+
+
+def test_a_single_judged_flight_and_a_judge_that_was_fitted_are_named_as_such(result):
+    own = result.flights[0].name
+    alone = verdict(judged(result, {"other": 0.3}, {"other": 0.1}, [0.5, 0.8])).more
+    halves = verdict(judged(result, {own: 0.3}, {own: 0.1}, [0.5, 0.8])).more
+    assert "One flight does not tell how much flights differ." in alone
+    assert any("decided on these same flights" in sentence for sentence in halves)
+    assert not any("decided on these same flights" in sentence for sentence in alone)
+
+
+def test_effects_that_were_in_the_model_already_are_mentioned(result):
+    more = EffectSet((*result.effects.effects, EFFECTS["range_scale"]({"scale": 0.01})))
+    assert any("with the 1 effect that the model held" in s for s in verdict(replace(result, effects=more)).more)
+    assert not any("held already" in sentence for sentence in verdict(result).more)
+
+
+def test_nothing_found_and_nothing_added_are_told_apart(result):
+    nothing = judged(result, {"one": 0.1}, {"one": 0.1}, [0.0, 0.0], findings=[], effects=EffectSet())
+    assert verdict(nothing).kind == "nothing" and "looks like noise" in verdict(nothing).headline
+    assert "10.0 cm, 95 % interval 9.0 to 11.0 cm" in " ".join(verdict(nothing).more)
+    useless = replace(nothing, findings=[finding(delay(), added=False, worth=None)])
+    assert verdict(useless).kind == "same" and "One effect was found" in verdict(useless).headline
+
+
+def test_without_ground_truth_no_error_is_claimed(without_truth):
+    found = verdict(without_truth)
+    text = " ".join(found.sentences)
+    assert found.kind == "unknown" and "Without ground truth" in text and without_truth.judged_on in text
+    assert "because it explains at least 33 % of what is slow" in text
+    assert "RMSE" not in text and "falls" not in text
+    calm = replace(without_truth, findings=[])
+    assert verdict(calm).kind == "nothing"
+
+
+def test_without_ground_truth_what_is_not_borne_out_is_not_added_with_the_reason_in_one_place(without_truth):
+    findings = [
+        replace(item, added=False) for item in (finding(delay()), finding(EFFECTS["range_scale"]({"scale": 0.1})))
+    ]
+    why = Refused("anchor_delay + range_scale", "explain 20 % of what is slow")
+    refused = [*without_truth.attribution.refused, why]
+    doubted = replace(without_truth, findings=findings, refused=refused, effects=EffectSet())
+    found = verdict(doubted)
+    assert found.kind == "unknown" and found.headline.startswith("Nothing of what was found is added")
+    assert "Not added, anchor_delay + range_scale: explain 20 % of what is slow." in found.more
+    assert {entry.why_not for entry in entries(doubted)} == {"judged together with others: see the verdict"}
+
+
+# ---------------------------------------------------------------------------------------------------------- entries
+
+
+def test_what_came_into_the_model_together_is_one_entry_with_one_worth(result):
+    terms = [SmoothTerm({"3.c0": 0.1}, {"3.c0": 0.01}, "", "tdoa", name, "anchor", (0.0, 1.0)) for name in ("x", "y")]
+    together = Candidate(tuple(Term(term, ("3.c0",)) for term in terms))
+    findings = [Finding(term, "tdoa", {}, 0.2, (), (together,), True, 0.015) for term in terms]
+    (entry,) = entries(replace(result, findings=findings))
+    assert entry.title == "tdoa over x and y (by anchor)" and worth_in_words(entry) == "1.5 cm"
+
+
+def test_entries_are_ordered_by_worth_those_not_added_last(result):
+    findings = [
+        finding(delay(), False, None),
+        finding(EFFECTS["range_scale"]({"scale": 0.1}, {"scale": 0.01}), worth=0.01),
+    ]
+    findings.append(finding(EFFECTS["pair_offset"]({"0-1": 0.1}, {"0-1": 0.01}), worth=0.05))
+    found = entries(
+        replace(result, findings=findings, refused=[Refused("anchor_delay", "the filter does better without it")])
+    )
+    assert [entry.title for entry in found] == ["pair_offset", "range_scale", "anchor_delay"]
+    assert [bool(entry.why_not) for entry in found] == [False, False, True]
+    assert found[2].why_not == "the filter does better without it"
+
+
+@pytest.mark.parametrize(
+    "worth, words, matters",
+    [
+        (0.0151, "1.5 cm", True),
+        (0.0001, "less than 0.1 cm", False),
+        (-0.002, "nothing (-0.2 cm)", False),
+        (None, "not known", True),
+    ],
+)
+def test_worth_in_words(result, worth, words, matters):
+    (entry,) = entries(replace(result, findings=[finding(delay(), worth=worth)]))
+    assert worth_in_words(entry) == words and entry.matters == matters
+
+
+def test_what_else_it_could_be_stands_in_one_place(result):
+    (entry,) = entries(replace(result, findings=[finding(delay(), alternatives=(AS_WELL, ELSEWHERE))]))
+    assert doubt_in_words(entry) == [
+        "Could as well be anchor_position; to tell: a flight on several sides.",
+        "Could be imitated by pair_offset, less plausibly; to tell: TDoA3.",
+    ]
+
+
+def test_values_that_are_not_significant_are_counted_not_shown(result):
+    effect = EFFECTS["anchor_delay"]({"3": 0.3, "4": 0.01}, {"3": 0.01, "4": 0.02})
+    (entry,) = entries(replace(result, findings=[finding(effect)]))
+    assert entry.values == "3 = 0.30 ± 0.01 (m); 1 not significant"
+
+
+# ---------------------------------------------------------------------------------------------------- what is unclear
+
+
+def test_what_could_not_be_told_comes_with_what_would_tell(result):
+    every = {str(i): 0.35 for i in range(8)}
+    items = [
+        Unobservable("anchor_delay", every),
+        Unobservable("gyro_bias", None),
+        Unobservable("accel_scale", {"x": 1.0}),
+    ]
+    items.append(Unobservable("pair_offset", {"0-1": 0.7, "1-2": -0.7}))
+    found = {item.effect: item for item in untold(replace(result, unobservable=items))}
+    assert found["anchor_delay"].harmless and found["anchor_delay"].what == "0, 1, 2, 3, 4, 5, 6 and 7 together"
+    assert "gyroscope" in found["gyro_bias"].told_by and found["pair_offset"].what == "0-1 against 1-2"
+    assert "other places" in found["accel_scale"].told_by
+    assert by_remedy(found.values())[found["accel_scale"].told_by] == [
+        "accel_scale (x)",
+        "pair_offset (0-1 against 1-2)",
+    ]
+    assert "anchor_delay" not in str(by_remedy(found.values()))
+
+
+def test_without_truth_ground_truth_would_tell(without_truth):
+    remedies = {item.effect: item.told_by for item in untold(without_truth)}
+    assert "ground truth" in remedies["truth_frame"] and "accelerometer" in remedies["accel_bias"]
+
+
+# ------------------------------------------------------------------------------------------- the same in all outputs
+
+
+def test_the_numbers_of_findings_are_those_of_effects_yaml(result, page, tmp_path):
+    result.effects.to_yaml(tmp_path / "effects.yaml")
+    written = {effect.name: effect for effect in EffectSet.from_yaml(tmp_path / "effects.yaml").effects}
+    content, screen, text = result.as_json(), " ".join(result.as_text().split()), said(page)
+    added = [item for item in content["findings"] if item["added"]]
+    assert {item["effect"] for item in added} == set(written) >= {"anchor_delay", "anchor_position"}
+    for item in added:
+        effect = written[item["effect"]]
+        assert item["parameters"] == effect.values and item["std"] == effect.std
+        assert tuple(item["advice"]) == effect.advice()
+        for sentence in item["advice"]:
+            assert sentence in text and sentence in screen
+    value = measured(written["anchor_delay"].values["3"], written["anchor_delay"].std["3"])
+    assert f"3 = {value}" in screen and value in text
+
+
+def test_all_outputs_say_the_same(result, page):
+    content, screen, text = result.as_json(), " ".join(result.as_text().split()), said(page)
+    for sentence in content["verdict"]:
+        assert sentence in screen and sentence in text
+    for entry in entries(result):
+        assert worth_in_words(entry) in screen and worth_in_words(entry) in text
+        for sentence in doubt_in_words(entry):
+            assert sentence in screen and sentence in text
+    order = [screen.index(part) for part in ("verdict", " do ", " found ", " apply ")]
+    assert order == sorted(order)
+    parts = (
+        "What to do in the hall",
+        "What each effect is worth",
+        "Where in the room",
+        "What could not be told",
+        "Details",
+    )
+    places = [text.index(part) for part in parts]
+    assert places == sorted(places)
+
+
+def test_findings_and_alternatives_in_json(result):
+    doubtful = finding(delay(), alternatives=(AS_WELL, ELSEWHERE))
+    content = replace(result, findings=[doubtful]).as_json()
+    (item,) = content["findings"]
+    assert item["alternatives"][0] == {
+        "effect": "anchor_position", "share": 1.0, "criterion_gap": 2.0, "tell_apart": "a flight on several sides",
+    }  # fmt: skip
+    assert [other["effect"] for other in content["ambiguous"][0]["alternatives"]] == ["anchor_position"]
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+
+
+def keys_of(content):
+    if isinstance(content, list):
+        return set().union(*map(keys_of, content))
+    if not isinstance(content, dict):
+        return set()
+    return set(content).union(*(keys_of(item) for key, item in content.items() if key not in NAMES_BELOW))
+
+
+def test_every_key_of_json_is_in_the_document(result, without_truth):
+    text = (DOCS / "diagnosis.md").read_text()
+    term = SmoothTerm({"c0": 0.1}, {}, knots=(0.0, 1.0))
+    shown = replace(result, findings=[*result.findings, finding(term)], refused=[Refused("a", "b")])
+    keys = keys_of(shown.as_json()) | keys_of(without_truth.as_json())
+    assert {key for key in keys if f"`{key}`" not in text} == set()
+
+
+# ------------------------------------------------------------------------------------------------------------- page
+
+
+class Tags(HTMLParser):
+    """Every tag with those that it is in; what was not closed."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.seen = [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.append((tag, dict(attrs), list(self.open)))
+        if tag not in ("meta", "br", "img"):
+            self.open.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop()[0] == tag
+
+
+@pytest.fixture(scope="module")
+def all_pages(page, result, without_truth):
+    none = judged(result, {"one": 0.1}, {"one": 0.1}, [0.0, 0.0], findings=[], effects=EffectSet())
+    return [page, none.as_html(), without_truth.as_html()]
+
+
+def test_a_page_holds_everything_itself_and_is_light(all_pages):
+    for page in all_pages:
+        assert "http" not in page and "<script" not in page and "<link" not in page and "url(" not in page
+        assert len(page) < 1_000_000
+
+
+def test_a_page_is_well_formed_and_every_picture_is_described(all_pages):
+    for page in all_pages:
+        tags = Tags(page)
+        assert tags.open == []
+        pictures = [attributes for tag, attributes, _ in tags.seen if tag == "img"]
+        assert pictures and all(len(item["alt"]) > 20 and item["src"].startswith("data:image/") for item in pictures)
+        assert len({item["alt"] for item in pictures}) == len(pictures)
+
+
+def test_nothing_runs_off_a_narrow_page(all_pages):
+    for rule in ("img { display: block; max-width: 100%", ".wide { overflow-x: auto", "overflow-wrap: anywhere"):
+        assert rule in STYLE
+    assert "minmax(min(100%, 27rem), 1fr)" in STYLE
+    for page in all_pages:
+        assert 'name="viewport" content="width=device-width' in page
+        for tag, attributes, around in Tags(page).seen:
+            if tag == "table":
+                assert ("div", {"class": "wide"}) in around
+            if tag == "span":  # bars: less than a phone is wide
+                assert float(re.search(r"width:([\d.]+)em", attributes["style"])[1]) <= 8.0
+            assert tag == "img" or "width" not in attributes
+
+
+def test_every_abbreviation_is_spelled_out_and_every_effect_explained(all_pages):
+    for page in all_pages:
+        text, _, meanings = said(page).rpartition("What abbreviations and names of effects mean")
+        shown = abbreviations(f"{text} {meanings}") - {"FLIGHT"}
+        assert {"TDOA", "TDOAs", "IMU", "3D"} & shown
+        for name in shown:
+            assert TERMS[name] in meanings or TERMS[name.rstrip("s")] in meanings, name
+        named = {name for name in EFFECTS if re.search(rf"\b{name}\b", text)}
+        assert all(EFFECTS[name].physics in meanings for name in named)
+
+
+def test_a_row_is_either_worth_something_or_says_why_it_is_not_in_the_file(result):
+    findings = [
+        finding(delay(), worth=0.03),
+        finding(EFFECTS["floor_multipath"]({"size": 2.0}, {"size": 0.1}), False, None, tried=False),
+    ]
+    changed = replace(
+        result, findings=findings, refused=[Refused("floor_multipath", "does not make the filter better")]
+    )
+    text = said(sections.worth(changed, entries(changed)))
+    assert "3.0 cm" in text and "not in effects.yaml: does not make the filter better" in text
+    assert "yes" not in text.split() and "0 %" not in text
+    assert "Nothing else in the catalogue explains as much." in text  # of the delay, that nothing imitates
+    assert "Was not compared with others; may be confused with" in text
+
+
+def test_advice_on_what_is_not_added_is_less_urgent(result):
+    findings = [
+        finding(delay(), worth=0.0),
+        finding(EFFECTS["outlier_rate"]({"share": 0.1}, {"share": 0.01}), False, None, tried=False),
+    ]
+    text = said(sections.to_do(entries(replace(result, findings=findings))))
+    todo, _, rest = text.partition("Seen too, less urgent")
+    assert "Calibrate" not in todo and "Calibrate the antenna delay" in rest and "10 ± 1 % of the TDOAs" in rest
+
+
+def test_a_blocked_region_is_on_the_map_and_in_the_list(result):
+    values = {"1.x": -0.9, "1.y": -1.2, "1.z": 2.0, "1.radius": 1.0, "1.delay": 0.5}
+    effect = EFFECTS["nlos"](values, {"1.delay": 0.02})
+    changed = replace(result, findings=[finding(effect)], effects=EffectSet((effect,)))
+    shifts, (region,) = room.shifts_and_regions(changed)
+    assert shifts == {} and region.anchor == 1 and region.radius == 1.0
+    assert "1 region where an anchor is disturbed" in maps.maps(changed)
+    assert "anchor 1 and (-0.9, -1.2, 2.0) m" in said(sections.to_do(entries(changed)))
+
+
+def test_shifts_of_anchors_add_up_over_effects(result):
+    effects = (
+        EFFECTS["anchor_position"]({"6.x": 0.2}, {"6.x": 0.03}),
+        EFFECTS["anchor_position"]({"6.x": 0.1}, {"6.x": 0.04}),
+    )
+    by, std = room.shifts_and_regions(replace(result, effects=EffectSet(effects)))[0][6]
+    assert by[0] == pytest.approx(0.3) and std[0] == pytest.approx(0.05)
+
+
+# --------------------------------------------------------------------------------------------------------- pictures
+
+
+def score(error):
+    """Judged by `errors`, (n, 3) m, while it flies from one cell into the next, ten samples each."""
+    places = np.where(np.arange(20)[:, None] < 10, [0.5, 0.5, 1.5], [1.5, 0.5, 1.5])
+    return SimpleNamespace(t=5.0 + np.arange(20) * 0.1, first=5.0, p=places, error=np.array(error))
+
+
+def test_mean_errors_are_those_of_the_cells():
+    runs = room.flown([score(np.where(np.arange(20)[:, None] < 10, [0.2, 0.0, 0.0], [0.0, 0.0, 0.1]))])
+    places, errors = room.mean_errors(runs, [0, 2])
+    np.testing.assert_allclose(places, [[0.5, 1.5], [1.5, 1.5]])
+    np.testing.assert_allclose(errors, [[0.2, 0.0], [0.0, 0.1]])
+    assert len(room.mean_errors([], [0, 1])[0]) == 0
+
+
+def test_runs_without_an_estimate_are_left_out(result):
+    lost = score(np.full((20, 3), np.nan))
+    assert room.flown([lost]) == []
+    late = score(np.where(np.arange(20)[:, None] < 5, np.nan, 0.1) * np.ones(3))
+    (run,) = room.flown([late])
+    assert len(run.t) == 15 and run.t[0] == pytest.approx(0.5)
+    sides = [{**side, "scores": [lost]} for side in (result.before, result.after)]
+    changed = replace(result, before=sides[0], after=sides[1])
+    assert curves.errors_over_time(changed) == "" and "estimated path" in maps.maps(changed)
+
+
+def test_a_curve_keeps_its_largest_value():
+    t, values = np.arange(10_000) * 0.01, np.zeros(10_000)
+    values[7_777] = 5.0
+    shown = curves._peaks(t, values)
+    assert len(shown[0]) <= curves.BINS and shown[1].max() == 5.0
+
+
+def test_the_smaller_kind_of_picture_is_taken():
+    few, _ = pictures.drawing(2.0)
+    assert "data:image/svg+xml" in pictures.embedded(few, "empty axes", "")
+    many, ax = pictures.drawing(2.0)
+    ax.plot(np.random.default_rng(0).random((20_000, 2)), ".")
+    assert "data:image/png" in pictures.embedded(many, "many dots", "")

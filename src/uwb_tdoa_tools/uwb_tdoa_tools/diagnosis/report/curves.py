@@ -1,0 +1,151 @@
+"""Curves: the error over time, what measurements leave, and functions without a name."""
+
+import numpy as np
+
+from uwb_tdoa_bias.effects.covariates import UNITS
+from uwb_tdoa_bias.effects.wording import listed
+
+from ..channels import CHANNELS
+from ..health import health
+from .markup import grid, paragraphs
+from .pictures import AFTER, BEFORE, COLOURS, drawing, embedded
+from .room import flown
+from .runs import CM, labels
+
+BINS = 300  # of a curve over time; of each the largest is drawn
+MOST = 12  # flights whose errors are drawn
+PAIRS, FEWEST = 16, 20  # that are drawn, and measurements of each
+FUNCTIONS = 12  # that are drawn
+POINTS = 3000  # of a series of residuals
+ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 2, "frameon": False}  # of a legend
+
+
+def errors_over_time(diagnosis):
+    """Markup: the 3D error of every judged flight before and after, the largest marked."""
+    changed = any(finding.added for finding in diagnosis.findings)
+    sides = [("before", BEFORE, diagnosis.before), ("after", AFTER, diagnosis.after)] if changed else []
+    sides = sides or [("error", AFTER, diagnosis.before)]
+    curves = [
+        [(title, colour, run) for title, colour, side in sides for run in flown(side["scores"][k : k + 1])]
+        for k in range(len(diagnosis.before["scores"]))
+    ]
+    runs = [(name, each) for name, each in zip(labels(diagnosis), curves) if each]
+    if not runs:
+        return ""
+    note = f"Distance between estimate and ground truth, judged on {diagnosis.judged_on}. Dots mark the largest."
+    if len(runs) > MOST:
+        note += f" The first {MOST} of {len(runs)} are shown."
+    top = CM * max(run.distance.max() for _, each in runs[:MOST] for _, _, run in each)
+    return paragraphs([note], "note") + grid([_errors(name, each, top) for name, each in runs[:MOST]])
+
+
+def _errors(name, each, top):
+    """One picture; each : [(title, colour, Flown)]; top : cm, largest error that is to be seen."""
+    figure, ax = drawing(2.4)
+    for title, colour, run in each:
+        t, distance, k = run.t, CM * run.distance, int(np.argmax(run.distance))
+        ax.plot(*_peaks(t, distance), color=colour, lw=1.2, label=title)
+        ax.plot(t[k], distance[k], "o", color=colour, ms=5)
+        right = t[k] > 0.5 * t[-1]
+        place = {"xytext": (-6 if right else 6, 3), "textcoords": "offset points", "ha": "right" if right else "left"}
+        ax.annotate(f"{distance[k]:.0f} cm", (t[k], distance[k]), color=colour, fontweight="bold", **place)
+    ax.set(xlabel="time in the air [s]", ylabel="position error [cm]", ylim=(0.0, 1.15 * top))
+    ax.set_title(name, loc="left", fontsize=10)
+    ax.grid(alpha=0.25, lw=0.5)
+    if len(each) > 1:
+        ax.legend(**ABOVE)
+    largest = listed(f"{CM * run.distance.max():.0f} cm ({title})" for title, _, run in each)
+    return embedded(figure, f"Position error over time, {name}: at most {largest}")
+
+
+def _peaks(t, values):
+    """A series with the largest value of each of some bins."""
+    if len(t) <= BINS:
+        return t, values
+    starts = np.linspace(0, len(t), BINS, endpoint=False).astype(int)
+    largest = np.maximum.reduceat(values, starts)
+    return t[starts], largest
+
+
+def residual_series(diagnosis):
+    """Markup: what every channel leaves in the first flight, before and after."""
+    before, after = (_series(found[0]) for found in (diagnosis.attribution.residuals, diagnosis.remaining))
+    note = (
+        f"Measured minus modelled at the place and attitude of the reference, {diagnosis.flights[0].name}. A good "
+        "model leaves a narrow band about zero that does not wander. Where nothing has changed, before lies hidden "
+        "behind after."
+    )
+    names = [name for name in before if name in after]
+    return paragraphs([note], "note") + grid([_residuals(name, before[name], after[name]) for name in names])
+
+
+def _series(flight):
+    """{channel: (stamps, residuals)} of {channel: ChannelResidual}."""
+    return {label: series for part in flight.values() for label, series in part.series().items()}
+
+
+def _residuals(name, *sides):
+    figure, ax = drawing(1.8)
+    for side, colour, title in zip(sides, (BEFORE, AFTER), ("before", "after")):
+        t, r = (values[:: max(1, len(values) // POINTS)] for values in side)
+        ax.plot(t, r, ".", ms=2.0, color=colour, label=title, rasterized=True)
+    limit = 1.3 * np.quantile(np.abs(sides[0][1]), 0.99) + 1e-9
+    ax.set(ylim=(-limit, limit), xlabel="time [s]")
+    ax.set_title(name.replace("^2", "²"), loc="left", fontsize=10)
+    ax.grid(alpha=0.25, lw=0.5)
+    ax.legend(**ABOVE, markerscale=5)
+    scatter = " and ".join(
+        f"{np.std(np.clip(r, -limit, limit)):.2g} {title}" for (_, r), title in zip(sides, ("before", "after"))
+    )
+    return embedded(figure, f"Residual of {name} over time, standard deviation {scatter}")
+
+
+def pairs(diagnosis):
+    """Markup: offset and scatter of every pair of anchors, before and after."""
+    after = {item["pair"]: item for item in health(diagnosis.remaining)["pairs"]}
+    before = {
+        item["pair"]: item for item in diagnosis.health["pairs"] if item["count"] >= FEWEST and item["pair"] in after
+    }
+    names = sorted(before, key=lambda name: -before[name]["count"])[:PAIRS]
+    if not names:
+        return ""
+    figure, ax = drawing(3.0)
+    for shift, side, colour, title in ((-0.15, before, BEFORE, "before"), (0.15, after, AFTER, "after")):
+        bias, spread = (CM * np.array([side[name][key] for name in names]) for key in ("bias", "spread"))
+        ax.errorbar(np.arange(len(names)) + shift, bias, spread, fmt="o", ms=4, color=colour, label=title, lw=1.2)
+    ax.axhline(0.0, color="k", lw=0.6)
+    ax.set(xticks=np.arange(len(names)), xticklabels=names, xlabel="pair of anchors", ylabel="residual [cm]")
+    ax.grid(alpha=0.25, lw=0.5, axis="y")
+    ax.legend(**ABOVE)
+    caption = (
+        "Dots: by how much the measurements of a pair are off, their median; bars: how much they scatter about it."
+    )
+    return embedded(figure, "Offset and scatter of the residual of every pair of anchors, before and after", caption)
+
+
+def functions(diagnosis):
+    """Markup: functions without a name, in the model or not."""
+    return grid([_function(f.effect) for f in diagnosis.findings if not f.declared][:FUNCTIONS])
+
+
+def _function(effect):
+    at = np.linspace(effect.knots[0], effect.knots[-1], 60)
+    prefixes = sorted({key.rpartition("c")[0] for key in effect.values})
+    figure, ax = drawing(2.6)
+    for k, prefix in enumerate(prefixes):
+        style = ("-", "--", ":", "-.")[k // len(COLOURS) % 4]
+        ax.plot(
+            at, effect.curve(at, prefix), COLOURS[k % len(COLOURS)], ls=style, lw=1.4, label=prefix.rstrip(".") or None
+        )
+    over, part = effect.covariate.replace("_", " "), CHANNELS[effect.channel.partition(".")[0]]
+    ax.set(
+        xlabel=f"{over} [{UNITS.get(effect.covariate, 'as recorded')}]",
+        ylabel=f"part of {effect.channel} [{part.unit}]",
+    )
+    ax.grid(alpha=0.25, lw=0.5)
+    if len(prefixes) > 1:
+        ax.legend(title="anchor", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    each = ", a curve for each anchor" if len(prefixes) > 1 else ""
+    return embedded(
+        figure, f"Function of {over} in {effect.channel}", f"What depends on {over} without having a name{each}."
+    )

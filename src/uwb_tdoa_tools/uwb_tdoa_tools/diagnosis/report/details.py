@@ -1,0 +1,150 @@
+"""What is there for who wants to know more: values, errors, residuals, health, words."""
+
+from html import escape
+
+from uwb_tdoa_bias.effects.wording import rounded, significant
+
+from ..channels import CHANNELS
+from . import curves
+from .entries import entries
+from .markup import folded, paragraphs, table
+from .runs import CM, labels
+from .words import used
+
+
+def details(diagnosis):
+    """Folded parts."""
+    return [
+        folded("Every value in effects.yaml", _values(diagnosis)),
+        folded("How sure each finding is", _evidence(diagnosis)),
+        folded("Errors of every run", _errors(diagnosis)),
+        folded("Functions without a name", curves.functions(diagnosis)),
+        folded("What measurements leave, over time", curves.residual_series(diagnosis)),
+        folded("What measurements leave, pair by pair", curves.pairs(diagnosis)),
+        folded("Looked at and not added", _refused(diagnosis)),
+        folded("Health of every channel, before", _health(diagnosis.health)),
+    ]
+
+
+def terms(text):
+    """Meanings of the terms that a text uses."""
+    rows = "".join(f"<dt><b>{escape(name)}</b></dt><dd>{escape(meaning)}</dd>" for name, meaning in used(text).items())
+    return folded("What abbreviations and names of effects mean", f"<dl>{rows}</dl>" if rows else "")
+
+
+def _values(diagnosis):
+    note = (
+        "Standard deviations are those of the fit. A value smaller than two of them is not significant: by itself "
+        "it could be chance, beside the others it may still help. Values without one were set, not estimated. "
+        "Coefficients of functions without a name are in the file alone."
+    )
+    rows = []
+    for effect in (effect for effect in diagnosis.effects.effects if not effect.settings):
+        known = significant(effect)
+        for key, value in effect.values.items():
+            std = effect.std.get(key)
+            sure = "" if std is None else ("yes" if key in known else "no")
+            rows.append(
+                (effect.name, key, rounded(value, std), "" if std is None else rounded(std, std), effect.unit, sure)
+            )
+    if not rows:
+        return ""
+    head = ("effect", "parameter", "value", "standard deviation", "unit", "significant")
+    return paragraphs([note], "note") + table(head, rows, numbers=(2, 3))
+
+
+EVIDENCE = {
+    "criterion": "criterion",
+    "held_out_gain": "gain on data held out",
+    "held_out_t": "its t value",
+    "standard_errors": "standard errors",
+    "scatter_over_air": "scatter over that in the air",
+}
+
+
+def _evidence(diagnosis):
+    if not diagnosis.findings:
+        return ""
+    note = (
+        "Criterion: by how much likelier the measurements are with it, as twice a logarithm, less the price of its "
+        "parameters and of the search. Gain on data held out: the same on stretches that it was not fitted to, "
+        "without any price; its t value says how evenly they agree. Standard errors: the size of what a search of "
+        "its own found, in its uncertainty."
+    )
+    used_keys = [key for key in EVIDENCE if any(key in finding.evidence for finding in diagnosis.findings)]
+    rows = [
+        (entry.title, entry.findings[0].channel, *(entry.findings[0].evidence.get(key) or "" for key in used_keys))
+        for entry in entries(diagnosis)
+    ]
+    head = ("finding", "channel", *(EVIDENCE[key] for key in used_keys))
+    return paragraphs([note], "note") + table(head, rows, numbers=range(2, len(head)))
+
+
+FIGURES = (  # key, title, factor
+    ("rmse_x", "x", CM), ("rmse_y", "y", CM), ("rmse_z", "z", CM), ("rmse_3d", "3D RMSE", CM),
+    ("median_3d", "median", CM), ("max_3d", "largest", CM), ("residual_spread", "scatter of innovations", CM),
+    ("nis_mean", "NIS", 1.0), ("nees_mean", "NEES", 1.0),
+)  # fmt: skip
+
+
+def _errors(diagnosis):
+    before, after = diagnosis.before, diagnosis.after
+    shown = [item for item in FIGURES if before["pooled"].get(item[0]) is not None]
+    names = [*labels(diagnosis), "all"]
+    rows = []
+    for name, first, second in zip(names, [*before["runs"], before["pooled"]], [*after["runs"], after["pooled"]]):
+        intervals = [_interval(side) for side in (first, second)] if first.get("rmse_3d_ci") else []
+        rows.append((name, *(f"{_figure(first, *item)} → {_figure(second, *item)}" for item in shown), *intervals))
+    note = (
+        f"Before → after, on {diagnosis.judged_on}. Errors and scatter in centimetres; NIS and NEES as they are, 1 "
+        "and 3 if the filter judges itself rightly, more if it is too sure."
+    )
+    bounds = ("95 % of 3D RMSE before", "after") if rows and len(rows[0]) > 1 + len(shown) else ()
+    head = ("run", *(title for _, title, _ in shown), *bounds)
+    return paragraphs([note], "note") + table(head, rows, numbers=range(1, len(head)))
+
+
+def _figure(row, key, title, factor):
+    value = row.get(key)
+    return "?" if value is None else f"{value * factor:.{1 if factor > 1.0 else 2}f}"
+
+
+def _interval(row):
+    return " to ".join(f"{bound * CM:.1f}" for bound in row["rmse_3d_ci"] or ()) or "?"
+
+
+def _refused(diagnosis):
+    added = {finding.effect.label for finding in diagnosis.findings if finding.added}
+    rows = [
+        (f"a further part of {item.what}" if item.what in added else item.what, item.why) for item in diagnosis.refused
+    ]
+    return table(("what", "why not"), rows) if rows else ""
+
+
+def _health(health):
+    note = (
+        "Offset: median of what is left; scatter: its spread, as standard deviation of the bulk; far off: share "
+        "beyond four times the scatter; likeness: correlation with what is left 0.1 s later, 0 for white noise. "
+        f"Units: {', '.join(f'{channel.unit} for {name}' for name, channel in CHANNELS.items())}."
+    )
+    parts = [paragraphs([note], "note")]
+    for group, name in (("pairs", "pair"), ("anchors", "anchor"), ("axes", "axis")):
+        rows = [_row(item, name) for item in health[group]]
+        parts.append(
+            table((name, "samples", "offset", "scatter", "far off", "likeness"), rows, range(1, 6)) if rows else ""
+        )
+    crossed = [(" and ".join(item["pairs"]), f"{item['correlation']:.2f}") for item in health["cross_correlation"]]
+    parts.append(table(("pairs that err together", "correlation"), crossed, (1,)) if crossed else "")
+    rows = []
+    for item in health["filter"]:
+        means = [f"{item[key]:.2f}" for key in ("nis_mean", "nees_mean")]
+        rows.append((item["flight"], *means, *(f"{item[key]:.0%}" for key in ("nis_below_3.84", "nees_below_7.81"))))
+    head = ("flight", "NIS", "NEES", "NIS within its 95 % bound", "NEES within its 95 % bound")
+    parts.append(table(head, rows, range(1, 5)) if rows else "")
+    return "".join(parts)
+
+
+def _row(item, name):
+    near = next(iter((item.get("autocorrelation") or {}).values()), None)
+    offset, scatter = (f"{item[key]:.4f}" for key in ("bias", "spread"))
+    return item[name], item["count"], offset, scatter, f"{item['tails']:.1%}", "" if near is None else f"{near:.2f}"

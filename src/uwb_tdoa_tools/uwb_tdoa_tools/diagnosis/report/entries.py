@@ -1,0 +1,146 @@
+"""Findings as a reader wants them: what came into the model together is one entry, with its worth and its doubts."""
+
+from dataclasses import dataclass
+
+from uwb_tdoa_bias.effects.wording import listed, measured, significant
+
+CM = 100.0  # in a metre
+OR = "or"
+LEAST_WORTH = 0.0005  # m; less is no difference
+FORMS = {"common": "", "arrival": " (of each arrival)", "anchor": " (by anchor)"}
+SHOWN = 6  # values
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Findings that came and went together.
+
+    title : of all of them; values : those that are significant, in words; why_not : reason for not being in the model,
+    "" for what is added; alternatives : (Alternative, ...).
+    """
+
+    findings: tuple
+    title: str
+    values: str
+    why_not: str
+    alternatives: tuple
+
+    @property
+    def added(self):
+        """Whether it is in the model that is written."""
+        return self.findings[0].added
+
+    @property
+    def worth(self):
+        """m by which the 3D RMSE is larger without it; None if nobody tried."""
+        return self.findings[0].worth
+
+    @property
+    def advice(self):
+        """What a person can do about it: (sentence, ...)."""
+        return tuple(sentence for finding in self.findings for sentence in finding.effect.advice())
+
+    @property
+    def matters(self):
+        """Whether the position gains from taking it out, as far as anybody knows."""
+        return self.added and (self.worth is None or self.worth >= LEAST_WORTH)
+
+    @property
+    def undecided(self):
+        """Alternatives that fit nearly as well, the nearest first."""
+        return sorted((other for other in self.alternatives if other.gap is not None), key=lambda other: other.gap)
+
+    @property
+    def imitators(self):
+        """Alternatives that explain as much, but would need more, or less plausible, values."""
+        return [other for other in self.alternatives if other.gap is None]
+
+
+def entries(diagnosis):
+    """[Entry] of a Diagnosis: what is added, the most worth first, then what is not."""
+    groups = {}
+    for finding in diagnosis.findings:
+        key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
+        groups.setdefault(key, []).append(finding)
+    out = [_entry(tuple(group), diagnosis.refused) for group in groups.values()]
+    return sorted(out, key=lambda entry: (not entry.added, -(entry.worth or 0.0)))
+
+
+def worth_in_words(entry):
+    """ "1.5 cm" """
+    if entry.worth is None:
+        return "not known"
+    if abs(entry.worth) < LEAST_WORTH:
+        return "less than 0.1 cm"
+    return f"{entry.worth * CM:.1f} cm" if entry.worth > 0.0 else f"nothing ({entry.worth * CM:.1f} cm)"
+
+
+def undecided_in_words(entry):
+    """What it could as well be, and how to tell, one sentence each: list."""
+    return [f"Could as well be {names}; to tell: {flight}." for names, flight in by_flight(entry.undecided)]
+
+
+def doubt_in_words(entry):
+    """What else it could be, and how to tell, one sentence each: list."""
+    imitated = by_flight(entry.imitators)
+    return undecided_in_words(entry) + [
+        f"Could be imitated by {names}, less plausibly; to tell: {flight}." for names, flight in imitated
+    ]
+
+
+def certainty_in_words(entry):
+    """What there is to say where nothing else is named: a sentence."""
+    first = entry.findings[0]
+    if first.candidates:
+        return "Nothing else in the catalogue explains as much."
+    like = first.effect.confounded_with
+    return f"Was not compared with others{f'; may be confused with {listed(like, OR)}' if like else ''}."
+
+
+def by_flight(alternatives):
+    """[(names in words, flight that tells)], one for each such flight."""
+    groups = {}
+    for other in alternatives:
+        groups.setdefault(other.tell_apart, []).append(other.effect)
+    return [(listed(names, "or"), flight) for flight, names in groups.items()]
+
+
+def _entry(findings, refused):
+    first = findings[0]
+    others = {other.effect: other for finding in findings for other in finding.alternatives}
+    return Entry(findings, _title(findings), _values(first), _why_not(first, refused), tuple(others.values()))
+
+
+def _title(findings):
+    effect = findings[0].effect
+    if findings[0].declared:
+        return effect.name
+    covariates = listed(finding.effect.covariate.replace("_", " ") for finding in findings)
+    return f"{effect.channel} over {covariates}{FORMS[effect.form]}"
+
+
+def _values(finding):
+    effect = finding.effect
+    if not finding.declared:
+        return "a smooth function without a name"
+    told = significant(effect)
+    shown = [f"{key} = {measured(value, effect.std.get(key))}" for key, value in effect.values.items() if key in told]
+    rest, vague = shown[SHOWN:], len(effect.values) - len(shown)
+    words = shown[:SHOWN] + ([f"{len(rest)} more"] if rest else [])
+    if not words:
+        return f"{vague} values, none by itself twice its standard deviation"
+    return f"{', '.join(words)} ({effect.unit})" + (f"; {vague} not significant" if vague else "")
+
+
+def _why_not(finding, refused):
+    if finding.added:
+        return ""
+    label = finding.candidates[0].label if finding.candidates else finding.effect.label
+    reasons = {item.what: item.why for item in reversed(refused)}
+    if label in reasons:
+        return reasons[label]
+    if not finding.effect.usable:
+        return "nodes cannot, or need not, take it out"
+    if any(f" + {label} + " in f" + {what} + " for what in reasons):
+        return "judged together with others: see the verdict"
+    return reasons.get("all", "the filter does as well without it")

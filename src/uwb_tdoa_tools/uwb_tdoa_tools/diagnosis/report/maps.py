@@ -1,0 +1,182 @@
+"""The room from above and from the side: anchors, what was found there, and where the estimate errs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.patches import Circle, Ellipse
+
+from .markup import grid
+from .pictures import FOUND, REGION, WIDTH, drawing, embedded, plt
+from .room import CELL, VIEWS, estimated, flown, mean_errors, shifts_and_regions
+
+POINTS = 1500  # of all paths
+GAP = 1.0  # s without an estimate that breaks a path
+BESIDE = 0.7  # m between anchors that share a label
+MARGIN = 0.7  # m around anchors and paths
+LONGEST = 0.11  # of the room, of an arrow
+KEYS = (1, 2, 5, 10, 20, 50, 100, 200)  # cm
+ENLARGED = (1, 2, 3, 5, 10, 20, 50, 100)
+BRIGHT = 0.95  # quantile of the errors at the end of the colours, and of arrows that are to be seen whole
+COLOURS = LinearSegmentedColormap.from_list("error", plt.get_cmap("viridis_r")(np.linspace(0.06, 1.0, 64)))
+ARROW = {"arrowstyle": "-|>", "color": FOUND, "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
+
+
+def maps(diagnosis):
+    """Markup: one map before and one after; one alone if nothing has changed, or nobody knows the errors."""
+    sides = [(name, flown(side["scores"])) for name, side in (("before", diagnosis.before), ("after", diagnosis.after))]
+    if not any(runs for _, runs in sides):
+        return grid([_drawn(diagnosis, "", [], None, Arrows.of(diagnosis, []))])
+    if not any(finding.added for finding in diagnosis.findings):
+        sides = [("", sides[0][1])]
+    distances = np.concatenate([run.distance for _, runs in sides for run in runs])
+    norm = Normalize(0.0, 100.0 * np.quantile(distances, BRIGHT))
+    arrows = Arrows.of(diagnosis, [runs for _, runs in sides])
+    return grid([_drawn(diagnosis, title, runs, norm, arrows) for title, runs in sides])
+
+
+@dataclass(frozen=True)
+class Arrows:
+    """How arrows are drawn, the same on every map. enlarged : times what they are; key : cm, length of the one that is
+    explained."""
+
+    enlarged: int
+    key: int
+
+    @classmethod
+    def of(cls, diagnosis, sides):
+        """For a Diagnosis; sides : lists of Flown."""
+        errors = [mean_errors(runs, view)[1] for runs in sides for view in VIEWS]
+        lengths = np.concatenate([np.zeros(1), *(np.linalg.norm(error, axis=1) for error in errors)])
+        longest = np.quantile(lengths, BRIGHT)  # not that of a start gone wrong
+        shifts = [np.linalg.norm(by) for by, _ in shifts_and_regions(diagnosis)[0].values()]
+        room = np.ptp(diagnosis.flights[0].anchors.positions, axis=0).max()
+        most = LONGEST * room / max(longest, *shifts, 1e-9)
+        return cls(
+            max((factor for factor in ENLARGED if factor <= most), default=1),
+            max((key for key in KEYS if key <= 100.0 * longest), default=KEYS[0]),
+        )
+
+
+def _drawn(diagnosis, title, runs, norm, arrows):
+    low, high = _limits(diagnosis, runs)
+    size = high - low
+    tall = WIDTH * 0.87 * (size[1] + size[2]) / size[0]
+    figure, axes = drawing(min(tall, 2.0 * WIDTH) + 1.6, nrows=2, height_ratios=size[1:])
+    figure.get_layout_engine().set(w_pad=0.1)
+    for ax, view in zip(axes, VIEWS):
+        _path(ax, diagnosis, runs, view, norm)
+        _anchors(ax, diagnosis, view, arrows.enlarged)
+        key = _arrows(ax, runs, view, arrows.enlarged)
+        limits = [(low[k], high[k]) for k in view]
+        ax.set(aspect="equal", xlim=limits[0], ylim=limits[1], xlabel="x [m]", ylabel=f"{'xyz'[view[1]]} [m]")
+        ax.grid(alpha=0.25, lw=0.5)
+        if key is not None:
+            ax.quiverkey(key, 0.8, 1.03, 0.01 * arrows.key, f"{arrows.key} cm", labelpos="E", coordinates="axes")
+    axes[0].set_title(f"{title}: from above".lstrip(": ").capitalize(), loc="left", fontsize=10)
+    axes[1].set_title(f"{title}: from the side".lstrip(": ").capitalize(), loc="left", fontsize=10)
+    if norm is not None:
+        colours = plt.cm.ScalarMappable(norm, COLOURS)
+        figure.colorbar(
+            colours, ax=axes, orientation="horizontal", label="position error [cm]", extend="max", aspect=40, pad=0.02
+        )
+    return embedded(figure, _alt(diagnosis, title, runs), _caption(diagnosis, runs, arrows.enlarged))
+
+
+def _limits(diagnosis, runs):
+    """(lowest (3,), highest (3,)) m of what is drawn."""
+    paths = [run.p for run in runs] or list(map(estimated, diagnosis.remaining))
+    places = [diagnosis.flights[0].anchors.positions, *paths]
+    low, high = (getattr(np.concatenate(places), name)(axis=0) for name in ("min", "max"))
+    return low - MARGIN, high + MARGIN
+
+
+def _path(ax, diagnosis, runs, view, norm):
+    if not runs:
+        for flight in diagnosis.remaining:
+            path = estimated(flight)
+            ax.plot(*path[:: max(1, len(path) // POINTS), view].T, color="0.6", lw=1.0)
+        return
+    every = max(1, sum(len(run.t) for run in runs) // POINTS)
+    for run in runs:
+        t, p, distance = run.t[::every], run.p[::every, view], 100.0 * run.distance[::every]
+        near = np.diff(t) < max(GAP, 2.0 * np.median(np.diff(run.t)) * every)
+        parts, colour = np.stack([p[:-1], p[1:]], axis=1)[near], distance[1:][near]
+        order = np.argsort(colour)  # the worst on top
+        lines = LineCollection(parts[order], array=colour[order], cmap=COLOURS, norm=norm, lw=1.8, rasterized=True)
+        ax.add_collection(lines)
+
+
+def _anchors(ax, diagnosis, view, enlarged):
+    anchors = diagnosis.flights[0].anchors
+    places = dict(zip(anchors.ids.tolist(), anchors.positions[:, view]))
+    shifts, regions = shifts_and_regions(diagnosis)
+    for region in regions:
+        centre = region.centre[view]
+        ax.add_patch(Circle(centre, region.radius, fill=False, ec=REGION, ls="--", lw=1.4, zorder=3))
+        ax.plot(*zip(centre, places[region.anchor]), color=REGION, ls=":", lw=1.0, zorder=3)
+    for anchor, (by, std) in shifts.items():
+        tip = places[anchor] + enlarged * by[view]
+        ax.annotate("", tip, places[anchor], arrowprops=ARROW)
+        width, height = 2.0 * enlarged * np.nan_to_num(std[view])
+        ax.add_patch(Ellipse(tip, width, height, fc=FOUND, alpha=0.25, ec=FOUND, lw=0.8))
+    ax.plot(*anchors.positions[:, view].T, "k^", ms=6, zorder=4)
+    _names(ax, places)
+
+
+def _names(ax, places):
+    """Ids beside anchors; those that stand one behind the other share a label."""
+    labels = {}
+    for anchor, place in places.items():
+        near = next((known for known in labels if np.linalg.norm(place - known) < BESIDE), tuple(place))
+        labels.setdefault(near, []).append(str(anchor))
+    for place, names in labels.items():
+        ax.annotate(
+            ", ".join(names), place, (0, 6), textcoords="offset points", ha="center", fontweight="bold", zorder=5
+        )
+
+
+def _arrows(ax, runs, view, enlarged):
+    """Quiver of the mean errors; None without any."""
+    places, errors = mean_errors(runs, view)
+    if not len(places):
+        return None
+    how = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / enlarged, "width": 0.0045, "minlength": 0.1}
+    return ax.quiver(*places.T, *errors.T, color="k", zorder=6, **how)
+
+
+def _alt(diagnosis, title, runs):
+    shifts, regions = shifts_and_regions(diagnosis)
+    out = [f"Map of {len(diagnosis.flights[0].anchors)} anchors from above and from the side"]
+    if runs:
+        worst = 100.0 * max(run.distance.max() for run in runs)
+        out.append(
+            f"the path flown{f' {title}' if title else ''}, coloured by the position error, at most {worst:.0f} cm"
+        )
+    if shifts:
+        out.append(f"shifts of {len(shifts)} anchors")
+    if regions:
+        out.append(f"{len(regions)} region{'s' if len(regions) > 1 else ''} where an anchor is disturbed")
+    return "; ".join(out)
+
+
+def _caption(diagnosis, runs, enlarged):
+    shifts, regions = shifts_and_regions(diagnosis)
+    times = f", drawn {enlarged} times as long as they are" if enlarged > 1 else ""
+    out = ["Triangles: anchors with their numbers."]
+    if runs:
+        out.append(
+            "Coloured: the true path, dark where the estimate errs most. Black arrows: mean error in cells of "
+            f"{CELL:g} m, from the true place towards the estimate{times}."
+        )
+    else:
+        out.append("Grey: the estimated path.")
+    if shifts:
+        out.append(
+            f"Orange arrows: by how much anchors seem to stand elsewhere than surveyed{times}; "
+            "ellipses: one standard deviation; an arrow shorter than twice that may be chance."
+        )
+    if regions:
+        out.append("Dashed circles: where the tag is when the anchor at the end of the dotted line is heard late.")
+    return " ".join(out)

@@ -1,0 +1,30 @@
+"""The report: one page of HTML that holds everything itself."""
+
+from .curves import errors_over_time
+from .details import details, terms
+from .entries import entries
+from .maps import maps
+from .markup import page, paragraphs, section
+from .sections import head, not_told, to_do, worth
+from .verdict import verdict
+
+
+def html(diagnosis):
+    """The page of a Diagnosis: verdict, what to do, what each effect is worth, map, errors, what could not be told, and
+    folded details."""
+    found = entries(diagnosis)
+    names = ", ".join(flight.name for flight in diagnosis.flights)
+    parts = [
+        head(diagnosis, verdict(diagnosis)),
+        to_do(found),
+        worth(diagnosis, found),
+        section("Where in the room", maps(diagnosis)),
+        section("When in the flight", errors_over_time(diagnosis)),
+        not_told(diagnosis),
+        section(
+            "Details",
+            paragraphs([f"Fitted to {names}, beside {diagnosis.reference.words}."], "note"),
+            *details(diagnosis),
+        ),
+    ]
+    return page(f"Diagnosis of {names}", [*parts, terms("".join(parts))])

@@ -1,0 +1,51 @@
+"""Pictures inside of a page. Importing this takes a second: it loads the drawing library."""
+
+import base64
+import io
+from html import escape
+
+from ...scoring.plots import plt
+
+# Told apart by colour-blind eyes (Okabe and Ito); the purple and the yellow are darker than theirs.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a8437f", "#e69f00", "#56b4e9", "#000000", "#8c8c00")
+AFTER, FOUND, _, REGION, BEFORE = COLOURS[:5]
+WIDTH = 5.6  # in, of one picture
+PIXELS = 96  # of a page in an inch
+LIGHT = 40_000  # bytes, of a picture that need not be smaller
+SHARP = 130  # dots in an inch of what is drawn as dots
+
+_FONT = {
+    "font.family": "sans-serif", "font.sans-serif": ["DejaVu Sans"], "font.size": 9.0, "svg.fonttype": "none",
+    "svg.hashsalt": "report", "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
+}  # fmt: skip
+
+
+def drawing(height, width=WIDTH, **options):
+    """(Figure, axes), height and width in inches; options as of plt.subplots."""
+    with plt.rc_context(_FONT):
+        return plt.subplots(figsize=(width, height), layout="constrained", **options)
+
+
+def embedded(figure, alt, caption=""):
+    """<figure> with a drawn Figure, as SVG, or as PNG where that is smaller and it matters; the Figure is closed.
+
+    alt : what it shows, for who cannot see it; caption : how to read it, if nothing else says so.
+    """
+    with plt.rc_context(_FONT):
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # is laid out now, once for both kinds
+        kinds = {"svg+xml": _saved(figure, "svg", metadata={"Date": None})}
+        if len(kinds["svg+xml"]) > LIGHT:
+            kinds["png"] = _saved(figure, "png")
+    width = round(figure.get_figwidth() * PIXELS)
+    plt.close(figure)
+    kind = min(kinds, key=lambda name: len(kinds[name]))
+    source = f"data:image/{kind};base64,{base64.b64encode(kinds[kind]).decode()}"
+    image = f'<img alt="{escape(alt)}" width="{width}" src="{source}">'
+    return f"<figure>{image}{f'<figcaption>{escape(caption)}</figcaption>' if caption else ''}</figure>"
+
+
+def _saved(figure, kind, **options):
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, dpi=SHARP, **options)
+    return buffer.getvalue()

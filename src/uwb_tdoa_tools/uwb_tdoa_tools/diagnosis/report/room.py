@@ -1,0 +1,67 @@
+"""What is known of places: where the estimate errs, where anchors seem to stand, from where they are blocked."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwb_tdoa_bias.effects.marks import Region, Shift
+
+VIEWS = ([0, 1], [0, 2])  # x and y from above, x and z from the side
+CELL = 1.0  # m
+FEWEST = 0.5  # s in a cell whose mean error is told
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A judged run where its estimate is finite: t (n,) s in the air; p (n, 3) m, true; error (n, 3) m."""
+
+    t: np.ndarray
+    p: np.ndarray
+    error: np.ndarray
+
+    @property
+    def distance(self):
+        """(n,) m, between estimate and truth."""
+        return np.linalg.norm(self.error, axis=1)
+
+
+def flown(scores):
+    """[Flown] of Scores; without those that hold no estimate."""
+    out = []
+    for score in scores:
+        known = np.isfinite(score.error).all(axis=1)
+        if known.sum() > 1:
+            out.append(Flown(score.t[known] - score.first, score.p[known], score.error[known]))
+    return out
+
+
+def mean_errors(runs, view):
+    """Mean errors of [Flown] in cells of a view, two axes: (true places (k, 2) m, mean errors (k, 2) m)."""
+    if not runs:
+        return np.empty((0, 2)), np.empty((0, 2))
+    p, error = (np.concatenate([getattr(run, name)[:, view] for run in runs]) for name in ("p", "error"))
+    label = np.unique(np.floor(p / CELL), axis=0, return_inverse=True)[1].ravel()
+    count = np.bincount(label)
+    means = [np.stack([np.bincount(label, values[:, k]) / count for k in range(2)], axis=1) for values in (p, error)]
+    filled = count * np.median([np.median(np.diff(run.t)) for run in runs]) >= FEWEST
+    return means[0][filled], means[1][filled]
+
+
+def shifts_and_regions(diagnosis):
+    """({anchor id: (by (3,), std (3,))} m, [Region]) of the model that is written, of anchors of the flights."""
+    anchors, shifts, regions = diagnosis.flights[0].anchors, {}, []
+    for mark in (mark for effect in diagnosis.effects.effects for mark in effect.marks(anchors)):
+        if mark.anchor not in anchors.ids:
+            continue
+        if isinstance(mark, Region):
+            regions.append(mark)
+        elif isinstance(mark, Shift):
+            by, std = shifts.get(mark.anchor, (np.zeros(3), np.zeros(3)))
+            shifts[mark.anchor] = by + mark.by, np.hypot(std, mark.std)
+    return shifts, regions
+
+
+def estimated(flight):
+    """(n, 3) m, the path in the air of {channel: ChannelResidual} as estimated, where nobody knows better."""
+    rows = next(iter(flight.values())).rows()
+    return rows.place[np.argsort(rows.t, kind="stable")]

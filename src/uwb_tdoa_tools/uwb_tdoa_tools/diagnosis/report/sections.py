@@ -1,0 +1,131 @@
+"""What everybody should read: verdict, what to do, what each effect is worth, what could not be told."""
+
+from html import escape
+
+from uwb_tdoa_bias.effects.wording import listed
+
+from .apply import APPLY
+from .entries import certainty_in_words, doubt_in_words, undecided_in_words, worth_in_words
+from .markup import bar, folded, listing, paragraphs, section, stacked, table
+from .unclear import by_remedy, untold
+
+
+def head(diagnosis, verdict):
+    """Title and verdict."""
+    names = ", ".join(flight.name for flight in diagnosis.flights)
+    box = f'<div class="verdict {verdict.kind}">{paragraphs(verdict.sentences)}</div>'
+    out = f"<h1>Diagnosis of {escape(names)}</h1>{box}"
+    if diagnosis.before["pooled"].get("rmse_3d") is None:
+        return out
+    return out + paragraphs(
+        [
+            "The error is the distance between estimate and ground truth in the air, as root mean square (RMSE). "
+            "The intervals come from drawing the blocks of 5 s of the judged flights again and again: they hold for "
+            "flights like these."
+        ],
+        "note",
+    )
+
+
+def to_do(found):
+    """What to do in the hall, and how to let the filter do the rest. found : [Entry]."""
+    added = [entry for entry in found if entry.added]
+    urgent = [entry for entry in added if entry.matters and entry.advice]
+    rest = [entry for entry in found if not entry.matters and entry.advice]
+    nameless = [entry.title for entry in added if not entry.advice]
+    parts = [listing([(entry.advice, _known_with(entry)) for entry in urgent], ordered=True)]
+    if not urgent:
+        parts += paragraphs(["Nothing that the position is known to gain from."])
+    if nameless:
+        parts += paragraphs([f"Leave to effects.yaml what has no known cause in the hall: {'; '.join(nameless)}."])
+    if rest:
+        parts.append("<h3>Seen too, less urgent</h3>")
+        parts += paragraphs(
+            ["Nobody has seen the position gain from taking it out of the measurements, or it cannot be taken out."],
+            "note",
+        )
+        parts.append(listing([(entry.advice, ()) for entry in rest]))
+    return section("What to do in the hall", *parts, _apply() if added else "")
+
+
+def _known_with(entry):
+    """What has to be known with its advice: [sentence]."""
+    worth = (
+        []
+        if entry.worth is None
+        else [f"Worth {worth_in_words(entry)} of position{', together' * (len(entry.advice) > 1)}."]
+    )
+    doubt = " ".join(undecided_in_words(entry))
+    return worth + ([f"Make sure first: this {doubt[0].lower()}{doubt[1:]}"] if doubt else [])
+
+
+def _apply():
+    lines = "".join(
+        f"<dt><code>{escape(command)}</code></dt><dd class='note'>{escape(what)}</dd>" for command, what in APPLY
+    )
+    text = (
+        "effects.yaml, beside this page, takes out what the model lacked, whether or not anything is done in the "
+        "hall. Once something is set right there, fly and diagnose again: the file then takes out too much. Both "
+        "nodes take the same file:"
+    )
+    return f"<h3>Apply effects.yaml</h3>{paragraphs([text])}<dl>{lines}</dl>"
+
+
+def worth(diagnosis, found):
+    """What was found, and what each is worth in centimetres of position. found : [Entry]."""
+    if not found:
+        return ""
+    largest = max((entry.worth or 0.0 for entry in found), default=0.0)
+    head = ("effect", "worth in position", "what else it could be")
+    rows = [[_name(entry), _worth(entry, largest), _else(entry)] for entry in found]
+    note = [
+        "By how much the position error (3D RMSE) grows if this one alone is left out, each flight with effects "
+        "fitted to the others, or each half of it. Effects that can stand in for each other are each worth less "
+        "than both together: the figures need not add up to the gain of all."
+        if diagnosis.reference.judges
+        else "Nobody knows what each is worth for the position: without ground truth there is no error to compare."
+    ]
+    return section("What each effect is worth", paragraphs(note, "note"), stacked(head, rows))
+
+
+def _name(entry):
+    effect = entry.findings[0].effect
+    physics = effect.physics if entry.findings[0].declared else "structure that no effect of the catalogue explains"
+    return f"<b>{escape(entry.title)}</b><br><small>{escape(physics)}</small>"
+
+
+def _else(entry):
+    return "<br>".join(map(escape, doubt_in_words(entry) or [certainty_in_words(entry)]))
+
+
+def _worth(entry, largest):
+    if entry.why_not:
+        return f"not in effects.yaml: {escape(entry.why_not)}"
+    if entry.worth is None:
+        return "not known"
+    drawn = bar(entry.worth / largest) if largest > 0.0 and entry.matters else ""
+    return f"{drawn}{escape(worth_in_words(entry))}"
+
+
+def not_told(diagnosis):
+    """What could not be told, and what would."""
+    items = untold(diagnosis)
+    parts = [
+        table(
+            ("what would tell", "effects that could be there unseen"),
+            [(told_by, listed(what)) for told_by, what in by_remedy(items).items()],
+        )
+        if by_remedy(items)
+        else "<p>Every effect that is fitted shows in these flights, if it is there.</p>"
+    ]
+    every = [(item.effect, item.what or "all of it", item.told_by) for item in items if item.what or not item.harmless]
+    parts.append(
+        folded(
+            "Every combination of parameters that leaves too little trace",
+            paragraphs(["They were not fitted further than what is plausible anyway."], "note"),
+            table(("effect", "parameters", "what would tell"), every),
+        )
+        if every
+        else ""
+    )
+    return section("What could not be told", *parts)

@@ -1,0 +1,88 @@
+"""What could not be told, and what would tell."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_bias.effects.wording import listed
+
+from ..channels import CHANNELS
+
+NOTHING = 1e-9  # largest contribution, relative to those of its parts, of a combination that cancels
+NAMED = 6  # parameters of a combination that are named
+GROUND_TRUTH = "ground truth, from motion capture for example"
+CANCELS = "nothing: it cancels in every measurement, and hence does no harm"
+
+
+@dataclass(frozen=True)
+class Untold:
+    """effect : name; what : of it, in words, "" for all of it; told_by : which flight, mark or sensor would tell, in
+    words; harmless : whether it cancels in every measurement."""
+
+    effect: str
+    what: str
+    told_by: str
+    harmless: bool
+
+
+def untold(diagnosis):
+    """[Untold], one for each of diagnosis.unobservable."""
+    out = []
+    for item in diagnosis.unobservable:
+        told_by = _told_by(item, diagnosis)
+        out.append(Untold(item.effect, _what(item), told_by, told_by is CANCELS))
+    return out
+
+
+def by_remedy(items):
+    """{what would tell: [effect and what of it, in words]} of Untolds that could do harm."""
+    groups = {}
+    for item in items:
+        if not item.harmless:
+            groups.setdefault(item.told_by, {}).setdefault(item.effect, []).append(item.what)
+    return {told_by: [_few(*each) for each in effects.items()] for told_by, effects in groups.items()}
+
+
+def _few(effect, whats):
+    if whats == [""]:
+        return effect
+    if len(whats) > 2 or "combination" in whats[0]:
+        return f"{effect} ({len(whats)} combination{'s' if len(whats) > 1 else ''} of its parameters)"
+    return f"{effect} ({'; '.join(whats)})"
+
+
+def _what(item):
+    if item.direction is None:
+        return ""
+    if len(item.direction) == 1:
+        return next(iter(item.direction))
+    if len(item.direction) > NAMED and len({abs(weight) for weight in item.direction.values()}) > 1:
+        return f"a combination of {len(item.direction)} parameters"
+    sides = [[key for key, weight in item.direction.items() if weight * sign > 0.0] for sign in (1, -1)]
+    first, second = sorted(sides, key=len, reverse=True)
+    together = f"{listed(first)} together" if len(first) > 1 else first[0]
+    return f"{together} against {listed(second)}" if second else together
+
+
+def _told_by(item, diagnosis):
+    effect = EFFECTS[item.effect]
+    alone = not diagnosis.reference.judges
+    if item.direction is None:
+        return GROUND_TRUTH if alone and effect.needs_reference else CHANNELS[effect.channels[0]].needs
+    size, parts = _contribution(item, diagnosis)
+    if parts > 0.0 and size <= NOTHING * parts:
+        return CANCELS
+    if parts == 0.0 and effect.uses_attitude:
+        return "ground truth of the attitude"
+    if alone:
+        return GROUND_TRUTH
+    return "a flight through other places, headings, heights and speeds"
+
+
+def _contribution(item, diagnosis):
+    """Largest contribution to any row: of the combination, and of its parts alone."""
+    table = diagnosis.attribution.selection.table
+    places = {(column.effect[0], column.key): place for column, place in table.columns.items()}
+    x = table.x[:, [places[item.effect, key] for key in item.direction]]
+    return np.abs(x @ list(item.direction.values())).max(), np.abs(x).max()

@@ -1,0 +1,154 @@
+"""The verdict: the error before and after, on which data, and how sure that is."""
+
+from dataclasses import dataclass
+
+from ..judging import LEAST_EXPLAINED
+
+CM = 100.0  # in a metre
+ERROR = "The position error (3D RMSE)"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """headline : one sentence; more : (sentence, ...), what has to be known with it; kind : "better", "unsure" (it may
+    be chance), "same" (nothing is added), "nothing" (nothing was found) or "unknown" (no ground truth)."""
+
+    headline: str
+    more: tuple
+    kind: str
+
+    @property
+    def sentences(self):
+        """All of it: tuple."""
+        return (self.headline, *self.more)
+
+
+def verdict(diagnosis):
+    """Verdict of a Diagnosis."""
+    if diagnosis.after["pooled"].get("rmse_3d") is None:
+        return _without_truth(diagnosis)
+    if not any(finding.added for finding in diagnosis.findings):
+        return _nothing_added(diagnosis)
+    return _judged(diagnosis)
+
+
+def centimetres(value):
+    """ "20.2 cm" of metres."""
+    return f"{value * CM:.1f} cm"
+
+
+def percent(interval):
+    """ "66 to 72 %" of shares."""
+    return f"{interval[0] * 100:.0f} to {interval[1] * 100:.0f} %"
+
+
+def _share(value):
+    return f"{value * 100:.0f} %"
+
+
+def _bounds(interval):
+    return f"{interval[0] * CM:.1f} to {interval[1] * CM:.1f}" if interval else "unknown"
+
+
+def _judged(diagnosis):
+    before, after = diagnosis.before["pooled"], diagnosis.after["pooled"]
+    gain, interval = 1.0 - after["rmse_3d"] / before["rmse_3d"], after.get("rmse_3d_gain_ci")
+    change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
+    more = [_intervals(before, after, interval), f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}."]
+    more += [*_caveats(diagnosis), *_worse(diagnosis), *_diverged(diagnosis)]
+    if interval and interval[0] > 0.0:
+        return Verdict(f"{ERROR} falls {change}: {_share(gain)} of it is gone.", tuple(more), "better")
+    more.append(
+        "More flights to judge on (--holdout) make that certain; until then compare before relying on effects.yaml."
+    )
+    return Verdict(f"It is not certain that the position error (3D RMSE) falls: {change}.", tuple(more), "unsure")
+
+
+def _intervals(before, after, gain):
+    sides = [f"{_bounds(side['rmse_3d_ci'])} cm {name}" for side, name in ((before, "before"), (after, "after"))]
+    share = 1.0 - after["rmse_3d"] / before["rmse_3d"]
+    return (
+        f"95 % intervals: {', '.join(sides)}; gain {_share(share)} ({percent(gain)})."
+        if gain
+        else f"95 % intervals: {', '.join(sides)}."
+    )
+
+
+def _nothing_added(diagnosis):
+    pooled, found = diagnosis.before["pooled"], len({finding.key for finding in diagnosis.findings})
+    interval = f"95 % interval {_bounds(pooled['rmse_3d_ci'])} cm"
+    more = (f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {_flights(diagnosis)}.", *_diverged(diagnosis))
+    if not found:
+        return Verdict(
+            "Nothing was found: what the model leaves of the measurements looks like noise.", more, "nothing"
+        )
+    what = (
+        "One effect was found, but taking it out does"
+        if found == 1
+        else f"{found} effects were found, but taking them out does"
+    )
+    return Verdict(f"{what} not make the position better; nothing is added to the model.", more, "same")
+
+
+def _without_truth(diagnosis):
+    before, after = (side["pooled"]["residual_spread"] for side in (diagnosis.before, diagnosis.after))
+    scatter = f"Innovations (measured minus predicted TDOAs) scatter by {centimetres(before)}"
+    if not diagnosis.findings:
+        headline = "Nothing was found: what the model leaves of the measurements looks like noise."
+        return Verdict(headline, (_UNKNOWN, f"{scatter}."), "nothing")
+    if not any(finding.added for finding in diagnosis.findings):
+        headline = (
+            "Nothing of what was found is added to the model: nobody can tell whether it would help the position."
+        )
+        decided = diagnosis.refused[len(diagnosis.attribution.refused) :]
+        why = tuple(f"Not added, {item.what}: {item.why}." for item in decided)
+        return Verdict(headline, (_UNKNOWN, *why, f"{scatter}."), "unknown")
+    headline = "What was found makes measurements agree better; what that is worth for the position is unknown."
+    borne_out = (
+        f"It is added because it explains at least {LEAST_EXPLAINED * 100:.0f} % of what is slow in the innovations of "
+        "flights, or halves of one, that it was not fitted to."
+    )
+    change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
+    return Verdict(headline, (_UNKNOWN, borne_out, change), "unknown")
+
+
+_UNKNOWN = "Without ground truth nobody knows the position error, neither before nor after."
+
+
+def _names(diagnosis):
+    """Of the flights that were judged, each once."""
+    return list(dict.fromkeys(run["flight"] for run in diagnosis.before["runs"]))
+
+
+def _flights(diagnosis):
+    count = len(_names(diagnosis))
+    seconds = sum(score.last - score.first for score in diagnosis.before["scores"])
+    return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s in the air"
+
+
+def _caveats(diagnosis):
+    out, base = [], len(diagnosis.effects) - sum(finding.added for finding in diagnosis.findings)
+    if base > 0:
+        out.append(f"Before is with the {base} effect{'s' if base > 1 else ''} that the model held already.")
+    if set(_names(diagnosis)) & {flight.name for flight in diagnosis.flights}:
+        out.append("Which effects to add was decided on these same flights; flights given as --holdout judge that too.")
+    elif len(_names(diagnosis)) == 1:
+        out.append("One flight does not tell how much flights differ.")
+    return out
+
+
+def _worse(diagnosis):
+    runs = list(zip(diagnosis.before["runs"], diagnosis.after["runs"]))
+    worse = [(b["rmse_3d"], a["rmse_3d"], b["flight"]) for b, a in runs if a["rmse_3d"] > b["rmse_3d"]]
+    if not worse or len(runs) == 1:
+        return []
+    before, after, name = max(worse, key=lambda run: run[1] - run[0])
+    much = f"most on {name}, from {centimetres(before)} to {centimetres(after)}"
+    return [f"On {len(worse)} of {len(runs)} runs the error grows, {much}."]
+
+
+def _diverged(diagnosis):
+    before, after = (sum(run["diverged"] for run in side["runs"]) for side in (diagnosis.before, diagnosis.after))
+    if not before and not after:
+        return []
+    return [f"Of {len(diagnosis.before['runs'])} runs, {before} diverged before and {after} after."]

@@ -1,0 +1,145 @@
+"""Height, pressure and velocity on measured flights: what each is worth, and what faults put into them do."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.foundation.flight import Velocity
+from uwb_tdoa_bias.foundation.pressure import altitude_of, pressure_at
+from uwb_tdoa_ekf.core.config import FilterConfig
+
+from .. import options
+from ..readers import inputs
+from ..scoring.evaluation import evaluate
+from ..scoring.metrics import airborne
+
+AIDS = "height", "pressure", "velocity"
+SETS = (), ("height",), ("pressure",), ("height", "pressure"), ("velocity",), ("height", "velocity")
+VELOCITY_RATE, VELOCITY_STD = 25.0, 0.1  # Hz, m/s: of a velocity made of the ground truth, where none was recorded
+TAKE_OFF = 0.2  # s into the airborne part, whose largest error is told
+GRACE = 3.0  # s after the beginning of a fault that do not count
+ONSET = 8.0  # s into the airborne part at which a fault begins that is not there from the start
+STEPS = 0.3, -0.5, 0.8  # m, of the ground below, one after the other,
+STEP_PERIOD, STEP_LENGTH = 6.0, 3.0  # s between their beginnings, and of each
+
+
+def add_options(add):
+    """add : add_argument of a parser."""
+    add("table", choices=("worth", "faults"), help="what each aid is worth, or what faults put into them do")
+    add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
+    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    add("-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[], help="one filter parameter")
+
+
+def run(args):
+    """Print one of the two tables."""
+    config = options.with_parameters(FilterConfig(), args.parameters)
+    flights = [with_velocity(flight) for flight in inputs.load_flights(args.flights, args.survey)]
+    {"worth": worth, "faults": faults}[args.table](flights, config)
+
+
+def with_velocity(flight):
+    """The flight with a velocity in the body frame, made of its ground truth and noise."""
+    truth = flight.truth
+    t = np.arange(truth.t[0] + 0.1, truth.t[-1] - 0.1, 1.0 / VELOCITY_RATE)
+    ends = [np.stack([np.interp(t + s, truth.t, truth.p[:, k]) for k in range(3)], axis=1) for s in (-0.05, 0.05)]
+    near = truth.q[np.clip(np.searchsorted(truth.t, t), 0, len(truth) - 1)]
+    v = Rotation.from_quat(near).inv().apply((ends[1] - ends[0]) / 0.1)
+    noise = VELOCITY_STD * np.random.default_rng(0).standard_normal(v.shape)
+    return replace(flight, velocity=Velocity(t, v + noise, np.full(v.shape, VELOCITY_STD)))
+
+
+def only(flight, names):
+    """The flight with no other aids than those of these names."""
+    return replace(flight, **{name: None for name in AIDS if name not in names})
+
+
+def worth(flights, config):
+    """Table of the errors with each set of aids: means over the flights, the largest, and the least coverage of an axis."""
+    print("| aids | x | y | z | 3D | largest 3D | at take-off | NEES | coverage |\n|---|" + 8 * "---:|")
+    for names in SETS:
+        scores = [evaluate(only(flight, names), config)[0] for flight in flights]
+        rows = [score.row() for score in scores]
+        take_off = max(np.linalg.norm(s.error[s.t < s.first + TAKE_OFF], axis=1).max() for s in scores)
+        means = [np.mean([row[f"rmse_{axis}"] for row in rows]) for axis in ("x", "y", "z", "3d")]
+        nees = [row["nees_mean"] for row in rows]
+        least = min(row[f"coverage_3sigma_{axis}"] for row in rows for axis in "xyz")
+        cells = [f"{value:.3f}" for value in (*means, max(row["rmse_3d"] for row in rows), take_off)]
+        cells += [f"{min(nees):.1f} - {max(nees):.1f}", f"{least:.3f}"]
+        print(f"| {', '.join(names) or 'none'} | {' | '.join(cells)} |")
+
+
+def faults(flights, config):
+    """Table of the 3D RMSE with a faulty aid over that without the aid: one row per fault."""
+    print("| fault | mean 3D without | sound | faulty | largest faulty / without |\n|---|---:|---:|---:|---:|")
+    plain = [evaluate(only(flight, ()), config)[0] for flight in flights]
+    for name, (aid, from_start, change) in FAULTS.items():
+        rows = []
+        for flight, none in zip(flights, plain):
+            begin = airborne(flight.truth)[0] + (0.0 if from_start else ONSET)
+            sound = only(flight, (aid,))
+            faulty = replace(sound, **{aid: change(getattr(sound, aid), begin)})
+            scores = none, *(evaluate(each, config)[0] for each in (sound, faulty))
+            rows.append([_rmse(score, begin) for score in scores])
+        rows = np.array(rows)
+        without, with_sound, with_faulty = rows.mean(axis=0)
+        worst = int(np.argmax(rows[:, 2] / rows[:, 0]))
+        ratio = rows[worst, 2] / rows[worst, 0]
+        print(f"| {name} | {without:.3f} | {with_sound:.3f} | {with_faulty:.3f} | {ratio:.2f} ({flights[worst].name}) |")
+
+
+def _rmse(score, begin):
+    counted = (score.t < begin) | (score.t > begin + GRACE)
+    return float(np.sqrt(np.mean(np.sum(score.error[counted] ** 2, axis=1))))
+
+
+def _range(change):
+    """Fault of a Height, by what it makes of (stamps since the beginning, ranges)."""
+    return lambda height, begin: replace(height, range=change(height.t - begin, height.range))
+
+
+def _steps(since, distance):
+    number = np.floor(since / STEP_PERIOD).astype(int)
+    on_it = (since >= 0.0) & (since % STEP_PERIOD < STEP_LENGTH)
+    return np.maximum(distance - np.where(on_it, np.take(STEPS, number % len(STEPS)), 0.0), 0.02)
+
+
+def _stuck(since, distance):
+    return np.where(since < 0.0, distance, distance[np.searchsorted(since, 0.0)])
+
+
+def _drifting(pressure, begin):
+    extra = np.maximum(pressure.t - begin, 0.0) / 60.0
+    return replace(pressure, pressure=pressure_at(altitude_of(pressure.pressure) + extra))
+
+
+def _slipping(velocity, begin):
+    slips = ((velocity.t - begin) % 10.0 < 2.0) & (velocity.t > begin)
+    return replace(velocity, v=np.where(slips[:, None], 0.0, velocity.v))
+
+
+def _turned(velocity, begin):
+    return replace(velocity, v=Rotation.from_euler("z", np.pi / 2).apply(velocity.v))
+
+
+FAULTS = {  # name: aid, whether it is there from the start, and what it makes of the stream
+    "height: steps of 0.3 to 0.8 m": ("height", False, _range(_steps)),
+    "height: out of range for 5 s": (
+        "height", False, _range(lambda since, r: np.where((since > 0.0) & (since < 5.0), np.inf, r)),
+    ),
+    "height: stuck": ("height", False, _range(_stuck)),
+    "height: stuck on the floor": ("height", True, _range(lambda since, r: np.full(len(r), r[0]))),
+    "height: stuck at 1 m from the start": ("height", True, _range(lambda since, r: np.ones(len(r)))),
+    "height: near 0 with noise, from the start": (
+        "height", True, _range(lambda since, r: 0.02 + 0.005 * np.random.default_rng(0).random(len(r))),
+    ),
+    "height: mm for m": ("height", True, _range(lambda since, r: 1000.0 * r)),
+    "height: sign": ("height", True, _range(lambda since, r: -r)),
+    "height: one in five 1 m too long": (
+        "height", True, _range(lambda since, r: r + (np.random.default_rng(0).random(len(r)) < 0.2)),
+    ),
+    "pressure: drifts 1 m per minute": ("pressure", True, _drifting),
+    "velocity: slips for 2 s of 10": ("velocity", False, _slipping),
+    "velocity: turned by 90 degrees": ("velocity", True, _turned),
+}  # fmt: skip
