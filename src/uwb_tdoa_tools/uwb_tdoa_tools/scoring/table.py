@@ -16,7 +16,10 @@ def head():
 
 def line(row):
     """One run, `Score.row`, or several, `pooled`."""
-    return _line(row["flight"], (f"{row[key]:.3f}" for key in COLUMNS)) + ("  DIVERGED" if row["diverged"] else "")
+    word = ""
+    if row["diverged"]:
+        word = "  LATE START" if row["diverged"] == row["late_start"] else "  DIVERGED"
+    return _line(row["flight"], (f"{row[key]:.3f}" for key in COLUMNS)) + word
 
 
 def lines_of_errors(scores):
