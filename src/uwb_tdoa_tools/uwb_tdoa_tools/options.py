@@ -14,7 +14,9 @@ from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
 from .readers import inputs
 
-TOPICS = ("uwb/tdoa", "uwb/anchors", "imu/data", "ground_truth/pose", "odometry")  # that are read from bags
+TOPICS = (  # that are read from bags
+    "uwb/tdoa", "uwb/anchors", "imu/data", "height", "pressure", "velocity", "ground_truth/pose", "odometry",
+)  # fmt: skip
 
 
 def add_recordings(parser, nargs="+"):

@@ -1,7 +1,7 @@
 """What is fuzzed: every function that reads a file from outside, each with bytes. It may return or raise InputError.
 
-A target that is protected by a checksum is also entered behind it (`*_sealed`): what a fuzzer changes would not get past
-it otherwise.
+A target that is protected by a checksum is also entered behind it (`*_sealed`): what a fuzzer changes would not get
+past it otherwise.
 """
 
 from functools import lru_cache
@@ -181,13 +181,17 @@ def model(data):
 
 def _finite(flight):
     """What is read is finite: AssertionError otherwise. (A height of inf or NaN says that nothing was in range.)"""
-    finite = dict(tdoa="tabd", imu=("t", "gyro", "accel"), truth="tp", height="t", pressure=("t", "pressure"), velocity="t")
+    finite = {
+        "tdoa": "tabd", "imu": ("t", "gyro", "accel"), "truth": "tp",
+        "height": "t", "pressure": ("t", "pressure"), "velocity": "t",
+    }  # fmt: skip
     for stream, names in finite.items():
         part = getattr(flight, stream)
         for name in names if part is not None else ():
             assert np.isfinite(getattr(part, name)).all(), (stream, name)
     if flight.velocity is not None:
-        assert (flight.velocity.std >= 0.0).all() and np.isfinite(flight.velocity.v[np.isfinite(flight.velocity.std)]).all()
+        measured = np.isfinite(flight.velocity.std)
+        assert (flight.velocity.std >= 0.0).all() and np.isfinite(flight.velocity.v[measured]).all()
 
 
 def _repacked(data):
@@ -227,11 +231,11 @@ def _bag_of(topic, msgtype, data):
         return struct.pack("<BQ", kind, len(content)) + content
 
     parts = [record(mcap.HEADER, text("ros2") + text(""))]
-    for number, (name, kind, content) in enumerate((("/uwb/tdoa", TDOA, _tdoa()), (topic, msgtype, data)), start=1):
-        schema = struct.pack("<H", number) + text(kind) + text("ros2msg") + text(_definition(kind))
+    for place, (name, kind, content) in enumerate((("/uwb/tdoa", TDOA, _tdoa()), (topic, msgtype, data)), start=1):
+        schema = struct.pack("<H", place) + text(kind) + text("ros2msg") + text(_definition(kind))
         parts.append(record(mcap.SCHEMA, schema))
-        parts.append(record(mcap.CHANNEL, struct.pack("<HH", number, number) + text(name) + text("cdr") + bytes(4)))
-        parts.append(record(mcap.MESSAGE, struct.pack("<HIQQ", number, 0, number, number) + content))
+        parts.append(record(mcap.CHANNEL, struct.pack("<HH", place, place) + text(name) + text("cdr") + bytes(4)))
+        parts.append(record(mcap.MESSAGE, struct.pack("<HIQQ", place, 0, place, place) + content))
     parts += [record(mcap.DATA_END, bytes(4)), record(mcap.FOOTER, bytes(20))]
     return mcap.MAGIC + b"".join(parts) + mcap.MAGIC
 
@@ -239,8 +243,8 @@ def _bag_of(topic, msgtype, data):
 TARGETS = {
     function.__name__: function
     for function in (
-        yaml, anchors, effects, config, antenna, places, survey, table, log, log_sealed, log_salvaged, csv, csv_salvaged,
-        bag_mcap, bag_mcap_sealed, bag_mcap_salvaged, bag_sqlite, bag_sqlite_salvaged, bag_metadata, bag_message,
+        yaml, anchors, effects, config, antenna, places, survey, table, log, log_sealed, log_salvaged, csv,
+        csv_salvaged, bag_mcap, bag_mcap_sealed, bag_mcap_salvaged, bag_sqlite, bag_sqlite_salvaged, bag_metadata, bag_message,
         flyable, flyable_sealed, bias_map, bias_map_sealed, model,
     )
 }  # fmt: skip

@@ -37,7 +37,7 @@ __all__ = [
     "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry", "write_bag",
 ]  # fmt: skip
 
-_AIDS = {  # topic and field of Flight: its type, messages of it, a row of a message, which numbers of rows may be, it of rows
+_AIDS = {  # topic and field of Flight: its type, messages of it, a row of a message, what may be in rows, it of rows
     "height": (
         "sensor_msgs/msg/Range", bag_messages.height_messages, bag_messages.height_row, bag_messages.height_sound,
         bag_messages.height_of,
@@ -197,8 +197,8 @@ def read_odometry(path, namespace="", salvage=False, topics=None):
         found = _find(path, names, topic, "nav_msgs/msg/Odometry")
         t, rows, _ = _table(path, reader, found, bag_messages.odometry_row)
     if not len(t):
-        others = ", ".join(name for name in names if name.endswith("/odometry"))
-        remedy = f"say which to take (--topic odometry={others})" if others else "record the output of the filter"
+        others = " or ".join(f"--topic odometry={name}" for name in names if name.endswith("/odometry"))
+        remedy = f"say which to take ({others})" if others else "record the output of the filter"
         raise InputError(f"{path}: has no message on {topic}; {remedy}.")
     p, v, q = rows[:, 0:3], rows[:, 3:6], rows[:, 6:10]
     known = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0.0)
