@@ -16,8 +16,11 @@ SETTLE_LIMIT = 60.0  # s for the diagnostics of the nodes to settle
 PATIENCE = {"bias_node": "hold", "ekf_node": "lag"}  # parameters, s of stamps
 TROUBLE = {  # {node: {key in its diagnostics: words}}
     "bias_node": {"released before their pose": "TDOAs corrected before their pose was there"},
-    "ekf_node": {"late": "TDOAs late", "imu_late": "IMU samples late"},
-}
+    "ekf_node": {
+        "late": "TDOAs late", "imu_late": "IMU samples late", "height_late": "heights late",
+        "pressure_late": "pressures late", "velocity_late": "velocities late",
+    },
+}  # fmt: skip
 RECEIVED = {  # {node: {key in its diagnostics: what it counts}}
     "bias_node": {"received": "TDOAs"},
     "ekf_node": {"TDOAs received": "TDOAs", "IMU samples received": "IMU samples"},
@@ -28,7 +31,8 @@ class Nodes:
     """bias_node and ekf_node in our namespace, as far as they are there."""
 
     def __init__(self, node):
-        """Raises InputError if their parameters do not allow to wait for what is on its way."""
+        """Raises InputError if their parameters do not allow to wait for what is on its way, or if one says nothing on
+        /diagnostics."""
         self._node, self._diagnostics = node, Diagnostics(node)
         space = node.get_namespace()
         there = node.get_node_names_and_namespaces()
@@ -36,6 +40,11 @@ class Nodes:
         if len(self._names) == len(TROUBLE):
             self._check_patience()
         self._before = self._counts(bool)
+        for name in self._names:
+            if not self._before[name]:
+                raise InputError(
+                    f"--follow: {self._names[name]} says nothing on /diagnostics for {SETTLE_LIMIT:g} s; start it again."
+                )
 
     def wrong(self, player, stop):
         """{what went wrong since: how often}, once the diagnostics have settled or `stop` is true. player : Player, who

@@ -24,8 +24,11 @@ MATCHED = {
 PATIENCE = {"bias_node": {"hold": 9.975}, "ekf_node": {"lag": 10.0}}  # s of stamps; hold: see config/bias_node.yaml
 RELIABLE = {
     "bias_node": ("/uwb/tdoa.subscription", "/odometry.subscription", "/uwb/tdoa_corrected.publisher"),
-    "ekf_node": ("/imu/data.subscription", "/uwb/tdoa_corrected.subscription", "/odometry.publisher"),
-}
+    "ekf_node": (
+        "/imu/data.subscription", "/uwb/tdoa_corrected.subscription", "/height.subscription", "/pressure.subscription",
+        "/velocity.subscription", "/odometry.publisher",
+    ),
+}  # fmt: skip
 DEPTH = 1_000_000  # messages that may wait in a subscription
 READY_LIMIT = 180.0  # s: the very first start compiles the filter
 MATCH_LIMIT = 60.0  # s
