@@ -99,7 +99,12 @@ def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
 def delayed(bag, out, count=10, delay=1_000_000_000):
     """A copy of a bag in which some TDOAs from the middle were recorded a second after their stamps."""
     with open_bag(bag) as reader, new_bag(out) as writer:
-        made = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=typestore()) for c in reader.connections}
+        made = {
+            c.topic: writer.add_connection(
+                c.topic, c.msgtype, typestore=typestore(), offered_qos_profiles=c.ext.offered_qos_profiles
+            )
+            for c in reader.connections
+        }
         found = [(stamp, c.topic, data) for c, stamp, data in messages(bag, reader, reader.connections)]
         tdoas = [number for number, (_, topic, _) in enumerate(found) if topic == "/uwb/tdoa"]
         for number in tdoas[len(tdoas) // 2 :][:count]:

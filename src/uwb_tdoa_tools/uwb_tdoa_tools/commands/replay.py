@@ -78,7 +78,7 @@ def _replay(args):
     if not done.acknowledged:
         say(f"not every subscription acknowledged every message within {ACKNOWLEDGE_LIMIT:g} s")
     for what, count in done.wrong.items():
-        say(f"{count} {what}; the result is not that of the bag: replay slower (--rate)")
+        say(f"{count} {what}; the result is not that of the bag: look at /diagnostics, or replay slower (--rate)")
     return int(bool(done.wrong) or not done.acknowledged)
 
 

@@ -13,6 +13,7 @@ from .processes import Diagnostics
 SPIN = 0.05  # s
 ANSWER_LIMIT = 10.0  # s for a node's parameters
 SETTLE_LIMIT = 60.0  # s for the diagnostics of the nodes to settle
+UNKNOWN = "_NODE_NAME_UNKNOWN_"  # what rmw calls a node whose name has not come yet
 PATIENCE = {"bias_node": "hold", "ekf_node": "lag"}  # parameters, s of stamps
 TROUBLE = {  # {node: {key in its diagnostics: words}}
     "bias_node": {"released before their pose": "TDOAs corrected before their pose was there"},
@@ -35,6 +36,7 @@ class Nodes:
         /diagnostics."""
         self._node, self._diagnostics = node, Diagnostics(node)
         space = node.get_namespace()
+        self._wait_for_names()
         there = node.get_node_names_and_namespaces()
         self._names = {name: f"{space.rstrip('/')}/{name}" for name in TROUBLE if (name, space) in there}
         if len(self._names) == len(TROUBLE):
@@ -82,6 +84,16 @@ class Nodes:
                 f"--follow: bias_node's hold is {hold:g} s and ekf_node's lag {lag:g} s; to be followed they need "
                 f"{1e-9 * STEP:g} s < hold < lag."
             )
+
+    def _wait_for_names(self):
+        """Return when the node of every publisher and subscription is known: DDS tells that later than that they are."""
+        node, until = self._node, time.monotonic() + ANSWER_LIMIT
+        while time.monotonic() < until:
+            ends = [node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic]
+            topics = [topic for topic, _ in node.get_topic_names_and_types()]
+            if not any(end.node_name == UNKNOWN for find in ends for topic in topics for end in find(topic)):
+                return
+            time.sleep(SPIN)
 
     def _parameter(self, name, parameter):
         client = AsyncParameterClient(self._node, self._names[name])

@@ -40,6 +40,11 @@ def is_latched(publisher):
     return publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 
+def is_tdoa(publisher):
+    """Whether it publishes raw TDOAs."""
+    return publisher.msg_type.__name__ == "Tdoa"
+
+
 class Player:
     """Publishes to {topic in the bag: publisher}, `rate` times as fast as recorded, with /clock if it has a rate, Hz.
 
@@ -52,7 +57,7 @@ class Player:
         self._clock = node.create_publisher(Clock, "/clock", QoSProfile(depth=10)) if clock_rate else None
         self._clock_period = 1.0 / clock_rate if clock_rate else None
         self._stamped = {topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)}
-        self._tdoas = {topic for topic, publisher in publishers.items() if publisher.msg_type.__name__ == "Tdoa"}
+        self._tdoas = {topic for topic, publisher in publishers.items() if is_tdoa(publisher)}
         self._latched = [publisher for publisher in publishers.values() if is_latched(publisher)]
         self._start = self._began = self._next_tick = None
 

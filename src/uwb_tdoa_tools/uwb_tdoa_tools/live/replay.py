@@ -13,13 +13,13 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..bags.files import messages, open_bag
 from .follow import Follower
 from .followed_nodes import Nodes
-from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player
+from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player, is_tdoa
 from .read_ahead import read_ahead
 from .session import message_class, publisher_qos, session
 
 GLOBAL = ("/tf", "/tf_static", "/clock", "/diagnostics", "/rosout", "/parameter_events")  # in no robot's namespace
 SETTLE = 0.2  # s from the last match to the first message: a subscription learns of a match a little later than we do
-DISCOVERY = 1.0  # s without anybody new after which who listens by now is enough
+DISCOVERY = 2.0  # s without anybody new after which who listens by now is enough
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Options:
 
     rate : times as fast as recorded; loop : start again at the end; clock_rate : Hz of /clock, None for none;
     wait : s until somebody must subscribe; wait_topics : to all of these; follow : topic that is kept in step with, or
-    None; ros_arguments : command line with --ros-args.
+    None (the TDOAs of the bag are of the wait_topics then); ros_arguments : command line with --ros-args.
     """
 
     rate: float = 1.0
@@ -102,10 +102,13 @@ def _publishers(node, bag, reader, say):
 
 
 def _wait_for_listeners(node, publishers, options, stop, say):
-    """Return when somebody subscribes to each wanted topic (all of the bag, unless options name some), or to some of
-    them and for DISCOVERY s nobody new has come. InputError if after `options.wait` s nobody subscribes to one that was
-    named, or to any."""
-    wanted = [f"/{topic.lstrip('/')}" for topic in options.wait_topics] or list(publishers)
+    """Return when somebody subscribes to each wanted topic: those that options name, or else all of the bag, as far as
+    they have any subscriber once nobody new has come for DISCOVERY s; and when somebody publishes what is followed.
+    InputError if after `options.wait` s nobody subscribes to one that must have a subscriber, or to any."""
+    needed = [f"/{topic.lstrip('/')}" for topic in options.wait_topics]
+    wanted = needed or list(publishers)
+    if options.follow and not needed:
+        needed = [topic for topic, publisher in publishers.items() if is_tdoa(publisher)]
     if missing := [topic for topic in wanted if topic not in publishers]:
         raise InputError(f"--wait-topics: {missing[0]} is not in the bag; it has {', '.join(publishers)}.")
     names = ", ".join(publishers[topic].topic_name for topic in wanted)
@@ -116,17 +119,20 @@ def _wait_for_listeners(node, publishers, options, stop, say):
         now = time.monotonic()
         counts = tuple(publishers[topic].get_subscription_count() for topic in wanted)
         known = tuple(node.count_subscribers(publishers[topic].topic_name) for topic in wanted)
+        followed = not options.follow or node.count_publishers(node.resolve_topic_name(options.follow))
         missing = [topic for topic, count in zip(wanted, counts) if not count]
         if (counts, known) != heard:
             heard, changed = (counts, known), now
-        settled = now > changed + DISCOVERY and all(count >= there for count, there in zip(counts, known))
-        enough = not missing or (len(missing) < len(wanted) and not options.wait_topics and settled)
-        if (enough and all(count >= there for count, there in zip(counts, known))) or now > began + options.wait:
+        settled = now > changed + DISCOVERY
+        enough = not missing or (settled and len(missing) < len(wanted) and not set(missing) & set(needed))
+        matched = all(count >= there for count, there in zip(counts, known))
+        if (enough and followed and matched) or now > began + options.wait:
             break
         time.sleep(0.01)
     names = [publishers[topic].topic_name for topic in missing]
-    if missing and not stop and (options.wait_topics or len(missing) == len(wanted)):
-        what = names[0] if options.wait_topics else "any topic of the bag"
+    unheard = [publishers[topic].topic_name for topic in missing if topic in needed]
+    if not stop and (unheard or len(missing) == len(wanted)):
+        what = unheard[0] if unheard else "any topic of the bag"
         raise InputError(
             f"nobody subscribes to {what} within {options.wait:g} s; start the nodes first, or wait longer "
             "(--wait-matched)."
