@@ -74,3 +74,7 @@ def test_other_files_are_refused(tmp_path):
     for wrong in ({"step": [0.1, 0.1]}, {"bound": np.ones((5, 4, 2))}):
         with pytest.raises(InputError, match="do not fit together"):
             volume(**wrong)
+    negative, unknown = np.full((5, 4, 3), -1.0), np.full((5, 4, 3), np.nan)
+    for wrong in ({"step": [0.1, 0.1, 0.0]}, {"lower": [0.0, np.nan, 0.0]}, {"bound": negative}, {"bound": unknown}):
+        with pytest.raises(InputError, match="not finite, a step that is not above 0 or a bound below 0"):
+            volume(**wrong)

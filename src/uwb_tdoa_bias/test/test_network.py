@@ -164,3 +164,61 @@ def test_a_model_is_named_by_its_file_or_as_the_one_shipped():
     assert load_network(SHIPPED).name == "default"
     with pytest.raises(InputError, match="other.onnx does not exist"):
         load_network("other.onnx")
+
+
+@pytest.mark.parametrize(
+    ("meta", "named"),
+    [
+        ({"offset": "[NaN, 0.0]"}, "finite"),
+        ({"clip": "-1"}, "clip must be above 0"),
+        ({"clip": "NaN"}, "clip must be above 0"),
+        ({"validity": "[1]", "fade_std": "1"}, "metadata"),
+        ({"validity": '{"x": [0, 1, 1]}', "fade_std": "Infinity"}, "fade_std"),
+        ({"offset": "[" * 10_000}, "metadata"),
+    ],
+)
+def test_metadata_that_make_no_sense_are_refused(tmp_path, meta, named):
+    with pytest.raises(InputError, match=named):
+        Network(changed(tmp_path, **meta))
+
+
+def otherwise(tmp_path, nodes, constants=(), inputs=(("features", 1, ["n", 2]),)):
+    """A model with the metadata of the known answer and other insides."""
+    onnx = pytest.importorskip("onnx")
+    made, helper = known_answer.make(), onnx.helper
+    graph = helper.make_graph(
+        [helper.make_node(*node[:3], **(node[3] if len(node) > 3 else {})) for node in nodes],
+        "other",
+        [helper.make_tensor_value_info(*one) for one in inputs],
+        [helper.make_tensor_value_info("bias", 1, None)],
+        [onnx.numpy_helper.from_array(np.asarray(value), name) for name, value in constants],
+    )
+    made.graph.CopyFrom(graph)
+    path = tmp_path / "other.onnx"
+    path.write_bytes(made.SerializeToString())
+    return path
+
+
+WIDE = ("weight", np.ones((2, 4), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("nodes", "constants", "named"),
+    [
+        ([("MatMul", ["features", "weight"], ["bias"])], [WIDE], "gives (1, 4)"),
+        ([("ReduceSum", ["features"], ["bias"], {"keepdims": 0})], [], "gives ()"),
+        ([("Reshape", ["features", "shape"], ["bias"])], [("shape", np.array([7, 2], np.int64))], "cannot be run"),
+        ([("Div", ["features", "zero"], ["bias"])], [("zero", np.zeros(2, np.float32))], "no finite numbers"),
+    ],
+)
+def test_a_model_that_fails_when_it_is_asked_is_refused_when_it_is_loaded(tmp_path, nodes, constants, named):
+    with pytest.raises(InputError) as error:
+        Network(otherwise(tmp_path, nodes, constants))
+    assert named in str(error.value)
+
+
+def test_a_model_with_two_inputs_is_refused(tmp_path):
+    inputs = (("features", 1, ["n", 2]), ("more", 1, ["n", 2]))
+    path = otherwise(tmp_path, [("Add", ["features", "more"], ["bias"])], inputs=inputs)
+    with pytest.raises(InputError, match="has 2 inputs"):
+        Network(path)

@@ -52,14 +52,14 @@ def flights(draw):
         ticks = draw(st.lists(st.integers(0, 10**12), min_size=smallest, max_size=5))
         return np.sort(np.array(ticks, dtype=np.int64)) / 1e6
 
-    def values(*shape, finite=False):
-        return draw(arrays(float, shape, elements=st.floats(allow_nan=not finite, allow_infinity=not finite)))
+    def values(*shape):
+        return draw(arrays(float, shape, elements=st.floats(allow_nan=False, allow_infinity=False)))
 
     ids = draw(st.lists(st.integers(0, 65535), min_size=1, max_size=4, unique=True))
     unit = st.sampled_from([[0.0, 0.0, 0.0, 1.0], [0.6, 0.0, -0.8, 0.0], [np.nan] * 4])
     n = len(ids)
     anchors = Anchors(
-        ids, np.clip(values(n, 3, finite=True), -1e300, 1e300), draw(st.lists(unit, min_size=n, max_size=n))
+        ids, np.clip(values(n, 3), -1e8, 1e8), draw(st.lists(unit, min_size=n, max_size=n))
     )
     t = stamps(1)
     tdoas = Tdoas(
@@ -70,6 +70,7 @@ def flights(draw):
     t = stamps(1)
     q = np.array(draw(st.lists(unit, min_size=len(t), max_size=len(t))))
     truth = draw(st.sampled_from([None, Truth(t, values(len(t), 3), q)]))
+    name = draw(st.text(st.characters(codec="utf-8", exclude_characters="/\0\n\r"), min_size=1, max_size=5))
     t, ranges = stamps(1), st.sampled_from([0.0, 1.25, 1000.0, np.inf, np.nan])
     height = draw(st.sampled_from([None, Height(t, draw(arrays(float, len(t), elements=ranges)))]))
     t = stamps(1)
@@ -78,7 +79,7 @@ def flights(draw):
     std = draw(arrays(float, (len(t), 3), elements=st.sampled_from([0.5, 2.0, np.inf])))
     velocity = draw(st.sampled_from([None, Velocity(t, values(len(t), 3), std)]))
     aids = dict(height=height, pressure=pressure, velocity=velocity)
-    return Flight(draw(st.text(max_size=5)), anchors, tdoas, imu, truth, **aids)
+    return Flight(name, anchors, tdoas, imu, truth, **aids)
 
 
 @settings(deadline=None, max_examples=15)
@@ -88,7 +89,7 @@ def test_any_flight_comes_back_exactly(flight, storage):
         write_bag(flight, Path(folder) / "flight", storage)
         back = read_bag(Path(folder) / "flight")
     assert differences(flight, back) == []
-    assert back.name == flight.name
+    assert back.name == (flight.name if flight.name not in (".", "..") else "flight")
 
 
 def test_what_the_messages_say(tmp_path):
@@ -282,7 +283,7 @@ def test_cut_data_file(tmp_path, storage, kept):
     (file,) = (tmp_path / "flight").glob("flight.*")
     whole = file.read_bytes()
     file.write_bytes(whole[: int(kept * len(whole))])
-    with pytest.raises(InputError, match="cut or damaged"):
+    with pytest.raises(InputError, match="cut or damaged|is no YAML"):
         read_bag(tmp_path / "flight")
 
 
@@ -290,7 +291,7 @@ def test_cut_data_file(tmp_path, storage, kept):
 def test_damaged_metadata(tmp_path, metadata):
     write_bag(small_flight(0.05), tmp_path / "flight")
     (tmp_path / "flight" / "metadata.yaml").write_text(metadata)
-    with pytest.raises(InputError, match="cut or damaged"):
+    with pytest.raises(InputError, match="cut or damaged|is no YAML"):
         read_bag(tmp_path / "flight")
 
 

@@ -73,9 +73,9 @@ def test_flights_make_a_map_and_are_judged_by_it(tmp_path, flights, capsys):
     [
         (["fit", "--out", "m.npz"], "FLIGHT: there is none"),
         (["fit", "--static", "POINTS", "--step", "0", "--out", "m.npz"], "--step: 0.0"),
-        (["fit", "--static", "nowhere.csv", "--out", "m.npz"], "nowhere.csv: No such file"),
+        (["fit", "--static", "nowhere.csv", "--out", "m.npz"], "nowhere.csv: cannot be read .No such file"),
         (["fit", "--static", "SHORT", "--out", "m.npz"], "has no column true_z"),
-        (["fit", "--static", "TEXT", "--planar", "--out", "m.npz"], "line 3: .* needs a number"),
+        (["fit", "--static", "TEXT", "--planar", "--out", "m.npz"], "line 3: x is .one.; it must be"),
         (["fit", "--static", "EMPTY", "--planar", "--out", "m.npz"], "holds no positions"),
         (["fit", "FLIGHTS/one.bag", "--holdout", "FLIGHTS", "--out", "m.npz"], "one.bag is also a FLIGHT"),
         (["judge", "POINTS", "FLIGHTS/one.bag"], "is no position bias map"),

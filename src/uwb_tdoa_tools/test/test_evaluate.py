@@ -32,8 +32,9 @@ def bag(flight, tmp_path_factory):
     return path
 
 
-def write_odometry(path, odometry, covariance=None):
-    """A bag with a nav_msgs/Odometry for each estimate on /odometry; covariance: 36 numbers, default the estimate's."""
+def write_odometry(path, odometry, covariance=None, space="", verdicts=()):
+    """A bag with a nav_msgs/Odometry for each estimate on /odometry; covariance: 36 numbers, default the estimate's;
+    space: before the topics; verdicts: one uwb/residual for each."""
     store = typestore()
     types = store.types
 
@@ -42,7 +43,7 @@ def write_odometry(path, odometry, covariance=None):
         return types[f"{package}/msg/{kind}"](*values)
 
     with new_bag(path) as writer:
-        connection = writer.add_connection("/odometry", "nav_msgs/msg/Odometry", typestore=store)
+        connection = writer.add_connection(f"{space}/odometry", "nav_msgs/msg/Odometry", typestore=store)
         for k in range(len(odometry.t)):
             stamp = int(round(odometry.t[k] * 1e9))
             header = of("std_msgs/Header", of("builtin_interfaces/Time", *divmod(stamp, 10**9)), "map")
@@ -60,6 +61,12 @@ def write_odometry(path, odometry, covariance=None):
                 "nav_msgs/Odometry", header, "base_link", of("geometry_msgs/PoseWithCovariance", pose, whole), twist
             )
             writer.write(connection, stamp, store.serialize_cdr(message, connection.msgtype))
+        if verdicts:
+            residual = "uwb_tdoa_msgs/msg/TdoaResidual"
+            connection = writer.add_connection(f"{space}/uwb/residual", residual, typestore=store)
+        for verdict in verdicts:
+            message = types[residual](header, 0, 1, 0.0, 1.0, 0.0, verdict)
+            writer.write(connection, stamp, store.serialize_cdr(message, residual))
     return path
 
 
@@ -143,6 +150,20 @@ def test_recorded_odometry_is_judged(flight, bag, tmp_path):
 def test_recorded_odometry_without_covariance_is_judged(flight, bag, tmp_path):
     recorded = write_odometry(tmp_path / "recorded", run_offline(flight).odometry, np.zeros(36))
     assert report([bag, "--odometry", recorded], tmp_path)["runs"][0]["rmse_3d"] < 0.1
+
+
+def test_odometry_of_a_tag_is_judged_against_the_flight_of_a_bag_without_namespace(flight, bag, tmp_path, capsys):
+    recorded = write_odometry(tmp_path / "recorded", run_offline(flight).odometry, space="/tag1", verdicts=(0, 1))
+    assert main([str(bag), "--odometry", str(recorded)]) == 2
+    assert "has no message on /odometry; say which to take (--topic odometry=/tag1/odometry)." in capsys.readouterr().err
+    judged = report([bag, "--odometry", recorded, "--topic", "odometry=/tag1/odometry"], tmp_path)["runs"][0]
+    assert judged["rmse_3d"] < 0.1
+
+
+def test_odometry_of_late_tdoas_is_told_with_code_1(flight, bag, tmp_path, capsys):
+    recorded = write_odometry(tmp_path / "recorded", run_offline(flight).odometry, verdicts=(0, 2, 1, 2))
+    assert main([str(bag), "--odometry", str(recorded)]) == 1
+    assert "2 TDOAs came too late for that filter" in capsys.readouterr().err
 
 
 def test_flights_without_truth_are_told_in_one_sentence(flight, tmp_path, capsys):

@@ -6,12 +6,14 @@ import time
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rclpy.serialization import serialize_message  # noqa: E402
 from sensor_msgs.msg import Imu, TimeReference  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_tools.live import follow  # noqa: E402
+from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 from uwb_tdoa_tools.live.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
 
 SECOND = 10**9
@@ -28,13 +30,15 @@ def node():
 class Speaker:
     """Publishes stamps on a topic and waits until somebody has subscribed."""
 
-    def __init__(self, node, topic):
-        self._publisher = node.create_publisher(Imu, topic, 10)
+    def __init__(self, node, topic, kind=Imu):
+        self._publisher, self._kind = node.create_publisher(kind, topic, 1000), kind
 
-    def say(self, seconds):
-        message = Imu()
-        message.header.stamp.sec = seconds
-        self._publisher.publish(message)
+    def say(self, *seconds):
+        for second in seconds:
+            message = self._kind()
+            message.header.stamp.sec, nanosec = divmod(round(second * SECOND), SECOND)
+            message.header.stamp.nanosec = nanosec
+            self._publisher.publish(message)
 
     def matched(self):
         until = time.monotonic() + 60.0
@@ -95,3 +99,77 @@ def test_stamps_are_read_from_the_bytes():
     message.header.stamp.sec, message.header.stamp.nanosec = -3, 999_999_999
     message.header.frame_id = "somewhere"
     assert stamp_of(serialize_message(message)) == -3 * SECOND + 999_999_999
+
+
+@pytest.fixture
+def filtered(node, speaker):
+    """(Follower of TDOAs too, Speaker of what comes out of the filter)."""
+    residuals = Speaker(node, "uwb/residual", TdoaResidual)
+    follower = Follower(node, "imu/late")
+    speaker.matched()
+    residuals.matched()
+    return follower, residuals
+
+
+def play(follower, stamps):
+    """Play TDOAs at stamps, s, as far as they need not be waited for: how many were."""
+    for number, stamp in enumerate(stamps):
+        began = time.monotonic()
+        stop = Soon(began + 0.2)
+        follower.wait(round(stamp * SECOND), stop)
+        if stop:
+            return number
+        follower.note_tdoa(round(stamp * SECOND))
+    return len(stamps)
+
+
+class Soon:
+    """True from some time on."""
+
+    def __init__(self, until):
+        self._until = until
+
+    def __bool__(self):
+        return time.monotonic() > self._until
+
+
+STAMPS = [10.0 + 0.01 * k for k in range(200)]
+
+
+def test_no_tdoa_is_played_while_those_a_step_older_are_in_the_filter(filtered):
+    follower, residuals = filtered
+    assert play(follower, STAMPS) == 11  # the last of them is a step newer than the first
+    residuals.say(*STAMPS[:6])
+    assert play(follower, STAMPS[11:]) == 6
+    residuals.say(*STAMPS[6:100])
+    assert play(follower, STAMPS[17:]) == 94
+
+
+def test_tdoas_that_are_lost_are_not_waited_for(filtered):
+    follower, residuals = filtered
+    play(follower, STAMPS)
+    residuals.say(*STAMPS[:3], *STAMPS[7:9])
+    assert play(follower, STAMPS[11:]) == 9
+
+
+def test_shifted_stamps_are_waited_for_as_little(filtered):
+    """bias_node takes tdoa_time_offset out of the stamps."""
+    follower, residuals = filtered
+    play(follower, STAMPS)
+    residuals.say(*(stamp - 0.4 for stamp in STAMPS[:10]))
+    assert play(follower, STAMPS[11:]) == 10
+
+
+def test_a_recording_that_starts_again_is_followed_anew(filtered):
+    follower, residuals = filtered
+    play(follower, STAMPS)
+    residuals.say(*STAMPS)
+    assert play(follower, STAMPS[11:]) == 189
+    assert play(follower, [stamp - 5.0 for stamp in STAMPS]) == 11
+
+
+def test_a_filter_that_has_gone_silent_is_not_waited_for(filtered, monkeypatch):
+    monkeypatch.setattr(follow, "SILENCE", 0.1)
+    follower, residuals = filtered
+    residuals.say(10.0)
+    assert play(follower, STAMPS) == 200

@@ -3,7 +3,7 @@ import pytest
 from recordings import ANCHORS, SURVEY, log_bytes
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.readers.inputs import find_flights, load_flights, survey_for
+from uwb_tdoa_tools.readers.inputs import Reading, find_flights, survey_for
 
 
 def make(folder, *names):
@@ -86,18 +86,24 @@ def test_nothing_there_is_bad_input(tmp_path):
         find_flights([tmp_path / "empty"])
 
 
-def test_flights_are_read_one_by_one(tmp_path):
+def test_flights_are_read_with_their_survey(tmp_path):
     for name in ("one", "two"):
         (tmp_path / name).write_bytes(log_bytes())
     (tmp_path / "surveys").mkdir()
     survey = tmp_path / "surveys" / "here.csv"
     survey.write_text(SURVEY)
-    flights = load_flights([tmp_path / "one", tmp_path / "two"], survey)
-    assert next(flights).name == "one"
-    second = next(flights)
-    assert second.name == "two"
-    np.testing.assert_array_equal(second.anchors.positions, ANCHORS.positions)
-    assert next(flights, None) is None
+    flights = Reading(survey).flights([tmp_path / "one", tmp_path / "two"])
+    assert [flight.name for flight in flights] == ["one", "two"]
+    np.testing.assert_array_equal(flights[1].anchors.positions, ANCHORS.positions)
+
+
+def test_what_is_missing_in_a_recording_is_told(tmp_path, capsys):
+    (tmp_path / "cut").write_bytes(log_bytes()[:-9])
+    (tmp_path / "survey.csv").write_text(SURVEY)
+    with pytest.raises(InputError, match="cut or damaged: .*--salvage"):
+        Reading(tmp_path / "survey.csv").one(tmp_path / "cut")
+    flight = Reading(tmp_path / "survey.csv", salvage=True).one(tmp_path / "cut")
+    assert len(flight.tdoa) == 2 and "cut: cut or damaged: " in capsys.readouterr().err
 
 
 def test_every_measured_recording_finds_its_survey(shared_data):

@@ -19,6 +19,7 @@ ROS = """
     uwb_tdoa_tools.benchmark.nodes uwb_tdoa_tools.benchmark.rates uwb_tdoa_tools.benchmark.source
     uwb_tdoa_tools.benchmark.suite uwb_tdoa_tools.commands.bench uwb_tdoa_tools.commands.demo
     uwb_tdoa_tools.commands.record uwb_tdoa_tools.commands.replay uwb_tdoa_tools.live.demo uwb_tdoa_tools.live.follow
+    uwb_tdoa_tools.live.followed_nodes
     uwb_tdoa_tools.live.player uwb_tdoa_tools.live.processes uwb_tdoa_tools.live.record uwb_tdoa_tools.live.replay
     uwb_tdoa_tools.live.run uwb_tdoa_tools.live.session
 """.split()
@@ -26,10 +27,13 @@ IS_ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces|domain_coordinator|ament_ind
 # import name: (rosdep key, name on the Python package index); ROS packages are imported under their own name
 KEYS = {
     "PIL": ("python3-pil", "Pillow"),
+    "atheris": (None, "atheris"),  # for who wants to fuzz
+    "backports": (None, "backports.zstd"),  # comes with rosbags, as lz4 does
     "dask": (None, "distributed"),
     "distributed": (None, "distributed"),
     "hypothesis": ("python3-hypothesis", "hypothesis"),
     "joblib": ("python3-joblib", "joblib"),
+    "lz4": (None, "lz4"),
     "matplotlib": ("python3-matplotlib", "matplotlib"),
     "numba": ("python3-numba", "numba"),
     "numpy": ("python3-numpy", "numpy"),
@@ -84,7 +88,7 @@ def ours(module, top_only=False):
 
 def test_the_walk_sees_what_there_is():
     assert "uwb_tdoa_bias.foundation.errors" in imports("uwb_tdoa_tools.cli")
-    assert "uwb_tdoa_tools.readers.inputs" in imports("uwb_tdoa_tools.commands.train")
+    assert "uwb_tdoa_tools.options" in imports("uwb_tdoa_tools.commands.train")
     assert "rclpy" in imports("uwb_tdoa_tools.planning.messages")
     assert "rclpy" not in imports("uwb_tdoa_tools.planning.messages", True)
     assert len(modules()) > 120
@@ -153,7 +157,7 @@ def needed(package, *folders):
     """Top-level names, not of ours and not of Python, that the files in some folders of a package import."""
     names = set()
     for folder in folders:
-        local = {path.stem for path in (SRC / package / folder).glob("*.py")} if folder != package else set()
+        local = {path.stem for path in (SRC / package / folder).rglob("*.py")} if folder != package else set()
         for path in (SRC / package / folder).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.Import):
@@ -162,7 +166,7 @@ def needed(package, *folders):
                     names.add(node.module.partition(".")[0])
         names -= local
     beside = {path.stem for other in PACKAGES for path in (SRC / other / "test").glob("*.py")}  # helpers of tests
-    return names - set(sys.stdlib_module_names) - beside - {package, "setuptools"}
+    return names - set(sys.stdlib_module_names) - beside - {package, "setuptools", "compression"}
 
 
 def declared(package, *tags):
@@ -190,7 +194,7 @@ def test_setup_py_declares_what_is_imported_and_nothing_else(package):
     given = {keyword.arg: keyword.value for keyword in call.keywords}
     extras = ast.literal_eval(given["extras_require"]).values() if "extras_require" in given else []
     required = [*ast.literal_eval(given["install_requires"]), *(text for some in extras for text in some)]
-    names = {re.match(r"[\w-]+", text)[0] for text in required} - {"setuptools"}
+    names = {re.match(r"[\w.-]+", text)[0] for text in required} - {"setuptools"}
     imported = needed(package, package)
     assert names == {KEYS[name][1] for name in imported if name in KEYS} | (imported & set(PACKAGES))
 

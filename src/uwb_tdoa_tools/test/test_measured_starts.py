@@ -10,7 +10,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_memory, structured
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_tools.readers.inputs import load_flights
+from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.scoring.metrics import airborne
 
 FLIGHTS = (
@@ -25,7 +25,7 @@ YAW_TIME = 10.0  # s in the air by which the yaw must be known
 def flights(shared_data):
     paths = [path for name in FLIGHTS for path in (shared_data / "flights").rglob(name)]
     assert len(paths) == len(FLIGHTS)
-    return list(load_flights(paths, shared_data / "surveys"))
+    return Reading(shared_data / "surveys").flights(paths)
 
 
 def between(stream, low, high):

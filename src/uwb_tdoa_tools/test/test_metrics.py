@@ -7,6 +7,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.scoring.metrics import Score, airborne, coverage, nees, nis, pooled, position_errors, summary
+from uwb_tdoa_tools.scoring.table import line
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 
@@ -101,7 +102,14 @@ def test_a_late_start_is_told_and_too_late_is_a_diverged_run(begin, diverged):
     truth = straight()
     row = Score("flight", estimate(truth, constant(0.0, 0.0, 0.0), low=begin), truth).row()
     assert row["start_delay"] == pytest.approx(max(0.0, begin - 1.0), abs=0.011)
-    assert row["diverged"] is diverged
+    assert row["diverged"] is row["late_start"] is diverged
+    assert line(row).endswith("LATE START") is diverged and "DIVERGED" not in line(row)
+
+
+def test_a_late_start_does_not_hide_what_else_is_wrong():
+    truth = straight()
+    row = Score("flight", estimate(truth, constant(2.0, 0.0, 0.0), low=2.1), truth).row()
+    assert row["diverged"] and not row["late_start"] and line(row).endswith("DIVERGED")
 
 
 def test_an_estimate_that_ends_in_mid_flight_has_diverged():
@@ -113,6 +121,7 @@ def test_no_estimate_at_all_has_diverged():
     truth = straight()
     row = Score("flight", estimate(truth, constant(0.0, 0.0, 0.0), low=9.5), truth).row()
     assert row["diverged"] and row["frac_gt_1m"] == 1.0 and np.isnan(row["rmse_3d"]) and row["start_delay"] == np.inf
+    assert not row["late_start"]
 
 
 def test_nees_of_hand_made_errors():

@@ -50,9 +50,9 @@ def test_a_process_that_must_stay_may_not_even_end_well(start):
 
 
 def test_a_process_that_may_end_must_end_well(start):
-    start("player", "exit 0", may_end=True).wait(20)
+    start("player", "exit 0", may_end_with=(0,)).wait(20)
     start.processes.check()
-    start("failing", "exit 1", may_end=True).wait(20)
+    start("failing", "exit 1", may_end_with=(0,)).wait(20)
     with pytest.raises(processes.LiveError, match="failing ended with code 1"):
         start.processes.check()
 

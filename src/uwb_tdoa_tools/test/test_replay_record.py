@@ -252,7 +252,30 @@ def test_nobody_subscribes(tmp_path, start):
     assert "replay: error: nobody subscribes to /imu/data within 0.1 s; start the nodes first" in waited.said[-1]
     alone = start("replay", tmp_path / "flight.bag", "--wait-matched", 0.1)
     code, out = alone.end()
-    assert code == 0 and "/imu/data: 100 messages" in out
+    assert code == 2 and "nobody subscribes to any topic of the bag within 0.1 s" in alone.said[-1] and out == ""
+
+
+def test_nobody_to_follow(tmp_path, start, node):
+    """Some listen, but not to the TDOAs, or nobody says what comes of them."""
+    write_bag(small_flight(seconds=0.1), tmp_path / "flight.bag")
+    subscribe(node, Imu, "imu/data")
+    options = ("--wait-matched", 4, "--follow", "odometry")
+    unheard = start("replay", tmp_path / "flight.bag", *options)
+    assert unheard.end()[0] == 2 and "nobody subscribes to /uwb/tdoa within 4 s" in unheard.said[-1]
+    subscribe(node, Tdoa, "uwb/tdoa")
+    silent = start("replay", tmp_path / "flight.bag", *options)
+    assert silent.end()[0] == 2 and "--follow: nobody publishes /odometry; start the node that does" in silent.said[-1]
+
+
+def test_who_listens_to_some_topics_gets_all_of_them(tmp_path, start, node):
+    """Best effort, and without naming topics to wait for: not one message may be lost for want of discovery."""
+    write_bag(small_flight(seconds=0.3), tmp_path / "flight.bag")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+    subscribe(node, AnchorArray, "uwb/anchors", latched)
+    imu = subscribe(node, Imu, "imu/data", QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT))
+    replaying = start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT)
+    messages = take(imu, lambda messages: messages and messages[-1].header.stamp.nanosec == 299_000_000)
+    assert len(messages) == 300 and replaying.end()[0] == 0
 
 
 @pytest.mark.slow

@@ -1,4 +1,6 @@
+import re
 import struct
+import time
 import zlib
 
 import numpy as np
@@ -12,10 +14,10 @@ from uwb_tdoa_tools.readers import read_usd_log
 
 @pytest.fixture
 def read(tmp_path):
-    def read(content):
+    def read(content, **options):
         file = tmp_path / "flight"
         file.write_bytes(content)
-        return read_usd_log(file, ANCHORS)
+        return read_usd_log(file, ANCHORS, **options)
 
     return read
 
@@ -108,3 +110,86 @@ def with_checksum(content):
 def test_refused_with_the_reason(read, content, sentence):
     with pytest.raises(InputError, match=sentence):
         read(content)
+
+
+def with_number(name, column, value):
+    """Rows of which one number is another."""
+    rows, changed = [], False
+    for event, ticks, values in ROWS:
+        if event == name and not changed:
+            values, changed = (*values[:column], value, *values[column + 1 :]), True
+        rows.append((event, ticks, values))
+    return rows
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize(
+    ("name", "column", "said"),
+    [
+        ("estTDOA", 2, "tdoa, record 1 of 2 at 1.000 s: d is"),
+        ("estGyroscope", 1, "gyro, record 1 of 3 at 1.000 s: y is"),
+        ("estAcceleration", 0, "acc, record 1 of 3 at 1.000 s: x is"),
+        ("estPose", 2, "pose, record 1 of 2 at 1.001 s: z is"),
+        ("estPose", 5, "pose, record 1 of 2 at 1.001 s: qz is"),
+        ("estBarometer", 0, "baro, record 1 of 3 at 1.002 s: baro is"),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused_or_left_out(read, name, column, said, value):
+    rows = [*with_number(name, column, value), ("estPose", 1_003_000, (1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 1.0))]
+    with pytest.raises(InputError, match=said):
+        read(log_bytes(rows))
+    flight = read(log_bytes(rows), salvage=True)
+    (remark,) = flight.meta["remarks"]
+    assert "1 of " in remark and "left out" in remark
+    whole = read(log_bytes([*ROWS, rows[-1]]))
+    assert sum(map(len, (flight.tdoa, flight.truth))) >= sum(map(len, (whole.tdoa, whole.truth))) - 1
+    numbers = (flight.tdoa.d, flight.imu.gyro, flight.imu.accel, flight.truth.p, flight.truth.q, flight.pressure.pressure)
+    for array in numbers:
+        assert np.isfinite(array).all()
+
+
+def test_an_altitude_above_the_air_is_refused_or_left_out(read):
+    content = log_bytes(with_number("estBarometer", 0, 45_000.0))
+    with pytest.raises(InputError, match="baro is 45000.0; it must be within \\+-40000: leave"):
+        read(content)
+    assert np.isfinite(read(content, salvage=True).pressure.pressure).all()
+
+
+def test_a_cut_log_is_read_up_to_the_cut(read):
+    whole, counts = log_bytes(), []
+    start = whole.index(b"motion.deltaY(h)") + 17
+    for cut in range(start, len(whole)):
+        try:
+            flight = read(whole[:cut], salvage=True)
+        except InputError as error:
+            assert re.search("no TDOA|never overlap|inside the header", str(error))
+            continue
+        assert "remarks" in flight.meta and np.isin(flight.tdoa.t, [1.0005, 1.0025]).all()
+        counts.append(len(flight.tdoa))
+    assert sorted(counts) == counts and set(counts) == {1, 2}
+
+
+def test_a_damaged_log_is_read_up_to_the_damage(read):
+    content = bytearray(log_bytes())
+    where = content.index(struct.pack("<HQ", 3, 1_002_500))
+    content[where] = 0xEE  # no event has this id
+    flight = read(bytes(content), salvage=True)
+    assert len(flight.tdoa) == 1 and f"from byte {where} on left out" in flight.meta["remarks"][0]
+    content = bytearray(log_bytes())
+    content[where + 9] = 0x7F  # a stamp of 292,000 years
+    flight = read(bytes(content), salvage=True)
+    assert len(flight.tdoa) == 1 and len(flight.meta["remarks"]) == 2
+
+
+def test_names_of_our_streams_are_no_events(read):
+    rows = [*ROWS, ("tdoa", 1_000_000, (1.0,)), ("pose", 1_000_000, (1.0,))]
+    flight = read(log_bytes(rows, events=EVENTS | {"tdoa": (50, [("x", "f")]), "pose": (51, [("t", "f")])}))
+    assert len(flight.tdoa) == 2 and set(flight.extra) == {"estTemperature", "tdoa", "pose"}
+
+
+def test_a_header_of_many_types_takes_no_time(read):
+    events = {f"e{k}": (1000 + k, []) for k in range(20_000)} | EVENTS
+    events["wide"] = (999, [(f"v{k}", "b") for k in range(20_000)])
+    began = time.perf_counter()
+    assert len(read(log_bytes(events=events)).tdoa) == 2
+    assert time.perf_counter() - began < 5.0

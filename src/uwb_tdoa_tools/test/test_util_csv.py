@@ -1,20 +1,21 @@
 import gzip
+import tracemalloc
 
 import numpy as np
 import pytest
 from recordings import ANCHORS, FULL_HEADER, FULL_ROWS, csv_text
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.readers import read_util_csv
+from uwb_tdoa_tools.readers import read_util_csv, util_csv
 
 SUBSET = "t_tdoa,idA,idB,tdoa_meas,t_pose,pose_x,pose_y,pose_z"
 
 
 @pytest.fixture
 def read(tmp_path):
-    def read(content, name="const9-trial1-tdoa2.csv"):
+    def read(content, name="const9-trial1-tdoa2.csv", **options):
         file = tmp_path / name
         file.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return read_util_csv(file, ANCHORS)
+        return read_util_csv(file, ANCHORS, **options)
 
     return read
 
@@ -116,3 +117,50 @@ def test_not_text(read):
         read(b"\xff\xfe" + FULL_ROWS[0].encode())
     with pytest.raises(InputError, match="is 0, not text"):
         read((FULL_HEADER + "\n\0\n").encode())
+
+
+@pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
+def test_every_kind_of_line_end(read, end):
+    assert len(read(csv_text().replace("\n", end)).tdoa) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "count", "said"),
+    [
+        (csv_text(TDOA, ["1,0,1,1", "2,0,1,2"])[:-3], 1, "line 3 is cut"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0", "3,0,1,1"]), 1, "line 3 has 2 cells"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,1,nan", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,1,one", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
+        (csv_text(TDOA + ",t_baro,baro", ["1,0,1,1,1,99.5", "2,0,1,2,2,nan"]), 2, "baro: 1 of 2 records left out"),
+        (csv_text(TDOA + ",t_tof,tof", ["1,0,1,1,1,31", "2,0,1,2,2,-1e12"]), 2, "tof: 1 of 2 records left out"),
+    ],
+)
+def test_what_is_sound_can_be_read(read, text, count, said):
+    with pytest.raises(InputError):
+        read(text)
+    flight = read(text, salvage=True)
+    assert len(flight.tdoa) == count and said in " ".join(flight.meta["remarks"])
+
+
+def test_a_cut_gzip_can_be_read_up_to_the_cut(read):
+    rows = [f"{k / 100:.2f},0,1,{k % 7}.{k}" for k in range(5000)]
+    packed = gzip.compress(csv_text(TDOA, rows).encode())
+    for cut in (len(packed) // 2, len(packed) - 5):
+        flight = read(packed[:cut], salvage=True)
+        assert 1000 < len(flight.tdoa) <= 5000 and "cut or damaged" in flight.meta["remarks"][0]
+    assert len(flight.tdoa) == 5000
+
+
+def test_two_members_and_padding_are_one_file(read):
+    head, tail = csv_text(TDOA, ["1,0,1,1"]), "2,0,1,2\n"
+    assert len(read(gzip.compress(head.encode()) + gzip.compress(tail.encode()) + b"\0" * 9).tdoa) == 2
+
+
+def test_a_gzip_that_unfolds_without_end_is_refused(read, monkeypatch):
+    monkeypatch.setattr(util_csv, "MOST_TEXT", 2_000_000)
+    packed = gzip.compress(csv_text(TDOA, ["1,0,1,1"]).encode() + b"\n" * 500_000_000, 1)
+    tracemalloc.start()
+    with pytest.raises(InputError, match="more than 2000000 bytes of text"):
+        read(packed)
+    assert tracemalloc.get_traced_memory()[1] < 100e6
+    tracemalloc.stop()

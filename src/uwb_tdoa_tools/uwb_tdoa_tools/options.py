@@ -1,8 +1,8 @@
 """Options that several commands share, and what they ask for.
 
-    options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace
+    options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
     options.add_filter(parser)                      # --effects, --config
-    config, effects = options.filter_of(args)
+    reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
 from dataclasses import fields, replace
@@ -14,22 +14,38 @@ from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
 from .readers import inputs
 
+TOPICS = (  # that are read from bags
+    "uwb/tdoa", "uwb/anchors", "imu/data", "height", "pressure", "velocity", "ground_truth/pose", "odometry",
+)  # fmt: skip
+
 
 def add_recordings(parser, nargs="+"):
     """FLIGHT..., and how to read them."""
     parser.add_argument("flights", nargs=nargs, metavar="FLIGHT", help=inputs.HELP)
-    add_survey(parser)
-    add_namespace(parser)
+    add_reading(parser)
 
 
-def add_survey(parser):
-    """--survey."""
-    parser.add_argument("--survey", metavar="S", help=inputs.SURVEY_HELP)
+def add_reading(parser):
+    """--survey, --namespace, --topic and --salvage: how recordings are read."""
+    add = parser.add_argument
+    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    add("--namespace", default="", metavar="NS", help="of the tag's topics in bags, e.g. tag1")
+    add(
+        "--topic", dest="topics", action="append", default=[], metavar="OURS=THEIRS",
+        help="a topic of bags that has another name there, e.g. uwb/tdoa=/my/tdoa; may be repeated",
+    )  # fmt: skip
+    add("--salvage", action="store_true", help="read cut or damaged recordings as far as they are sound, with a remark")
 
 
-def add_namespace(parser):
-    """--namespace."""
-    parser.add_argument("--namespace", default="", help="of the topics in the bags, e.g. tag1")
+def reading_of(args):
+    """The Reading that those options ask for. Raises InputError."""
+    topics = {}
+    for text in args.topics:
+        ours, given, theirs = text.partition("=")
+        if not given or ours not in TOPICS or not theirs.strip("/") or ours in topics:
+            raise InputError(f"--topic: {text!r} is not OURS=THEIRS, where OURS, once, is one of {', '.join(TOPICS)}.")
+        topics[ours] = theirs
+    return inputs.Reading(args.survey, args.namespace, topics, args.salvage)
 
 
 def add_filter(parser, effects="effects.yaml to correct the TDOAs with, before the filter"):

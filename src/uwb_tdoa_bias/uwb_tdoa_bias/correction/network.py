@@ -44,29 +44,48 @@ class Network:
         self._path = Path(path).absolute()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 3
+        options.log_severity_level = 4  # what goes wrong is told here
         if not Path(path).is_file():
             raise InputError(f"model: {path} does not exist; give an .onnx file or leave the model empty.")
         try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
+            self.meta = self._session.get_modelmeta().custom_metadata_map
+            inputs = [(entry.name, entry.shape) for entry in self._session.get_inputs()]
         except Exception as error:  # onnxruntime raises its own family of exceptions, with no common public base
-            raise InputError(f"model: {path} cannot be loaded as ONNX ({str(error).splitlines()[0]}).") from error
-        self.meta = self._session.get_modelmeta().custom_metadata_map
+            raise InputError(f"model: {path} cannot be loaded as ONNX ({_first_line(error)}).") from error
         try:
             self._read(self.meta)
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise InputError(
                 f"model: {path}: its metadata must hold features (names out of {', '.join(NAMES)}), offset, scale, "
                 f"clip and name, and may hold validity with fade_std, as JSON; the problem is {error!r}."
             ) from error
-        (entry,) = self._session.get_inputs()
-        width, n = entry.shape[-1], len(self._inputs)
+        if len(inputs) != 1 or not inputs[0][1]:
+            raise InputError(f"model: {path}: has {len(inputs)} inputs; it must have one, of n rows of features.")
+        (self._input, shape), n = inputs[0], len(self._inputs)
+        width = shape[-1]
         if not (n == len(self._offset) == len(self._scale) == width) or (self._scale == 0).any():
             raise InputError(
-                f"model: {path}: input {entry.name!r} has {width} columns, the metadata name {n} features, "
+                f"model: {path}: input {self._input!r} has {width} columns, the metadata name {n} features, "
                 f"{len(self._offset)} offsets and {len(self._scale)} scales; they must agree, and no scale may be 0."
             )
-        self._input = entry.name
+        self._ask(path)
+
+    def _ask(self, path):
+        """Ask it for the mean of all features. Raises InputError: a model may load and fail only when it is asked."""
+        for rows in (1, 3):
+            try:
+                out = self._session.run(None, {self._input: np.zeros((rows, len(self._inputs)), np.float32)})[0]
+            except Exception as error:  # as above
+                raise InputError(f"model: {path} cannot be run ({_first_line(error)}).") from error
+            shape = getattr(out, "shape", None)
+            if shape not in ((rows, 1), (rows, 2), (rows, 3)) or out.dtype.kind != "f" or not np.isfinite(out).all():
+                raise InputError(
+                    f"model: {path}: gives {shape} for {rows} rows of features, or no finite numbers; the output must "
+                    "be (n, 1), (n, 2) or (n, 3)."
+                )
 
     def __reduce__(self):
         """Pickled as the path of its file: a session cannot be."""
@@ -84,6 +103,10 @@ class Network:
         self._lower, self._upper, self._margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
         if not ((self._margin > 0.0) & (self._upper >= self._lower)).all():
             raise ValueError("validity: every feature needs [lowest, highest, margin above 0]")
+        if not all(np.isfinite(values).all() for values in (self._offset, self._scale, self._margin)):
+            raise ValueError("offset, scale and margins must be finite numbers")
+        if not (self.clip > 0.0 and 0.0 <= self._fade_std < np.inf and self._largest_yaw_std >= 0.0):
+            raise ValueError("clip must be above 0, fade_std and largest_yaw_std not below")
 
     def predict(self, samples):
         """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
@@ -106,3 +129,7 @@ class Network:
                 std[undecided] = np.hypot(std[undecided], bias[undecided])
                 bias[undecided] = known[undecided] = 0.0
         return bias, std, known
+
+
+def _first_line(error):
+    return (str(error).splitlines() or [type(error).__name__])[0]

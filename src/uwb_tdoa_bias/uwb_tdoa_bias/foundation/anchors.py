@@ -9,6 +9,8 @@ import yaml
 from .errors import InputError
 from .safe_yaml import read_yaml
 
+FARTHEST = 1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
+
 
 @dataclass(frozen=True)
 class Anchors:
@@ -43,9 +45,12 @@ class Anchors:
         values, counts = np.unique(ids, return_counts=True)
         if (counts > 1).any():
             raise InputError(f"anchors: id {values[counts > 1][0]} is given twice; every anchor needs its own id.")
-        bad = ~np.isfinite(positions).all(axis=1)
+        bad = ~(np.abs(positions) <= FARTHEST).all(axis=1)
         if bad.any():
-            raise InputError(f"anchors: position of anchor {ids[bad][0]} is {positions[bad][0]}; it must be finite metres.")
+            raise InputError(
+                f"anchors: position of anchor {ids[bad][0]} is {positions[bad][0]}; it must be finite metres, at most "
+                f"{FARTHEST:g} from the origin."
+            )
         bad = ~np.isfinite(orientations).all(axis=1) & ~np.isnan(orientations).all(axis=1)
         bad |= np.abs(np.nan_to_num(orientations)).max(axis=1) > 1e6
         if bad.any():

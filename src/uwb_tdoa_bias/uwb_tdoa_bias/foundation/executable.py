@@ -16,7 +16,7 @@ SOON = 0.05  # s, until an interrupt that was lost comes again
 
 
 def executable(module):
-    """The entry point of a module with a main(): imports the module when it is called, and returns what main returns."""
+    """The entry point of a module with a main(): imports the module when it is called, returns what main returns."""
     return partial(_run, module)
 
 
@@ -67,5 +67,6 @@ def _imported(module):
 
 
 def _remedy(package):
-    ros = package.endswith("_msgs") or package in ("rclpy", "builtin_interfaces", "ament_index_python", "domain_coordinator")
-    return "source ROS 2 Jazzy and the built workspace, or use ./dev run" if ros else "install it with pip"
+    if package.endswith(("_msgs", "_interfaces")) or package in ("rclpy", "ament_index_python", "domain_coordinator"):
+        return "source ROS 2 Jazzy and the built workspace, or use ./dev run"
+    return "install it with pip"

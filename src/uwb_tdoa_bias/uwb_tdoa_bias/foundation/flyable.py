@@ -1,15 +1,16 @@
 """The volume in which a tag can be trusted, as `plan` saves it and the filter's node asks for it."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from zipfile import BadZipFile
-import zlib
 
 import numpy as np
 
+from .arrays_file import read_arrays
 from .errors import InputError
 
-_FIELDS = ("frame", "lower", "step", "flyable", "bound", "ids", "positions", "planar")
+_FIELDS = {  # of the file, and the kinds of their numbers
+    "frame": "U", "lower": "f", "step": "f", "flyable": "b", "bound": "f", "ids": "i", "positions": "f", "planar": "b",
+}  # fmt: skip
+_REMEDY = "make one with `plan ... --volume`"
 
 
 @dataclass(frozen=True)
@@ -40,10 +41,15 @@ class FlyableVolume:
         kinds = {"lower": float, "step": float, "flyable": bool, "bound": np.float32, "ids": int, "positions": float}
         for name, kind in kinds.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
-        shapes = (self.lower.shape, self.step.shape, self.flyable.ndim, self.positions.shape)
-        fits = shapes == ((3,), (3,), 3, (len(self.ids), 3)) and self.bound.shape == self.flyable.shape
-        if not (fits and (self.step > 0.0).all()):
+        shapes = (self.lower.shape, self.step.shape, self.flyable.ndim, self.ids.ndim, self.positions.shape)
+        fits = shapes == ((3,), (3,), 3, 1, (self.ids.size, 3)) and self.bound.shape == self.flyable.shape
+        if not (fits and self.flyable.size):
             raise InputError("flyable volume: lower, step, flyable, bound, ids and positions do not fit together.")
+        finite = all(np.isfinite(array).all() for array in (self.lower, self.step, self.positions))
+        if not (finite and (self.step > 0.0).all() and (self.bound >= 0.0).all()):
+            raise InputError(
+                "flyable volume: it holds a number that is not finite, a step that is not above 0 or a bound below 0."
+            )
 
     def contains(self, p):
         """Whether positions p (..., 3), m, are flyable: (...) bool. Nothing is outside of the box or where not
@@ -81,9 +87,8 @@ class FlyableVolume:
     @classmethod
     def load(cls, path):
         """Read a file that `save` wrote; raises InputError."""
+        fields = read_arrays(path, _FIELDS, "flyable volume", _REMEDY)
         try:
-            with np.load(Path(path), allow_pickle=False) as content:
-                fields = {name: content[name] for name in _FIELDS}
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
-            raise InputError(f"{path}: is no flyable volume ({error}); make one with `plan ... --volume`.") from error
-        return cls(**{**fields, "frame": str(fields["frame"]), "planar": bool(fields["planar"])})
+            return cls(**{**fields, "frame": str(fields["frame"]), "planar": bool(fields["planar"])})
+        except (TypeError, ValueError, OverflowError) as error:  # InputError is a ValueError
+            raise InputError(f"{path}: is no flyable volume ({error}); {_REMEDY}.") from error

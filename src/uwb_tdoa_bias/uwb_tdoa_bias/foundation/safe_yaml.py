@@ -1,7 +1,7 @@
 """YAML as our files need it, and nothing more: what could be misread is refused with the line.
 
-Mappings, lists, texts, finite numbers, true, false and null (YAML 1.2's core schema, with yes, no, on and off as ROS has
-them). No tags, no aliases (ROS refuses them too), no key twice, no second document, no number that is not finite.
+Mappings, lists, texts, finite numbers, true, false and null (YAML 1.2's core schema, with yes, no, on and off as ROS
+has them). No tags, no aliases (ROS refuses them too), no key twice, no second document, no number that is not finite.
 """
 
 import math

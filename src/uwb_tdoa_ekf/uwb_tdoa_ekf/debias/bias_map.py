@@ -2,14 +2,12 @@
 file."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from zipfile import BadZipFile
-import zlib
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from uwb_tdoa_bias.foundation.arrays_file import read_arrays
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .network import AngularNetwork
@@ -19,6 +17,8 @@ UNITS = "metres, square metres for added, in the world frame named by frame; bia
 INTERPOLATORS = ("thin_plate", "network")
 SMOOTHING = 0.3  # of the thin plate, at a marker of median count; see docs/debiasing.md
 FADE = 1.0  # m beyond the known region over which the correction goes to nothing; see docs/debiasing.md
+MOST_MARKERS = 20_000  # the thin plate takes their number squared
+LARGEST = 1e5  # m; more is a mistake
 _ARRAYS = {"cell": int, "at": float, "bias": float, "std": float, "count": int, "added": float}
 
 
@@ -55,9 +55,17 @@ class BiasMap:
         shapes = (self.cell.shape, self.bias.shape, self.std.shape, self.count.shape, self.added.shape)
         if d not in (2, 3) or shapes != ((n, d), (n, d), (n, d), (n,), (d, d)):
             raise InputError("bias map: cell, at, bias, std, count and added do not fit together.")
+        if n > MOST_MARKERS:
+            raise InputError(f"bias map: {n} markers are more than {MOST_MARKERS}; map with a larger step.")
         arrays = (self.at, self.bias, self.std, self.added)
-        if not (all(np.isfinite(array).all() for array in arrays) and self.step > 0.0):
+        if not (all(np.isfinite(array).all() for array in arrays) and 0.0 < self.step < np.inf):
             raise InputError("bias map: it holds a number that is not finite, or a step that is not above 0.")
+        if max(np.abs(array).max(initial=0.0) for array in (self.at, self.bias, self.std)) > LARGEST:
+            raise InputError(f"bias map: it holds a place or a bias of more than {LARGEST:g} m.")
+        if (self.std < 0.0).any() or (self.count < 1).any() or np.linalg.eigvalsh(self.added).min() < -1e-9:
+            raise InputError("bias map: it holds a deviation or a variance below 0, or a marker of no measurements.")
+        if not np.allclose(self.added, self.added.T):
+            raise InputError("bias map: added is no covariance: it is not symmetric.")
         if self.interpolator not in INTERPOLATORS:
             raise InputError(f"interpolator: {self.interpolator!r} is not one of {', '.join(INTERPOLATORS)}.")
         try:
@@ -127,15 +135,14 @@ class BiasMap:
     @classmethod
     def load(cls, path):
         """Read a file that `save` wrote; raises InputError."""
+        what, remedy = f"position bias map of version {VERSION}", "make one with `debias`"
+        kinds = {name: "i" if kind is int else "f" for name, kind in _ARRAYS.items()}
+        texts = ("format", "units", "frame", "source", "interpolator")
+        content = read_arrays(path, {**kinds, **dict.fromkeys(texts, "U"), "version": "i", "step": "f"}, what, remedy)
         try:
-            with np.load(Path(path), allow_pickle=False) as content:
-                if str(content["format"]) != FORMAT or int(content["version"]) != VERSION:
-                    raise ValueError(f"format {content['format']}, version {content['version']}")
-                fields = {name: content[name] for name in _ARRAYS}
-                texts = {name: str(content[name]) for name in ("interpolator", "frame", "source")}
-                step = float(content["step"])
-        except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, BadZipFile, zlib.error) as error:
-            raise InputError(
-                f"{path}: is no position bias map of version {VERSION} ({error}); make one with `debias`."
-            ) from error
-        return cls(**fields, **texts, step=step)
+            if str(content["format"]) != FORMAT or int(content["version"]) != VERSION:
+                raise ValueError(f"format {content['format']}, version {content['version']}")
+            fields = {name: content[name] for name in _ARRAYS} | {name: str(content[name]) for name in texts[2:]}
+            return cls(**fields, step=float(content["step"]))
+        except (TypeError, ValueError, OverflowError) as error:  # InputError is a ValueError
+            raise InputError(f"{path}: is no {what} ({error}); {remedy}.") from error

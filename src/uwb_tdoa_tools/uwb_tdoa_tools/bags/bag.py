@@ -15,11 +15,11 @@ The time of a message is its header stamp. `Flight.extra` has no message type an
 
 import heapq
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from scipy.spatial.transform import Rotation
 
@@ -28,22 +28,27 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
 
 from . import messages as bag_messages
-from .files import check_output, check_type, deserialize, is_bag, messages, new_bag, open_bag
-from .message_types import typestore
+from .files import check_output, deserialize, is_bag, messages, new_bag, open_bag
+from .integrity import metadata
+from .mcap import Damaged
+from .message_types import check_type, typestore
 
-__all__ = ["RecordedOdometry", "check_output", "is_bag", "read_bag", "read_fields", "read_odometry", "write_bag"]
+__all__ = [
+    "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry", "write_bag",
+]  # fmt: skip
 
-_AIDS = {  # name of the topic and the field of Flight: its type, messages of it, a row of a message, it of rows
+_AIDS = {  # topic and field of Flight: its type, messages of it, a row of a message, what may be in rows, it of rows
     "height": (
-        "sensor_msgs/msg/Range", bag_messages.height_messages, bag_messages.height_row, bag_messages.height_of,
+        "sensor_msgs/msg/Range", bag_messages.height_messages, bag_messages.height_row, bag_messages.height_sound,
+        bag_messages.height_of,
     ),
     "pressure": (
-        "sensor_msgs/msg/FluidPressure", bag_messages.pressure_messages, bag_messages.pressure_row,
+        "sensor_msgs/msg/FluidPressure", bag_messages.pressure_messages, bag_messages.pressure_row, np.isfinite,
         bag_messages.pressure_of,
     ),
     "velocity": (
         "geometry_msgs/msg/TwistWithCovarianceStamped", bag_messages.velocity_messages, bag_messages.velocity_row,
-        bag_messages.velocity_of,
+        bag_messages.velocity_sound, bag_messages.velocity_of,
     ),
 }  # fmt: skip
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
@@ -110,7 +115,7 @@ def write_bag(flight, out, storage="mcap", force=False):
     }
     if flight.imu is not None:
         topics["/imu/data"] = "sensor_msgs/msg/Imu", _STREAM_QOS, bag_messages.imu_messages(flight.imu, store)
-    for name, (msgtype, outgoing, _, _) in _AIDS.items():
+    for name, (msgtype, outgoing, *_) in _AIDS.items():
         if getattr(flight, name) is not None:
             topics[f"/{name}"] = msgtype, _STREAM_QOS, outgoing(getattr(flight, name), store)
     topics["/uwb/tdoa"] = "uwb_tdoa_msgs/msg/Tdoa", _STREAM_QOS, bag_messages.tdoa_messages(flight.tdoa, store)
@@ -136,53 +141,80 @@ def _serialized(connection, outgoing, store):
         yield stamp, connection, store.serialize_cdr(message, connection.msgtype)
 
 
-def read_bag(path, namespace="", anchors=None):
+def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):
     """Flight of a bag that was written here, by `ros2 bag record` or by our `record`; other topics are ignored.
 
     namespace : where the tag's topics are in the bag, e.g. "tag1" for /tag1/uwb/tdoa.
+    topics : {our name of a topic: its name in the bag}, e.g. {"uwb/tdoa": "/my/tdoa"}; not absolute: in the namespace.
     anchors : Anchors to use instead of the recorded uwb/anchors.
+    salvage : read a cut or damaged bag up to there, and without messages that are no numbers; `meta["remarks"]` tells.
     Stamps are header stamps; messages that were recorded out of their order are sorted (`meta["reordered"]`).
-    Raises InputError for a bag that is damaged, has no uwb/tdoa, or neither anchors nor uwb/anchors.
+    Raises InputError for a bag that is damaged, has no uwb/tdoa, or neither anchors nor uwb/anchors, and for messages
+    with numbers that are not finite.
     """
-    with open_bag(path) as reader:
+    with open_bag(path, salvage) as reader:
         connections = _connections(reader)
         about = _about(path)
-        meta = {**about.get("meta", {}), "bag": str(path)}
+        meta = {**about["meta"], "bag": str(path)}
+        remarks, name_of = list(reader.remarks), _Names(namespace, topics)
 
-        def stream(topic, msgtype, row, make):
-            found = _find(path, connections, namespace, topic, msgtype)
+        def stream(topic, msgtype, row, make, sound=np.isfinite):
+            found = _find(path, connections, name_of(topic), msgtype)
             stamps, rows, falls = _table(path, reader, found, row)
             if falls:
                 meta.setdefault("reordered", {})[topic] = falls
+            whole = sound(rows).all(axis=1)
+            if not whole.all():
+                if not salvage:
+                    raise _not_finite(path, name_of(topic), stamps, rows, sound)
+                remarks.append(f"{topic}: {np.count_nonzero(~whole)} messages left out, they are no numbers.")
+                stamps, rows = stamps[whole], rows[whole]
             return make(stamps, rows) if len(stamps) else None
 
         tdoa = stream("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of)
         if tdoa is None:
-            raise InputError(
-                f"{path}: has no message on {_absolute(namespace, 'uwb/tdoa')}; {_others(connections, namespace)}."
-            )
+            raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {_others(connections, namespace)}.")
         if anchors is None:
-            anchors = _read_anchors(path, reader, connections, namespace)
+            anchors = _read_anchors(path, reader, connections, name_of("uwb/anchors"))
         imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
-        aids = {name: stream(name, msgtype, row, make) for name, (msgtype, _, row, make) in _AIDS.items()}
+        aids = {name: stream(name, msgtype, row, make, sound) for name, (msgtype, _, row, sound, make) in _AIDS.items()}
         pose = "geometry_msgs/msg/PoseStamped"
         truth = stream("ground_truth/pose", pose, bag_messages.pose_row, bag_messages.truth_of)
-    return Flight(about.get("name", Path(path).stem), anchors, tdoa, imu, truth, {}, meta, **aids)
+    if remarks:
+        meta["remarks"] = remarks
+    return Flight(about["name"], anchors, tdoa, imu, truth, {}, meta, **aids)
 
 
-def read_odometry(path, topic="odometry", namespace=""):
+def read_odometry(path, namespace="", salvage=False, topics=None):
     """RecordedOdometry of a nav_msgs/Odometry topic, in order of header stamps; raises InputError.
 
-    nav_msgs/Odometry has the velocity in the child frame; it is turned into the world frame here.
+    nav_msgs/Odometry has the velocity in the child frame; it is turned into the world frame here. An estimate may be
+    NaN: that is for who judges it. namespace, salvage, topics : see `read_bag`.
     """
-    with open_bag(path) as reader:
-        found = _find(path, _connections(reader), namespace, topic, "nav_msgs/msg/Odometry")
+    with open_bag(path, salvage) as reader:
+        topic = _Names(namespace, topics)("odometry")
+        names = _connections(reader)
+        found = _find(path, names, topic, "nav_msgs/msg/Odometry")
         t, rows, _ = _table(path, reader, found, bag_messages.odometry_row)
     if not len(t):
-        raise InputError(f"{path}: has no message on {_absolute(namespace, topic)}; record the output of the filter.")
+        others = " or ".join(f"--topic odometry={name}" for name in names if name.endswith("/odometry"))
+        remedy = f"say which to take ({others})" if others else "record the output of the filter"
+        raise InputError(f"{path}: has no message on {topic}; {remedy}.")
     p, v, q = rows[:, 0:3], rows[:, 3:6], rows[:, 6:10]
-    v = Rotation.from_quat(q).apply(v)
+    known = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0.0)
+    v = np.where(known[:, None], Rotation.from_quat(np.where(known[:, None], q, [0.0, 0.0, 0.0, 1.0])).apply(v), np.nan)
     return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6))
+
+
+def late_tdoas(path, namespace="", salvage=False, topics=None):
+    """How many TDOAs came too late for the filter that made the odometry of a bag, by the uwb/residual beside it.
+
+    0 where that was not recorded. Arguments as of `read_odometry`. Raises InputError."""
+    beside = _Names(namespace, topics)("odometry").rpartition("/")[0]
+    with open_bag(path, salvage) as reader:
+        found = _find(path, _connections(reader), f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual")
+        residuals = (deserialize(path, c, data) for c, _, data in messages(path, reader, found))
+        return sum(residual.verdict == residual.VERDICT_LATE for residual in residuals)
 
 
 def read_fields(path, topic, namespace=""):
@@ -192,9 +224,10 @@ def read_fields(path, topic, namespace=""):
     stamps; raises InputError.
     """
     with open_bag(path) as reader:
-        found = _find(path, _connections(reader), namespace, topic)
+        topic = _Names(namespace)(topic)
+        found = _find(path, _connections(reader), topic)
         if not found:
-            raise InputError(f"{path}: has no topic {_absolute(namespace, topic)}; record it.")
+            raise InputError(f"{path}: has no topic {topic}; record it.")
         recorded = [deserialize(path, c, data) for c, _, data in messages(path, reader, found)]
     stamps = np.array([bag_messages.stamp_of(message.header) for message in recorded], dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
@@ -212,22 +245,45 @@ def _connections(reader):
 
 
 def _about(path):
-    """Name and meta of the flight, as `write_bag` left them in the bag's custom data; {} in bags of others."""
-    file = Path(path) / "metadata.yaml"
-    if not file.is_file():
-        return {}
-    information = yaml.safe_load(file.read_text())["rosbag2_bagfile_information"]
-    return json.loads((information.get("custom_data") or {}).get(_FLIGHT_KEY, "{}"))
+    """{"name", "meta"} of the flight, as `write_bag` left them in the bag's custom data; of bags of others, and where
+    they cannot be read, the name of the file and nothing."""
+    out = {"name": Path(path).stem, "meta": {}}
+    try:
+        about = json.loads(metadata(Path(path))["custom_data"].get(_FLIGHT_KEY, "{}"))
+    except (InputError, Damaged, TypeError, ValueError, RecursionError):
+        return out
+    if isinstance(about, dict):
+        name, meta = about.get("name"), about.get("meta")
+        if isinstance(name, str) and re.fullmatch(r"[^/\0\n\r]{1,200}", name) and name not in (".", ".."):
+            out["name"] = name
+        if isinstance(meta, dict):
+            out["meta"] = meta
+    return out
 
 
-def _absolute(namespace, topic):
-    parts = [part.strip("/") for part in (namespace, topic)]
-    return "/" + "/".join(part for part in parts if part)
+def _not_finite(path, topic, stamps, rows, sound):
+    row, column = np.argwhere(~sound(rows))[0]
+    return InputError(
+        f"{path}: {topic}, message {row + 1} of {len(rows)} at {stamps[row]:.3f} s: its number {column + 1} is "
+        f"{rows[row, column]}; it must be finite: leave such messages out with --salvage."
+    )
 
 
-def _find(path, connections, namespace, topic, msgtype=None):
+class _Names:
+    """Absolute names of our topics in a bag."""
+
+    def __init__(self, namespace="", topics=None):
+        self._namespace, self._topics = namespace.strip("/"), topics or {}
+
+    def __call__(self, topic):
+        name = self._topics.get(topic, topic)
+        absolute = name.startswith("/") or not self._namespace
+        return f"/{name.strip('/')}" if absolute else f"/{self._namespace}/{name.strip('/')}"
+
+
+def _find(path, connections, topic, msgtype=None):
     """The connection of a topic as a list, empty if it is not there; raises InputError if its type is another."""
-    connection = connections.get(_absolute(namespace, topic))
+    connection = connections.get(topic)
     if connection is None:
         return []
     if msgtype is not None and connection.msgtype != msgtype:
@@ -240,7 +296,7 @@ def _table(path, reader, connections, row):
     """Stamps (n,) s, the other columns (n, k) of row(message) in order of stamps, and how often the stamps fell."""
     rows = [row(deserialize(path, c, data)) for c, _, data in messages(path, reader, connections)]
     if not rows:
-        return np.empty(0), np.empty((0, 0)), 0
+        return np.empty(0), np.empty((0, 1)), 0
     stamps = np.array([values[0] for values in rows], dtype=np.int64)
     table = np.array([values[1:] for values in rows], dtype=float)
     falls = int((np.diff(stamps) < 0).sum())
@@ -250,19 +306,17 @@ def _table(path, reader, connections, row):
     return stamps / 1e9, table, falls
 
 
-def _read_anchors(path, reader, connections, namespace):
-    found = _find(path, connections, namespace, "uwb/anchors", "uwb_tdoa_msgs/msg/AnchorArray")
+def _read_anchors(path, reader, connections, topic):
+    found = _find(path, connections, topic, "uwb_tdoa_msgs/msg/AnchorArray")
     last = None
     for connection, _, data in messages(path, reader, found):
         last = deserialize(path, connection, data)
     if last is None:
-        raise InputError(
-            f"{path}: has no message on {_absolute(namespace, 'uwb/anchors')}; give a survey file (--survey FILE)."
-        )
+        raise InputError(f"{path}: has no message on {topic}; give a survey file (--survey FILE).")
     try:
         return Anchors.from_message(last)
     except InputError as error:
-        raise InputError(f"{path}: {_absolute(namespace, 'uwb/anchors')}: {error}") from error
+        raise InputError(f"{path}: {topic}: {error}") from error
 
 
 def _others(connections, namespace):

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..readers import inputs, read_flight
 from .bag import check_output, write_bag
 
 
@@ -25,10 +24,10 @@ class Converted:
     meta: dict
 
 
-def convert(recording, survey, out, storage="mcap", force=False):
-    """Write a recording as a bag, see `read_flight` and `write_bag`. Returns Converted. Raises InputError."""
+def convert(recording, reading, out, storage="mcap", force=False):
+    """Write a recording as a bag, see `Reading` and `write_bag`. Returns Converted. Raises InputError."""
     check_output(out, force)  # before the work, not after it
-    flight = read_flight(recording, inputs.survey_for(recording, survey))
+    flight = reading.one(recording)
     counts = write_bag(flight, out, storage, force)
     streams = [stream for stream in (flight.tdoa, flight.imu, flight.truth) if stream is not None and len(stream)]
     known = (flight.anchors.index(flight.tdoa.a) >= 0) & (flight.anchors.index(flight.tdoa.b) >= 0)

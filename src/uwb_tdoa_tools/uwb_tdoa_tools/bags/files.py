@@ -1,17 +1,20 @@
 """Bags as files: opening them, going through their messages, and making new ones that are never half-written."""
 
-import shutil
-import tempfile
 from contextlib import contextmanager
 from pathlib import Path
+import re
+import shutil
+import tempfile
 
-from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .message_types import add_type, typestore
+from ..readers.streams import SALVAGE
+from .integrity import NO_SUM, SUM_KEY, check as check_whole, is_packed, metadata, seal, unpack
+from .mcap import Damaged
+from .message_types import typestore
+from .salvage import salvage as write_sound_part
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _FILE_MAGIC = (b"\x89MCAP0\r\n", b"SQLite format 3\0")
@@ -29,7 +32,9 @@ def new_bag(out, storage="mcap", force=False):
     scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
     try:
         with Writer(scratch / out.name, version=Writer.VERSION_LATEST, storage_plugin=STORAGES[storage]) as writer:
+            writer.set_custom_data(SUM_KEY, NO_SUM)
             yield writer
+        seal(scratch / out.name)
         if out.exists():
             check_output(out, force)
             out.rename(scratch / "replaced")
@@ -63,35 +68,71 @@ def is_bag(path):
 
 
 @contextmanager
-def open_bag(path):
-    """An open rosbags Reader of a bag directory or data file; raises InputError with what is wrong with it."""
+def open_bag(path, salvage=False):
+    """An open rosbags Reader of a bag directory or data file; raises InputError with what is wrong with it.
+
+    salvage : read what is sound of a cut or damaged one; the Reader's `remarks` are sentences on what is missing.
+    """
     path = Path(path)
     if not is_bag(path):
         raise InputError(f"{path}: is not a bag; give the directory with metadata.yaml or its .mcap or .db3 file.")
-    if path.is_dir() and not (path / "metadata.yaml").is_file():
-        raise InputError(f"{path}: has no metadata.yaml: the recording was not closed; run `ros2 bag reindex` on it.")
+    if path.is_dir() and not (path / "metadata.yaml").is_file() and not salvage:
+        raise InputError(
+            f"{path}: has no metadata.yaml: the recording was not closed; run `ros2 bag reindex` on it, or {SALVAGE}."
+        )
+    with tempfile.TemporaryDirectory(prefix="uwb_tdoa_") as folder:
+        reader = _opened(path, Path(folder), salvage)
+        try:
+            yield reader
+        finally:
+            reader.close()
+
+
+def _opened(path, folder, salvage):
+    remarks, readable = [], path
     try:
-        reader = Reader(path)
+        if salvage:
+            readable = folder / "sound"
+            remarks = write_sound_part(path, readable)
+        else:
+            check_whole(path)
+            if path.is_dir() and is_packed(metadata(path)):
+                readable = folder
+                unpack(path, folder)
+                check_whole(folder)
+        reader = Reader(readable)
         reader.open()
+        reader.remarks = remarks
+        for connection in reader.connections:
+            if not re.fullmatch(r"[/\w]+", connection.topic) or not re.fullmatch(r"\w+/\w+/\w+", connection.msgtype):
+                raise Damaged(f"topic {connection.topic!r} of type {connection.msgtype!r} is none")
+    except InputError:
+        raise
     except Exception as error:  # rosbags raises whatever its parsers run into
         raise _damaged(path, error) from error
-    try:
-        yield reader
-    finally:
-        reader.close()
+    return reader
 
 
 def messages(path, reader, connections):
-    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order; raises InputError."""
+    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order; raises InputError, also if there
+    are more or fewer than the bag says."""
     found = reader.messages(connections=connections) if connections else iter(())
+    left = {(connection.topic, connection.msgtype): 0 for connection in connections}
+    for connection in connections:
+        left[connection.topic, connection.msgtype] += connection.msgcount
     while True:
         try:
-            message = next(found)
+            connection, stamp, data = next(found)
         except StopIteration:
-            return
-        except Exception as error:  # as in open_bag
+            break
+        except Exception as error:  # as in _opened
             raise _damaged(path, error) from error
-        yield message
+        left[connection.topic, connection.msgtype] -= 1
+        yield connection, stamp, data
+    for (topic, _), count in left.items():
+        if count:
+            what = f"{count} messages are missing" if count > 0 else f"{-count} messages are too many"
+            raise _damaged(path, f"{what} on {topic}")
 
 
 def deserialize(path, connection, data):
@@ -102,22 +143,8 @@ def deserialize(path, connection, data):
         raise _damaged(path, error) from error
 
 
-def check_type(path, connection):
-    """Raise InputError unless we know the type of a topic, in the version in which it was recorded."""
-    store = typestore()
-    add_type(store, connection.msgtype)
-    recorded = connection.digest
-    if not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG:  # a data file without metadata.yaml
-        of_bag = get_typestore(Stores.EMPTY)
-        of_bag.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
-        recorded = of_bag.hash_rihs01(connection.msgtype)
-    if recorded and recorded != store.hash_rihs01(connection.msgtype):
-        raise InputError(
-            f"{path}: {connection.topic} was recorded with another version of {connection.msgtype}; use the version of "
-            "this software that recorded it."
-        )
-
-
 def _damaged(path, error):
-    said = str(error) or type(error).__name__
-    return InputError(f"{path}: the bag is cut or damaged ({said}); copy it again, or record it again.")
+    said = " ".join(str(error).split()) or type(error).__name__
+    return InputError(
+        f"{path}: the bag is cut or damaged ({said}); copy it again, record it again, or {SALVAGE}."
+    )

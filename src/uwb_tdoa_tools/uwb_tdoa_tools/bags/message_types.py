@@ -4,7 +4,7 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
-from rosbags.interfaces import Nodetype
+from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -35,6 +35,33 @@ def add_type(store, msgtype):
                 field = field[1][0]
             if field[0] == Nodetype.NAME:
                 add_type(store, field[1])
+
+
+def check_type(path, connection):
+    """Raise InputError unless we know the type of a topic, in the version in which it was recorded."""
+    store = typestore()
+    add_type(store, connection.msgtype)
+    recorded = connection.digest
+    if not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG:  # a data file without metadata.yaml
+        try:
+            recorded = _hash_of(connection.msgdef.data, connection.msgtype)
+        except Exception as error:  # rosbags raises whatever its parsers run into
+            raise InputError(
+                f"{path}: the definition of {connection.msgtype} in the bag cannot be read ({error!r}); record it again."
+            ) from error
+    if recorded and recorded != store.hash_rihs01(connection.msgtype):
+        raise InputError(
+            f"{path}: {connection.topic} was recorded with another version of {connection.msgtype}; use the version of "
+            "this software that recorded it."
+        )
+
+
+@lru_cache(maxsize=64)
+def _hash_of(definition, msgtype):
+    """Hash of a type by a definition that a bag holds."""
+    of_bag = get_typestore(Stores.EMPTY)
+    of_bag.register(get_types_from_msg(definition, msgtype))
+    return of_bag.hash_rihs01(msgtype)
 
 
 def _definition(msgtype):

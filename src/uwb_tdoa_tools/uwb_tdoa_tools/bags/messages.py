@@ -1,5 +1,6 @@
 """The arrays of a Flight as ROS messages (of a rosbags typestore), and back.
 
+`<stream>_sound` tells which numbers of rows (n, k) may be there: (n, k) bool; without it, those that are finite.
 What was not measured is marked as the messages say: an orientation of (0, 0, 0, 0), an orientation_covariance[0] of -1,
 covariances of 0 for unknown.
 """
@@ -12,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Height, Imu, Pressure, Tdoas, Truth, Velocity
 
 BODY_FRAME = "base_link"
-FIELD_OF_VIEW, LONGEST_RANGE = 0.47, 1000.0  # rad and m, of a sensor_msgs/Range: typical, and a bound that bounds nothing
+FIELD_OF_VIEW, LONGEST_RANGE = 0.47, 1000.0  # rad, m, of a sensor_msgs/Range: typical, and a bound that bounds nothing
 UNKNOWN_VARIANCE = 1e12  # of what is not measured: covariances of messages are to be finite
 
 
@@ -64,6 +65,10 @@ def height_row(message):
     return stamp_of(message.header), value
 
 
+def height_sound(rows):
+    return np.ones(rows.shape, dtype=bool)  # REP 117: what is not finite says that nothing was in range
+
+
 def height_of(stamps, rows):
     return Height(stamps, rows[:, 0])
 
@@ -96,12 +101,18 @@ def velocity_messages(velocity, store):
 
 
 def velocity_row(message):
-    v, variance = message.twist.twist.linear, np.diag(message.twist.covariance.reshape(6, 6))[:3]
-    return stamp_of(message.header), v.x, v.y, v.z, *np.where(variance < UNKNOWN_VARIANCE, variance, np.inf).tolist()
+    v, variance = message.twist.twist.linear, message.twist.covariance[[0, 7, 14]].tolist()
+    std = [math.sqrt(value) if 0.0 <= value < UNKNOWN_VARIANCE else math.inf for value in variance]
+    return stamp_of(message.header), v.x, v.y, v.z, *std
+
+
+def velocity_sound(rows):
+    unknown = np.isinf(rows[:, 3:6])
+    return np.hstack([np.isfinite(rows[:, 0:3]) | unknown, np.ones(unknown.shape, dtype=bool)])
 
 
 def velocity_of(stamps, rows):
-    return Velocity(stamps, rows[:, 0:3], np.sqrt(rows[:, 3:6]))
+    return Velocity(stamps, rows[:, 0:3], rows[:, 3:6])
 
 
 def tdoa_messages(tdoa, store):

@@ -28,9 +28,11 @@ def parser():
         "convert 0425-traj1 --survey anchor_0425.txt --out 0425-traj1.bag",
         "convert const1-trial1-tdoa2.csv.gz --survey anchor_const1.csv --out const1.bag --storage sqlite3",
         "convert flight.log --survey anchors.yaml --out flight.bag --force --json",
+        "convert cut.log --survey anchors.yaml --salvage --out flight.bag",
+        "convert theirs.bag --topic uwb/tdoa=/dwm/tdoa --topic imu/data=/fcu/imu --survey anchors.yaml --out our.bag",
     )
     made.add_argument("input", metavar="IN", help="the recording; its kind is found by its content")
-    options.add_survey(made)
+    options.add_reading(made)
     made.add_argument("--out", metavar="BAG", required=True, help="the bag to write, a new directory")
     made.add_argument("--storage", choices=STORAGES, default="mcap", help="default: mcap")
     made.add_argument("--force", action="store_true", help="replace an existing bag")
@@ -39,7 +41,7 @@ def parser():
 
 
 def _convert(args):
-    made = convert(args.input, args.survey, args.out, args.storage, args.force)
+    made = convert(args.input, options.reading_of(args), args.out, args.storage, args.force)
     if args.json:
         print(json.dumps(asdict(made), indent=2, default=str))
         return

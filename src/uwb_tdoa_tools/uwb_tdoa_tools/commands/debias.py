@@ -9,8 +9,8 @@ from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 
 from .. import cli, options, parallel
 from ..debiasing import report
-from ..debiasing.mapping import Estimator, fit_map
-from ..readers import inputs
+from ..debiasing.judge import Estimator
+from ..debiasing.mapping import fit_map
 
 DESCRIPTION = """Map the bias of estimated positions over the room, after Grasso et al. (Sensors 2022, 22, 9136), and
 take it out.
@@ -62,13 +62,13 @@ def _fit(args):
         raise InputError("FLIGHT: there is none; give flights with ground truth, or --static points.")
     if not 0.01 <= args.step <= 10.0:
         raise InputError(f"--step: {args.step!r} is outside 0.01 ... 10 m.")
-    estimator = Estimator(*options.filter_of(args), args.namespace)
-    recordings, held = (_found(args, paths) for paths in (args.flights, args.holdout))
+    estimator = Estimator(options.reading_of(args), *options.filter_of(args))
+    recordings, held = (estimator.reading.find(paths, bool(args.dask)) for paths in (args.flights, args.holdout))
     shared = {path.resolve() for path, _ in recordings} & {path.resolve() for path, _ in held}
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
     fitted = list(parallel.over(estimator, recordings, args.jobs, args.dask))
-    made = fit_map(fitted, args.static, estimator, args.survey, args.step, args.planar, args.interpolator)
+    made = fit_map(fitted, args.static, estimator, args.step, args.planar, args.interpolator)
     made.save(args.out)
     print(f"wrote {args.out}: {report.about(made)}")
     figures = {"map": report.about_figures(made), "fitted": report.rows(fitted, made, estimator.effects)}
@@ -80,18 +80,14 @@ def _fit(args):
 
 
 def _judge(args):
-    estimator, made = Estimator(*options.filter_of(args), args.namespace), BiasMap.load(args.map)
-    rows = _judged(args, estimator, _found(args, args.flights), made)
+    estimator, made = Estimator(options.reading_of(args), *options.filter_of(args)), BiasMap.load(args.map)
+    rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     report.say_rows("flight", rows)
     _write(args.json, {"map": report.about_figures(made), "runs": rows})
 
 
 def _judged(args, estimator, recordings, made):
     return report.rows(parallel.over(estimator, recordings, args.jobs, args.dask), made, estimator.effects)
-
-
-def _found(args, paths):
-    return inputs.find_flights(paths, args.survey, absolute=bool(args.dask)) if paths else []
 
 
 def _write(path, figures):

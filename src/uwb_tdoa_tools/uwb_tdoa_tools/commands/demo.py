@@ -6,9 +6,8 @@ import time
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli
+from .. import cli, options
 from ..live import demo
-from ..readers import inputs
 from ..scoring.plots import plot_comparison
 from ..scoring.table import lines_of_errors
 
@@ -18,7 +17,7 @@ compare the estimate with ground truth.
 Without --flight it is a simulated one whose anchors have delays of 0.1 m (standard deviation); the nodes correct for
 them with an effects.yaml that holds their true values, as a calibration would find them. A measured flight is corrected
 with what --effects and --model give, or else with the model that bias_node ships. "raw" is the same filter without any
-correction, run without ROS.
+correction, run without ROS. The exit code is 1 if the estimate diverged, or messages were lost or late.
 """
 
 
@@ -38,7 +37,7 @@ def parser():
     )
     add = made.add_argument
     add("--flight", metavar="LOG", help="a recording: micro-SD log, UTIL CSV or bag (default: simulate one)")
-    add("--survey", metavar="S", help=inputs.SURVEY_HELP)
+    options.add_reading(made)
     add("--rate", metavar="R", type=float, default=1.0, help="replay R times as fast as flown (default 1)")
     add("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="for all files (default out/demo)")
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
@@ -54,7 +53,7 @@ def _demo(args):
     started = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
     if args.flight:
-        case = demo.measured(args.flight, args.survey, args.effects, args.model)
+        case = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
     else:
         case = demo.simulated(args.out, args.effects, args.model)
     flight = case.flight
@@ -62,7 +61,8 @@ def _demo(args):
     print(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
     print(f"correction {case.corrector().model} ({', '.join(case.sources)})")
     became, scores = demo.fly(case, args.out, args.rate, lambda text: print(f"nodes      {text}", flush=True))
-    if not _all_in_time(flight, became):
+    in_time = _all_in_time(flight, became)
+    if not in_time:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
     print("\n".join(lines_of_errors(scores)))
     before, after = (score.row()["rmse_3d"] for score in scores[:2])
@@ -70,7 +70,7 @@ def _demo(args):
     plot_comparison(flight, scores[:2], args.out / "error.png")
     print(f"plot       {args.out / 'error.png'}")
     print(f"took {time.monotonic() - started:.0f} s")
-    return int(scores[1].row()["diverged"])
+    return int(scores[1].row()["diverged"] or not in_time)
 
 
 def _all_in_time(flight, became):

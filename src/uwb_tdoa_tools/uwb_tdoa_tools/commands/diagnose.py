@@ -11,7 +11,6 @@ from .. import cli, options
 from ..diagnosis import diagnose
 from ..diagnosis.references import GroundTruth, Nothing
 from ..progress import Progress
-from ..readers import inputs
 
 DESCRIPTION = """Find out what is wrong with the measurements of some flights, and put it right.
 
@@ -49,8 +48,8 @@ def _diagnose(args):
     if out.exists() and not out.is_dir():
         raise InputError(f"--out: {out} is a file; give a directory.")
     config, effects = options.filter_of(args)
-    groups = (args.flights, args.holdout)
-    flights, holdout = (inputs.read_flights(paths, args.survey, args.namespace) for paths in groups)
+    reading = options.reading_of(args)
+    flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)
     shared = {f.name for f in flights} & {f.name for f in holdout}
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")

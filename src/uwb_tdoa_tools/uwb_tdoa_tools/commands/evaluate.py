@@ -11,7 +11,6 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.aids import STREAMS
 
 from .. import cli, options, parallel
-from ..readers import inputs
 from ..scoring import table
 from ..scoring.judge import Judge
 from ..scoring.metrics import as_json, pooled
@@ -27,11 +26,13 @@ def parser():
     made = cli.parser(
         "evaluate",
         "Errors of the estimate against ground truth over the airborne part (truth z > 0.3 m), in metres.\n"
-        "Runs bias correction and filter here, as the nodes would, or takes a recorded odometry.",
+        "Runs bias correction and filter here, as the nodes would, or takes a recorded odometry (exit code 1 if TDOAs were\n"
+        "late for it, as far as uwb/residual was recorded too).",
         "evaluate flight.bag",
         "evaluate 0425-traj2 --survey anchor_0425.txt --plot error.png",
         "evaluate flights/ --survey surveys/ --no-bias --json errors.json",
         "evaluate flight.bag --odometry recorded.bag --tum out/",
+        "evaluate flight.bag --odometry tags.bag --topic odometry=/tag1/odometry",
         "evaluate flights/ --survey surveys/ -p adapt_noise:=false -p loss:=huber",
         "evaluate flights/ --survey surveys/ --without height --without pressure",
         "evaluate flights/ --survey surveys/ --dask tcp://10.0.0.1:8786",
@@ -68,12 +69,13 @@ def _evaluate(args):
     without = [f"use_{aid}:=false" for aid in args.without]
     config = options.with_parameters(config, args.parameters + without)
     network = None if args.no_bias else load_network(args.model)
-    found = inputs.find_flights(args.flights, args.survey, absolute=bool(args.dask))
+    reading = options.reading_of(args)
+    found = reading.find(args.flights, bool(args.dask))
     for option in ("odometry", "plot"):
         if getattr(args, option) and len(found) != 1:
             raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
     judge = Judge(
-        config, None if args.no_bias else effects, network, args.smooth, args.odometry, args.namespace, args.plot,
+        reading, config, None if args.no_bias else effects, network, args.smooth, args.odometry, args.plot,
         Path(args.tum).absolute() if args.tum else None,
     )  # fmt: skip
     scores = []
@@ -93,6 +95,10 @@ def _evaluate(args):
         rows += [together] * (len(scores) > 1)
         others = table.read_others(args.beside) if args.beside else {}
         Path(args.markdown).write_text(table.markdown(rows, others))
+    if late := judge.late_tdoas():
+        cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
+                "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip
+    return int(late > 0)
 
 
 if __name__ == "__main__":

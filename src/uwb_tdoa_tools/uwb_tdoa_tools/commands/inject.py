@@ -34,8 +34,7 @@ def parser():
     add = made.add_argument
     add("flight", metavar="FLIGHT", nargs="?", help="a raw log, a UTIL CSV file or a bag")
     add("--list", action="store_true", help="list effects, parameters and units, and do nothing else")
-    options.add_survey(made)
-    options.add_namespace(made)
+    options.add_reading(made)
     add("--effect", metavar="NAME", choices=EFFECTS, help="the effect to add")
     add("--value", metavar="KEY=NUMBER", nargs="+", default=[], help="its parameters")
     add("--seed", metavar="N", type=int, default=0, help="of effects that are random (default: 0)")
@@ -53,7 +52,7 @@ def _inject(args):
         if not getattr(args, option):
             raise InputError(f"{option}: is missing; see inject --help.")
     effect = parse_effect(args.effect, args.value)
-    name = inject(effect, args.flight, args.out, args.survey, args.namespace, args.seed, args.storage, args.force)
+    name = inject(effect, args.flight, options.reading_of(args), args.out, args.seed, args.storage, args.force)
     added = ", ".join(f"{key} = {value:g}" for key, value in effect.values.items())
     print(f"{name}: added {effect.name} ({added}, in {effect.unit}) -> {args.out}")
 

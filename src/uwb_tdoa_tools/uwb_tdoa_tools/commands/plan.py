@@ -87,7 +87,8 @@ def _plan(args):
     grid = options.grid_of(args, room)
     if args.flights and args.planar:
         raise InputError("flights: are judged in three dimensions; leave out --planar.")
-    recordings = inputs.find_flights(args.flights, args.anchors, bool(args.dask)) if args.flights else []
+    reading = inputs.Reading(args.anchors)
+    recordings = reading.find(args.flights or [], bool(args.dask))
     aim = options.aim_of(args, installation, room, grid.axes[2][0]) if args.improve else None
 
     if not np.isfinite(anchors.orientations).all():
@@ -101,7 +102,7 @@ def _plan(args):
         figures["check"] = run.check(installation, grid, args.out)
         report.say_check(figures["check"])
     if recordings:
-        flown = parallel.over(run.fly, recordings, args.jobs, args.dask)
+        flown = parallel.over(run.Fly(reading), recordings, args.jobs, args.dask)
         figures["flights"] = run.judge_flights(flown, installation, room, args.step or 0.4, args.out)
         report.say_flights(figures["flights"])
     if aim:

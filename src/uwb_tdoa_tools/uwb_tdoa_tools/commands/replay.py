@@ -11,10 +11,12 @@ DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 ba
 
 Every topic is published with the durability it was recorded with, and always reliably, which serves best-effort
 subscriptions too: a reliable subscription gets every message at any rate (the replay waits for it when it must), a
-best-effort one gets what it keeps up with. With --follow, nothing is played more than 2 s ahead of what comes of it: a
-slow computer then takes longer, and gets the same. Ends when every reliable subscription has everything, and tells what
-was published and how late. ROS arguments put all topics (but /tf, /clock and the like) into the namespace of a tag, or
-move single ones, as in the last examples.
+best-effort one gets what it keeps up with. Nothing is played before somebody listens. With --follow, nothing is played
+more than 2 s ahead of what comes of it, and while ekf_node publishes uwb/residual no TDOA before those that are 0.1 s
+older have come out of the filter: a slow computer then takes longer, and gets the same. Ends when every reliable
+subscription has everything, and tells what was published and how late; with code 1 if what was followed was late all
+the same. ROS arguments put all topics (but /tf, /clock and the like) into the namespace of a tag, or move single ones,
+as in the last examples.
 """
 
 
@@ -44,14 +46,14 @@ def parser():
         help="publish the bag's time on /clock (default 40 Hz)",
     )  # fmt: skip
     add(
-        "--wait-matched", type=_positive, default=2.0, metavar="SECONDS",
-        help="wait at most this long until somebody subscribes to every topic, then start (default 2)",
+        "--wait-matched", type=_positive, default=Options.wait, metavar="SECONDS",
+        help=f"wait at most this long until somebody subscribes, or fail (default {Options.wait:g})",
     )  # fmt: skip
     add(
         "--wait-topics", nargs="+", default=[], metavar="TOPIC",
-        help="wait for these topics only, and fail if nobody subscribes to one of them in time",
+        help="wait until somebody subscribes to each of these topics",
     )  # fmt: skip
-    add("--follow", metavar="TOPIC", help="wait whenever the stamps on this topic fall 2 s behind")
+    add("--follow", metavar="TOPIC", help="keep in step with this topic, e.g. odometry")
     return made
 
 
@@ -75,7 +77,9 @@ def _replay(args):
         return 0 if args.loop else 128 + done.stopped_by
     if not done.acknowledged:
         say(f"not every subscription acknowledged every message within {ACKNOWLEDGE_LIMIT:g} s")
-        return 1
+    for what, count in done.wrong.items():
+        say(f"{count} {what}; the result is not that of the bag: look at /diagnostics, or replay slower (--rate)")
+    return int(bool(done.wrong) or not done.acknowledged)
 
 
 def _positive(text):

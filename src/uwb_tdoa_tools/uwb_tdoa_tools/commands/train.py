@@ -5,7 +5,6 @@ from pathlib import Path
 import sys
 
 from .. import cli, options
-from ..readers import inputs
 from ..training import labels as labelling, models
 from ..training.plots import plot_curve
 
@@ -34,8 +33,7 @@ def parser():
         "train a.bag b.bag c.bag --validation c --model paper --out model/",
     )
     add = made.add_argument
-    add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
-    options.add_survey(made)
+    options.add_recordings(made)
     add("--model", choices=models.KINDS, required=True, help="what to train")
     add("--out", metavar="DIR", type=Path, required=True, help="where to write")
     add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
@@ -45,7 +43,7 @@ def parser():
 
 
 def _train(args):
-    flights = {flight.name: flight for flight in inputs.read_flights(args.flights, args.survey)}
+    flights = {flight.name: flight for flight in options.reading_of(args).flights(args.flights)}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):
         print(f"{what:13s} {', '.join(some)}")

@@ -1,10 +1,13 @@
 """Flights before and after a bias map."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_ekf.core.config import FilterConfig
+
+from ..readers.inputs import Reading
 from ..scoring.evaluation import evaluate, judging_truth
 from ..scoring.metrics import Score
-from ..readers import read_flight
 
 
 def debiased(odometry, bias_map):
@@ -14,11 +17,25 @@ def debiased(odometry, bias_map):
     return replace(odometry, p=p, covariance=covariance)
 
 
-def fly(recording, config=None, effects=None, namespace=""):
-    """(Flight, Score, odometry) of one (path, survey) with ground truth, run through the filter. Raises InputError."""
-    flight = read_flight(*recording, namespace)
+def fly(flight, config=None, effects=None):
+    """(Flight, Score, odometry) of a Flight with ground truth, run through the filter. Raises InputError."""
     score, run = evaluate(flight, config, effects)
     return flight, score, run.odometry
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """What positions are estimated with; estimator((path, survey)) is what `judge.fly` gives. Can be pickled.
+
+    reading : Reading; config : FilterConfig; effects : EffectSet or None, of the TDOAs before the filter.
+    """
+
+    reading: Reading = Reading()
+    config: FilterConfig | None = None
+    effects: EffectSet | None = None
+
+    def __call__(self, recording):
+        return fly(self.reading.read(recording), self.config, self.effects)
 
 
 def judge(flown, bias_map, effects=None):

@@ -1,6 +1,5 @@
 """Pairs of measured and true positions, to fit a bias map to: from flights, and from places where a tag stood still."""
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +9,11 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import Part
 from uwb_tdoa_ekf.offline import run_offline
 
-from ..readers import inputs
+from ..readers.streams import read_head
+from ..readers.tables import number, read_table
 from ..scoring.evaluation import judging_truth
 from ..scoring.metrics import position_at
-from ..readers import read_flight
+from .judge import Estimator
 
 LEAST = 10  # positions of flights, 5 ms apart, that make a marker
 COLUMNS = ("true_x", "true_y", "true_z", "x", "y", "z")
@@ -28,22 +28,20 @@ def part_of(score, odometry):
     return Part(measured, measured - score.error, score.covariance)
 
 
-def static_parts(path, survey=None, config=None, effects=None, planar=False):
+def static_parts(path, estimator=Estimator(), planar=False):
     """List of Part of a tag that stood still, one for each place.
 
     path : a CSV file with the columns true_x, true_y, true_z, x, y, z (m; without the z if planar), one row for each
         measured position; or any recording with ground truth, through which the filter is run, and of which the time at
         rest counts, but for the first SETTLE s at each place. Raises InputError.
     """
-    if not Path(path).is_dir():
-        with open(path, "rb") as file:
-            if b"true_x" in file.readline():
-                return _from_table(path, planar)
-    flight = read_flight(path, inputs.survey_for(path, survey))
+    if not Path(path).is_dir() and b"true_x" in read_head(path, 1000):
+        return _from_table(path, planar)
+    flight = estimator.reading.one(path)
     if flight.truth is None:
         raise InputError(f"{path}: holds no ground truth; record where the tag stood as ground_truth/pose.")
-    odometry = run_offline(flight, config, Corrector(flight.anchors, effects)).odometry
-    truth = judging_truth(flight, effects)
+    odometry = run_offline(flight, estimator.config, Corrector(flight.anchors, estimator.effects)).odometry
+    truth = judging_truth(flight, estimator.effects)
     true, t = position_at(odometry.t, truth), odometry.t
     moved = np.linalg.norm(true - position_at(t - SETTLE, truth), axis=1)
     resting = (moved < REST) & (t > np.min(t, initial=np.inf) + SETTLE)
@@ -56,22 +54,11 @@ def static_parts(path, survey=None, config=None, effects=None, planar=False):
 
 def _from_table(path, planar):
     names = [name for name in COLUMNS if not (planar and name.endswith("z"))]
-    with open(path, newline="") as file:
-        rows = csv.DictReader(file, skipinitialspace=True)
-        missing = [name for name in names if name not in (rows.fieldnames or ())]
-        if missing:
-            raise InputError(f"{path}: has no column {missing[0]}; it needs {', '.join(names)}, in metres.")
-        values = []
-        for row in rows:
-            try:
-                values.append([float(row[name]) for name in names])
-            except (TypeError, ValueError):
-                raise InputError(
-                    f"{path}: line {rows.line_num}: {row} needs a number in each of {', '.join(names)}."
-                ) from None
-    if not values:
+    rows = read_table(path, names)
+    if not rows:
         raise InputError(f"{path}: holds no positions; give one row for each.")
-    table, d = np.array(values), len(names) // 2
+    table = np.array([[number(path, line, row, name) for name in names] for line, row in rows])
+    d = len(names) // 2
     _, place = np.unique(table[:, :d], axis=0, return_inverse=True)
     true, measured = (np.pad(side, ((0, 0), (0, 3 - d))) for side in (table[:, :d], table[:, d:]))
     return [Part(measured[rows], true[rows]) for rows in (place.ravel() == k for k in range(place.max() + 1))]

@@ -11,7 +11,6 @@ from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.offline import run_offline
 
 from ..bags.bag import read_odometry, write_bag
-from ..readers import inputs, read_flight
 from ..scoring.metrics import Score, airborne
 from ..simulation import SimulationConfig, simulate
 from .run import accounts, run_live
@@ -50,10 +49,10 @@ def simulated(folder, effects_file=None, model=None):
     return Case(flight, effects_file, model)
 
 
-def measured(path, survey=None, effects_file=None, model=None):
-    """Case of a recording, corrected, if nothing else is given, with the model that bias_node ships. Raises
-    InputError."""
-    flight = read_flight(path, inputs.survey_for(path, survey))
+def measured(path, reading, effects_file=None, model=None):
+    """Case of a recording, read by a Reading, corrected, if nothing else is given, with the model that bias_node ships.
+    Raises InputError."""
+    flight = reading.one(path)
     if flight.truth is None:
         raise InputError(f"{path}: holds no ground truth to compare with; take a flight that has it.")
     airborne(flight.truth)

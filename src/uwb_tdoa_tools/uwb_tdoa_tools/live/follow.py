@@ -1,5 +1,7 @@
 """Let what is played keep in step with what comes of it."""
 
+from collections import deque
+import math
 import struct
 import time
 
@@ -7,16 +9,24 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .session import message_class
+from .session import READER_DEPTH, message_class, subscription_qos
 
 LEAD = 2_000_000_000  # ns of stamps that may be played ahead
+STEP = 100_000_000  # ns: a TDOA that is older than the newest by more has come out of the filter, or is waited for
+# (STEP is more than ekf_node's `reorder`, so that it can have come out, and less than bias_node's `hold` and ekf_node's
+# `lag`, so that neither goes on without what is still on its way.)
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
 SILENCE = 5.0  # s after which a topic is not waited for any more, until it speaks again
-POLL_PERIOD = 0.005  # s
+POLL_PERIOD = 0.001  # s
+RESIDUAL = "uwb/residual"
+LEARNED = 20  # TDOAs that tell by how much bias_node shifts their stamps
 
 
 class Follower:
-    """Watches a topic whose messages have a header, and says when to wait for it."""
+    """Watches a topic whose messages have a header, and says when to wait for it.
+
+    Where somebody also publishes uwb/residual, one message for each TDOA, TDOAs are followed too (`note_tdoa`).
+    """
 
     def __init__(self, node, topic):
         """Raises InputError if nobody publishes the topic, or its messages have no header."""
@@ -30,12 +40,21 @@ class Follower:
         self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)  # taken, never spun
         self._newest = self._looked = None
         self._silent = False
+        self._tdoas = _Tdoas(node)
+
+    def note_tdoa(self, stamp):
+        """A TDOA with this stamp, ns, has been played."""
+        self._tdoas.note(stamp)
 
     def wait(self, stamp, stop):
-        """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to be played.
+        """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to be played, and
+        until every TDOA older than the newest by STEP has come out of the filter.
 
         Returns how long that took, s; stop : true once the wait shall end.
         """
+        return self._tdoas.wait(stop) + self._wait_for_stamps(stamp, stop)
+
+    def _wait_for_stamps(self, stamp, stop):
         if self._newest is None:
             self._newest = self._looked = stamp
         in_step = self._silent or stamp - self._newest <= LEAD
@@ -44,7 +63,8 @@ class Follower:
         self._looked = stamp
         began = heard = time.monotonic()
         while not stop:
-            if self._take():
+            if taken := _taken(self._subscription):
+                self._newest = stamp_of(taken[-1])
                 heard, self._silent = time.monotonic(), False
             if stamp - self._newest <= LEAD or self._silent:
                 break
@@ -52,13 +72,70 @@ class Follower:
             time.sleep(POLL_PERIOD)
         return time.monotonic() - began
 
-    def _take(self):
-        """Take what has come; returns whether anything has."""
-        any_new = False
-        with self._subscription.handle:
-            while (taken := self._subscription.handle.take_message(self._subscription.msg_type, True)) is not None:
-                self._newest, any_new = stamp_of(taken[0]), True
-        return any_new
+
+class _Tdoas:
+    """How far the TDOAs that were played have come out of the filter, in the order of their stamps."""
+
+    def __init__(self, node):
+        self._subscription = None
+        publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(RESIDUAL))
+        cls = message_class(publishers[0].topic_type) if publishers else None
+        if cls is not None:
+            qos = subscription_qos([publisher.qos_profile for publisher in publishers])
+            qos.depth = 10 * READER_DEPTH
+            self._subscription = node.create_subscription(cls, RESIDUAL, lambda _: None, qos, raw=True)
+        self._start_over()
+
+    def _start_over(self):
+        self._begin = self._newest = None  # ns: none up to here is waited for; newest stamp that was played
+        self._out, self._silent = -math.inf, False  # ns, newest stamp that has come out
+        self._first, self._shift = deque(), 0  # stamps that were played first; by how much those that come out are less
+        self._learned = 0
+
+    def note(self, stamp):
+        if self._newest is not None and stamp < self._newest - LEAD:  # a recording that starts again
+            self._start_over()
+        if self._newest is None:
+            self._begin, self._newest = stamp - 1, stamp
+        self._newest = max(self._newest, stamp)
+        if self._learned < LEARNED:
+            self._first.append(stamp)
+
+    def wait(self, stop):
+        if self._subscription is None or self._newest is None:
+            return 0.0
+        if self._is_in_step():
+            return 0.0
+        began = heard = time.monotonic()
+        while not stop:
+            if taken := _taken(self._subscription):
+                self._learn(list(map(stamp_of, taken)))
+                heard, self._silent = time.monotonic(), False
+            if self._is_in_step() or self._silent:
+                break
+            self._silent = time.monotonic() - heard > SILENCE
+            time.sleep(POLL_PERIOD)
+        return time.monotonic() - began
+
+    def _is_in_step(self):
+        return self._newest - STEP <= max(self._begin, self._out + self._shift)
+
+    def _learn(self, stamps):
+        """Note stamps that have come out. An effect may have shifted them: the first ones tell by how much."""
+        self._out = max(self._out, *stamps)
+        for stamp in stamps[: len(self._first)]:
+            if self._learned < LEARNED:
+                self._shift = max(self._shift, self._first.popleft() - stamp)
+                self._learned += 1
+
+
+def _taken(subscription):
+    """Take what has come: list of bytes."""
+    found = []
+    with subscription.handle:
+        while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+            found.append(taken[0])
+    return found
 
 
 def is_stamped(cls):

@@ -4,8 +4,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 import time
 
+from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -14,6 +15,7 @@ from .follow import is_stamped, stamp_of
 
 RCLError = rclpy_implementation.RCLError
 LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all that follows, instead of a burst that a subscription cannot take
+LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
 LONGEST_SLEEP = 0.05  # s: how soon a signal is seen
 ACKNOWLEDGE_LIMIT = 30.0  # s; longer than the 20 s after which DDS forgets a subscription that died
 
@@ -33,6 +35,16 @@ class Played:
     waited: float = 0.0
 
 
+def is_latched(publisher):
+    """Whether who subscribes late gets the last messages too."""
+    return publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+
+
+def is_tdoa(publisher):
+    """Whether it publishes raw TDOAs."""
+    return publisher.msg_type.__name__ == "Tdoa"
+
+
 class Player:
     """Publishes to {topic in the bag: publisher}, `rate` times as fast as recorded, with /clock if it has a rate, Hz.
 
@@ -45,7 +57,14 @@ class Player:
         self._clock = node.create_publisher(Clock, "/clock", QoSProfile(depth=10)) if clock_rate else None
         self._clock_period = 1.0 / clock_rate if clock_rate else None
         self._stamped = {topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)}
+        self._tdoas = {topic for topic, publisher in publishers.items() if is_tdoa(publisher)}
+        self._latched = [publisher for publisher in publishers.values() if is_latched(publisher)]
         self._start = self._began = self._next_tick = None
+
+    def count(self, what):
+        """How many "TDOAs" or "IMU samples" have been played."""
+        kind = {"TDOAs": "Tdoa", "IMU samples": "Imu"}[what]
+        return sum(n for topic, n in self.played.counts.items() if self._publishers[topic].msg_type.__name__ == kind)
 
     def play(self, recorded):
         """Publish an iterable of (connection, stamp ns, bytes), from the beginning."""
@@ -58,12 +77,32 @@ class Player:
             if self._stop:
                 return
             self._count_delay(behind)
-            if self.follower is not None and connection.topic in self._stamped:
+            publisher, topic = self._publishers[connection.topic], connection.topic
+            if self._latched and not is_latched(publisher):
+                self._began += self._wait_for_latched()
+            if self.follower is not None and topic in self._stamped:
                 waited = self.follower.wait(stamp_of(data), self._stop)
                 self.played.waited += waited
                 self._began += waited
-            if self._publish(self._publishers[connection.topic], data):
-                self.played.counts[connection.topic] += 1
+            if self._publish(publisher, data):
+                self.played.counts[topic] += 1
+                if self.follower is not None and topic in self._tdoas:
+                    self.follower.note_tdoa(stamp_of(data))
+
+    def _wait_for_latched(self):
+        """Wait, before the first message of a stream, until what is latched (the anchors) has been acknowledged.
+        Returns the s that took.
+
+        Their publishers were made last, and a participant hears of our publishers in the order in which they were made:
+        who acknowledges a message of theirs listens to all the others too, the best-effort ones among them.
+        """
+        began = time.perf_counter()
+        for publisher in self._latched:
+            while time.perf_counter() < began + LATCHED_LIMIT and not self._stop:
+                if publisher.wait_for_all_acked(Duration(seconds=LONGEST_SLEEP)):
+                    break
+        self._latched = []
+        return time.perf_counter() - began
 
     def _sleep_until(self, due):
         """Sleep, and publish the clock meanwhile. Returns the s by which it is later than due."""

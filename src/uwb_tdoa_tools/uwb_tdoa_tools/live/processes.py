@@ -90,7 +90,7 @@ class Processes:
 
     def __init__(self, folder, stop):
         self.folder = Path(folder)
-        self._stop, self._running, self._may_end = stop, {}, set()
+        self._stop, self._running, self._may_end = stop, {}, {}
 
     def __enter__(self):
         return self
@@ -99,9 +99,9 @@ class Processes:
         for title in list(self._running)[::-1]:
             self._end(title)
 
-    def start(self, package, name, *arguments, title=None, may_end=False):
+    def start(self, package, name, *arguments, title=None, may_end_with=()):
         """The Popen of the executable; title : to tell it from others, default its name, output in `file(title)`;
-        with may_end, ending with code 0 is no failure."""
+        may_end_with : exit codes with which it is no failure that it ends."""
         try:
             program = Path(get_package_prefix(package)) / "lib" / package / name
         except PackageNotFoundError as error:
@@ -112,8 +112,7 @@ class Processes:
                 [str(part) for part in (program, *arguments)],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
-        if may_end:
-            self._may_end.add(title)
+        self._may_end[title] = may_end_with
         return self._running[title]
 
     def pid(self, title):
@@ -130,7 +129,7 @@ class Processes:
             raise KeyboardInterrupt
         for title, process in self._running.items():
             code = process.poll()
-            if code is not None and not (code == 0 and title in self._may_end):
+            if code is not None and code not in self._may_end[title]:
                 raise self._failure(title, code)
 
     def stop(self, title):

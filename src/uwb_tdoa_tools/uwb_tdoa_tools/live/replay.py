@@ -6,17 +6,20 @@ import itertools
 import time
 
 from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.files import messages, open_bag
 from .follow import Follower
-from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player
+from .followed_nodes import Nodes
+from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player, is_tdoa
 from .read_ahead import read_ahead
 from .session import message_class, publisher_qos, session
 
 GLOBAL = ("/tf", "/tf_static", "/clock", "/diagnostics", "/rosout", "/parameter_events")  # in no robot's namespace
 SETTLE = 0.2  # s from the last match to the first message: a subscription learns of a match a little later than we do
+DISCOVERY = 2.0  # s without anybody new after which who listens by now is enough
 
 
 @dataclass(frozen=True)
@@ -24,14 +27,14 @@ class Options:
     """How to replay.
 
     rate : times as fast as recorded; loop : start again at the end; clock_rate : Hz of /clock, None for none;
-    wait : s until somebody must subscribe to every topic; wait_topics : to these only, and it is an error if nobody
-    does; follow : topic whose stamps may not fall behind, or None; ros_arguments : command line with --ros-args.
+    wait : s until somebody must subscribe; wait_topics : to all of these; follow : topic that is kept in step with, or
+    None (the TDOAs of the bag are of the wait_topics then); ros_arguments : command line with --ros-args.
     """
 
     rate: float = 1.0
     loop: bool = False
     clock_rate: float | None = None
-    wait: float = 2.0
+    wait: float = 10.0
     wait_topics: tuple = ()
     follow: str | None = None
     ros_arguments: tuple = ()
@@ -40,12 +43,14 @@ class Options:
 @dataclass(frozen=True)
 class Replayed:
     """played : Played; took : s; acknowledged : whether every subscription has everything; stopped_by : number of the
-    signal that ended it early, or None."""
+    signal that ended it early, or None; wrong : {what went wrong with what was followed: count}, empty if nothing did
+    or nothing was followed."""
 
     played: Played = field(default_factory=Played)
     took: float = 0.0
     acknowledged: bool = True
     stopped_by: int | None = None
+    wrong: dict = field(default_factory=dict)
 
 
 def replay(bag, options=Options(), say=print):
@@ -57,8 +62,9 @@ def replay(bag, options=Options(), say=print):
         if not count:
             raise InputError(f"{bag}: has no message to replay.")
         player = Player(node, publishers, options.rate, options.clock_rate, stop)
-        _wait_matched(publishers, options.wait, options.wait_topics, stop, say)
+        _wait_for_listeners(node, publishers, options, stop, say)
         player.follower = Follower(node, options.follow) if options.follow else None
+        nodes = Nodes(node) if options.follow else None
         length = (reader.end_time - reader.start_time) / 1e9
         say(f"playing {count} messages, {length:.1f} s at rate {options.rate:g}")
         began = time.perf_counter()
@@ -69,13 +75,14 @@ def replay(bag, options=Options(), say=print):
                 break
         took = time.perf_counter() - began
         acknowledged = _wait_acknowledged(publishers.values(), stop)
-        return Replayed(player.played, took, acknowledged, stop.signal)
+        wrong = nodes.wrong(player, stop) if nodes else {}
+        return Replayed(player.played, took, acknowledged, stop.signal, wrong)
 
 
 def _publishers(node, bag, reader, say):
-    """{topic in the bag: publisher} of all topics whose type is installed. What belongs to one robot is published in
-    the namespace of the node (--ros-args -r __ns:=/tag1)."""
-    publishers = {}
+    """{topic in the bag: publisher} of all topics whose type is installed, those that are latched last. What belongs to
+    one robot is published in the namespace of the node (--ros-args -r __ns:=/tag1)."""
+    made = []
     by_topic = itertools.groupby(sorted(reader.connections, key=lambda c: c.topic), key=lambda c: c.topic)
     for topic, connections in by_topic:
         connections = list(connections)
@@ -84,29 +91,52 @@ def _publishers(node, bag, reader, say):
             say(f"leaving out {topic}: its type {connections[0].msgtype} is not installed")
             continue
         recorded = [qos for connection in connections for qos in connection.ext.offered_qos_profiles]
-        qos = publisher_qos(recorded, sum(connection.msgcount for connection in connections))
-        publishers[topic] = node.create_publisher(cls, topic if topic in GLOBAL else topic.lstrip("/"), qos)
-    if not publishers:
+        made.append((topic, cls, publisher_qos(recorded, sum(connection.msgcount for connection in connections))))
+    if not made:
         raise InputError(f"{bag}: has no topic of an installed type; build and source the workspace first.")
-    return publishers
+    made.sort(key=lambda entry: entry[2].durability == DurabilityPolicy.TRANSIENT_LOCAL)
+    return {
+        topic: node.create_publisher(cls, topic if topic in GLOBAL else topic.lstrip("/"), qos)
+        for topic, cls, qos in made
+    }
 
 
-def _wait_matched(publishers, limit, topics, stop, say):
-    """Return when every topic has a subscription, or after `limit` s; InputError if a named one has none then."""
-    wanted = [f"/{topic.lstrip('/')}" for topic in topics] or list(publishers)
+def _wait_for_listeners(node, publishers, options, stop, say):
+    """Return when somebody subscribes to each wanted topic: those that options name, or else all of the bag, as far as
+    they have any subscriber once nobody new has come for DISCOVERY s; and when somebody publishes what is followed.
+    InputError if after `options.wait` s nobody subscribes to one that must have a subscriber, or to any."""
+    needed = [f"/{topic.lstrip('/')}" for topic in options.wait_topics]
+    wanted = needed or list(publishers)
+    if options.follow and not needed:
+        needed = [topic for topic, publisher in publishers.items() if is_tdoa(publisher)]
     if missing := [topic for topic in wanted if topic not in publishers]:
         raise InputError(f"--wait-topics: {missing[0]} is not in the bag; it has {', '.join(publishers)}.")
-    say(f"waiting up to {limit:g} s for subscriptions to {', '.join(publishers[t].topic_name for t in wanted)}")
-    until = time.monotonic() + limit
-    missing = wanted
+    names = ", ".join(publishers[topic].topic_name for topic in wanted)
+    say(f"waiting up to {options.wait:g} s for subscriptions to {names}")
+    began = changed = time.monotonic()
+    missing, heard = wanted, ()
     while not stop:
-        missing = [topic for topic in wanted if not publishers[topic].get_subscription_count()]
-        if not missing or time.monotonic() > until:
+        now = time.monotonic()
+        counts = tuple(publishers[topic].get_subscription_count() for topic in wanted)
+        known = tuple(node.count_subscribers(publishers[topic].topic_name) for topic in wanted)
+        followed = not options.follow or node.count_publishers(node.resolve_topic_name(options.follow))
+        missing = [topic for topic, count in zip(wanted, counts) if not count]
+        if (counts, known) != heard:
+            heard, changed = (counts, known), now
+        settled = now > changed + DISCOVERY
+        enough = not missing or (settled and len(missing) < len(wanted) and not set(missing) & set(needed))
+        matched = all(count >= there for count, there in zip(counts, known))
+        if (enough and followed and matched) or now > began + options.wait:
             break
         time.sleep(0.01)
     names = [publishers[topic].topic_name for topic in missing]
-    if missing and topics and not stop:
-        raise InputError(f"nobody subscribes to {names[0]} within {limit:g} s; start the nodes first, or wait longer.")
+    unheard = [publishers[topic].topic_name for topic in missing if topic in needed]
+    if not stop and (unheard or len(missing) == len(wanted)):
+        what = unheard[0] if unheard else "any topic of the bag"
+        raise InputError(
+            f"nobody subscribes to {what} within {options.wait:g} s; start the nodes first, or wait longer "
+            "(--wait-matched)."
+        )
     if missing:
         say(f"nobody subscribes to {', '.join(names)}")
     time.sleep(SETTLE)

@@ -24,8 +24,11 @@ MATCHED = {
 PATIENCE = {"bias_node": {"hold": 9.975}, "ekf_node": {"lag": 10.0}}  # s of stamps; hold: see config/bias_node.yaml
 RELIABLE = {
     "bias_node": ("/uwb/tdoa.subscription", "/odometry.subscription", "/uwb/tdoa_corrected.publisher"),
-    "ekf_node": ("/imu/data.subscription", "/uwb/tdoa_corrected.subscription", "/odometry.publisher"),
-}
+    "ekf_node": (
+        "/imu/data.subscription", "/uwb/tdoa_corrected.subscription", "/height.subscription", "/pressure.subscription",
+        "/velocity.subscription", "/odometry.publisher",
+    ),
+}  # fmt: skip
 DEPTH = 1_000_000  # messages that may wait in a subscription
 READY_LIMIT = 180.0  # s: the very first start compiles the filter
 MATCH_LIMIT = 60.0  # s
@@ -65,7 +68,7 @@ def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, s
         wait(READY_LIMIT, "the nodes to find each other", processes, node, lambda: _is_ready(node, diagnostics))
         say(f"replaying {bag} at rate {rate:g}")
         options = ("--rate", rate, "--follow", "odometry", "--wait-matched", MATCH_LIMIT, "--wait-topics", *inputs)
-        replay = processes.start("uwb_tdoa_tools", "replay", bag, *options, may_end=True)
+        replay = processes.start("uwb_tdoa_tools", "replay", bag, *options, may_end_with=(0, 1))
         wait(None, None, processes, node, lambda: replay.poll() is not None)
         diagnostics.forget()
         wait(SETTLE_LIMIT, "the nodes to finish", processes, node, diagnostics.is_settled)

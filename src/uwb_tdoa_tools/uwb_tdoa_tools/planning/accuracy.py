@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwb_tdoa_ekf.core.aids import STREAMS
+from uwb_tdoa_ekf.core.config import FilterConfig
+
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from .precision import bound, information
@@ -23,8 +26,9 @@ class Samples:
 
 
 def fly(flight):
-    """Samples of a Flight with ground truth, static or moving. Raises InputError."""
-    score, _ = evaluate(flight)
+    """Samples of a Flight with ground truth, static or moving, without height, pressure and velocity, of which the bound
+    knows nothing. Raises InputError."""
+    score, _ = evaluate(flight, FilterConfig(**{f"use_{stream}": False for stream in STREAMS}))
     return Samples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
 
 

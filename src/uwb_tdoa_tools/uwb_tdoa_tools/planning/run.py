@@ -1,11 +1,12 @@
 """The parts of plan: each writes its pictures to a folder and returns its figures, plain values."""
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from tqdm import tqdm
 
-from ..readers import read_flight
+from ..readers.inputs import Reading
 from . import accuracy, layout, messages, plots
 from .check import brute_force
 from .maps import Grid, chart
@@ -30,14 +31,19 @@ def check(installation, grid, out):
     return {"places": len(points), "agreement": float(np.mean(agrees)), "unique_share": float(np.mean(unique))}
 
 
-def fly(recording):
-    """(name, Samples) of one (path, survey)."""
-    flight = read_flight(*recording)
-    return flight.name, accuracy.fly(flight)
+@dataclass(frozen=True)
+class Fly:
+    """fly((path, survey)) is the name of a recording and its Samples. reading : Reading. Can be pickled."""
+
+    reading: Reading
+
+    def __call__(self, recording):
+        flight = self.reading.read(recording)
+        return flight.name, accuracy.fly(flight)
 
 
 def judge_flights(flown, installation, room, step, out):
-    """Rows of `accuracy.comparison`, one for each of what `fly` gave, and one for all. step : m, of the picture."""
+    """Rows of `accuracy.comparison`, one for each of what a Fly gave, and one for all. step : m, of the picture."""
     samples, rows = [], []
     for name, one in flown:
         samples.append(one)

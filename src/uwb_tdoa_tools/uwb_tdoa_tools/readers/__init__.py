@@ -5,7 +5,7 @@ from pathlib import Path
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .streams import read_bytes
+from .streams import read_head
 from .survey import read_survey
 from .usd_log import MAGIC, read_usd_log
 from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
@@ -13,13 +13,15 @@ from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
 __all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
 
 
-def read_flight(path, survey=None, namespace=""):
+def read_flight(path, survey=None, namespace="", salvage=False, topics=None):
     """Flight of a recording of any known kind, told apart by content, not by name.
 
     path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (its directory or its .mcap or .db3 file).
     survey : path of a survey file (see `read_survey`) or Anchors. Logs and CSV files need it; a bag brings its own
         anchors, and a survey given with it replaces them.
-    namespace : of the tag's topics in a bag, see `read_bag`.
+    namespace, topics : where the tag's topics are in a bag, see `read_bag`.
+    salvage : read a cut or damaged recording up to there, without records that are no numbers; the Flight's
+        `meta["remarks"]` tell what is missing. Otherwise it is refused.
     Raises InputError.
     """
     from ..bags.bag import is_bag, read_bag  # here, because bags need the rosbags library and the others do not
@@ -28,13 +30,13 @@ def read_flight(path, survey=None, namespace=""):
     if not path.exists():
         raise InputError(f"{path}: does not exist; give a micro-SD log, a UTIL CSV file or a bag.")
     if is_bag(path):
-        return read_bag(path, namespace, _anchors(survey))
+        return read_bag(path, namespace, _anchors(survey), salvage, topics)
     if path.is_dir():
         raise InputError(f"{path}: is a directory without metadata.yaml; give a bag directory or a file.")
     reader = _reader(path)
     if survey is None:
         raise InputError(f"{path}: does not say where the anchors are; give a survey file (--survey FILE).")
-    return reader(path, _anchors(survey))
+    return reader(path, _anchors(survey), salvage)
 
 
 def _anchors(survey):
@@ -42,7 +44,7 @@ def _anchors(survey):
 
 
 def _reader(path):
-    head = read_bytes(path)[: 1 << 16]
+    head = read_head(path, 1 << 16)
     if head[0] == MAGIC:
         return read_usd_log
     if head.startswith(GZIP_MAGIC):

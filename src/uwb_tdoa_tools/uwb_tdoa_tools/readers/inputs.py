@@ -1,6 +1,8 @@
 """From the paths on a command line to flights: files or folders of recordings, one survey or a folder of them."""
 
+from dataclasses import dataclass, field
 from pathlib import Path
+import sys
 
 from tqdm import tqdm
 
@@ -47,10 +49,39 @@ def survey_for(path, survey):
     return keys[fitting[-1]]
 
 
-def load_flights(paths, survey=None):
-    """Read them one by one: a generator of Flight."""
-    for path, its_survey in find_flights(paths, survey):
-        yield read_flight(path, its_survey)
+@dataclass(frozen=True)
+class Reading:
+    """How recordings are read. Can be pickled.
+
+    survey : path of a survey or of a folder of them, or None; namespace : of the tag's topics in bags; topics : {our
+    name of a topic: its name in the bags}; salvage : read cut and damaged recordings as far as they are sound.
+    """
+
+    survey: str | Path | None = None
+    namespace: str = ""
+    topics: dict = field(default_factory=dict)
+    salvage: bool = False
+
+    def find(self, paths, absolute=False):
+        """Pairs (recording, survey or None), see `find_flights`; none of no paths."""
+        return find_flights(paths, self.survey, absolute)
+
+    def read(self, recording):
+        """Flight of a pair (recording, survey or None); tells on stderr what is missing in it. Raises InputError."""
+        path, survey = recording
+        flight = read_flight(path, survey, self.namespace, self.salvage, self.topics)
+        for remark in flight.meta.get("remarks", ()):
+            tqdm.write(f"{path}: {remark}", file=sys.stderr)
+        return flight
+
+    def one(self, path):
+        """Flight of one recording."""
+        return self.read((path, survey_for(path, self.survey)))
+
+    def flights(self, paths):
+        """Flights of recordings and folders, with a progress bar: list."""
+        found = tqdm(self.find(paths), desc="reading", unit="flight", disable=None, leave=False)
+        return [self.read(recording) for recording in found]
 
 
 def _is_bag(path):
@@ -64,10 +95,3 @@ def _recordings(path):
     for inside in sorted(path.iterdir()):
         if not inside.name.startswith("."):
             yield from _recordings(inside)
-
-
-def read_flights(paths, survey, namespace=""):
-    """Flights of recordings, with a progress bar: list. namespace : of the topics in bags. Raises InputError."""
-    found = find_flights(paths, survey)
-    found = tqdm(found, desc="reading", unit="flight", disable=None, leave=False)
-    return [read_flight(*recording, namespace) for recording in found]

@@ -1,7 +1,5 @@
 """What the readers of recordings share: putting streams in order, making one IMU stream of two, naming the protocol."""
 
-from pathlib import Path
-
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -10,12 +8,25 @@ from uwb_tdoa_bias.foundation.pressure import pressure_at
 
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
+LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
+MOST_BYTES = 1 << 30  # of a file; a flight of an hour has 300 MB
+SALVAGE = "read what is sound of it with --salvage"
+DAY = 86400.0  # s
 
 
-def read_bytes(path):
-    """The content of a file; raises InputError if it cannot be read or is empty."""
+def read_bytes(path, most=MOST_BYTES):
+    """The content of a file; raises InputError if it cannot be read, is empty or has more than `most` bytes."""
+    content = read_head(path, most + 1)
+    if len(content) > most:
+        raise InputError(f"{path}: has more than {most} bytes, too many for one recording; is it the right file?")
+    return content
+
+
+def read_head(path, size):
+    """The first bytes of a file; raises InputError as `read_bytes`."""
     try:
-        content = Path(path).read_bytes()
+        with open(path, "rb") as file:
+            content = b"".join(_blocks(file, size))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a recording.") from error
     if not content:
@@ -23,48 +34,88 @@ def read_bytes(path):
     return content
 
 
-def make_flight(name, anchors, streams, meta):
+def _blocks(file, size):
+    """The first bytes of an open file, block by block: one read would take the memory of `size` at once."""
+    while size > 0 and (block := file.read(min(size, 1 << 24))):
+        size -= len(block)
+        yield block
+
+
+def make_flight(name, anchors, streams, extra, meta, salvage=False):
     """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams left out.
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
         "tdoa": a, b, d (m); "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw.
         "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere).
-        Every other name goes to `Flight.extra` as it is.
+    extra : the same of everything else, for `Flight.extra`.
     meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps
-        of each stream fell before they were sorted) and "imu_accel_interpolated".
+        of each stream fell before they were sorted), "imu_accel_interpolated" and "remarks" (list of sentences).
+    salvage : leave out records that are not finite, or whose stamps are a day away from the others, with a remark.
+    Raises InputError; without salvage for such records too.
     """
+    meta = {"remarks": [], **meta}
+    streams = {key: _sound(key, columns, meta, salvage) for key, columns in streams.items() if len(columns["t"])}
     streams = {key: columns for key, columns in streams.items() if len(columns["t"])}
-    meta = dict(meta)
+    extra = {key: columns for key, columns in extra.items() if len(columns["t"])}
     reordered = {}
-    for key, columns in streams.items():
-        falls = int((np.diff(columns["t"]) < 0).sum())
-        if falls:
-            order = np.argsort(columns["t"], kind="stable")
-            streams[key] = {column: values[order] for column, values in columns.items()}
-            reordered[key] = falls
+    for group in (streams, extra):
+        for key, columns in group.items():
+            falls = int((np.diff(columns["t"]) < 0).sum())
+            if falls:
+                order = np.argsort(columns["t"], kind="stable")
+                group[key] = {column: values[order] for column, values in columns.items()}
+                reordered[key] = falls
     if reordered:
         meta["reordered"] = reordered
-    tdoa = streams.pop("tdoa", None)
+    tdoa = streams.get("tdoa")
     if tdoa is None:
         raise InputError(f"{meta['source']}: holds no TDOA measurement; record the tag's TDOAs with the flight.")
     tdoas = Tdoas(tdoa["t"], tdoa["a"], tdoa["b"], tdoa["d"])
     meta["protocol"] = protocol(tdoas)
-    imu = None
+    imu = truth = None
     if "gyro" in streams and "acc" in streams:
-        imu = _imu(streams.pop("gyro"), streams.pop("acc"), meta)
-    truth = None
+        imu = _imu(streams["gyro"], streams["acc"], meta)
     if "pose" in streams:
-        pose = streams.pop("pose")
+        pose = streams["pose"]
         truth = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
     height = pressure = None
     if "tof" in streams:
-        tof = streams.pop("tof")
+        tof = streams["tof"]
         ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(float)  # as a sensor_msgs/Range holds it
         height = Height(tof["t"], np.where(ranges < NO_TARGET, ranges, np.inf))
     if "baro" in streams:
-        baro = _readings(streams.pop("baro"), "baro")
+        baro = _readings(streams["baro"], "baro")
         pressure = Pressure(baro["t"], pressure_at(baro["baro"]))
-    return Flight(name, anchors, tdoas, imu, truth, streams, meta, height, pressure)
+    if not meta["remarks"]:
+        del meta["remarks"]
+    return Flight(name, anchors, tdoas, imu, truth, extra, meta, height, pressure)
+
+
+def _sound(key, columns, meta, salvage):
+    """The columns of a stream without what is not finite."""
+    columns = {name: np.asarray(values) for name, values in columns.items()}
+    judged = dict(columns)
+    if key == "pose" and all(np.isnan(columns[name]).all() for name in ("qx", "qy", "qz", "qw")):
+        judged = {name: values for name, values in columns.items() if not name.startswith("q")}  # not recorded
+    bad = np.zeros(len(columns["t"]), dtype=bool)
+    for name, values in judged.items():
+        values, largest = values.astype(float), LARGEST.get(name)
+        wrong = ~np.isfinite(values) if largest is None else ~(np.abs(values) <= largest)
+        if wrong.any() and not salvage:
+            row = int(np.flatnonzero(wrong)[0])
+            wanted = "finite" if largest is None else f"within +-{largest:g}"
+            raise InputError(
+                f"{meta['source']}: {key}, record {row + 1} of {len(bad)} at {columns['t'][row]:.3f} s: {name} is "
+                f"{columns[name][row]}; it must be {wanted}: leave such records out with --salvage."
+            )
+        bad |= wrong
+    if salvage and not bad.all():
+        middle = np.sort(columns["t"][~bad])[(np.count_nonzero(~bad) - 1) // 2]
+        bad |= np.abs(columns["t"] - middle) > DAY
+    if not bad.any():
+        return columns
+    meta["remarks"].append(f"{key}: {np.count_nonzero(bad)} of {len(bad)} records left out, they are no numbers.")
+    return {name: values[~bad] for name, values in columns.items()}
 
 
 def _readings(columns, name):

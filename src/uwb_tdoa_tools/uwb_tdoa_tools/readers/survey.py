@@ -1,13 +1,14 @@
 """Anchor surveys: total-station text files, CSV files of positions, and our own YAML."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.anchors import FARTHEST, Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+
+from .streams import read_bytes
 
 # The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z), arm 3 forward (x).
 # Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this makes a right-handed frame
@@ -17,8 +18,11 @@ from uwb_tdoa_bias.foundation.errors import InputError
 ARM_TIPS = np.array([[0.0, 0.0, 0.110], [0.0, -0.121, 0.0], [0.080, 0.0, 0.0]])
 MAX_TIP_RESIDUAL = 0.010  # metres RMS; measured: 0.5 ... 2.2 mm
 
-_ANTENNA = re.compile(r"anchorAnt_?(\d+)$")
-_TIP = re.compile(r"anchor_?(\d+)_([123])$")
+MOST_BYTES = 1_000_000
+
+_ANTENNA = re.compile(r"anchorAnt_?([0-9]{1,9})$")
+_TIP = re.compile(r"anchor_?([0-9]{1,9})_([123])$")
+_OURS = re.compile(r"[{\s]*[\"']?anchors[\"']?\s*:")
 
 
 def read_survey(path):
@@ -33,25 +37,24 @@ def read_survey(path):
     Positions stay in the frame of the survey. Raises InputError with the line.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a survey file.") from error
+        text = read_bytes(path, MOST_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv or .yaml)."
         ) from error
-    if re.search(r"^[{\s]*[\"']?anchors[\"']?\s*:", text, flags=re.MULTILINE):
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    if any(_OURS.match(line) for _, line in lines):
         return Anchors.from_yaml(path)
-    lines = [
-        (number, [cell.strip() for cell in line.split(",")])
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip()
-    ]
+    lines = [(number, [cell.strip() for cell in line.split(",")]) for number, line in lines]
     if not lines:
         raise InputError(f"{path}: is empty; give a survey file (.txt, .csv or .yaml).")
-    if lines[0][1] == ["id", "x", "y", "z"]:
-        return _positions(path, lines[1:])
-    return _total_station(path, lines)
+    try:
+        if lines[0][1] == ["id", "x", "y", "z"]:
+            return _positions(path, lines[1:])
+        return _total_station(path, lines)
+    except InputError as error:
+        message = str(error)
+        raise InputError(message if message.startswith(f"{path}: ") else f"{path}: {message}") from error
 
 
 def orientation_from_tips(tips):
@@ -68,7 +71,7 @@ def orientation_from_tips(tips):
 def _positions(path, lines):
     ids, positions = [], []
     for number, cells in lines:
-        if not cells[0].isdigit():
+        if not re.fullmatch("[0-9]{1,9}", cells[0]):
             raise InputError(f"{path}: line {number}: id is {cells[0]!r}; it must be a whole number.")
         ids.append(int(cells[0]))
         positions.append(_point(path, number, cells))
@@ -122,6 +125,6 @@ def _point(path, number, cells):
         point = [float(cell) for cell in cells[1:]]
     except ValueError:
         point = []
-    if len(point) != 3 or not np.isfinite(point).all():
+    if len(point) != 3 or not (np.abs(point) <= FARTHEST).all():
         raise InputError(f"{path}: line {number}: {','.join(cells)[:60]!r} is not 'name,x,y,z' with finite metres.")
     return point

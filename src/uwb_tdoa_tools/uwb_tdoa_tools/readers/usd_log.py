@@ -4,14 +4,15 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .streams import make_flight, read_bytes
+from .streams import SALVAGE, make_flight, read_bytes
+from .usd_scan import scan
 
 MAGIC = 0xBC
 _CRC_SIZE = 4
+_BLOCK = 100_000  # records that are taken out of the file at once
 _STAMP = {1: ("<u4", 1e3), 2: ("<u8", 1e6)}  # version: type of the time stamp, its ticks per second
 _NUMPY_OF_STRUCT = {  # codes of Python's struct module, little endian and packed
     "b": "i1", "B": "u1", "?": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "l": "<i4", "L": "<u4",
@@ -27,12 +28,16 @@ _STREAMS = {  # event name: our stream, {column in the log: column of the stream
 }
 
 
-def read_usd_log(path, anchors):
+def read_usd_log(path, anchors, salvage=False):
     """Flight of a micro-SD event log.
 
     TDOAs come from estTDOA, the IMU from estGyroscope (deg/s to rad/s) and estAcceleration (g to m/s^2), the ground
-    truth from estPose, the height from estTOF (mm to m) and the pressure from estBarometer (altitude to Pa). Other events that occur are in `Flight.extra` under the names and in the units of the log.
-    Raises InputError for a file that is empty, foreign, cut or damaged (the checksum is always verified).
+    truth from estPose, the height from estTOF (mm to m) and the pressure from estBarometer (altitude to Pa). Other
+    events that occur are in `Flight.extra` under the names and in the units of the log.
+    Raises InputError for a file that is empty, foreign, cut or damaged (the checksum is always verified), and for
+    records that are not finite.
+    salvage : read a cut or damaged log up to there, as the power of a vehicle that fell leaves it; `meta["remarks"]`
+        tells what is missing. Single values may be damaged then: nothing but the checksum could tell.
     Format: "uSD logger" of the Crazyflie firmware.
     """
     data = read_bytes(path)
@@ -44,28 +49,59 @@ def read_usd_log(path, anchors):
         dtypes[name] = np.dtype([("id", "<u2"), ("t", stamp), ("values", np.dtype(fields))])
         size_of_id[number] = dtypes[name].itemsize
     raw = np.frombuffer(data, dtype=np.uint8)
-    offsets, ids, stopped = _scan(raw, start, len(data) - _CRC_SIZE, size_of_id)
-    _check(path, data, stopped)
+    meta = {"source": str(path), "format": f"uSD log version {version}", "remarks": []}
+    whole = int.from_bytes(data[-_CRC_SIZE:], "little") == zlib.crc32(memoryview(data)[:-_CRC_SIZE])
+    end = len(data) - _CRC_SIZE if whole or not salvage else len(data)
+    offsets, ids, stopped = scan(raw, start, end, size_of_id)
+    if not (whole and stopped < 0):
+        if not salvage:
+            raise _damaged(path, data, whole, stopped)
+        lost = "nothing is visibly missing"
+        if stopped >= 0:
+            lost = f"{end - stopped} bytes from byte {stopped} on left out"
+        meta["remarks"].append(f"cut or damaged: {lost}; single values may be damaged too.")
 
-    streams = {}
-    for number, (name, fields) in events.items():
-        dtype = dtypes[name]
-        at = offsets[ids == number]
-        rows = raw[at[:, None] + np.arange(dtype.itemsize)].view(dtype)[:, 0]
+    streams, extra, order = {}, {}, np.argsort(ids, kind="stable")
+    numbers = np.array(list(events), dtype=np.uint16)
+    ends = [np.searchsorted(ids[order], numbers, side) for side in ("left", "right")]
+    for (name, fields), first, last in zip(events.values(), *ends):
+        rows = _gather(raw, offsets[order[first:last]], dtypes[name])
         columns = {field: np.ascontiguousarray(rows["values"][field]) for field, _ in fields}
-        stream, rename = _STREAMS.get(name, (name, {field: field for field in columns}))
+        columns["t"] = rows["t"] / ticks
+        if name not in _STREAMS:
+            extra[name] = columns
+            continue
+        stream, rename = _STREAMS[name]
         missing = [field for field in rename if field not in columns]
         if missing:
-            raise InputError(f"{path}: event {name} has no variable {missing[0]} (it has {', '.join(columns)}).")
-        streams[stream] = {rename[field]: values for field, values in columns.items() if field in rename}
-        streams[stream]["t"] = rows["t"] / ticks
-    streams["tdoa"] = _tdoa(streams.get("tdoa", {"t": np.empty(0)}))
-    name = Path(path).name
-    return make_flight(name, anchors, streams, {"source": str(path), "format": f"uSD log version {version}"})
+            known = ", ".join(field for field, _ in fields)
+            raise InputError(f"{path}: event {name} has no variable {missing[0]} (it has {known}).")
+        streams[stream] = {"t": columns["t"], **{rename[field]: columns[field] for field in rename}}
+    if "tdoa" in streams:
+        streams["tdoa"] = _tdoa(path, streams["tdoa"])
+    return make_flight(Path(path).name, anchors, streams, extra, meta, salvage)
 
 
-def _tdoa(columns):
+def _gather(raw, at, dtype):
+    """Records of one kind at the offsets: (n,) structured array."""
+    rows = np.empty(len(at), dtype=dtype)
+    inside = np.arange(dtype.itemsize)
+    for first in range(0, len(at), _BLOCK):
+        block = raw[at[first : first + _BLOCK, None] + inside]
+        rows[first : first + _BLOCK] = block.view(dtype)[:, 0]
+    return rows
+
+
+def _tdoa(path, columns):
     """The integers and doubles that `Tdoas` holds (the log has bytes and floats)."""
+    for name in ("a", "b"):
+        values = columns[name].astype(float)
+        bad = ~((values >= 0) & (values <= 65535) & (values == np.floor(values)))
+        if bad.any():
+            raise InputError(
+                f"{path}: estTDOA, record {np.flatnonzero(bad)[0] + 1}: id{name.upper()} is {columns[name][bad][0]}; "
+                "it must be a whole number 0 ... 65535."
+            )
     types = {"t": float, "a": np.int64, "b": np.int64, "d": float}
     return {column: np.asarray(values, dtype=types[column]) for column, values in columns.items()}
 
@@ -104,66 +140,41 @@ def _read_header(path, data):
     version = number("the version")
     if version not in _STAMP:
         raise InputError(f"{path}: is an event log of version {version}; versions 1 and 2 can be read.")
-    events = {}
+    events, names = {}, set()
     for _ in range(number("the number of event types")):
         where, event = at, number("the id of an event type")
         name = string("the name of an event type")
-        fields = []
+        fields, known = [], set()
         for _ in range(number(f"the number of variables of {name}")):
             variable = string(f"a variable of {name}")
             field, code = variable[:-3], variable[-2:-1]
-            if variable[-3:] != f"({code})" or code not in _NUMPY_OF_STRUCT or field in dict(fields):
+            if variable[-3:] != f"({code})" or code not in _NUMPY_OF_STRUCT or not field or field in known:
                 raise InputError(
                     f"{path}: byte {at - len(variable) - 1}: {variable!r} is not a new variable of {name} (expected "
                     f"'name(c)', c one of {' '.join(_NUMPY_OF_STRUCT)}); the file is damaged."
                 )
             fields.append((field, _NUMPY_OF_STRUCT[code]))
-        if event in events or name in (known for known, _ in events.values()):
+            known.add(field)
+        if event in events or name in names:
             raise InputError(
                 f"{path}: byte {where}: event type {event} {name!r} is defined twice; the file is damaged."
             )
         events[event] = (name, fields)
+        names.add(name)
     return version, events, at
 
 
-def _check(path, data, stopped):
-    """Raise InputError unless the checksum is right and the events fill the file. stopped: where they do not, or -1."""
-    stored, computed = int.from_bytes(data[-_CRC_SIZE:], "little"), zlib.crc32(data[:-_CRC_SIZE])
-    first = f"first event that cannot be read: byte {stopped}" if stopped >= 0 else "no event is visibly broken"
-    if stored != computed:
-        raise InputError(
-            f"{path}: the checksum in the last 4 bytes is 0x{stored:08X} but 0x{computed:08X} was expected for the "
-            f"{len(data) - _CRC_SIZE} bytes before it ({first}); the file is cut or damaged: copy it from the "
-            "card again."
-        )
-    if stopped >= 0:
-        raise InputError(
+def _damaged(path, data, whole, stopped):
+    """InputError of a log whose checksum is wrong, or whose events do not fill it. stopped: where they end, or -1."""
+    if whole:
+        return InputError(
             f"{path}: byte {stopped}: no event of a type that the header defines fits here, although the checksum is "
-            "right; the log was written by a faulty logger."
+            f"right; the log was written by a faulty logger: {SALVAGE}."
         )
-
-
-@njit(cache=True)
-def _scan(raw, start, end, size_of_id):
-    """Offsets and ids of the events in raw[start:end], and where the scan had to stop (-1: it ended at `end`).
-
-    size_of_id : (65536,) bytes of a whole event (id, stamp, payload), -1 where no type has the id.
-    """
-    smallest = 6  # id and version 1 stamp, no payload
-    room = max((end - start) // smallest, 0)
-    offsets = np.empty(room, dtype=np.int64)
-    ids = np.empty(room, dtype=np.uint16)
-    count = 0
-    at = start
-    while at < end:
-        if at + 2 > end:
-            return offsets[:count], ids[:count], at
-        number = raw[at] | (np.int64(raw[at + 1]) << 8)
-        size = size_of_id[number]
-        if size < 0 or at + size > end:
-            return offsets[:count], ids[:count], at
-        offsets[count] = at
-        ids[count] = number
-        count += 1
-        at += size
-    return offsets[:count], ids[:count], -1
+    stored, computed = int.from_bytes(data[-_CRC_SIZE:], "little"), zlib.crc32(memoryview(data)[:-_CRC_SIZE])
+    first = f"first event that cannot be read: byte {stopped}" if stopped >= 0 else "no event is visibly broken"
+    return InputError(
+        f"{path}: the checksum in the last 4 bytes is 0x{stored:08X} but 0x{computed:08X} was expected for the "
+        f"{len(data) - _CRC_SIZE} bytes before it ({first}); the file is cut or damaged: copy it from the card again, "
+        f"or {SALVAGE}."
+    )

@@ -1,7 +1,6 @@
 """CSV files of the UTIL dataset (Zhao et al., IJRR 2024), the full schema of 27 columns or a subset, plain or gzip."""
 
 import csv
-import gzip
 import io
 import zlib
 from pathlib import Path
@@ -10,9 +9,11 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .streams import make_flight, read_bytes
+from .streams import SALVAGE, make_flight, read_bytes
 
 GZIP_MAGIC = b"\x1f\x8b"
+MOST_TEXT = 200_000_000  # bytes; ten minutes of the full schema, and some GB in memory
+_BLOCK = 1 << 24  # bytes that are unpacked at once
 # Each sensor has its own time column and its own length: they are only set side by side, a row is not one instant.
 # Units: the authors' converter writes the columns as the micro-SD log has them, so acc is in g and gyro in deg/s
 # (utiasDSL/util-uwb-dataset, scripts/flight-dataset/sdcard_scripts/log_to_csv.py); stamps are in s from the start.
@@ -26,31 +27,23 @@ _STREAMS = {  # our stream: {column of the file: column of the stream}, the time
     "pose": {"t_pose": "t", "pose_x": "x", "pose_y": "y", "pose_z": "z"},
 }
 _QUATERNION = {"pose_qx": "qx", "pose_qy": "qy", "pose_qz": "qz", "pose_qw": "qw"}
+_EXTRA = ("flow",)
 TDOA_COLUMNS = tuple(_STREAMS["tdoa"])
 
 
-def read_util_csv(path, anchors):
+def read_util_csv(path, anchors, salvage=False):
     """Flight of a CSV file in the UTIL schema; it must hold at least t_tdoa, idA, idB and tdoa_meas.
 
     Acceleration g to m/s^2, rates deg/s to rad/s, tof mm to m, baro m of altitude to Pa. Ground truth without quaternion
-    columns has NaN for q. flow is in `Flight.extra` as it is; `meta["ignored_columns"]` names columns that the schema does not know.
+    columns has NaN for q. flow is in `Flight.extra` as it is; `meta["ignored_columns"]` names columns that the schema
+    does not know.
     Raises InputError with the line for a file that is empty, foreign or cut and for a cell that is not a finite number.
     A plain file that was cut exactly between two lines cannot be told from a shorter one; a gzip file can.
+    salvage : read a cut or damaged file up to there, and leave out records that are no numbers; `meta["remarks"]`
+        tells what is missing.
     """
-    text = _text(path)
-    rows = list(csv.reader(io.StringIO(text)))
-    header = [name.strip() for name in rows.pop(0)]
-    _check_header(path, header)
-    if not text.endswith("\n"):
-        raise InputError(
-            f"{path}: line {len(rows) + 1} has no line end: the file is cut; copy it again, or end it with a new line "
-            "if it is whole."
-        )
-    for line, row in enumerate(rows, start=2):
-        if len(row) != len(header):
-            raise InputError(
-                f"{path}: line {line} has {len(row)} cells, the header has {len(header)}; copy the file again."
-            )
+    remarks = []
+    header, rows = _table(path, _text(path, remarks, salvage), remarks, salvage)
     cells = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
 
     streams = {}
@@ -64,18 +57,22 @@ def read_util_csv(path, anchors):
             raise InputError(
                 f"{path}: the header has columns of {stream} but not {missing[0]}; all or none must be there."
             )
-        streams[stream] = {rename[name]: values for name, values in _numbers(path, rename, cells).items()}
+        streams[stream] = {rename[name]: values for name, values in _numbers(path, rename, cells, salvage).items()}
     tdoa = streams["tdoa"]
+    if salvage:
+        sound = np.isfinite(tdoa["a"]) & np.isfinite(tdoa["b"])
+        tdoa.update({name: values[sound] for name, values in tdoa.items()})
     tdoa["a"], tdoa["b"] = _ids(path, "idA", tdoa["a"]), _ids(path, "idB", tdoa["b"])
     if "pose" in streams and "qx" not in streams["pose"]:
         streams["pose"].update({name: np.full(len(streams["pose"]["t"]), np.nan) for name in _QUATERNION.values()})
 
-    meta = {"source": str(path), "format": "UTIL CSV"}
+    meta = {"source": str(path), "format": "UTIL CSV", "remarks": remarks}
     known = {name for rename in _STREAMS.values() for name in rename} | set(_QUATERNION)
     if ignored := [name for name in header if name not in known]:
         meta["ignored_columns"] = ignored
     name = Path(path).name.removesuffix(".gz").removesuffix(".csv")
-    return make_flight(name, anchors, streams, meta)
+    extra = {key: streams.pop(key) for key in _EXTRA if key in streams}
+    return make_flight(name, anchors, streams, extra, meta, salvage)
 
 
 def is_util_csv(line):
@@ -83,13 +80,12 @@ def is_util_csv(line):
     return "t_tdoa" in line or "tdoa_meas" in line
 
 
-def _text(path):
+def _text(path, remarks, salvage):
     content = read_bytes(path)
     if content.startswith(GZIP_MAGIC):
-        try:
-            content = gzip.decompress(content)
-        except (EOFError, OSError, zlib.error) as error:
-            raise InputError(f"{path}: the gzip data is cut or damaged ({error}); copy the file again.") from error
+        content = _unpacked(path, content, remarks, salvage)
+    if len(content) > MOST_TEXT:
+        raise InputError(f"{path}: has more than {MOST_TEXT} bytes of text, too many for one flight; split it.")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -105,6 +101,61 @@ def _text(path):
     return text
 
 
+def _unpacked(path, content, remarks, salvage):
+    """What gzip holds, at most one byte more than MOST_TEXT: its header does not tell how much that is."""
+    parts, size, problem = [], 0, "it ends early"
+    try:
+        while content and size <= MOST_TEXT:  # a file may have several members
+            unpacker = zlib.decompressobj(zlib.MAX_WBITS | 16)
+            while content and not unpacker.eof and size <= MOST_TEXT:
+                parts.append(unpacker.decompress(content, _BLOCK))
+                content = unpacker.unconsumed_tail
+                size += len(parts[-1])
+            if not unpacker.eof:
+                break
+            content = unpacker.unused_data.lstrip(b"\0")  # as gzip itself does
+            problem = None if not content else problem
+    except zlib.error as error:
+        problem = str(error)
+    if problem and size <= MOST_TEXT:
+        if not salvage:
+            raise InputError(
+                f"{path}: the gzip data is cut or damaged ({problem}); copy the file again, or {SALVAGE}."
+            )
+        remarks.append(f"the gzip data is cut or damaged ({problem}): read up to there.")
+    return b"".join(parts)
+
+
+def _table(path, text, remarks, salvage):
+    """Header, and rows of as many cells."""
+    if not text.endswith(("\n", "\r")):
+        line = len(text.splitlines())
+        if not salvage or line < 2:
+            raise InputError(
+                f"{path}: line {line} has no line end: the file is cut; copy it again, end it with a new line if it is "
+                f"whole, or {SALVAGE}."
+            )
+        remarks.append(f"line {line} is cut and left out.")
+        text = text[: max(text.rfind("\n"), text.rfind("\r")) + 1]
+    lines, header, rows = csv.reader(io.StringIO(text, newline="")), None, []
+    try:
+        for row in lines:
+            if header is None:
+                header = [name.strip() for name in row]
+                _check_header(path, header)
+            elif len(row) != len(header):
+                raise csv.Error(f"has {len(row)} cells, the header has {len(header)}")
+            else:
+                rows.append(row)
+    except csv.Error as error:
+        if header is None or not salvage:
+            raise InputError(f"{path}: line {lines.line_num} {error}; copy the file again, or {SALVAGE}.") from error
+        remarks.append(f"line {lines.line_num} {error}: read up to there.")
+    if header is None:
+        raise InputError(f"{path}: holds no line that is whole; copy the file again.")
+    return header, rows
+
+
 def _check_header(path, header):
     missing = [name for name in TDOA_COLUMNS if name not in header]
     if missing:
@@ -117,14 +168,15 @@ def _check_header(path, header):
         raise InputError(f"{path}: line 1: column {twice!r} is there twice; every column must be there once.")
 
 
-def _numbers(path, names, cells):
-    """{name: (n,) float array} of the columns of one sensor: the rows before the first empty cell."""
+def _numbers(path, names, cells, salvage):
+    """{name: (n,) float array} of the columns of one sensor: the rows before the first empty cell. NaN for what is no
+    number, with salvage."""
     columns = {name: [cell.strip() for cell in cells[name]] for name in names}
     length = min((column.index("") if "" in column else len(column)) for column in columns.values())
     values = {}
     for name, column in columns.items():
         after = next((row for row in range(length, len(column)) if column[row]), None)
-        if after is not None:
+        if after is not None and not salvage:
             raise InputError(
                 f"{path}: line {after + 2}: {name} is {column[after]!r} although {', '.join(names)} ended with an "
                 f"empty cell at line {length + 2}; fill the columns of one sensor from the top, without holes."
@@ -133,9 +185,11 @@ def _numbers(path, names, cells):
             values[name] = np.array(column[:length], dtype=float)
         except ValueError:
             row = next(row for row in range(length) if not _is_number(column[row]))
-            raise InputError(f"{path}: line {row + 2}: {name} is {column[row]!r}; it must be a number.") from None
+            if not salvage:
+                raise InputError(f"{path}: line {row + 2}: {name} is {column[row]!r}; it must be a number.") from None
+            values[name] = np.array([float(cell) if _is_number(cell) else np.nan for cell in column[:length]])
         bad = np.flatnonzero(~np.isfinite(values[name]))
-        if len(bad):
+        if len(bad) and not salvage:
             raise InputError(
                 f"{path}: line {bad[0] + 2}: {name} is {column[bad[0]]!r}; it must be finite: leave the cells after "
                 "the end of a sensor empty, and delete broken measurements."

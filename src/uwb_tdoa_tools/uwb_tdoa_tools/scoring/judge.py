@@ -9,8 +9,8 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
-from ..bags.bag import read_odometry
-from ..readers import read_flight
+from ..bags.bag import late_tdoas, read_odometry
+from ..readers.inputs import Reading
 from .evaluation import evaluate, need_truth
 from .metrics import Score
 from .plots import plot_error
@@ -21,26 +21,26 @@ from .tum import write_tum
 class Judge:
     """judge((path, survey)) is the Score of a recording: of the filter run over it, or of the odometry in a bag.
 
-    config : FilterConfig; effects, network : what the TDOAs are corrected with, or None; smoothed : use what came after
-    each estimate too; odometry : path of a bag whose odometry is judged instead, or None; namespace : of the topics in
-    bags; picture : file to draw the errors to, or None; trajectories : folder for TUM files, or None.
+    reading : Reading; config : FilterConfig; effects, network : what the TDOAs are corrected with, or None; smoothed :
+    use what came after each estimate too; odometry : path of a bag whose odometry is judged instead, or None; picture :
+    file to draw the errors to, or None; trajectories : folder for TUM files, or None.
     Raises InputError. Can be pickled.
     """
 
+    reading: Reading = Reading()
     config: FilterConfig | None = None
     effects: EffectSet | None = None
     network: Network | None = None
     smoothed: bool = False
     odometry: str | None = None
-    namespace: str = ""
     picture: str | None = None
     trajectories: Path | None = None
 
     def __call__(self, recording):
-        flight = read_flight(*recording, self.namespace)
+        flight = self.reading.read(recording)
         need_truth(flight)
         if self.odometry:
-            odometry = read_odometry(self.odometry, namespace=self.namespace)
+            odometry = read_odometry(self.odometry, *self._where)
             score = Score(flight.name, odometry, flight.truth)
         else:
             engine = smooth if self.smoothed else run_offline
@@ -53,3 +53,11 @@ class Judge:
             write_tum(folder / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
             write_tum(folder / f"{flight.name}_truth.tum", truth.t, truth.p, truth.q)
         return score
+
+    def late_tdoas(self):
+        """How many TDOAs were late for the odometry that is judged."""
+        return late_tdoas(self.odometry, *self._where) if self.odometry else 0
+
+    @property
+    def _where(self):
+        return self.reading.namespace, self.reading.salvage, self.reading.topics

@@ -90,11 +90,11 @@ class Score:
         self.nis = nis(residuals) if residuals is not None else np.empty(0)
 
     def row(self):
-        """The figures of this run: a dict."""
+        """The figures of this run: a dict. "late_start": nothing but that has made it a diverged run."""
         out = {"flight": self.name, **summary(self.error, self.nees, self.nis)}
         late = not len(self.t) or self.t[0] > self.first + START_GRACE
-        gone = len(self.t) and self.t[-1] < self.last - START_GRACE
-        out["diverged"] = bool(out["diverged"] or late or gone)
+        lost = out["diverged"] or not len(self.t) or self.t[-1] < self.last - START_GRACE
+        out["diverged"], out["late_start"] = bool(lost or late), bool(late and not lost)
         out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else float("inf")
         return {**out, **_named(coverage(self.error, self.covariance))}
 
@@ -107,7 +107,8 @@ def pooled(scores):
     parts = (np.concatenate([getattr(score, name) for score in scores]) for name in ("nees", "nis"))
     out = {"flight": f"{len(scores)} pooled", **summary(error, *parts), **_named(coverage(error, covariance))}
     out["start_delay"] = max(row["start_delay"] for row in rows)
-    out["diverged"] = sum(row["diverged"] for row in rows)
+    for key in ("diverged", "late_start"):
+        out[key] = sum(row[key] for row in rows)
     out["rmse_3d_mean_of_runs"] = float(np.mean([row["rmse_3d"] for row in rows]))
     out["rmse_3d_max_of_runs"] = float(np.max([row["rmse_3d"] for row in rows]))
     return out

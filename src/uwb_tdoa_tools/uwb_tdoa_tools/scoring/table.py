@@ -1,8 +1,6 @@
 """Errors as tables: lines for the screen, and Markdown, beside what others reach."""
 
-import csv
-
-from uwb_tdoa_bias.foundation.errors import InputError
+from ..readers.tables import number, read_table
 
 COLUMNS = {
     "rmse_x": "x", "rmse_y": "y", "rmse_z": "z", "rmse_3d": "3D", "median_3d": "median", "max_3d": "max",
@@ -18,7 +16,10 @@ def head():
 
 def line(row):
     """One run, `Score.row`, or several, `pooled`."""
-    return _line(row["flight"], (f"{row[key]:.3f}" for key in COLUMNS)) + ("  DIVERGED" if row["diverged"] else "")
+    word = ""
+    if row["diverged"]:
+        word = "  LATE START" if row["diverged"] == row["late_start"] else "  DIVERGED"
+    return _line(row["flight"], (f"{row[key]:.3f}" for key in COLUMNS)) + word
 
 
 def lines_of_errors(scores):
@@ -41,13 +42,9 @@ def markdown(rows, others):
 def read_others(path):
     """{peer and mode: {flight: 3D RMSE as text, or "diverged"}} of a CSV file. Raises InputError."""
     others = {}
-    with open(path, newline="") as file:
-        for entry in csv.DictReader(file):
-            try:
-                cell = "diverged" if entry["diverged"] == "True" else f"{float(entry['rmse_3d']):.3f}"
-                others.setdefault(f"{entry['peer']} {entry['mode']}", {})[entry["flight"]] = cell
-            except (KeyError, TypeError, ValueError) as error:
-                raise InputError(f"{path}: needs columns flight, peer, mode, rmse_3d, diverged ({error!r}).") from error
+    for line, row in read_table(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
+        cell = "diverged" if row["diverged"] == "True" else f"{number(path, line, row, 'rmse_3d'):.3f}"
+        others.setdefault(f"{row['peer']} {row['mode']}", {})[row["flight"]] = cell
     return others
 
 

@@ -6,7 +6,6 @@ from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.bag import check_output, write_bag
-from ..readers import inputs, read_flight
 
 
 def parse_effect(name, values):
@@ -21,13 +20,13 @@ def parse_effect(name, values):
     return kind(parameters, source="injected")
 
 
-def inject(effect, recording, out, survey=None, namespace="", seed=0, storage="mcap", force=False):
+def inject(effect, recording, reading, out, seed=0, storage="mcap", force=False):
     """Write the flight that would have been recorded with an Effect as a bag. Returns the name of the flight.
 
-    recording, survey, namespace : see `read_flight`; seed : of effects that are random. Raises InputError.
+    recording, reading : a path, and a Reading to read it; seed : of effects that are random. Raises InputError.
     """
     check_output(out, force)  # before the work, not after it
-    flight = read_flight(recording, inputs.survey_for(recording, survey), namespace)
+    flight = reading.one(recording)
     write_bag(effect.inject(flight, np.random.default_rng(seed)), out, storage, force)
     return flight.name
 

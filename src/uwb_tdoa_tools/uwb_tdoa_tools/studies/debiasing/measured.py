@@ -109,8 +109,9 @@ def _effects_file(diagnosed, split):
 
 
 def _fly(data, path, effects):
-    (recording,) = inputs.find_flights([data / path], data / "surveys")
-    return fly(recording, effects=effects)
+    reading = inputs.Reading(data / "surveys")
+    (recording,) = reading.find([data / path])
+    return fly(reading.read(recording), effects=effects)
 
 
 def _figures(score):

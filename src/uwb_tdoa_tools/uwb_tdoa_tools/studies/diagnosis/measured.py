@@ -65,7 +65,7 @@ PRESENT = (
 
 
 def _load(data, paths):
-    return list(inputs.load_flights([data / path for path in paths], data / "surveys"))
+    return inputs.Reading(data / "surveys").flights([data / path for path in paths])
 
 
 def run(data, name, out):

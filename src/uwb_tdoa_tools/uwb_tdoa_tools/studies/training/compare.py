@@ -61,8 +61,8 @@ def _measured(args):
     for name, *paths in args.test:
         if not paths:
             raise InputError(f"--test: {name} names no flight; write --test NAME FLIGHT...")
-        tests[name] = inputs.read_flights(paths, args.survey)
-    train = inputs.read_flights(args.train, args.survey)
+        tests[name] = inputs.Reading(args.survey).flights(paths)
+    train = inputs.Reading(args.survey).flights(args.train)
     both = {flight.name for flight in train} & {flight.name for group in tests.values() for flight in group}
     if both:
         raise InputError(f"--test: {sorted(both)[0]} is among the flights to train on; test on others.")

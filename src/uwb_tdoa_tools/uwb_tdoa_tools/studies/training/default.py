@@ -17,7 +17,6 @@ from uwb_tdoa_bias.correction.network import Network
 
 from ...readers import inputs
 from ...scoring.evaluation import evaluate
-from ...readers import read_flight
 from ...training import labels as labelling, models, simulated, structured
 
 FLIGHTS, SEED, SPACING = 20, 100, 0.02  # in each constellation; first seed; s between samples
@@ -35,8 +34,9 @@ def add_options(add):
 def run(args):
     """Make, judge and write the model."""
     days = {}
-    for path, survey in inputs.find_flights(args.flights, args.survey):
-        days.setdefault(Path(survey).stem, []).append(read_flight(path, survey))
+    reading = inputs.Reading(args.survey)
+    for path, survey in reading.find(args.flights):
+        days.setdefault(Path(survey).stem, []).append(reading.read((path, survey)))
     model, meta = learn(FLIGHTS)
     known = {day: [labelling.labels(flight) for flight in flights] for day, flights in days.items()}
     for day, flights in days.items():

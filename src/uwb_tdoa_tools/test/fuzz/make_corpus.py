@@ -1,0 +1,103 @@
+"""Makes the corpus that fuzzing starts from, of simulated and made-up recordings:  python make_corpus.py"""
+
+from dataclasses import replace
+import gzip
+from pathlib import Path
+import shutil
+import sys
+import tempfile
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np  # noqa: E402
+from recordings import ROWS, SURVEY, csv_text, log_bytes, small_flight  # noqa: E402
+from targets import CORPUS, MESSAGES  # noqa: E402
+from test_survey import survey_lines  # noqa: E402
+from uwb_tdoa_bias.correction.network import MODELS  # noqa: E402
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
+from uwb_tdoa_bias.foundation.flight import Height, Pressure, Velocity  # noqa: E402
+from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
+from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
+from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
+from uwb_tdoa_tools.bags.files import open_bag  # noqa: E402
+from uwb_tdoa_tools.bags.integrity import NO_SUM, SUM_KEY, metadata  # noqa: E402
+from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
+
+TEXTS = {
+    "yaml": ["a: [1, -2.5e3, .5, true, ~, 'x']\nb: {c: \"\\u00e4\"}\n3: |\n  text\n", "- - 1\n  - {a: b}\n# end\n"],
+    "config": ["ekf_node:\n  ros__parameters: {tdoa_std: 0.2, robust: gate, adapt_noise: false, iterations: 3}\n"],
+    "places": ["places: [[0, 0, 0, 4, 0, 3], [0, 0, 0, 0.5, 5, 0]]\n"],
+    "antenna": ["azimuth: [0, -1, 0, -1]\nelevation_1: [0, -9, 0, -9]\nelevation_2: [-1, -9, -1, -9]\ngain_offset: 2\n"],
+    "survey": [SURVEY, "\n".join(survey_lines()[0]) + "\nlandmark,1,2,3\n", "anchors: {0: {position: [1, 2, 3]}}\n"],
+    "table": ["true_x,x\n0.5,0.6\n1,1.1\n", 'x,note,true_x\r\n1,"a, b",2\r\n'],
+    "csv": [csv_text(), csv_text("t_tdoa,idA,idB,tdoa_meas", ["0.1,0,1,0.5", "0.2,1,5,-1e-1"])],
+}
+AIDS = {  # streams of a Flight
+    "height": Height(np.array([10.0, 10.1]), np.array([1.25, np.inf])),
+    "pressure": Pressure(np.array([10.0]), np.array([101325.0])),
+    "velocity": Velocity(np.array([10.0]), np.array([[0.5, -0.5, 0.0]]), np.array([[0.1, 0.1, np.inf]])),
+}
+
+
+def write(name, number, content):
+    folder = CORPUS / name
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / str(number)).write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def main():
+    shutil.rmtree(CORPUS, ignore_errors=True)
+    for name, texts in TEXTS.items():
+        for number, text in enumerate(texts):
+            write(name, number, text)
+    write("csv", "packed", gzip.compress(csv_text().encode(), mtime=0))
+    write("log", 2, log_bytes())
+    write("log", 1, log_bytes([(name, ticks // 1000, values) for name, ticks, values in ROWS], version=1))
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        corners().to_yaml(folder / "anchors.yaml")
+        write("anchors", 0, (folder / "anchors.yaml").read_bytes())
+        known = [EFFECTS["anchor_delay"]({"3": 0.1, "5": -0.05}), EFFECTS["tag_lever_arm"]({"z": 0.1})]
+        EffectSet(tuple(known)).to_yaml(folder / "effects.yaml")
+        write("effects", 0, (folder / "effects.yaml").read_bytes())
+        _bags(folder)
+        _maps(folder)
+    write("model", 0, (MODELS / "known_answer.onnx").read_bytes())
+    size = sum(path.stat().st_size for path in CORPUS.rglob("*") if path.is_file())
+    print(f"{size / 1e3:.0f} kB in {CORPUS}")
+
+
+def _bags(folder):
+    write_bag(small_flight(0.008), folder / "small")
+    write("bag_mcap", "small", (folder / "small" / "small.mcap").read_bytes())
+    text = (folder / "small" / "metadata.yaml").read_text()
+    write("bag_metadata", 0, text.replace(metadata(folder / "small")["custom_data"][SUM_KEY], NO_SUM))
+    write_bag(small_flight(0.008), folder / "tables", "sqlite3")
+    write_bag(replace(small_flight(0.008), **AIDS), folder / "aided")
+    with open_bag(folder / "aided") as reader:
+        for topic, _, data in {c.topic: (c.topic, t, d) for c, t, d in reader.messages()}.values():
+            if topic in MESSAGES:
+                write("bag_message", topic.strip("/").replace("/", "_"), bytes([list(MESSAGES).index(topic)]) + data)
+    write("bag_sqlite", "small", (folder / "tables" / "tables.db3").read_bytes())
+
+
+def _maps(folder):
+    anchors = corners()
+    cells = np.zeros((3, 2, 2), bool)
+    FlyableVolume([0, 0, 0], [1, 1, 1], cells, np.ones(cells.shape), anchors.ids, anchors.positions).save(folder / "v.npz")
+    _write_map("flyable", folder / "v.npz")
+    cell = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    BiasMap(cell, 0.5 * cell, 0.1 + 0.0 * cell, 0.1 + 0.0 * cell, np.full(8, 9), np.eye(3), 0.5).save(folder / "m.npz")
+    _write_map("bias_map", folder / "m.npz")
+
+
+def _write_map(name, file):
+    """As it is written, and not compressed: then single numbers can be changed."""
+    write(name, 0, file.read_bytes())
+    with np.load(file) as content:
+        np.savez(file, **content)
+    write(f"{name}_sealed", 0, file.read_bytes())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""Replays that follow the nodes, with the nodes' own parameters and best-effort links, beside a computer at work."""
+
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
+
+from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
+from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
+from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
+from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
+from uwb_tdoa_tools.live.processes import Diagnostics, Processes, own_domain, wait  # noqa: E402
+from uwb_tdoa_tools.live.session import session  # noqa: E402
+from uwb_tdoa_tools.readers import read_flight  # noqa: E402
+from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
+from uwb_tdoa_tools.scoring.metrics import Score  # noqa: E402
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
+
+READY_LIMIT, SETTLE_LIMIT = 180.0, 60.0  # s
+
+
+@pytest.fixture
+def load():
+    """load(n): n processes that never rest, until the test ends."""
+    running = []
+
+    def start(count):
+        running.extend(subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count))
+
+    yield start
+    for process in running:
+        process.kill()
+        process.wait()
+
+
+def replayed(bag, folder, *options, nodes=()):
+    """(exit code of a replay that follows the odometry, its output, diagnostics {node: {key: text}}, recorded bag).
+    nodes : {node: arguments}."""
+    nodes, recorded = dict(nodes), folder / "recorded.bag"
+    with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
+        diagnostics = Diagnostics(node)
+        for package, name in (("uwb_tdoa_bias", "bias_node"), ("uwb_tdoa_ekf", "ekf_node")):
+            processes.start(package, name, *nodes.get(name, ()))
+        ready = lambda: all(diagnostics.newest(name) for name in ("bias_node", "ekf_node"))
+        wait(READY_LIMIT, "the nodes", processes, node, ready)
+        processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
+        listening = lambda: node.count_subscribers("/odometry") == 2
+        wait(READY_LIMIT, "record", processes, node, listening)
+        command = ("uwb_tdoa_tools", "replay", bag, "--follow", "odometry", *options)
+        replay = processes.start(*command, may_end_with=(0, 1, 2))
+        wait(None, None, processes, node, lambda: replay.poll() is not None)
+        diagnostics.forget()
+        wait(SETTLE_LIMIT, "the nodes to finish", processes, node, diagnostics.is_settled)
+        if replay.returncode != 2:
+            processes.stop("record")
+        told = {name: diagnostics.newest(name) for name in ("bias_node", "ekf_node")}
+        return replay.returncode, processes.file("replay").read_text(), told, recorded
+
+
+def assert_equal_to_offline(flight, told, recorded):
+    offline, _ = evaluate(flight, network=load_network(SHIPPED))
+    live = Score("live", read_odometry(recorded), flight.truth)
+    assert live.row()["rmse_3d"] == pytest.approx(offline.row()["rmse_3d"], abs=1e-3)
+    assert told["bias_node"]["released before their pose"] == told["ekf_node"]["late"] == "0"
+    assert told["ekf_node"]["TDOAs received"] == str(len(flight.tdoa))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("rate", "busy"), [(1, 0), (4, 3), (8, 1)])
+def test_at_any_rate_and_load_the_result_is_that_of_the_bag(tmp_path, load, rate, busy):
+    write_bag(simulate(SimulationConfig(seed=3, duration=20.0)), tmp_path / "flight.bag")
+    load(busy)
+    code, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path, "--rate", rate)
+    assert code == 0, said
+    assert_equal_to_offline(read_bag(tmp_path / "flight.bag"), told, recorded)
+
+
+@pytest.mark.slow
+def test_a_measured_flight_beside_two_busy_processes(shared_data, tmp_path, load):
+    log, survey = shared_data / "flights/0426/0426-traj3", shared_data / "surveys/anchor_0426.txt"
+    write_bag(read_flight(log, survey), tmp_path / "flight.bag")
+    load(2)
+    code, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path, "--rate", 4)
+    assert code == 0, said
+    assert_equal_to_offline(read_bag(tmp_path / "flight.bag"), told, recorded)
+
+
+@pytest.mark.slow
+def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
+    write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
+    nodes = {"bias_node": ("--ros-args", "-p", "hold:=0.08")}
+    code, said, _, _ = replayed(tmp_path / "flight.bag", tmp_path, nodes=nodes)
+    assert code == 2 and "hold is 0.08 s and ekf_node's lag 0.25 s; to be followed they need 0.1 s < hold < lag" in said
+
+
+def delayed(bag, out, count=10, delay=1_000_000_000):
+    """A copy of a bag in which some TDOAs from the middle were recorded a second after their stamps."""
+    with open_bag(bag) as reader, new_bag(out) as writer:
+        made = {
+            c.topic: writer.add_connection(
+                c.topic, c.msgtype, typestore=typestore(), offered_qos_profiles=c.ext.offered_qos_profiles
+            )
+            for c in reader.connections
+        }
+        found = [(stamp, c.topic, data) for c, stamp, data in messages(bag, reader, reader.connections)]
+        tdoas = [number for number, (_, topic, _) in enumerate(found) if topic == "/uwb/tdoa"]
+        for number in tdoas[len(tdoas) // 2 :][:count]:
+            stamp, topic, data = found[number]
+            found[number] = stamp + delay, topic, data
+        for stamp, topic, data in sorted(found, key=lambda message: message[0]):
+            writer.write(made[topic], stamp, data)
+
+
+@pytest.mark.slow
+def test_what_was_late_is_told_with_code_1(tmp_path):
+    write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
+    delayed(tmp_path / "flight.bag", tmp_path / "delayed.bag")
+    code, said, told, _ = replayed(tmp_path / "delayed.bag", tmp_path)
+    assert told["ekf_node"]["late"] == "10"
+    assert code == 1 and "10 TDOAs late" in said

@@ -1,0 +1,189 @@
+"""Whether the files of a bag are whole, as far as their format can tell, before anything else is done with them."""
+
+from pathlib import Path
+import re
+import sqlite3
+from urllib.parse import quote
+import zlib
+
+import yaml
+
+from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+
+from . import mcap
+from .mcap import Damaged, zstd
+
+SUM_KEY = "uwb_tdoa_tools.crc32"  # in the bag's custom data: CRC-32 of its data file, 8 hexadecimal digits
+NO_SUM = "--------"
+MOST_UNPACKED = 8 << 30  # bytes of a data file that was compressed
+MOST_MESSAGE = 64 << 20  # bytes of a message that was compressed
+_BLOCK = 1 << 20  # bytes that are read at once
+_TYPES = (  # columns of an SQLite bag and what they hold
+    ("messages", {"timestamp": "integer", "topic_id": "integer", "data": "blob"}),
+    ("topics", {"id": "integer", "name": "text", "type": "text", "serialization_format": "text"}),
+)
+
+
+def check(path):
+    """Raise Damaged, or InputError for metadata.yaml, unless the files of a bag (directory or data file) are whole.
+
+    The checksums that MCAP files hold and that `seal` left in metadata.yaml, the structure of SQLite files, and that
+    metadata.yaml says what it must. Files that rosbag2 compressed as a whole (see `is_packed`) are only there or not.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return _check_data(path)
+    information = metadata(path)
+    stored = information["custom_data"].get(SUM_KEY, NO_SUM)
+    for file in data_files(path, information):
+        if not file.is_file():
+            raise Damaged(f"{file.name} is missing")
+        if stored != NO_SUM and _sum(file) != stored:
+            raise Damaged(f"the checksum of {file.name} in metadata.yaml is {stored}, but it has {_sum(file)}")
+        if not is_packed(information):
+            _check_data(file, packed_messages=information["compression_mode"] == "message")
+
+
+def data_files(path, information):
+    """Paths of the data files of a bag directory."""
+    return [path / Path(name).name for name in information["relative_file_paths"]]
+
+
+def is_packed(information):
+    """Whether rosbag2 has compressed the data files as a whole."""
+    return information["compression_mode"] == "file"
+
+
+def unpack(path, folder):
+    """Write a bag whose files are compressed as a whole to an empty folder, unpacked. Raises Damaged, InputError."""
+    information = metadata(path)
+    names = []
+    for file in data_files(path, information):
+        names.append(file.stem)
+        size = 0
+        try:
+            with zstd.open(file, "rb") as source, open(folder / file.stem, "wb") as target:
+                while block := source.read(_BLOCK):
+                    size += len(block)
+                    if size > MOST_UNPACKED:
+                        raise Damaged(f"{file.name} unpacks to more than {MOST_UNPACKED} bytes")
+                    target.write(block)
+        except (zstd.ZstdError, EOFError) as error:
+            raise Damaged(f"{file.name} cannot be unpacked ({error})") from error
+    information |= {"relative_file_paths": names, "compression_mode": "", "compression_format": "", "files": []}
+    information["custom_data"].pop(SUM_KEY, None)
+    content = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
+    (folder / "metadata.yaml").write_text(content)
+
+
+def metadata(path):
+    """What metadata.yaml of a bag directory says, with what we use in it present and of the right kind: dict. Raises
+    InputError, and Damaged."""
+    content = read_yaml(path / "metadata.yaml")
+    information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
+    if not isinstance(information, dict):
+        raise Damaged("metadata.yaml has no rosbag2_bagfile_information")
+    information = {"compression_mode": "", "custom_data": None, **information}
+    information["custom_data"] = information["custom_data"] or {}
+    if isinstance(information["compression_mode"], str):
+        information["compression_mode"] = information["compression_mode"].lower().replace("none", "")
+    kinds = {
+        "version": int, "message_count": int, "relative_file_paths": list, "topics_with_message_count": list,
+        "custom_data": dict, "storage_identifier": str, "duration": dict, "starting_time": dict,
+        "compression_mode": str,
+    }  # fmt: skip
+    for name, kind in kinds.items():
+        if type(information.get(name)) is not kind:
+            raise Damaged(f"metadata.yaml: {name} is {information.get(name)!r}")
+    for name in information["relative_file_paths"]:
+        if not isinstance(name, str) or not Path(name).name:
+            raise Damaged(f"metadata.yaml: relative_file_paths: {name!r} is no file")
+    for name, key in (("duration", "nanoseconds"), ("starting_time", "nanoseconds_since_epoch")):
+        if type(information[name].get(key)) is not int:
+            raise Damaged(f"metadata.yaml: {name} is {information[name]!r}")
+    for entry in information["topics_with_message_count"]:
+        count = entry.get("message_count") if isinstance(entry, dict) else None
+        if type(count) is not int or count < 0:
+            raise Damaged(f"metadata.yaml: message_count of a topic is {count!r}")
+    return information
+
+
+def seal(path):
+    """Put the checksums of a bag that rosbags has just written in their places. It must hold SUM_KEY: NO_SUM."""
+    (data,) = (file for file in Path(path).iterdir() if file.name != "metadata.yaml")
+    if data.suffix == ".mcap":
+        mcap.set_sums(data)
+    file = Path(path) / "metadata.yaml"
+    text = file.read_text()
+    sealed = re.sub(rf"({re.escape(SUM_KEY)}: *['\"]?){NO_SUM}", rf"\g<1>{_sum(data)}", text)
+    assert sealed != text
+    file.write_text(sealed)
+
+
+def open_sqlite(file):
+    """A connection that only reads, a file that is cut as well. Raises Damaged."""
+    try:
+        connection = sqlite3.connect(f"file:{quote(str(Path(file).absolute()))}?mode=ro&immutable=1", uri=True)
+        connection.execute("PRAGMA writable_schema=ON")  # else not one page of a file that has fewer than it says
+        return connection
+    except sqlite3.Error as error:
+        raise Damaged(str(error)) from error
+
+
+def is_mcap(file):
+    """Whether a data file is MCAP, by its first bytes; else it must be SQLite."""
+    with file.open("rb") as opened:
+        return opened.read(len(mcap.MAGIC)) == mcap.MAGIC
+
+
+def _check_data(file, packed_messages=False):
+    if is_mcap(file):
+        mcap.check(file)
+        contents = (content[22:] for kind, content in mcap.sound(file) if kind == mcap.MESSAGE)
+    else:
+        _check_sqlite(file)
+        contents = (data for _, _, _, data in sqlite_messages(file))
+    for content in contents if packed_messages else ():
+        try:
+            size = len(zstd.ZstdDecompressor().decompress(content, MOST_MESSAGE + 1))
+        except (zstd.ZstdError, TypeError) as error:
+            raise Damaged(f"a message cannot be unpacked ({error})") from error
+        if size > MOST_MESSAGE:
+            raise Damaged(f"a message unpacks to more than {MOST_MESSAGE} bytes")
+
+
+def sqlite_messages(file):
+    """Yields (id, topic id, stamp, data) of an SQLite file in the order of the ids. Raises Damaged where it is."""
+    connection = open_sqlite(file)
+    try:
+        yield from connection.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id")
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        raise Damaged(str(error)) from error
+    finally:
+        connection.close()
+
+
+def _check_sqlite(file):
+    connection = open_sqlite(file)
+    try:
+        connection.execute("PRAGMA writable_schema=OFF")
+        problems = [row[0] for row in connection.execute("PRAGMA integrity_check(1)")]
+        if problems != ["ok"]:
+            raise Damaged(" ".join(str(problems[0]).split()) if problems else "its integrity cannot be checked")
+        for table, columns in _TYPES:
+            wrong = " OR ".join(f"typeof({name}) <> '{kind}'" for name, kind in columns.items())
+            count = connection.execute(f"SELECT count(*) FROM {table} WHERE {wrong}").fetchone()[0]
+            if count:
+                raise Damaged(f"{count} rows of {table} hold text where numbers belong, or the other way round")
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        raise Damaged(str(error)) from error
+    finally:
+        connection.close()
+
+
+def _sum(file):
+    total = 0
+    with file.open("rb") as opened:
+        while block := opened.read(_BLOCK):
+            total = zlib.crc32(block, total)
+    return f"{total:08x}"

@@ -1,0 +1,223 @@
+"""MCAP files record by record (https://mcap.dev/spec): what rosbags does not check, and what is left of a cut one.
+
+Sizes are compared with the file, or bounded, before anything is read or unpacked.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+import struct
+import sys
+import zlib
+
+import lz4.frame
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+MAGIC = b"\x89MCAP0\r\n"
+MOST_UNPACKED = 256 << 20  # bytes of a chunk; rosbag2 makes chunks of 0.75 MB
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F
+_BLOCK = 1 << 20  # bytes that are read at once
+
+
+class Damaged(Exception):
+    """Where a file is not what it should be: the message says what, without the file's name."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """kind : opcode; start : of its opcode, bytes from the begin of the file; size : of its content."""
+
+    kind: int
+    start: int
+    size: int
+
+    @property
+    def content(self):
+        """Where its content starts."""
+        return self.start + 9
+
+    @property
+    def end(self):
+        """Where the next one starts."""
+        return self.start + 9 + self.size
+
+
+def check(path):
+    """Raise Damaged unless the file is whole: its records fill it, and the checksums that it has are right."""
+    with open(path, "rb") as file:
+        last = _size(file)
+        if _at(file, 0, 8) != MAGIC:
+            raise Damaged("it does not start as MCAP does")
+        if last < 16 or _at(file, last - 8, 8) != MAGIC:
+            raise Damaged("it does not end as MCAP does: the recording was cut")
+        chunks, footer, begin = {}, None, (0, 8)
+        for record in records(file, 8, last - 8):
+            if footer is not None:
+                raise Damaged(f"byte {record.start}: a record follows the footer")
+            if record.kind == HEADER:
+                begin = (0, 8, record.end)  # where the data begin is not the same to all who write these files
+            elif record.kind == CHUNK:
+                chunks[record.start] = _described(file, record)
+                unpacked(file, record)
+            elif record.kind == CHUNK_INDEX:
+                _check_index(file, record, chunks)
+            elif record.kind == DATA_END:
+                _check_sum(file, record, begin, record.start, 0)
+            elif record.kind == FOOTER:
+                footer = record
+        if footer is None or footer.size != 20:
+            raise Damaged("it has no footer")
+        (start,) = struct.unpack("<Q", _at(file, footer.content, 8))
+        _check_sum(file, footer, (start or footer.start,), footer.content + 16, 16)
+
+
+def sound(path):
+    """What is left of a file: yields (kind, content) of the schemas, channels and messages up to the first damage, and
+    raises Damaged there."""
+    with open(path, "rb") as file:
+        last = _size(file)
+        if _at(file, 0, min(8, last)) != MAGIC:
+            raise Damaged("it does not start as MCAP does")
+        for record in records(file, 8, last):
+            if record.kind in (SCHEMA, CHANNEL, MESSAGE):
+                yield record.kind, _at(file, record.content, record.size)
+            elif record.kind == CHUNK:
+                yield from inner(unpacked(file, record))
+            elif record.kind in (DATA_END, FOOTER):
+                return
+        raise Damaged("it ends early")
+
+
+def records(file, start, end):
+    """Records one after the other that fill file[start:end]. Raises Damaged where they do not."""
+    while start < end:
+        if start + 9 > end:
+            raise Damaged(f"byte {start}: it is cut within a record")
+        kind, size = struct.unpack("<BQ", _at(file, start, 9))
+        record = Record(kind, start, size)
+        if record.end > end or kind == 0:
+            raise Damaged(f"byte {start}: a record claims {size} bytes, {end - start - 9} are there")
+        yield record
+        start = record.end
+
+
+def inner(data):
+    """(kind, content) of the schemas, channels and messages within a chunk. Raises Damaged."""
+    at = 0
+    while at < len(data):
+        if at + 9 > len(data):
+            raise Damaged("a chunk is cut within a record")
+        kind, size = struct.unpack_from("<BQ", data, at)
+        at += 9
+        if size > len(data) - at or kind not in (SCHEMA, CHANNEL, MESSAGE) or (kind == MESSAGE and size < 22):
+            raise Damaged(f"a chunk holds a record of kind {kind} and {size} bytes that does not fit")
+        yield kind, data[at : at + size]
+        at += size
+
+
+def unpacked(file, record):
+    """Content of a chunk, its size and checksum verified. Raises Damaged."""
+    size, crc, compression, packed_at, packed_size = _chunk(file, record)
+    if size > MOST_UNPACKED:
+        raise Damaged(f"byte {record.start}: a chunk claims {size} bytes, more than {MOST_UNPACKED}")
+    data = _at(file, packed_at, packed_size)
+    try:
+        if compression == b"lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1)
+        elif compression == b"zstd":
+            data = zstd.ZstdDecompressor().decompress(data, size + 1)
+        elif compression:
+            raise Damaged(f"byte {record.start}: compression {compression[:20]!r} is not known")
+    except (RuntimeError, EOFError, zstd.ZstdError) as error:
+        raise Damaged(f"byte {record.start}: a chunk cannot be unpacked ({error})") from error
+    if len(data) != size:
+        raise Damaged(f"byte {record.start}: a chunk does not hold the {size} bytes it claims")
+    if crc and zlib.crc32(data) != crc:
+        raise Damaged(f"byte {record.start}: the checksum of a chunk is wrong")
+    return data
+
+
+def set_sums(path):
+    """Fill in the checksums that rosbags leaves at zero: of each chunk, of the data and of the summary."""
+    with open(path, "r+b") as file:
+        last = _size(file)
+        found = list(records(file, 8, last - 8))
+        for record in found:
+            if record.kind == CHUNK:
+                _put(file, record.content + 24, zlib.crc32(unpacked(file, record)))
+        for record in found:  # what the chunks hold by now counts
+            if record.kind == DATA_END:
+                _put(file, record.content, _sum(file, 0, record.start))
+            elif record.kind == FOOTER:
+                (start,) = struct.unpack("<Q", _at(file, record.content, 8))
+                _put(file, record.content + 16, _sum(file, start or record.start, record.content + 16))
+
+
+def _chunk(file, record):
+    """(unpacked size, checksum or 0, compression, where the packed content starts, its size)."""
+    if record.size < 40:
+        raise Damaged(f"byte {record.start}: a chunk has {record.size} bytes, too few")
+    _, _, size, crc, length = struct.unpack("<QQQII", _at(file, record.content, 32))
+    if length > record.size - 40:
+        raise Damaged(f"byte {record.start}: the compression of a chunk has a name of {length} bytes")
+    name = _at(file, record.content + 32, length)
+    (packed,) = struct.unpack("<Q", _at(file, record.content + 32 + length, 8))
+    at = record.content + 40 + length
+    if at + packed != record.end:
+        raise Damaged(f"byte {record.start}: a chunk does not end where it should")
+    return size, crc, name, at, packed
+
+
+def _described(file, record):
+    """What an index must say of a chunk: (start, size of the record, compression, packed and unpacked size)."""
+    size, _, compression, _, packed = _chunk(file, record)
+    return record.end - record.start, compression, packed, size
+
+
+def _check_index(file, record, chunks):
+    """Raise Damaged unless a chunk index describes one of the chunks."""
+    data = _at(file, record.content, record.size)
+    try:
+        start, length, offsets = struct.unpack_from("<QQI", data, 16)
+        (name,) = struct.unpack_from("<I", data, 44 + offsets)
+        compression = data[48 + offsets : 48 + offsets + name]
+        packed, size = struct.unpack_from("<QQ", data, 48 + offsets + name)
+    except struct.error:
+        raise Damaged(f"byte {record.start}: an entry of the index is cut") from None
+    if chunks.get(start) != (length, compression, packed, size):
+        raise Damaged(f"byte {record.start}: an entry of the index does not fit to any chunk")
+
+
+def _check_sum(file, record, starts, last, at):
+    """Raise Damaged unless the checksum at `at` in a record is 0, none, or that of the file from one of the starts to
+    last."""
+    (stored,) = struct.unpack("<I", _at(file, record.content + at, 4))
+    if stored and not any(_sum(file, first, last) == stored for first in starts if first <= last):
+        raise Damaged(f"byte {record.start}: the checksum of the bytes before it is wrong")
+
+
+def _sum(file, first, last):
+    total = 0
+    for start in range(first, last, _BLOCK):
+        total = zlib.crc32(_at(file, start, min(_BLOCK, last - start)), total)
+    return total
+
+
+def _at(file, start, size):
+    file.seek(start)
+    data = file.read(size)
+    if len(data) != size:
+        raise Damaged(f"byte {start}: it ends early")
+    return data
+
+
+def _put(file, at, number):
+    file.seek(at)
+    file.write(struct.pack("<I", number))
+
+
+def _size(file):
+    return Path(file.name).stat().st_size

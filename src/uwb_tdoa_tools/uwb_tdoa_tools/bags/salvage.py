@@ -1,0 +1,115 @@
+"""What is sound of a cut or damaged bag, as another bag."""
+
+from pathlib import Path
+import sqlite3
+import struct
+
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from . import integrity, mcap
+from .mcap import Damaged
+from .message_types import check_type, typestore
+
+_FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
+
+
+def salvage(path, out):
+    """Write what is sound of a bag (directory or data file, with or without metadata.yaml) to a new bag `out`, without
+    topics of types that are not installed. Returns remarks on what is missing, list of sentences. Raises InputError."""
+    path, remarks, connections = Path(path), [], {}
+    files = [path] if path.is_file() else _files(path, remarks)
+    with Writer(out, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
+        for file in files:
+            count, damage = _copy(path, file, writer, connections)
+            if damage:
+                remarks.append(f"{file.name} is cut or damaged ({damage}): read up to there, {count} messages.")
+        if not any(connections.values()):
+            raise InputError(f"{path}: holds no message that can be read; copy it again, or record it again.")
+    return remarks
+
+
+def _files(path, remarks):
+    try:
+        return [file for file in integrity.data_files(path, integrity.metadata(path)) if file.is_file()]
+    except (Damaged, InputError) as error:
+        remarks.append(f"metadata.yaml is of no use ({error}): read without it.")
+        return sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
+
+
+def _copy(path, file, writer, connections):
+    """Copy the messages of a data file. Returns (how many, where they end, as text, or None). connections : {(topic,
+    type): Connection of the writer, or None}."""
+    count = 0
+    try:
+        for connection, stamp, data in (_from_mcap if integrity.is_mcap(file) else _from_sqlite)(file):
+            key = connection.topic, connection.msgtype
+            if key not in connections:
+                connections[key] = _added(path, connection, writer)
+            if connections[key] is not None:
+                writer.write(connections[key], stamp, data)
+                count += 1
+    except Damaged as damage:
+        return count, str(damage)
+    return count, None
+
+
+def _added(path, connection, writer):
+    try:
+        check_type(path, connection)
+    except InputError:
+        if connection.msgtype in typestore().fielddefs:
+            raise  # it is another version of it
+        return None
+    return writer.add_connection(connection.topic, connection.msgtype, typestore=typestore())
+
+
+def _from_mcap(file):
+    schemas, channels = {}, {}
+    for kind, content in mcap.sound(file):
+        try:
+            if kind == mcap.SCHEMA:
+                (number,), texts = struct.unpack_from("<H", content), _texts(content, 2, 3)
+                schemas[number] = texts
+            elif kind == mcap.CHANNEL:
+                number, schema = struct.unpack_from("<HH", content)
+                channels[number] = _channel(number, *_texts(content, 4, 1), *schemas[schema])
+            else:
+                number, _, stamp = struct.unpack_from("<HIQ", content)
+                yield channels[number], stamp, content[22:]
+        except (struct.error, KeyError, UnicodeDecodeError) as error:
+            raise Damaged(f"a record cannot be read ({error!r})") from error
+
+
+def _from_sqlite(file):
+    connection, topics = integrity.open_sqlite(file), {}
+    try:
+        for number, topic, msgtype in connection.execute("SELECT id, name, type FROM topics"):
+            topics[number] = _channel(number, str(topic), str(msgtype), "", "")
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        raise Damaged(str(error)) from error
+    finally:
+        connection.close()
+    for _, topic, stamp, data in integrity.sqlite_messages(file):
+        if topic not in topics or type(stamp) is not int or type(data) is not bytes or not 0 <= stamp < 2**63:
+            raise Damaged("a row of messages cannot be read")
+        yield topics[topic], stamp, data
+
+
+def _texts(content, at, count):
+    """Texts, each after its length. Raises Damaged."""
+    found = []
+    for _ in range(count):
+        (length,) = struct.unpack_from("<I", content, at)
+        if length > len(content) - at - 4:
+            raise Damaged("a text in it is cut")
+        found.append(content[at + 4 : at + 4 + length].decode())
+        at += 4 + length
+    return found
+
+
+def _channel(number, topic, msgtype, encoding, definition):
+    definition = MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), definition)
+    return Connection(number, topic, msgtype, definition, "", 0, ConnectionExtRosbag2("cdr", []), None)
