@@ -4,7 +4,6 @@ from dataclasses import replace
 
 from ..scoring.evaluation import evaluate, judging_truth
 from ..scoring.metrics import Score
-from ..readers import read_flight
 
 
 def debiased(odometry, bias_map):
@@ -14,9 +13,8 @@ def debiased(odometry, bias_map):
     return replace(odometry, p=p, covariance=covariance)
 
 
-def fly(recording, config=None, effects=None, namespace=""):
-    """(Flight, Score, odometry) of one (path, survey) with ground truth, run through the filter. Raises InputError."""
-    flight = read_flight(*recording, namespace)
+def fly(flight, config=None, effects=None):
+    """(Flight, Score, odometry) of a Flight with ground truth, run through the filter. Raises InputError."""
     score, run = evaluate(flight, config, effects)
     return flight, score, run.odometry
 

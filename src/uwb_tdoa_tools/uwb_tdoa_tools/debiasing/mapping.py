@@ -8,6 +8,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import fit
 
+from ..readers import read_flight
 from .judge import fly
 from .parts import LEAST, part_of, static_parts
 
@@ -24,7 +25,7 @@ class Estimator:
     namespace: str = ""
 
     def __call__(self, recording):
-        return fly(recording, self.config, self.effects, self.namespace)
+        return fly(read_flight(*recording, self.namespace), self.config, self.effects)
 
 
 def fit_map(flown, static, estimator, survey=None, step=0.35, planar=False, interpolator="thin_plate"):

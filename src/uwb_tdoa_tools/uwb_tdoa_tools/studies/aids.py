@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.flight import Velocity
+from uwb_tdoa_bias.foundation.flight import AIDS, Velocity
 from uwb_tdoa_bias.foundation.pressure import altitude_of, pressure_at
 from uwb_tdoa_ekf.core.config import FilterConfig
 
@@ -14,7 +14,6 @@ from ..readers import inputs
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import airborne
 
-AIDS = "height", "pressure", "velocity"
 SETS = (), ("height",), ("pressure",), ("height", "pressure"), ("velocity",), ("height", "velocity")
 VELOCITY_RATE, VELOCITY_STD = 25.0, 0.1  # Hz, m/s: of a velocity made of the ground truth, where none was recorded
 TAKE_OFF = 0.2  # s into the airborne part, whose largest error is told
@@ -52,7 +51,7 @@ def with_velocity(flight):
 
 def only(flight, names):
     """The flight with no other aids than those of these names."""
-    return replace(flight, **{name: None for name in AIDS if name not in names})
+    return flight.without(*(name for name in AIDS if name not in names))
 
 
 def worth(flights, config):

@@ -5,6 +5,8 @@ import time
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.flight import AIDS
+
 from ...readers import inputs
 from ...diagnosis import diagnose
 from ...diagnosis.attribution import attribute
@@ -65,7 +67,8 @@ PRESENT = (
 
 
 def _load(data, paths):
-    return list(inputs.load_flights([data / path for path in paths], data / "surveys"))
+    flights = inputs.load_flights([data / path for path in paths], data / "surveys")
+    return [flight.without(*AIDS) for flight in flights]
 
 
 def run(data, name, out):

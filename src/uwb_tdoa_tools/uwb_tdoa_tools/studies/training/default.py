@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...readers import inputs
 from ...scoring.evaluation import evaluate
@@ -36,7 +37,7 @@ def run(args):
     """Make, judge and write the model."""
     days = {}
     for path, survey in inputs.find_flights(args.flights, args.survey):
-        days.setdefault(Path(survey).stem, []).append(read_flight(path, survey))
+        days.setdefault(Path(survey).stem, []).append(read_flight(path, survey).without(*AIDS))
     model, meta = learn(FLIGHTS)
     known = {day: [labelling.labels(flight) for flight in flights] for day, flights in days.items()}
     for day, flights in days.items():
