@@ -5,6 +5,8 @@ from functools import partial
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.foundation.errors import InputError
+
 from ..readers import read_flight
 from . import accuracy, layout, messages, plots
 from .check import brute_force
@@ -30,10 +32,13 @@ def check(installation, grid, out):
     return {"places": len(points), "agreement": float(np.mean(agrees)), "unique_share": float(np.mean(unique))}
 
 
-def fly(recording):
-    """(name, Samples) of one (path, survey)."""
+def fly(recording, aids=()):
+    """(name, Samples) of one (path, survey). aids : what it may use, as for accuracy.fly. Raises InputError."""
     flight = read_flight(*recording)
-    return flight.name, accuracy.fly(flight)
+    for name in aids:
+        if getattr(flight, name) is None:
+            raise InputError(f"{flight.name}: holds no {name}; leave out --with {name}, or this flight.")
+    return flight.name, accuracy.fly(flight, aids)
 
 
 def judge_flights(flown, installation, room, step, out):
