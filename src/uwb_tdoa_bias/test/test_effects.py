@@ -9,9 +9,14 @@ from random_samples import random_samples
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, ImuCorrector, Samples, SmoothTerm, TagLeverArm
+from uwb_tdoa_bias.effects import (
+    EFFECTS, AidCorrector, AnchorDelay, EffectSet, ImuCorrector, Samples, SmoothTerm, TagLeverArm, Track, aid_samples,
+)  # fmt: skip
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Height, Pressure, Tdoas, Truth, Velocity
 from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.effects.aid_error import values_of
+from uwb_tdoa_bias.foundation.pressure import pressure_at
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -65,7 +70,7 @@ def test_regressors_of_some_parameters_are_those_columns(effect):
 def test_is_declared_in_full(effect):
     assert EFFECTS[effect.name] is effect
     assert effect.bound > effect.negligible > 0.0 and effect.unit and effect.reference and effect.physics
-    assert set(effect.confounded_with) <= set(EFFECTS) and set(effect.channels) <= {"tdoa", "gyro", "accel"}
+    assert set(effect.confounded_with) <= set(EFFECTS) and set(effect.channels) <= {"tdoa", "gyro", "accel", *AIDS}
     np.testing.assert_array_equal(effect().bias(random_samples(1)), 0.0)  # no parameter, no effect
     np.testing.assert_array_equal(effect().noise_std(random_samples(1)), 0.0)
     bound = effect.bound_of(effect.example)
@@ -240,8 +245,6 @@ def test_inertial_samples_are_corrected_the_same_at_once_and_one_by_one():
 
 
 def test_stamps_and_spread():
-    from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
-
     samples = random_samples(4)
     ids = samples.anchors.ids
     noisy = EFFECTS["noise_level"]({f"{ids[0]}-{ids[1]}": 0.3})
@@ -267,3 +270,76 @@ def test_several_effects_of_one_name_are_all_kept(tmp_path):
     assert read == written
     samples = random_samples(3)
     np.testing.assert_array_equal(read.bias(samples), written.bias(samples))
+
+
+ON_AIDS = [effect for effect in EFFECTS.values() if set(effect.channels) <= set(AIDS)]
+
+
+def felt(seed, n=400):
+    """A Flight on a smooth path with true heights, pressures and velocities, and its AidSamples by stream."""
+    rng, t = np.random.default_rng(seed), np.arange(n) / 25.0
+    phase = rng.uniform(0.0, 6.0, 6)
+    p = np.stack([np.sin(0.7 * t + phase[0]), np.cos(0.5 * t + phase[1]), 1.5 + 0.5 * np.sin(0.9 * t + phase[2])], axis=1)
+    angles = np.stack([0.1 * np.sin(t + phase[3]), 0.1 * np.cos(t + phase[4]), 0.3 * t], axis=1)
+    truth = Truth(t, p, Rotation.from_euler("xyz", angles).as_quat())
+    samples = {stream: aid_samples(stream, t, Track(truth), t[0]) for stream in AIDS}
+    streams = {
+        "height": Height(t, samples["height"].reading[:, 0]),
+        "pressure": Pressure(t, pressure_at(samples["pressure"].reading[:, 0])),
+        "velocity": Velocity(t, samples["velocity"].reading, np.full((n, 3), 0.1)),
+    }
+    tdoa = Tdoas(t, np.zeros(n, int), np.ones(n, int), np.zeros(n))
+    return Flight("f", Anchors.from_positions(np.eye(3)), tdoa, truth=truth, **streams), samples
+
+
+def some_values(effect, rng, size=1e-3):
+    keys = effect.groups(None, None)[0] or (effect.example,)
+    limits = {"1.start": 3.0, "1.end": 9.0} if effect.example.startswith("1.") else {}
+    return {**limits, **{key: size * rng.uniform(0.5, 1.0) for key in keys}}
+
+
+@pytest.mark.parametrize("effect", ON_AIDS)
+@given(st.integers(0, 1000))
+def test_regressors_on_aids_are_what_inject_adds(effect, seed):
+    """To first order; at the ends of intervals and of the recording neither is defined."""
+    (flight, samples), rng = felt(seed), np.random.default_rng(seed)
+    values, (stream,) = some_values(effect, rng), effect.channels
+    made, keys = effect(values), [key for key in values if not key.endswith(("start", "end"))]
+    changed = getattr(made.inject(flight), stream)
+    before, after = values_of(getattr(flight, stream)), values_of(changed)
+    if not np.array_equal(changed.t, flight.truth.t):  # stamps moved: what it reads at the old ones
+        after = np.stack([np.interp(flight.truth.t, changed.t, column) for column in after.T], axis=1)
+    predicted = effect({k: v for k, v in values.items() if k not in keys}).regressors(samples[stream], keys) @ [
+        values[key] for key in keys
+    ]
+    inner, rough = slice(5, -5), 5e-5 if effect.name == "velocity_delay" else 2e-6  # of accelerations from poses
+    np.testing.assert_allclose((after - before)[inner], predicted[inner], atol=rough)
+
+
+@pytest.mark.parametrize("effect", ON_AIDS)
+def test_what_is_put_into_an_aid_is_taken_out_of_it_or_out_of_the_residual(effect):
+    flight, samples = felt(3)
+    (stream,), made = effect.channels, effect(some_values(effect, np.random.default_rng(0), 0.1))
+    back = getattr(EffectSet((made,)).correct_streams(made.inject(flight)), stream)
+    assert not np.array_equal(getattr(made.inject(flight), stream).t, back.t) == (effect.name == "velocity_delay")
+    left = values_of(back) - EffectSet((made,)).uncorrected(samples[stream])
+    np.testing.assert_allclose(left, values_of(getattr(flight, stream)), atol=1e-6)
+    np.testing.assert_allclose(back.t, flight.truth.t, atol=1e-9)
+    with pytest.raises(InputError, match=f"holds no {stream}"):
+        made.inject(flight.without(stream))
+
+
+def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_measured():
+    rng, n = np.random.default_rng(0), 50
+    values = {"velocity_scale": {"scale": 0.1}, "velocity_misalignment": {"yaw": 1.5}, "velocity_delay": {"offset": 0.02}}
+    corrector = AidCorrector([EFFECTS[name](each) for name, each in values.items()])
+    t, v, std = np.arange(n) / 25.0, rng.standard_normal((n, 3)), rng.uniform(0.1, 0.2, (n, 3))
+    v[:, 2], std[:, 2] = np.nan, np.inf
+    late, turned, wider = corrector.correct("velocity", t, v, std)
+    expected = Rotation.from_euler("z", 1.5).apply(np.where(np.isfinite(v), v, 0.0)) / 1.1
+    np.testing.assert_allclose(turned[:, :2], expected[:, :2], atol=1e-12)
+    np.testing.assert_allclose(late, t - 0.02)
+    assert np.isinf(wider[:, 2]).all() and (wider[:, :2] < 0.2).all()
+    single = [corrector.correct("velocity", *(column[k : k + 1] for column in (t, v, std))) for k in range(n)]
+    for column, whole in enumerate((late, turned, wider)):
+        np.testing.assert_allclose(np.concatenate([each[column] for each in single]), whole, atol=1e-12)

@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.core.config import CHOICES, RENAMED, TUNING, FilterConfig, cur
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"
 SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover", "use_height", "use_pressure", "use_velocity")
-SIGNED = "initial_yaw", "height_arm", "ground_height", "fixed_height", "velocity_yaw", "velocity_delay"
+SIGNED = "initial_yaw", "height_arm", "ground_height", "fixed_height"
 OTHERS = (*CHOICES, *SIGNED, *SWITCHES)
 NUMBERS = [field.name for field in fields(FilterConfig) if field.name not in OTHERS]
 

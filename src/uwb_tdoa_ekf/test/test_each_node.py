@@ -14,6 +14,8 @@ from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from flights import corners, with_aids  # noqa: E402
 from rig import MODULES, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from sensor_msgs.msg import Imu  # noqa: E402
+from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
+from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_bias.foundation import ros  # noqa: E402
 from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
@@ -169,12 +171,18 @@ def test_every_measurement_is_accounted_for(make_rig):
     assert imu == counts["IMU samples received"] == len(flight.imu) + 1
 
 
-@pytest.mark.parametrize("topic", ["velocity", "velocity/odometry"])
-def test_height_pressure_and_velocity_are_used_where_they_are_there(make_rig, topic):
-    rig = make_rig()
-    rig.start("ekf_node")
-    flight = recording(3.0)
-    flight = with_aids(flight, rate=50.0)
+MOUNTED = """effects: {height_offset: {values: {offset: 0.1}}, height_scale: {values: {scale: 0.02}}, velocity_scale:
+  {values: {scale: 0.1}}, velocity_misalignment: {values: {yaw: 1.5}}, velocity_delay: {values: {offset: 0.02}}}"""
+
+
+@pytest.mark.parametrize("topic, effects", [("velocity", MOUNTED), ("velocity/odometry", "effects: {}")])
+def test_height_pressure_and_velocity_are_used_where_they_are_there(make_rig, tmp_path, topic, effects):
+    rig, file = make_rig(), tmp_path / "effects.yaml"
+    file.write_text(effects)
+    rig.start("ekf_node", ekf_node=["-p", f"effects_file:={file}"])
+    effects, flight = EffectSet.from_yaml(file), with_aids(recording(3.0), rate=50.0)
+    for effect in effects.effects:
+        flight = effect.inject(flight)
     flight.height.range[:] = np.float32(flight.height.range)  # a sensor_msgs/Range is not more precise
     flight.height.range[20] = np.inf
     topics = ["height", "pressure", topic]
@@ -188,7 +196,7 @@ def test_height_pressure_and_velocity_are_used_where_they_are_there(make_rig, to
         assert sum(counts[f"{aid}_{verdict}"] for verdict in verdicts) == counts[f"{aid}_received"] > 100
         assert counts[f"{aid}_used"] > 50
     assert counts["height_invalid"] == 1
-    expected = run_offline(flight).odometry
+    expected = run_offline(flight, None, Corrector(flight.anchors, effects)).odometry
     place = np.searchsorted(expected.t, [seconds_of(m.header.stamp) for m in rig.odometry])
     p = [(m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z) for m in rig.odometry]
     np.testing.assert_allclose(p, expected.p[place], atol=1e-3)

@@ -80,15 +80,6 @@ def test_with_aids_too_skew_changes_nothing(seed, delay):
     assert_aids_as_offline(flight, order=order, advance=lambda: rng.random() < 0.3)
 
 
-def test_mounting_of_the_velocity_is_undone_alike():
-    """The very first velocity may be late: nobody knows of the stream before it. The filter is not running then."""
-    flight, config = with_aids(fly(1, 3.0)), FilterConfig(velocity_yaw=0.1, velocity_scale=1.1, velocity_delay=0.02)
-    estimator, expected = Estimator(flight.anchors, config), run_offline(flight, config)
-    assert_same(feed(estimator, flight)[0], expected.odometry)
-    assert estimator.counts["velocity_late"] <= 1
-    assert estimator.counts["velocity_used"] == np.sum(expected.aids["velocity"]["verdict"] == USED)
-
-
 def test_an_aid_that_stops_is_waited_for_for_a_second_and_then_done_without():
     flight = with_aids(fly(3, 6.0))
     estimator, behind = Estimator(flight.anchors), {}

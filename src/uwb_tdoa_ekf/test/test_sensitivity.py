@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flights import fly
+from flights import fly, with_aids
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, samples_at
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.sensitivity import record_innovations
@@ -13,9 +13,10 @@ PLAIN = FilterConfig(robust="gate", gate=1e3, adapt_noise=False, recover=False, 
 SETTLED = 4.0  # s; the start itself follows biases too, which `Innovations` do not know: it must be forgotten
 
 
-@pytest.mark.parametrize("imu", [True, False])
-def test_derivatives_are_those_of_two_runs(imu):
+@pytest.mark.parametrize("imu, aided", [(True, False), (False, False), (True, True)])
+def test_derivatives_are_those_of_two_runs(imu, aided):
     flight, step = fly(seed=3, duration=8.0, tdoa_std=0.02), 1e-4
+    flight = with_aids(flight) if aided else flight
     config = replace(PLAIN, use_imu=imu)
     keys = [str(i) for i in flight.anchors.ids[:3]]
     found = record_innovations(flight, config)
@@ -48,8 +49,10 @@ def test_what_the_position_can_follow_leaves_little_trace():
     assert kept(shift) < 0.1 and kept(delay) > 0.5
 
 
-def test_every_used_tdoa_is_found_in_the_history():
+@pytest.mark.parametrize("aided", [False, True])
+def test_every_used_tdoa_is_found_in_the_history(aided):
     flight = fly(seed=5, duration=6.0, outliers=0.1)
+    flight = with_aids(flight) if aided else flight
     found = record_innovations(flight)
     places = np.concatenate(found.of)
     assert sorted(places[places >= 0].tolist()) == list(range(len(found.rows)))

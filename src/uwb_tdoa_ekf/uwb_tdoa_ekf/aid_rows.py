@@ -1,4 +1,4 @@
-"""Heights, pressures and velocities as the core takes them: units, mounting, and which of them can be measurements."""
+"""Heights, pressures and velocities as the core takes them, and which of them can be measurements."""
 
 import numpy as np
 
@@ -28,16 +28,10 @@ def pressure_rows(config, t, pressure):
 
 
 def velocity_rows(config, t, v, std):
-    """The same of velocities v (n, 3) m/s with std (n, 3) m/s, inf where not measured: turned into the body frame, without
-    scale and delay."""
+    """The same of velocities v (n, 3) m/s, body frame, with std (n, 3) m/s, inf where not measured."""
     v, std = np.asarray(v, dtype=float), np.asarray(std, dtype=float)
-    rows = _rows(VELOCITY, np.asarray(t) - config.velocity_delay)
-    cos, sin = np.cos(config.velocity_yaw), np.sin(config.velocity_yaw)
-    known = np.isfinite(std)
-    x, y, z = (np.where(known, v, 0.0) / config.velocity_scale).T
-    rows["value"] = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
-    x, y, z = (np.where(known, std, UNKNOWN) / config.velocity_scale).T
-    rows["std"] = np.stack([np.hypot(cos * x, sin * y), np.hypot(sin * x, cos * y), z], axis=1)
+    rows, known = _rows(VELOCITY, t), np.isfinite(std)
+    rows["value"], rows["std"] = np.where(known, v, 0.0), np.where(known, std, UNKNOWN)
     sane = np.where(known, (np.abs(v) < MAX_SPEED) & (std > 0.0), True).all(axis=1)
     return rows, sane & known.any(axis=1) & ~np.isnan(std).any(axis=1) & np.isfinite(t)
 

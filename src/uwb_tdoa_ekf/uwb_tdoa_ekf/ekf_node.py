@@ -25,7 +25,7 @@ from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.effects import EffectSet, ImuCorrector
+from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
@@ -48,7 +48,7 @@ PARAMETERS = {  # beside those of FilterConfig: default and meaning, as in confi
         "", 'flyable.npz of plan; a warning on /diagnostics while the tag is outside; "" for none'
     ),
     "effects_file": (
-        "", "effects.yaml, the same as bias_node's: what it says of gyroscope and accelerometer is taken out"
+        "", "effects.yaml, the same as bias_node's: what it says of gyroscope, accelerometer, height and velocity is taken out"
     ),
     "reorder": (0.003, "s of stamps; how long a TDOA waits for older ones that are still on their way"),
     "lag": (0.25, "s of stamps; how long a silent stream is waited for; what comes later than that is late"),
@@ -70,6 +70,7 @@ class EkfNode(Node):
         self._reorder, self._lag, self._world = (others[name] for name in ("reorder", "lag", "world_frame"))
         volume, effects_file = others["flyable_volume"], others["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
+        self._aid_corrector = AidCorrector(self._effects.effects)
         if not 0.0 <= self._reorder < self._lag < math.inf:
             raise InputError(f"reorder, lag: {self._reorder!r}, {self._lag!r} must be seconds with 0 <= reorder < lag.")
         self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute")
@@ -173,16 +174,24 @@ class EkfNode(Node):
         distance = message.range
         if not message.min_range <= distance <= message.max_range:  # out of range, says REP 117
             distance = math.inf
-        self._estimator.add_height(self._epoch.seconds(message.header.stamp), distance)
+        self._estimator.add_height(*self._corrected("height", message.header.stamp, distance))
 
     def _take_pressure(self, message):
-        self._estimator.add_pressure(self._epoch.seconds(message.header.stamp), message.fluid_pressure)
+        self._estimator.add_pressure(*self._corrected("pressure", message.header.stamp, message.fluid_pressure))
 
     def _take_velocity(self, message):
         v, covariance = message.twist.twist.linear, message.twist.covariance
         variance = [float(covariance[place]) for place in (0, 7, 14)]
         std = [math.sqrt(x) if 0.0 <= x < UNKNOWN_VARIANCE else math.inf for x in variance]
-        self._estimator.add_velocity(self._epoch.seconds(message.header.stamp), (v.x, v.y, v.z), std)
+        self._estimator.add_velocity(*self._corrected("velocity", message.header.stamp, (v.x, v.y, v.z), std))
+
+    def _corrected(self, stream, stamp, *values):
+        """Stamp, s, and values of a height, pressure or velocity without the effects."""
+        columns = (self._epoch.seconds(stamp), *values)
+        if self._aid_corrector.idle:
+            return columns
+        corrected = self._aid_corrector.correct(stream, *(np.array([column]) for column in columns))
+        return [column[0].tolist() for column in corrected]
 
     def _publish(self, odometry, residuals):
         if len(odometry.t):

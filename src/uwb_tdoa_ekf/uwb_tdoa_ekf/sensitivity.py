@@ -5,12 +5,13 @@ The derivative of the state by every parameter goes through the recorded transit
 these derivatives knows of the path whatever the filter knew: the inertial sensor, the motion, every other measurement.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
+from .core.config import FilterConfig
 from .core.history import RESET
 from .core.state import ERROR_STATES, MOVING_STATES
 from .estimator import VERDICTS
@@ -50,7 +51,9 @@ class Innovations:
 
 
 def record_innovations(flight, config=None, corrector=None):
-    """Run a Flight through bias correction and filter, and keep what `Innovations` need. Takes what run_offline takes."""
+    """Run a Flight through bias correction and filter, without its pressure, and keep what `Innovations` need. Takes what
+    run_offline takes."""
+    config = replace(config or FilterConfig(), use_pressure=False)  # its offset is not among the states of the history
     records = []
     run = run_offline(flight, config, corrector, records)
     residuals = run.residuals

@@ -80,6 +80,12 @@ def test_what_others_use():
     assert shares["others"] + shares["stolen"] <= 1.0 - 0.8 * ours / (usage.used_by_all()[0] - before[0])
 
 
+@pytest.mark.parametrize("aid", core.NOISES)
+def test_an_aid_is_measured_beside_the_rest(aid):
+    microseconds = core.per_aid(aid, 15)
+    assert len(microseconds) == 15 and 0.0 < np.median(microseconds) < 50.0
+
+
 def test_the_core_is_measured_per_event():
     prediction, update = core.per_event(8, "innovation", 1, 5)
     assert prediction.shape == update.shape == (5,)

@@ -1,6 +1,7 @@
 import pytest
 
 from uwb_tdoa_tools.commands import study
+from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.studies.debiasing import measured
 from uwb_tdoa_tools.studies.debiasing.report import measured_tables
 from uwb_tdoa_tools.studies.diagnosis.measured import SPLITS
@@ -9,6 +10,14 @@ from uwb_tdoa_tools.studies.diagnosis.measured import SPLITS
 def test_no_flight_is_fitted_to_and_judged():
     for name, (_, to_fit, to_judge) in measured.cases().items():
         assert to_fit and to_judge and not set(to_fit) & set(to_judge), name
+
+
+def test_height_and_pressure_are_left_out(shared_data):
+    path = SPLITS["0425 a"][0][0]
+    (flight,) = inputs.Reading(shared_data / "surveys").flights([shared_data / path])
+    assert flight.height is not None and flight.pressure is not None
+    flown = measured.flown(shared_data, path, None)[0]
+    assert flown.height is None and flown.pressure is None
 
 
 @pytest.mark.slow

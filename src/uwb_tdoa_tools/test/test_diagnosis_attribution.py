@@ -6,7 +6,7 @@ from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.studies.diagnosis.bank import SIZES, clean_flight, effect_of, names_found
+from uwb_tdoa_tools.studies.diagnosis.bank import AIDED, SIZES, clean_flight, effect_of, names_found
 
 TRUTH = GroundTruth()
 
@@ -82,3 +82,21 @@ def test_measured_flight(shared_data):
     effects = EffectSet(attribute([one], TRUTH).effects)
     before, after = (residuals(two, TRUTH, model)["tdoa"] for model in (EffectSet(), effects))  # of a flight that was not fitted
     assert np.median(np.abs(after.residual[after.airborne])) < 0.7 * np.median(np.abs(before.residual[before.airborne]))
+
+
+@pytest.fixture(scope="module")
+def aided():
+    return clean_flight(101, 40.0, aided=True)
+
+
+@pytest.mark.parametrize("name", AIDED)
+def test_what_is_wrong_with_height_pressure_and_velocity_is_found_with_its_size(aided, name):
+    put_in = effect_of(name, True, 1)
+    (found,) = quick(put_in.inject(aided)).effects
+    assert found.name == name
+    for key, value in put_in.values.items():
+        assert found.values[key] == pytest.approx(value, rel=0.1, abs=1.0 if key.endswith(("start", "end")) else 0.0)
+
+
+def test_nothing_is_found_in_sound_heights_pressures_and_velocities(aided):
+    assert attribute([aided], TRUTH).effects == ()

@@ -9,11 +9,13 @@ from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
 
 @pytest.fixture(scope="module")
 def parts():
-    return residuals(clean_flight(100, 40.0), GroundTruth(), EffectSet())
+    return residuals(clean_flight(100, 40.0, aided=True), GroundTruth(), EffectSet())
 
 
 def test_residuals_of_a_clean_flight_are_its_noise(parts):
     assert np.std(parts["gyro"].residual) < 0.002 and np.std(parts["accel"].residual) < 0.01
+    for name, noise in (("height", 0.01), ("pressure", 0.1), ("velocity", 0.05)):  # medians of the 6 or 7 in a cell
+        assert np.std(parts[name].residual) == pytest.approx(1.2 * noise / np.sqrt(6.25), rel=0.15)
     tdoa = parts["tdoa"]
     assert 1.4826 * np.median(np.abs(tdoa.residual[tdoa.airborne])) == pytest.approx(0.06, rel=0.05)
 
@@ -51,3 +53,17 @@ def test_without_attitude_the_gyroscope_is_judged_at_rest_and_the_accelerometer_
     parts = residuals(reference.prepare(clean_flight(103, 30.0)), reference, EffectSet())
     assert "accel" not in parts
     assert "gyro" not in parts or np.abs(parts["gyro"].residual).max() < 0.1
+
+
+def test_without_reference_height_pressure_and_velocity_are_not_judged():
+    reference, flight = Nothing(), clean_flight(103, 30.0, aided=True)
+    assert not {"height", "pressure", "velocity"} & set(residuals(reference.prepare(flight), reference, EffectSet()))
+
+
+def test_a_component_of_the_velocity_that_is_not_measured_has_no_rows():
+    flight = clean_flight(100, 30.0, aided=True)
+    flight.velocity.std[:, 2], flight.velocity.v[:, 2] = np.inf, np.nan
+    part = residuals(flight, GroundTruth(), EffectSet())["velocity"]
+    rows = part.rows()
+    assert set(rows.series) == {0, 1} and np.isfinite(rows.y).all()
+    assert len(part.columns(EFFECTS["velocity_scale"](), ("scale",))) == len(rows.y)

@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, true_samples
+from uwb_tdoa_bias.effects.aid_error import values_of
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.inject import main
@@ -22,6 +24,9 @@ def flight():
             multipath=False,
             outlier_probability=0.0,
             imu_errors=NO_IMU_ERRORS,
+            height_noise=0.0,
+            pressure_noise=0.0,
+            velocity_noise=0.0,
         )
     )
 
@@ -38,6 +43,8 @@ def test_injected_effect_is_what_the_model_takes_out(flight, effect):
     changed = effect.inject(flight, np.random.default_rng(1))
     streams = [(flight.tdoa.t, changed.tdoa.t), (flight.tdoa.d, changed.tdoa.d), (flight.truth.t, changed.truth.t)]
     streams += [(flight.imu.gyro, changed.imu.gyro), (flight.imu.accel, changed.imu.accel)]
+    streams += [(getattr(flight, name).t, getattr(changed, name).t) for name in AIDS]
+    streams += [(values_of(getattr(flight, name)), values_of(getattr(changed, name))) for name in AIDS]
     assert any(not np.array_equal(before, after) for before, after in streams)
     if effect.name in ("noise_level", "noise_correlation", "outlier_rate"):
         return  # nothing to take out

@@ -194,3 +194,31 @@ def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
         process.stdout.close()
         context.try_shutdown()
     assert set(np.unique(got["plan/flyable"].data)) <= {0, 50, 100} and len(got["plan/markers"].markers) == 10
+
+
+def test_with_a_height_sensor_four_anchors_at_one_height_serve_a_volume(square, tmp_path, capsys):
+    """They do not without: their plane mirrors every position."""
+    options, out = ["--volume", "--area", "0", "4", "0", "4", "0", "2", "--step", "0.5"], tmp_path / "o"
+    assert plan.main([square, *options, "--out", str(out)]) == 2
+    assert "--with height" in capsys.readouterr().err
+    figures = []
+    for std in ("0.02", "0.2"):
+        assert plan.main([square, *options, "--with", "height", "--height-std", std, "--out", str(out)]) == 0
+        figures.append(json.loads((out / "plan.json").read_text())["map"])
+    assert figures[0] != figures[1]
+    assert plan.main([square, *options, "--with", "height", "--height-std", "0", "--out", str(out)]) == 2
+    assert "height std" in capsys.readouterr().err
+
+
+def test_flights_are_judged_with_the_height_that_they_hold(anchors, tmp_path, capsys):
+    write_bag(simulate(SimulationConfig(duration=20.0, height_noise=0.01)), tmp_path / "flight.bag")
+    ratios = {}
+    for options in ((), ("--with", "height")):
+        arguments = [anchors, *COARSE, *options, "--flights", str(tmp_path / "flight.bag"), "--out", str(tmp_path / "o")]
+        assert plan.main(arguments) == 0
+        ratios[options] = json.loads((tmp_path / "o" / "plan.json").read_text())["flights"][-1]
+    without, aided = ratios.values()
+    assert aided["bound"] < 0.9 * without["bound"] and aided["rmse"] < without["rmse"]
+    write_bag(simulate(SimulationConfig(duration=20.0)), tmp_path / "flight.bag", force=True)
+    assert plan.main(arguments) == 2
+    assert "holds no height; leave out --with height" in capsys.readouterr().err

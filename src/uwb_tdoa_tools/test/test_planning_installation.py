@@ -51,3 +51,13 @@ def test_hull():
     outline = installation.hull_outline()
     np.testing.assert_array_equal(outline[0], outline[-1])
     assert {tuple(corner) for corner in outline} == {(-2, -2), (-2, 2), (2, 2), (2, -2)}
+
+
+def test_with_a_height_sensor_anchors_in_a_plane_are_enough_and_the_hull_is_that_from_above():
+    flat = Installation(planar(), height_std=0.02)
+    high, low = flat.anchors.positions[:, :2].max(axis=0), flat.anchors.positions[:, :2].min(axis=0)
+    points = np.array([[*(0.5 * (high + low)), 7.0], [*(high + 0.1), 1.0]])
+    assert flat.inside_hull(points).tolist() == [True, False] and flat.unknowns == 2 and flat.dimensions == 3
+    for options in ({"height_std": 0.0}, {"height_std": np.nan}, {"height_std": 0.1, "dimensions": 2}):
+        with pytest.raises(InputError, match="height std"):
+            Installation(planar(), **options)

@@ -275,3 +275,21 @@ def test_what_measured_tdoas_share(shared_data, name):
 
     assert -0.35 < correlation(1) < -0.2
     assert abs(correlation(2)) < 0.05 and abs(correlation(3)) < 0.05
+
+
+@given(st.floats(0.01, 0.5))
+def test_a_height_sensor_adds_its_information(std):
+    plain, aided = Installation(corners(), NOISY), Installation(corners(), NOISY, height_std=std)
+    expected = information(PLACES, plain) + np.diag([0.0, 0.0, std**-2])
+    np.testing.assert_allclose(information(PLACES, aided), expected)
+    before, after = (bound(information(PLACES, each)) for each in (plain, aided))
+    assert (after[:, 2, 2] < std**2).all() and (np.linalg.eigvalsh(before - after) > -1e-9).all()
+
+
+def test_a_perfect_height_sensor_leaves_the_bound_at_known_height():
+    anchors = corners()
+    known = bound(information(PLACES, Installation(anchors, NOISY, dimensions=2)))
+    measured = bound(information(PLACES, Installation(anchors, NOISY, height_std=1e-4)))
+    np.testing.assert_allclose(measured[:, :2, :2], known, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(dilution(PLACES, Installation(anchors, height_std=0.1)),
+                               dilution(PLACES, Installation(anchors, dimensions=2)))  # fmt: skip

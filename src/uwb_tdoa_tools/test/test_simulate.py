@@ -41,6 +41,7 @@ def test_options_reach_the_configuration(tmp_path):
     SimulationConfig().complete()[0].anchors.to_yaml(anchors)
     options = "--protocol tdoa3 --seed 4 --noise 0.02 --shared-noise --no-bias --no-outliers --no-multipath"
     options += " --perfect-imu --yaw rotating --height 1.1 --speed 0.8 --start-in-air"
+    options += " --height-noise 0.02 --pressure-noise 0.3 --velocity-noise 0.1"
     options += f" --anchors {anchors} --json {report}"
     assert simulate.main([*SHORT, *options.split()]) == 0
     content = json.loads(report.read_text())
@@ -50,6 +51,7 @@ def test_options_reach_the_configuration(tmp_path):
         "yaw": "rotating",
     }  # fmt: skip
     assert (config["height"], config["speed"], config["outlier_probability"]) == (1.1, 0.8, 0.0)
+    assert [config[f"{stream}_noise"] for stream in ("height", "pressure", "velocity")] == [0.02, 0.3, 0.1]
     assert config["start_in_air"] and content["parameters"]["take_off"] is None
     assert set(config["imu_errors"].values()) == {0.0}
     assert content["bias_std"] == content["multipath_std"] == content["outliers"] == 0

@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.pressure import altitude_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import YAW_PROFILES
 from uwb_tdoa_tools.simulation.constellations import CONSTELLATIONS
@@ -137,3 +139,23 @@ def test_anchors_without_orientation_do_without_bias():
     anchors = Anchors.from_positions(SimulationConfig().complete()[0].anchors.positions)
     flight = simulate(SimulationConfig(anchors=anchors, bias=False, duration=20.0))
     np.testing.assert_array_equal(flight.extra["tdoa_truth"]["bias"], 0.0)
+
+
+def test_height_pressure_and_velocity_are_true_without_noise_and_noisy_as_told():
+    exact = simulate(SimulationConfig(duration=20.0, height_noise=0.0, pressure_noise=0.0, velocity_noise=0.0))
+    config = SimulationConfig(duration=20.0, height_noise=0.02, pressure_noise=0.1, velocity_noise=0.05)
+    noisy, plain = simulate(config), simulate(SimulationConfig(duration=20.0))
+    at = np.searchsorted(exact.truth.t, exact.height.t)
+    turn = Rotation.from_quat(exact.truth.q[at])
+    np.testing.assert_allclose(exact.truth.t[at], exact.height.t, atol=1e-9)
+    np.testing.assert_allclose(exact.height.range * turn.as_matrix()[:, 2, 2], exact.truth.p[at, 2], atol=1e-9)
+    np.testing.assert_allclose(altitude_of(exact.pressure.pressure) - 200.0, exact.truth.p[at, 2], atol=1e-6)
+    state = exact.extra["state_truth"]
+    v = np.stack([state[name][at] for name in ("vx", "vy", "vz")], axis=1)
+    np.testing.assert_allclose(turn.apply(exact.velocity.v), v, atol=1e-9)
+    air = exact.truth.p[at, 2] > 0.3
+    assert np.std((noisy.height.range - exact.height.range)[air]) == pytest.approx(0.02, rel=0.15)
+    assert np.std(noisy.velocity.v - exact.velocity.v) == pytest.approx(0.05, rel=0.1)
+    assert (noisy.velocity.std == 0.05).all() and (exact.velocity.std > 0.0).all()
+    assert plain.height is None and plain.pressure is None and plain.velocity is None
+    np.testing.assert_array_equal(noisy.tdoa.d, plain.tdoa.d)  # every part draws from its own stream

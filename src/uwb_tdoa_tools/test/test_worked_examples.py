@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.diagnosis.attribution import attribute
@@ -48,16 +49,15 @@ def test_an_effect_with_a_search_of_its_own(flight, monkeypatch):
 
 def test_a_channel(flight, monkeypatch, tmp_path):
     names = written("A channel")
-    offset = names["HeightOffset"]
+    offset = names["CompassOffset"]
     monkeypatch.setitem(EFFECTS, offset.name, offset)
-    monkeypatch.setitem(CHANNELS, "height", names["Height"]())
+    monkeypatch.setitem(CHANNELS, "heading", names["Heading"]())
     truth = flight.truth
-    noise = 0.01 * np.random.default_rng(0).standard_normal(len(truth))
-    tilt = 1.0 - 2.0 * (truth.q[:, 0] ** 2 + truth.q[:, 1] ** 2)
-    stream = {"t": truth.t, "distance": (truth.p[:, 2] - 0.04 + noise) / tilt}
-    seen = replace(flight, extra={"range": stream})
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(truth))
+    stream = {"t": truth.t, "heading": Rotation.from_quat(truth.q).as_euler("ZYX")[:, 0] - 0.1 + noise}
+    seen = replace(flight, extra={"compass": stream})
     attribution = attribute([seen], GroundTruth())
-    assert [effect.name for effect in attribution.effects] == ["height_offset"]
-    assert attribution.effects[0].values["offset"] == pytest.approx(-0.04, abs=0.01)
+    assert [effect.name for effect in attribution.effects] == ["compass_offset"]
+    assert attribution.effects[0].values["offset"] == pytest.approx(-0.1, abs=0.02)
     EffectSet(attribution.effects).to_yaml(tmp_path / "effects.yaml")
     assert EffectSet.from_yaml(tmp_path / "effects.yaml").effects == attribution.effects

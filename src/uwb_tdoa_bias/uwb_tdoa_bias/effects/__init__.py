@@ -17,16 +17,17 @@ The file, written by people and by the tools, read by the nodes:
         values: {c0: 0.01, c1: 0.04, c2: -0.02, c3: 0.0}
 """
 
+from .aid_corrector import AidCorrector
 from .anchor_delay import AnchorDelay
 from .base import ArrivalEffect, Effect
 from .catalogue import EFFECTS
 from .effect_set import EffectSet
 from .imu_corrector import ImuCorrector
-from .samples import ImuSamples, Samples, Track, samples_at, true_samples
+from .samples import AidSamples, ImuSamples, Samples, Track, aid_samples, samples_at, true_samples
 from .smooth_term import SmoothTerm
 from .tag_lever_arm import TagLeverArm
 
 __all__ = [
-    "EFFECTS", "AnchorDelay", "ArrivalEffect", "Effect", "EffectSet", "ImuCorrector", "ImuSamples", "Samples",
-    "SmoothTerm", "TagLeverArm", "Track", "samples_at", "true_samples",
+    "EFFECTS", "AidCorrector", "AidSamples", "AnchorDelay", "ArrivalEffect", "Effect", "EffectSet", "ImuCorrector",
+    "ImuSamples", "Samples", "SmoothTerm", "TagLeverArm", "Track", "aid_samples", "samples_at", "true_samples",
 ]  # fmt: skip

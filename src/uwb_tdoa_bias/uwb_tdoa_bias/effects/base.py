@@ -21,8 +21,8 @@ class Effect:
     values : {parameter name: value in `unit`}; std : the same keys, standard errors, empty if unknown;
     source : where the values came from, free text.
     An effect says what it does to measurements, and by that how it is undone, the same way in a node, off line and in a
-    recording: `bias` and `noise_std` of TDOAs, `stamp_offset` of streams, `sensor_model` and `sensor_bias` of inertial
-    samples. For `diagnose` it gives `regressors` on the channels where it shows.
+    recording: `bias` and `noise_std` of TDOAs, `stamp_offset` of streams, `sensor_model` of inertial samples, heights and
+    velocities, `sensor_bias` of inertial samples. For `diagnose` it gives `regressors` on the channels where it shows.
     """
 
     values: dict = field(default_factory=dict)
@@ -38,7 +38,7 @@ class Effect:
     physics: ClassVar[str]  # one sentence for the catalogue
     confounded_with: ClassVar[tuple] = ()
     reference: ClassVar[str]
-    channels: ClassVar[tuple] = ("tdoa",)  # where it shows: tdoa, gyro, accel
+    channels: ClassVar[tuple] = ("tdoa",)  # where it shows: names of channels of diagnose
     fitted: ClassVar[bool] = True  # False: found by a detector of its own, not by linear regression
     portable: ClassVar[bool] = True  # goes with the tag, the vehicle and the anchors' modules to another installation
     settings: ClassVar[tuple] = ()  # further entries in effects.yaml, constructor arguments
@@ -114,7 +114,7 @@ class Effect:
 
     def regressors(self, samples, keys):
         """Derivative of what `samples.channel` measures by the parameters `keys`: of Samples (n, len(keys)), metres per
-        `unit`; of ImuSamples (n, 3, len(keys)), body axes. Asked for the channels in `channels` only."""
+        `unit`; of ImuSamples (n, 3, len(keys)), body axes; of AidSamples (n, k, len(keys)). Asked for the channels in `channels` only."""
         return np.zeros((len(samples), len(keys)))
 
     def noise_std(self, samples):
@@ -147,11 +147,12 @@ class Effect:
         return ()
 
     def stamp_offset(self, stream):
-        """Seconds by which the stamps of the stream "tdoa", "imu" or "truth" are late."""
+        """Seconds by which the stamps of a stream of a Flight are late, by its name."""
         return 0.0
 
     def sensor_model(self, channel):
-        """Affine from the true to the measured values of "gyro" (rad/s) or "accel" (m/s^2), body axes."""
+        """Affine from the true to the measured values of "gyro" (rad/s), "accel" (m/s^2) or "velocity" (m/s), body axes, or
+        of "height" (m)."""
         return IDENTITY
 
     def sensor_bias(self, channel, features):
@@ -159,7 +160,8 @@ class Effect:
         return None
 
     def uncorrected(self, samples):
-        """What taking it out of a stream leaves of it in ImuSamples, (n, 3), because nodes know less than those."""
+        """What taking it out of a stream leaves of it in ImuSamples, (n, 3), or AidSamples, (n, k), because nodes know less
+        than those."""
         return 0.0
 
 

@@ -6,9 +6,13 @@ from .anchor_clock_drift import AnchorClockDrift
 from .anchor_delay import AnchorDelay
 from .anchor_position import AnchorPosition
 from .antenna_pattern import AntennaPattern
+from .barometer_drift import BarometerDrift
 from .floor_multipath import FloorMultipath
+from .floor_step import FloorStep
 from .gyro_bias import GyroBias
 from .gyro_scale import GyroScale
+from .height_offset import HeightOffset
+from .height_scale import HeightScale
 from .imu_gravity import ImuGravity
 from .imu_misalignment import ImuMisalignment
 from .nlos import Nlos
@@ -23,6 +27,10 @@ from .tag_lever_arm import TagLeverArm
 from .tdoa_time_offset import TdoaTimeOffset
 from .truth_frame import TruthFrame
 from .truth_time_offset import TruthTimeOffset
+from .velocity_delay import VelocityDelay
+from .velocity_misalignment import VelocityMisalignment
+from .velocity_scale import VelocityScale
+from .velocity_slip import VelocitySlip
 
 EFFECTS = {
     effect.name: effect
@@ -30,5 +38,7 @@ EFFECTS = {
         AnchorDelay, PairOffset, AnchorPosition, TagLeverArm, TdoaTimeOffset, TruthTimeOffset, TruthFrame, RangeScale,
         RangeBias, ReceivedPowerBias, AntennaPattern, AnchorClockDrift, Nlos, FloorMultipath, GyroBias, GyroScale,
         AccelBias, AccelScale, ImuMisalignment, ImuGravity, NoiseLevel, NoiseCorrelation, OutlierRate,
+        HeightOffset, HeightScale, FloorStep, BarometerDrift, VelocityScale, VelocityMisalignment, VelocityDelay,
+        VelocitySlip,
     )
 }  # fmt: skip

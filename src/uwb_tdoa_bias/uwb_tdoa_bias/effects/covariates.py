@@ -8,6 +8,7 @@ from ..foundation.compiled import compiled
 from ..foundation.radio import into_frame
 from ..foundation.vibration import VIBRATION_CORNER, low_pass, track_vibration
 from .base import tile
+from .samples import ImuSamples
 
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes
 OF_MOTION = ("speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor")  # need a history
@@ -71,11 +72,13 @@ UNITS = {
 OF_ACCEL = ("accel", "accel_x", "accel_y", "accel_z")  # specific force, m/s^2
 
 
-def imu_covariate(name, samples):
-    """Covariate `name`, of OF_IMU or of a pose in OF_TDOA, of ImuSamples: (n,)."""
+def sensor_covariate(name, samples):
+    """Covariate `name`, of a pose in OF_TDOA, of ImuSamples also of OF_IMU: (n,). samples : ImuSamples or AidSamples."""
     if samples.channel == "accel" and name in OF_ACCEL:  # the measured one shares its noise with the residual
         return _norm(samples.reading) if name == "accel" else samples.reading[:, "xyz".index(name[-1])]
-    return samples.features[:, OF_IMU.index(name)] if name in OF_IMU else OF_TDOA[name](samples)
+    if name in OF_IMU and isinstance(samples, ImuSamples):
+        return samples.features[:, OF_IMU.index(name)]
+    return OF_TDOA[name](samples)
 
 
 class ImuFeatures:

@@ -1,20 +1,22 @@
 """`effects.yaml`: which effects are in the model, with which values."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from ..foundation.errors import InputError
+from ..foundation.flight import AIDS
 from ..foundation.safe_yaml import read_yaml
+from .aid_corrector import AidCorrector
 from .catalogue import EFFECTS
 from .imu_corrector import ImuCorrector
 from .smooth_term import SmoothTerm
 from .stamp_error import shifted
 
 ENTRY = ("values", "std", "source")
-STREAMS = ("tdoa", "imu", "truth")
+STREAMS = ("tdoa", "imu", "truth")  # whose stamps are moved, beside those of AIDS
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,11 @@ class EffectSet:
             total += np.where(np.isfinite(part), part, 0.0)
         return total
 
+    def uncorrected(self, samples):
+        """What taking the effects out of a stream leaves of them in ImuSamples, (n, 3), or AidSamples, (n, k)."""
+        mine = (effect for effect in self.effects if samples.channel in effect.channels)
+        return sum((effect.uncorrected(samples) for effect in mine), np.zeros(samples.reading.shape))
+
     def noise_std(self, samples):
         """Standard deviation that the effects add to d_ab, (n,) metres."""
         return np.sqrt(sum((effect.noise_std(samples) ** 2 for effect in self.effects), np.zeros(len(samples))))
@@ -55,19 +62,30 @@ class EffectSet:
         return any(effect.needs_motion for effect in self.effects)
 
     def stamp_offset(self, stream):
-        """Seconds by which the stamps of the stream "tdoa", "imu" or "truth" are late."""
+        """Seconds by which the stamps of a stream of a Flight are late, by its name."""
         return sum(effect.stamp_offset(stream) for effect in self.effects)
 
     def correct_streams(self, flight):
-        """The Flight without the effects' part in stamps and inertial samples. TDOA biases are the Corrector's."""
+        """The Flight without the effects' part in stamps, inertial samples, heights and velocities. TDOA biases are the
+        Corrector's."""
         for stream in STREAMS:
             flight = shifted(flight, stream, -self.stamp_offset(stream))
+        flight = self._correct_aids(flight)
         corrector = ImuCorrector(self.effects)
         if flight.imu is None or corrector.idle:
             return flight
         imu = flight.imu
         gyro, accel = corrector.correct(imu.t, imu.gyro, imu.accel)
         return replace(flight, imu=replace(imu, gyro=gyro, accel=accel))
+
+    def _correct_aids(self, flight):
+        corrector = AidCorrector(self.effects)
+        for stream in AIDS if not corrector.idle else ():
+            part = getattr(flight, stream)
+            if part is not None:
+                columns = [getattr(part, field.name) for field in fields(part)]
+                flight = replace(flight, **{stream: type(part)(*corrector.correct(stream, *columns))})
+        return flight
 
     @classmethod
     def from_yaml(cls, path):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..foundation.errors import InputError
-from .affine import IDENTITY
+from .affine import IDENTITY, regressors
 from .base import Effect
 from .wording import listed, significant, size
 
@@ -30,19 +30,10 @@ class ImuEffect(Effect):
         return np.array([self.values.get(key, 0.0) for key in "xyz"])
 
     def sensor_model(self, channel):
-        return {"gyro": self.gyro, "accel": self.accel}[channel]()
+        return {"gyro": self.gyro, "accel": self.accel}.get(channel, lambda: IDENTITY)()
 
     def regressors(self, samples, keys):
-        """Derivative of what the sensor of ImuSamples reads by the parameters `keys`: (n, 3, len(keys)); numerical."""
-        step, out = 1e-6, np.empty((len(samples), 3, len(keys)))
-        for column, key in enumerate(keys):
-            here = self.values.get(key, 0.0)
-            ends = [
-                type(self)({**self.values, key: here + s}).sensor_model(samples.channel)(samples.reading)
-                for s in (-step, step)
-            ]
-            out[:, :, column] = (ends[1] - ends[0]) / (2.0 * step)
-        return out
+        return regressors(self, samples, keys)
 
     def inject(self, flight, rng=None):
         need_imu(self, flight)

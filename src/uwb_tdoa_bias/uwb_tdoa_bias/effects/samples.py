@@ -1,4 +1,4 @@
-"""A batch of TDOAs with the motion of the tag, as effects see it."""
+"""A batch of measurements with the motion of the tag, as effects see it."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -82,6 +82,30 @@ class ImuSamples:
         return len(self.t)
 
 
+@dataclass(frozen=True)
+class AidSamples:
+    """A height, a pressure or a velocity, as effects see it.
+
+    channel : name of the stream; t (n,) s; p (n, 3) m, world; start : s, as of Samples.
+    reading (n, k): what it should have read: of a range finder over the ground at z = 0, m; of a barometer the height, m; of
+    a velocity that in the body frame, m/s. change (n, k): how fast that changes, per s.
+    up (n,): cosine of the tilt, NaN where the attitude is not known; motion : Motion; vibration (n,) as of Samples, or None.
+    """
+
+    channel: str
+    t: np.ndarray
+    p: np.ndarray
+    start: float
+    reading: np.ndarray
+    change: np.ndarray
+    up: np.ndarray
+    motion: Motion
+    vibration: np.ndarray | None = None
+
+    def __len__(self):
+        return len(self.t)
+
+
 class Track:
     """Poses, to be asked at any stamp: positions interpolated linearly, attitudes on the great circle."""
 
@@ -131,3 +155,24 @@ def true_samples(flight):
     rows = np.flatnonzero((a >= 0) & (b >= 0) & (a != b) & np.isfinite(tdoa.d) & np.isfinite(tdoa.t))
     start = float(tdoa.t[0]) if len(tdoa) else 0.0
     return samples_at(tdoa.t[rows], a[rows], b[rows], flight.truth, flight.anchors, start), rows
+
+
+def aid_samples(stream, t, track, start=0.0, vibration=None):
+    """AidSamples of a stream at stamps t (n,), s, of a Track. start, vibration : see there."""
+    before, reading, after = (_reading(stream, track, t + late) for late in (-0.5 * STEP, 0.0, 0.5 * STEP))
+    change = (after - before) / STEP
+    return AidSamples(
+        stream, t, track.positions(t), start, reading, change, _up(track, t), track.motion(t), vibration
+    )
+
+
+def _up(track, t):
+    q = track.attitudes(t)
+    return 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
+
+
+def _reading(stream, track, t):
+    if stream == "velocity":
+        return Rotation.from_quat(track.attitudes(t)).inv().apply(track.velocities(t))
+    z = track.positions(t)[:, 2]
+    return (z / _up(track, t) if stream == "height" else z)[:, None]

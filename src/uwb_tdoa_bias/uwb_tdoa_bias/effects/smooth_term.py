@@ -10,10 +10,11 @@ import numpy as np
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
 from .base import Effect, known_anchors, once_per_anchors, tile
-from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_TDOA, imu_covariate
+from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_TDOA, sensor_covariate
 
 DEGREE = 2
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
+AID_CHANNELS = ("height", "pressure", *(f"velocity.{axis}" for axis in "xyz"))
 FORMS = ("common", "arrival", "anchor")
 OLD_NAMES = {"force": "accel", **{f"force_{axis}": f"accel_{axis}" for axis in "xyz"}}  # of covariates, until 0.3
 
@@ -22,8 +23,8 @@ OLD_NAMES = {"force": "accel", **{f"force_{axis}": f"accel_{axis}" for axis in "
 class SmoothTerm(Effect):
     """A quadratic B-spline of one covariate, held constant beyond its knots; `values` are its coefficients c0, c1, ...
 
-    channel : "tdoa", or "gyro.x" ... "accel.z"
-    covariate : a name of covariates.OF_TDOA or OF_ARRIVAL, or for the inertial channels of OF_IMU
+    channel : "tdoa", "gyro.x" ... "accel.z", or of AID_CHANNELS
+    covariate : a name of covariates.OF_TDOA, or for "tdoa" of OF_ARRIVAL, for the inertial channels of OF_IMU
     form : for "tdoa" only: "common", the same f(covariate) on every d_ab; "arrival", f of each anchor's own
         covariate, as d_ab = f_b - f_a; "anchor", the same with a function for each anchor, coefficients "3.c0", ...
     knots : where the pieces meet, ends included, rising; for a covariate of names: the names, one coefficient each
@@ -55,7 +56,8 @@ class SmoothTerm(Effect):
             self.knots = ()
         if len(self.knots) < 2 or not (np.diff(self.knots) > 0.0).all():
             raise InputError(f"effects: smooth_term: knots: {self.knots!r} are not two or more rising numbers.")
-        known = {**dict.fromkeys(IMU_CHANNELS, (*OF_IMU, *OF_TDOA)), "tdoa": (*OF_TDOA, *OF_ARRIVAL)}
+        known = {**dict.fromkeys(IMU_CHANNELS, (*OF_IMU, *OF_TDOA)), **dict.fromkeys(AID_CHANNELS, OF_TDOA)}
+        known["tdoa"] = (*OF_TDOA, *OF_ARRIVAL)
         extra = self.covariate.startswith("extra.")
         if self.form not in FORMS or self.channel not in known or not (extra or self.covariate in known[self.channel]):
             raise InputError(
@@ -98,7 +100,7 @@ class SmoothTerm(Effect):
         """Whether the nodes, and the filter off line, have the covariate at hand."""
         if self.channel == "tdoa":
             return self.covariate in (*OF_TDOA, *OF_ARRIVAL) and self.covariate != "vibration"
-        return self.covariate in OF_IMU
+        return self.channel in IMU_CHANNELS and self.covariate in OF_IMU
 
     def keys(self, anchors=None):
         """All coefficients: of every anchor for the form "anchor"."""
@@ -162,18 +164,28 @@ class SmoothTerm(Effect):
         return late[n:] - late[:n]
 
     def sensor_bias(self, channel, features):
-        sensor, _, axis = self.channel.partition(".")
-        if sensor != channel or not self.usable:
+        if channel not in self.channels or not self.usable:
             return None
         out = np.zeros((len(features), 3))
-        out[:, "xyz".index(axis)] = self.curve(features[:, OF_IMU.index(self.covariate)])
+        out[:, self._axis] = self.curve(features[:, OF_IMU.index(self.covariate)])
         return out
+
+    @property
+    def _axis(self):
+        """Place of its axis in what the sensor reads."""
+        return "xyz".index(self.channel.partition(".")[2] or "x")
+
+    def uncorrected(self, samples):
+        if self.channel not in AID_CHANNELS:
+            return 0.0
+        keys = self.keys()
+        return self.regressors(samples, keys) @ np.array([self.values.get(key, 0.0) for key in keys])
 
     def regressors(self, samples, keys):
         if samples.channel != "tdoa":
-            out = np.zeros((len(samples), 3, len(keys)))
-            basis = self.basis(imu_covariate(self.covariate, samples))
-            out[:, "xyz".index(self.channel[-1])] = basis[:, [int(key[1:]) for key in keys]]
+            out = np.zeros((*samples.reading.shape, len(keys)))
+            basis = self.basis(sensor_covariate(self.covariate, samples))
+            out[:, self._axis] = basis[:, [int(key[1:]) for key in keys]]
             return out
         n, out = len(samples), np.zeros((len(samples), len(keys)))
         values, both = self._covariate(samples)

@@ -6,7 +6,7 @@ from .base import Effect
 
 
 class StampEffect(Effect):
-    """An effect on the stamps of one stream. Subclasses say which: "tdoa", "imu" or "truth"."""
+    """An effect on the stamps of one stream. Subclasses say which, by its name in a Flight."""
 
     stream = "tdoa"
 

@@ -24,7 +24,7 @@ class TruthTimeOffset(StampEffect):
     reference = "UTIL web page: motion-capture poses logged on board have about 10 ms of radio latency"
     needs_reference = True
     portable = False
-    channels = ("tdoa", "gyro")  # on the accelerometer it is less than its vibration
+    channels = ("tdoa", "gyro", "height", "pressure", "velocity")  # on the accelerometer it is less than its vibration
 
     def regressors(self, samples, keys):
         if samples.channel != "tdoa":  # the truth of that stamp is an earlier one: the sensor reads what comes later

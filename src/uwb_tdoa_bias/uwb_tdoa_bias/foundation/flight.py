@@ -1,10 +1,12 @@
 """Flight: the numpy arrays of one recording. Every reader returns one, every tool takes one."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from .anchors import Anchors
+
+AIDS = "height", "pressure", "velocity"  # streams of a Flight that the filter can do without
 
 
 @dataclass(frozen=True)
@@ -107,3 +109,7 @@ class Flight:
     height: Height | None = None
     pressure: Pressure | None = None
     velocity: Velocity | None = None
+
+    def without(self, *streams):
+        """The Flight without some of the streams that may be missing, by their names, e.g. AIDS."""
+        return replace(self, **dict.fromkeys(streams))

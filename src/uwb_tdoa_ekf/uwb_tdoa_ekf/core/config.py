@@ -90,9 +90,6 @@ class FilterConfig:
     pressure_walk: float = _parameter(0.1, "m/sqrt(s); how fast the offset of the altitude wanders: weather, prop wash, warming up")
     pressure_drift: float = _parameter(0.02, "m/s; how fast it drifts, as is known before it is measured")
     use_velocity: bool = _parameter(True, "use velocities in the body frame, if there are any")
-    velocity_scale: float = _parameter(1.0, "measured over true velocity")
-    velocity_yaw: float = _parameter(0.0, "rad; yaw of the axes of the velocity in the body frame", low=-1e9)
-    velocity_delay: float = _parameter(0.0, "s; by which the stamps of the velocity are late", low=-1e9)
     fixed_height: float = _parameter(0.0, "m; height of a tag that stays on its floor", low=-1e9)
     fixed_height_std: float = _parameter(0.0, "m; its standard deviation; 0.0: the tag does not stay there", with_low=True)
 

@@ -13,6 +13,16 @@ BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more 
 STOPPED = 2.0  # s without a message of an aid that was there, before it becomes a warning
 LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it becomes a warning
 
+REMEDY = {  # of each aid, what to check
+    "height": "its unit, height_arm and ground_height",
+    "pressure": "and shield it from wind",
+    "velocity": "its unit and how it is turned (velocity_misalignment in effects_file), and look for slip",
+}
+INVALID = {  # what a message of each must hold
+    "height": "out of range, or less than 0 m",
+    "pressure": "give Pa, some 1e5 on the ground",
+    "velocity": "give m/s and a covariance that is neither 0 nor unknown for all components",
+}
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -85,13 +95,21 @@ class Health:
             if received != before:
                 since = now
             self._aids_heard[aid] = received, since
-            unused = counts[f"{aid}_rejected"] + counts[f"{aid}_late"] + counts[f"{aid}_invalid"]
-            recent = [n - m for n, m in zip((received, unused), self._aids_before.get(aid, (0, 0)))]
-            self._aids_before[aid] = received, unused
+            reasons = {
+                "rejected": f"contradict everything else and are not used: check the sensor, {REMEDY[aid]}",
+                "late": f"are late: check its stamps, or raise lag (now {self._lag} s)",
+                "invalid": f"are invalid: {INVALID[aid]}",
+            }
+            totals = {"received": received} | {reason: counts[f"{aid}_{reason}"] for reason in reasons}
+            before = self._aids_before.get(aid, dict.fromkeys(totals, 0))
+            recent = {name: total - before[name] for name, total in totals.items()}
+            self._aids_before[aid] = totals
             if received and now - since > STOPPED:
                 judgement = WARN, f"no messages on {aid} any more: done without; check the sensor and its driver"
-            elif recent[1] > LARGEST_UNUSED * recent[0]:
-                judgement = WARN, f"more than half of the messages on {aid} are not used: they contradict everything else, or are late or invalid"
+                continue
+            for reason, words in reasons.items():
+                if recent[reason] > LARGEST_UNUSED * recent["received"]:
+                    judgement = WARN, f"more than half of the messages on {aid} {words}"
         return judgement
 
     def _judge_use(self, counts):

@@ -1,9 +1,10 @@
-"""us per prediction and per robust update in the compiled core."""
+"""us per prediction, per robust update, and per height, pressure or velocity in the compiled core."""
 
 import time
 
 import numpy as np
 
+from uwb_tdoa_ekf.aid_rows import rows_of
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.memory import HYPOTHESES, IMU_SAMPLE, TDOA, Measurements, new_memory, structured
@@ -15,6 +16,8 @@ ANCHORS = (4, 8, 16, 32, 64)
 BEFORE, MEASURED = 3.0, 4.0  # s of a flight: until it is measured, and measured
 RARELY = 1e-3  # Hz of odometry: the core alone is measured
 TARGET = 2.5  # us of one prediction and one robust update
+OF_AID = 2.0  # us, of one height, pressure or velocity
+NOISES = {"height": 0.01, "pressure": 0.1, "velocity": 0.05}  # m, m, m/s
 SECTION = "compiled core, one core"
 
 
@@ -34,6 +37,9 @@ def measure(progress, quick=False):
         yield from _pair(f"8 anchors, {robust}", 8, robust, 1, repeats)
     progress("core, yaw unknown")
     yield from _pair(f"8 anchors, {ROBUST[0]}, while {HYPOTHESES} yaws are followed", 8, ROBUST[0], HYPOTHESES, repeats)
+    for aid in NOISES:
+        progress(f"core, {aid}")
+        yield Figure.of(SECTION, f"one {aid}", "us", per_aid(aid, repeats), OF_AID)
 
 
 def _pair(name, anchors, robust, hypotheses, repeats, target=None):
@@ -63,6 +69,19 @@ def per_event(anchors, robust, hypotheses, repeats):
     return 1e6 * seconds[:, 0] / core.samples, 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.tdoas
 
 
+def per_aid(aid, repeats):
+    """us per height, pressure or velocity beside 1 kHz IMU and 400 Hz TDOA: (repeats,)."""
+    flight = make_flight(
+        BEFORE + MEASURED, start_in_air=True, multipath=False, **{f"{aid}_noise": NOISES[aid]}
+    )
+    core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
+    core.run(BEFORE, core.memory)
+    if not core.memory.record.running:
+        raise RuntimeError("the filter has not started, so that there is nothing to measure")
+    seconds = np.array([[core.timed(True), core.timed(True, True)] for _ in range(repeats + 1)])[1:]
+    return 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.aids
+
+
 class Core:
     """engine.feed on a stretch of a flight, again and again from the same Memory."""
 
@@ -74,21 +93,26 @@ class Core:
         stamps = imu.t[np.maximum(np.searchsorted(imu.t, tdoa.t, side="right") - 1, 0)]
         rows = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
         self._tdoa = structured(TDOA, stamps, *rows, tdoa.d, np.zeros(len(tdoa)))
+        self._aids = rows_of(flight, config)[0]
+        self._aids["t"] = imu.t[np.maximum(np.searchsorted(imu.t, self._aids["t"], side="right") - 1, 0)]
         self._begin = imu.t[0]
 
     def run(self, until, memory):
         """Feed the flight's first seconds; what is measured is the rest."""
-        k, n = (int(np.searchsorted(stream["t"], self._begin + until)) for stream in (self._imu, self._tdoa))
-        self._feed(memory, self._imu[:k], self._tdoa[:n])
-        self._imu, self._tdoa = self._imu[k:], self._tdoa[n:]
-        self.samples, self.tdoas = len(self._imu), len(self._tdoa)
+        streams = self._imu, self._tdoa, self._aids
+        ends = [int(np.searchsorted(stream["t"], self._begin + until)) for stream in streams]
+        self._feed(memory, *(stream[:end] for stream, end in zip(streams, ends)))
+        self._imu, self._tdoa, self._aids = (stream[end:] for stream, end in zip(streams, ends))
+        self.samples, self.tdoas, self.aids = len(self._imu), len(self._tdoa), len(self._aids)
 
-    def timed(self, tdoa):
-        """s that the rest takes, with or without its TDOAs."""
+    def timed(self, tdoa, aids=False):
+        """s that the rest takes, with or without its TDOAs, and its heights, pressures and velocities."""
         self.last = self.memory.copy()
-        return self._feed(self.last, self._imu, self._tdoa if tdoa else self._tdoa[:0])
+        return self._feed(
+            self.last, self._imu, self._tdoa if tdoa else self._tdoa[:0], self._aids if aids else self._aids[:0]
+        )
 
-    def _feed(self, memory, imu, tdoa):
+    def _feed(self, memory, *measured):
         began = time.perf_counter()
-        feed(memory, self._tuning, Measurements(imu, tdoa))
+        feed(memory, self._tuning, Measurements(*measured))
         return time.perf_counter() - began

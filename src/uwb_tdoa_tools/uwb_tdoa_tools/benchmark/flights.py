@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.flight import AIDS
+
 from ..simulation import SimulationConfig, simulate
 
 SHORTEST = 16.0  # s that the simulation needs to take off and land
@@ -27,8 +29,9 @@ def thinned(flight):
 def first(flight, seconds):
     """Its first seconds."""
     end = flight.imu.t[0] + seconds
-    streams = {name: getattr(flight, name) for name in ("tdoa", "imu", "truth")}
-    return replace(flight, **{name: _rows(stream, stream.t < end) for name, stream in streams.items()})
+    streams = {name: getattr(flight, name) for name in ("tdoa", "imu", "truth", *AIDS)}
+    kept = {name: _rows(stream, stream.t < end) for name, stream in streams.items() if stream is not None}
+    return replace(flight, **kept)
 
 
 def _rows(stream, chosen):

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .. import cli, parallel
 from ..planning import messages, options, report, run
@@ -32,7 +33,7 @@ def parser():
         "plan anchors.yaml --height 1.2 --out plan/",
         "plan survey.txt --volume --area -3 4 -4 4 0 3 --protocol tdoa3 --out plan/",
         "plan square.yaml --planar --height 0.2 --check --out plan/",
-        "plan survey.txt --volume --flights flights/0425 --out plan/",
+        "plan survey.txt --volume --with height --flights flights/0425 --out plan/",
         "plan survey.txt --volume --improve add --out plan/",
     )
     add, number, path, default = made.add_argument, {"type": float}, {"type": Path}, "(default: %(default)s)"
@@ -61,6 +62,9 @@ def parser():
     add("--noise", metavar="M", **number, help="standard deviation of every reception, instead of the radio's")
     own = "error that every TDOA has of its own besides (default: 0)"
     add("--link-noise", metavar="M", **number, default=0.0, help=own)
+    felt = "what the tag measures besides, as with a range finder that looks down"
+    add("--with", dest="aids", action="append", default=[], choices=["height"], help=felt)
+    add("--height-std", metavar="M", **number, default=FilterConfig().height_std, help=f"of that height {default}")
     unique = "one solution by every pairing alone or by a whole round (default: pairings)"
     add("--flyable", choices=FLYABLE, default="pairings", help=unique)
 
@@ -102,7 +106,7 @@ def _plan(args):
         figures["check"] = run.check(installation, grid, args.out)
         report.say_check(figures["check"])
     if recordings:
-        flown = parallel.over(run.Fly(reading), recordings, args.jobs, args.dask)
+        flown = parallel.over(run.Fly(reading, tuple(args.aids)), recordings, args.jobs, args.dask)
         figures["flights"] = run.judge_flights(flown, installation, room, args.step or 0.4, args.out)
         report.say_flights(figures["flights"])
     if aim:

@@ -33,7 +33,7 @@ def parser():
         "simulate",
         "Simulate a flight of a quadrotor with a UWB tag among fixed anchors, and write it as a ROS 2 bag.",
         "simulate --out flight.bag",
-        "simulate --trajectory circle --protocol tdoa3 --seed 7 --out circle.bag --plot circle.png",
+        "simulate --trajectory circle --protocol tdoa3 --height-noise 0.01 --seed 7 --out circle.bag --plot circle.png",
         "simulate --constellation random-12-16 --duration 120 --out unseen.bag --json unseen.json",
         "simulate --no-bias --no-multipath --no-outliers --noise 0 --perfect-imu --out exact.bag",
         "simulate --list",
@@ -60,8 +60,7 @@ def parser():
     name = "name, random-SEED or random-SEED-COUNT (default: corners)"
     room.add_argument("--constellation", metavar="NAME", default=default.constellation, help=name)
     room.add_argument("--anchors", metavar="FILE.yaml", type=Path, help="your own anchors, with orientations")
-    add, off = radio.add_argument, {"action": "store_false"}
-    share = default.outlier_probability
+    add, off, share = radio.add_argument, {"action": "store_false"}, default.outlier_probability
     add("--protocol", choices=PROTOCOLS, default=default.protocol, help="(default: tdoa2)")
     add(
         "--noise", dest="noise_std", metavar="M", type=float, default=default.noise_std,
@@ -78,6 +77,11 @@ def parser():
     imu = made.add_argument_group("inertial sensor").add_mutually_exclusive_group()
     imu.add_argument("--perfect-imu", action="store_true", help="no noise and no bias")
     imu.add_argument("--vibration", metavar="M/S2", type=float, default=0.0, help="noise of motors (default: 0)")
+
+    add = made.add_argument_group("what else the vehicle feels, with white noise of this standard deviation").add_argument
+    add("--height-noise", metavar="M", type=float, help="write ranges to the floor, along the body's -z")
+    add("--pressure-noise", metavar="M", type=float, help="write pressures; in metres of altitude")
+    add("--velocity-noise", metavar="M/S", type=float, help="write velocities in the body frame")
     return made
 
 

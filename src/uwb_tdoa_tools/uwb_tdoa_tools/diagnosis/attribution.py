@@ -20,6 +20,7 @@ from .regression.terms import Candidate, Term, candidates_of, columns_of
 
 ROUNDS = 2  # of linearising about what was found
 MAPS_GAIN, MAPS_SURE = 20.0, 3.0  # held-out log-likelihood, twice, and its t value over blocks, that maps must bring
+DISGUISED = 4  # times that what disguises itself as noise is searched for before noise is measured
 MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
 
 
@@ -71,7 +72,7 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
     for last in (number == ROUNDS - 1 for number in range(ROUNDS)):
         table = _linearised(current, declared, model)
         if inflation is None:
-            inflation = fit(table, columns_of(declared)).inflation
+            inflation = _inflation(table, declared, [detector for detector in detectors if detector.disguises])
         progress()
         selection = select(table, declared, inflation, search, progress=progress)
         model = effects_of(selection)
@@ -169,6 +170,20 @@ def _linearised(found, candidates, model):
     about = [Term(here.get(term.effect.identity, term.effect), term.keys) for term in terms]
     table = table_of(found).with_terms([*own, *about])
     return table.with_contribution([(term.effect, term.columns) for term in own])
+
+
+def _inflation(table, declared, detectors):
+    """(channels,) loss of independence, on the residual of a fit with all that is declared, and with what `detectors` find."""
+    known, model = list(declared), fit(table, columns_of(declared))
+    for _ in range(DISGUISED):
+        alike = replace(model, inflation=np.ones_like(model.inflation))
+        found = [candidate for detector in detectors for candidate in detector.search(table, alike, known)]
+        if not found:
+            break
+        known += found
+        table = table.with_terms([term for candidate in found for term in candidate.terms])
+        model = fit(table, columns_of(known))
+    return model.inflation
 
 
 def _with_smooth(selection, declared, smooth, search, progress):

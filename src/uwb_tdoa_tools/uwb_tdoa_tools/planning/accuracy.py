@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_ekf.core.aids import STREAMS
-from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
@@ -25,10 +24,10 @@ class Samples:
     covariance: np.ndarray
 
 
-def fly(flight):
-    """Samples of a Flight with ground truth, static or moving, without height, pressure and velocity, of which the bound
-    knows nothing. Raises InputError."""
-    score, _ = evaluate(flight, FilterConfig(**{f"use_{stream}": False for stream in STREAMS}))
+def fly(flight, aids=()):
+    """Samples of a Flight with ground truth, static or moving, from its TDOAs, IMU and `aids`, names of AIDS, alone. Raises
+    InputError."""
+    score, _ = evaluate(flight.without(*(name for name in AIDS if name not in aids)))
     return Samples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
 
 
@@ -82,7 +81,7 @@ def accuracy_map(samples, installation, grid):
 
 
 def promised(samples, installation):
-    """The bound of one round of TDOAs at the place of every sample: (n, 3, 3) m^2. Needs three dimensions."""
+    """The bound of one round at the place of every sample: (n, 3, 3) m^2. Needs three dimensions."""
     return bound(information(samples.place, installation))
 
 

@@ -16,7 +16,7 @@ def brute_force(installation, grid, progress=iter):
 
     Returns (unique (n,) bool: every pairing solved gave one position; agrees (n,) bool: each as predicted; points (n,
     3) m; arrows ((m, 2), (m, 2)): some of the flips, from and to, within the grid)."""
-    subsets = Subsets(installation.anchors, installation.dimensions)
+    subsets = Subsets(installation.anchors, installation.unknowns)
     extent = np.array(grid.shape) * grid.step
     across = min(ACROSS[3 if grid.shape[2] > 1 else 2], max(grid.shape))
     points = Grid.box(grid.lower, grid.lower + extent, extent.max() / across).points
@@ -33,7 +33,7 @@ def brute_force(installation, grid, progress=iter):
     for q in progress(chosen):
         corners = installation.anchors.positions[subsets.rows[q]]
         for rows in np.array_split(np.arange(len(points)), max(1, len(points) // _BATCH)):
-            found = solutions(points[rows], corners, installation.dimensions)
+            found = solutions(points[rows], corners, installation.unknowns)
             one = (np.isnan(found[..., 0]) | same_place(points[rows, None], found, corners)).all(axis=1)
             unique[rows] &= one
             agrees[rows] &= one == predicted[rows, q]

@@ -44,7 +44,7 @@ def errors_and_slopes(goal, layout, x, points):
             for rows in np.array_split(np.arange(len(points)), max(1, len(points) * chosen.size * k // _CHUNK))
         ]
     ).reshape(len(points), -1, k, k)
-    covariance = bound(information[:, 0])
+    covariance = bound(installation.with_height(information[:, 0]))
     errors = position_error(covariance)
     lost = ~(errors < UNUSABLE)
     covariance[lost], errors[lost] = 0.0, UNUSABLE
@@ -59,9 +59,9 @@ def failing_and_slopes(goal, layout, x, points):
     Outside of the anchors' hull or, for the criterion "pairings", where one of them has two solutions."""
     try:
         anchors = layout.anchors(x)
-        good, along = _inside(anchors.positions, points, goal.installation.dimensions)
+        good, along = _inside(anchors.positions, points, goal.installation.unknowns)
         if goal.criterion == "pairings":
-            subsets = Subsets(anchors, goal.installation.dimensions)
+            subsets = Subsets(anchors, goal.installation.unknowns)
             excess = subsets.discriminant(points) / SOFT
             single = expit(-excess).prod(axis=1)
             along = along * single[:, None, None]

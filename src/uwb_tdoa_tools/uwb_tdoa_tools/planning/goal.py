@@ -42,7 +42,7 @@ class Goal:
     def judge(self, anchors):
         """{"worst", "mean": m, bound over the points; "failing": share of the points that are not flyable}."""
         errors, installation = self.errors(anchors), self.installed(anchors)
-        subsets = Subsets(anchors, installation.dimensions)
+        subsets = Subsets(anchors, installation.unknowns)
         if self.criterion == "pairings":
             unique = subsets.ambiguous(self.points) == 0.0
         else:

@@ -26,6 +26,7 @@ class Installation:
     pairing : Pairing, the TDOAs of one round (default: the ring of TDOA2)
     link_std : m, error that every TDOA has of its own, besides those of the tag's receptions (default 0)
     dimensions : 3, or 2 for a tag whose height is known
+    height_std : m, of a height sensor on the tag beside every round of TDOAs; inf for none (default)
     """
 
     anchors: Anchors
@@ -33,18 +34,35 @@ class Installation:
     pairing: Pairing = None
     link_std: float = 0.0
     dimensions: int = 3
+    height_std: float = np.inf
 
     def __post_init__(self):
-        check_anchors(self.anchors, self.dimensions)
+        if not self.height_std > 0.0 or (self.dimensions == 2 and self.height_std < np.inf):
+            raise InputError(
+                f"height std: {self.height_std!r} m is not the standard deviation of a height sensor; give one above 0, "
+                "e.g. 0.02, and none for a tag of known height."
+            )
+        check_anchors(self.anchors, self.unknowns)
         if self.pairing is None:
             object.__setattr__(self, "pairing", ring(len(self.anchors)))
         if not 0.0 <= self.link_std < 100.0:
             raise InputError(f"link noise: {self.link_std!r} m is not a standard deviation; give 0 or more, e.g. 0.05.")
 
+    @property
+    def unknowns(self):
+        """Coordinates that TDOAs alone must tell: 2 where a height is known or measured, else 3."""
+        return 2 if self.height_std < np.inf else self.dimensions
+
+    def with_height(self, information):
+        """Information (n, k, k) 1/m^2 of TDOAs about the position, with that of the height sensor added."""
+        if self.height_std < np.inf:
+            information = information + np.diag([0.0, 0.0, self.height_std**-2])
+        return information
+
     def inside_hull(self, points):
-        """Whether points (n, 3) are inside the convex hull of the anchors (seen from above if height is known):
+        """Whether points (n, 3) are inside the convex hull of the anchors (seen from above if height is known or measured):
         (n,)."""
-        k = self.dimensions
+        k = self.unknowns
         hull = Delaunay(self.anchors.positions[:, :k])
         return hull.find_simplex(points[:, :k]) >= 0
 
@@ -71,7 +89,7 @@ def check_anchors(anchors, dimensions):
     if dimensions == 3 and size[2] <= FLAT * size[0]:
         raise InputError(
             f"anchors: all are in one plane to {size[2]:.3f} m, so that its two sides cannot be told apart; move one "
-            "of them out of it, or plan for a tag of known height (--planar)."
+            "of them out of it, or plan for a tag of known height (--planar) or one that measures it (--with height)."
         )
 
 

@@ -70,7 +70,7 @@ class Chart:
     covariance : (n, k, k) m^2, the Cramer-Rao bound of one round of TDOAs
     error : (n,) m, root of its trace; dop : (n,), position dilution of precision
     hull : (n,) inside the anchors' convex hull
-    ambiguous : (n,) share of the pairings, each k + 1 anchors, with two solutions
+    ambiguous : (n,) share of the pairings, each of one anchor more than TDOAs must tell coordinates, with two solutions
     flyable : (n,) inside the hull and with one solution, by the criterion that was asked for
     """
 
@@ -104,7 +104,7 @@ class Chart:
 def chart(installation, grid, criterion="pairings"):
     """Chart of an Installation over a Grid. criterion : of FLYABLE."""
     points = grid.points
-    subsets = Subsets(installation.anchors, installation.dimensions)
+    subsets = Subsets(installation.anchors, installation.unknowns)
     covariance = bound(information(points, installation))
     dop = np.linalg.norm(dilution(points, installation), axis=1)
     hull, ambiguous = installation.inside_hull(points), subsets.ambiguous(points)

@@ -39,7 +39,8 @@ def installation_of(args, anchors):
         antenna = antenna_from_yaml(args.antenna) if args.antenna else Antenna()
         noise = RadioNoise(antenna, args.tx_power, args.temperature, args.voltage)
     pairing = PAIRINGS[_pairing(args)](len(anchors)) if len(anchors) > 1 else None
-    return Installation(anchors, noise, pairing, args.link_noise, 2 if args.planar else 3)
+    height_std = args.height_std if "height" in args.aids else np.inf
+    return Installation(anchors, noise, pairing, args.link_noise, 2 if args.planar else 3, height_std)
 
 
 def room_for(args, anchors):
@@ -67,7 +68,7 @@ def grid_of(args, room):
 def aim_of(args, installation, room, height):
     """Aim of --improve. height : m, of the flown slice if the tag's height is known. Raises InputError."""
     count = len(installation.anchors) if args.count is None else args.count
-    for name, value, least in (("count", count, installation.dimensions + 1), ("starts", args.starts, 1)):
+    for name, value, least in (("count", count, installation.unknowns + 1), ("starts", args.starts, 1)):
         if value < least:
             raise InputError(f"{name}: {value} is too few; give at least {least}.")
     fly = _box("fly", args.fly) if args.fly else Room(*room.flyable)

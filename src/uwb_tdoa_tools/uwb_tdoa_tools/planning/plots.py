@@ -33,7 +33,7 @@ def plot_failure(installation, chart, path):
     """Where pairings have two solutions: their share, each bifurcation curve, the envelope, hull and flyable area."""
     layers = _layers(chart.grid)
     figure, axes = _panels(2 * len(layers), 2)
-    subsets = Subsets(installation.anchors, installation.dimensions)
+    subsets = Subsets(installation.anchors, installation.unknowns)
     x, y, _ = chart.grid.axes
     for row, k in zip(axes, layers):
         points = chart.grid.layer(chart.grid.points, k).reshape(-1, 3)

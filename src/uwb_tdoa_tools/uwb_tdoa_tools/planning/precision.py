@@ -14,7 +14,8 @@ _CHUNK = 200_000  # numbers in the largest array of one step: what a processor c
 
 
 def information(points, installation, correction=True):
-    """Fisher information about the position from one round of TDOAs: (n, k, k) 1/m^2, k the installation's dimensions.
+    """Fisher information about the position from one round of TDOAs and, where the tag measures it, a height: (n, k, k)
+    1/m^2, k the installation's dimensions.
 
     points : (n, 3) m. correction : with the second term of eq. 1, the information that lies in the size of the errors.
     Source: eq. 1 of Grasso et al. (Sensors 2022, 22, 9136).
@@ -22,7 +23,8 @@ def information(points, installation, correction=True):
     anchors, pairing = len(installation.anchors), installation.pairing
     width = len(pairing.a) * (anchors if pairing.shared and installation.link_std else 3) + 9 * anchors
     chunks = np.array_split(points, max(1, len(points) * width // _CHUNK))
-    return np.concatenate([_information(chunk, installation, correction) for chunk in chunks])
+    parts = [_information(chunk, installation, correction) for chunk in chunks]
+    return installation.with_height(np.concatenate(parts))
 
 
 def _information(points, installation, correction):
@@ -101,11 +103,12 @@ def position_error(covariance):
 
 
 def dilution(points, installation):
-    """Dilution of precision: (n, k), error along x, y (and z) over that of one reception, if all are alike.
+    """Dilution of precision: (n, k), error along x, y (and z) over that of one reception, if all are alike; k the
+    coordinates that TDOAs must tell.
 
     Its squares add up: of x and y to the horizontal, of all to the position dilution (PDOP).
     """
-    alike = replace(installation, noise=FixedNoise(1.0), link_std=0.0)
+    alike = replace(installation, noise=FixedNoise(1.0), link_std=0.0, dimensions=installation.unknowns, height_std=np.inf)
     covariance = bound(information(points, alike, correction=False))
     return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 

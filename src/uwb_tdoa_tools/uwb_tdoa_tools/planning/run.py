@@ -6,6 +6,8 @@ from functools import partial
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.foundation.errors import InputError
+
 from ..readers.inputs import Reading
 from . import accuracy, layout, messages, plots
 from .check import brute_force
@@ -33,13 +35,18 @@ def check(installation, grid, out):
 
 @dataclass(frozen=True)
 class Fly:
-    """fly((path, survey)) is the name of a recording and its Samples. reading : Reading. Can be pickled."""
+    """fly((path, survey)) is the name of a recording and its Samples. reading : Reading; aids : what it may use, as for
+    accuracy.fly. Can be pickled. Raises InputError."""
 
     reading: Reading
+    aids: tuple = ()
 
     def __call__(self, recording):
         flight = self.reading.read(recording)
-        return flight.name, accuracy.fly(flight)
+        for name in self.aids:
+            if getattr(flight, name) is None:
+                raise InputError(f"{flight.name}: holds no {name}; leave out --with {name}, or this flight.")
+        return flight.name, accuracy.fly(flight, self.aids)
 
 
 def judge_flights(flown, installation, room, step, out):

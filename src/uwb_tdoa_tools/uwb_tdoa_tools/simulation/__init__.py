@@ -8,7 +8,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
-from . import imu, ranging
+from . import aids, imu, ranging
 from .config import SimulationConfig
 from .imu import NO_IMU_ERRORS, ImuErrors
 from .trajectories import Trajectory
@@ -53,4 +53,5 @@ def simulate(config):
             "config": filled.as_dict(),
             "parameters": parameters,
         },
+        **aids.measure(filled, room, trajectory),
     )

@@ -59,6 +59,12 @@ class SimulationConfig:
     tag_lever_arm : tag antenna in the body frame, m (default (0, 0, 0))
     multipath : late arrivals near the floor (default True)
     outlier_probability : share of TDOAs that are outliers, 0 for none (default 0.01)
+
+    What else the vehicle feels, at 25 Hz each
+    ------------------------------------------
+    height_noise : standard deviation of a range finder along the body's -z, m (default None: there is none)
+    pressure_noise : standard deviation of a barometer, m of altitude (default None: there is none)
+    velocity_noise : standard deviation of each component of a velocity in the body frame, m/s (default None: there is none)
     """
 
     seed: int = 0
@@ -88,6 +94,9 @@ class SimulationConfig:
     tag_lever_arm: tuple = (0.0, 0.0, 0.0)
     multipath: bool = True
     outlier_probability: float = 0.01
+    height_noise: float | None = None
+    pressure_noise: float | None = None
+    velocity_noise: float | None = None
 
     def __post_init__(self):
         for name, choices in (("trajectory", TRAJECTORIES), ("yaw", YAW_PROFILES), ("protocol", PROTOCOLS)):
@@ -110,6 +119,9 @@ class SimulationConfig:
             ("noise_std", 0.0, 100.0),
             ("anchor_delay_std", 0.0, 100.0),
             ("outlier_probability", 0.0, 1.0),
+            ("height_noise", 0.0, 100.0),
+            ("pressure_noise", 0.0, 100.0),
+            ("velocity_noise", 0.0, 100.0),
         ):
             value = getattr(self, name)
             if value is not None and not lowest <= value <= highest:

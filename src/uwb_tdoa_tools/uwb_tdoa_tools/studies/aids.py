@@ -1,22 +1,32 @@
-"""Height, pressure and velocity on measured flights: what each is worth, and what faults put into them do."""
+"""Height, pressure and velocity on measured flights: what each is worth, what faults put into them do, and optical flow."""
 
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.flight import Velocity
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flight import AIDS, Tdoas, Velocity
 from uwb_tdoa_bias.foundation.pressure import altitude_of, pressure_at
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .. import options
+from ..diagnosis.attribution import attribute
+from ..diagnosis.channels import residuals
+from ..diagnosis.references import GroundTruth
+from ..planning.installation import Installation
+from ..planning.precision import bound, information
 from ..readers import inputs
 from ..scoring.evaluation import evaluate
-from ..scoring.metrics import airborne
+from ..scoring.metrics import airborne, position_at
 
-AIDS = "height", "pressure", "velocity"
 SETS = (), ("height",), ("pressure",), ("height", "pressure"), ("velocity",), ("height", "velocity")
 VELOCITY_RATE, VELOCITY_STD = 25.0, 0.1  # Hz, m/s: of a velocity made of the ground truth, where none was recorded
+FLOW_SETS = (), ("height",), ("velocity",), ("height", "velocity")
+COUNTS = 4.7  # of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, told in tenths: 4.2 to 4.9
+FLOW_TIME = 0.01  # s that one reading counts over
+WILD = 40.0  # counts, beyond which a reading is clipped
 TAKE_OFF = 0.2  # s into the airborne part, whose largest error is told
 GRACE = 3.0  # s after the beginning of a fault that do not count
 ONSET = 8.0  # s into the airborne part at which a fault begins that is not there from the start
@@ -26,17 +36,19 @@ STEP_PERIOD, STEP_LENGTH = 6.0, 3.0  # s between their beginnings, and of each
 
 def add_options(add):
     """add : add_argument of a parser."""
-    add("table", choices=("worth", "faults"), help="what each aid is worth, or what faults put into them do")
+    tables = "what each aid is worth, what faults put into them do, or a velocity made of pixel counts (estFlow)"
+    add("table", choices=("worth", "faults", "flow"), help=tables)
     add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
     add("-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[], help="one filter parameter")
 
 
 def run(args):
-    """Print one of the two tables."""
+    """Print one of the tables."""
     config = options.with_parameters(FilterConfig(), args.parameters)
-    flights = [with_velocity(flight) for flight in inputs.load_flights(args.flights, args.survey)]
-    {"worth": worth, "faults": faults}[args.table](flights, config)
+    prepare = with_flow if args.table == "flow" else with_velocity
+    flights = [prepare(flight) for flight in inputs.Reading(args.survey).flights(args.flights)]
+    {"worth": worth, "faults": faults, "flow": flow}[args.table](flights, config)
 
 
 def with_velocity(flight):
@@ -50,15 +62,83 @@ def with_velocity(flight):
     return replace(flight, velocity=Velocity(t, v + noise, np.full(v.shape, VELOCITY_STD)))
 
 
+def with_flow(flight):
+    """The flight with the velocity in the body frame, x and y, that pixel counts, range finder and gyroscope tell.
+
+    A sensor that looks down sees the ground turn and pass: with the height h along its axis,
+    deltaX = -COUNTS (v_y / h + omega_x), deltaY = -COUNTS (v_x / h - omega_y), as in the flow deck's driver.
+    """
+    stream = flight.extra["estFlow"]
+    cell = np.unique((stream["t"] * VELOCITY_RATE).astype(int), return_inverse=True)[1]
+    columns = (stream["t"], *(np.clip(stream[f"motion.delta{axis}"], -WILD, WILD) for axis in "XY"))
+    t, x, y = (np.bincount(cell, column) / np.bincount(cell) for column in columns)
+    t = t - 0.5 * FLOW_TIME
+    seen = np.isfinite(flight.height.range)
+    h = np.interp(t, flight.height.t[seen], flight.height.range[seen])
+    turns = np.cumsum(flight.imu.gyro[:, :2] * np.gradient(flight.imu.t)[:, None], axis=0)
+    ends = [np.stack([np.interp(t + s, flight.imu.t, turns[:, k]) for k in range(2)], axis=1) for s in (-0.02, 0.02)]
+    rate = (ends[1] - ends[0]) / 0.04
+    v = np.stack([h * (rate[:, 1] - y / COUNTS), -h * (rate[:, 0] + x / COUNTS), np.zeros(len(t))], axis=1)
+    std = np.tile([VELOCITY_STD, VELOCITY_STD, np.inf], (len(t), 1))
+    return replace(flight, velocity=Velocity(t, v, std))
+
+
 def only(flight, names):
     """The flight with no other aids than those of these names."""
-    return replace(flight, **{name: None for name in AIDS if name not in names})
+    return flight.without(*(name for name in AIDS if name not in names))
+
+
+def flow(flights, config):
+    """What diagnose finds in the velocity of `with_flow`, and the table of `worth` with it."""
+    print("| flight | noise x, y [m/s] | found |\n|---|---|---|")
+    for flight in flights:
+        error = residuals(flight, GroundTruth(), EffectSet())["velocity"].residual
+        spread = 1.4826 * np.median(np.abs(error[:, :2] - np.median(error[:, :2], axis=0)), axis=0)
+        kinds = [name for name, effect in EFFECTS.items() if effect.channels == ("velocity",)]
+        found = attribute([flight], GroundTruth(), kinds=kinds, undeclared=False).effects
+        words = "; ".join(f"{e.name} {', '.join(f'{k} {v:.3g}' for k, v in e.values.items())}" for e in found)
+        print(f"| {flight.name} | {spread[0]:.3f}, {spread[1]:.3f} | {words or 'nothing'} |")
+    print()
+    _worth(flights, config, FLOW_SETS)
 
 
 def worth(flights, config):
-    """Table of the errors with each set of aids: means over the flights, the largest, and the least coverage of an axis."""
+    """Tables of the errors with each set of aids: with all anchors and the IMU, without IMU, and with TDOAs of four anchors
+    only; and the bound of `plan` beside them, of one round of TDOAs and a height."""
+    for words, change, setting in (
+        ("all anchors", lambda flight: flight, config),
+        ("without IMU", lambda flight: flight, replace(config, use_imu=False)),
+        ("four anchors", of_four, config),
+    ):
+        print(f"{words}\n")
+        _worth([change(flight) for flight in flights], setting, SETS)
+        print()
+
+
+def of_four(flight):
+    """The flight with the TDOAs among its first four anchors alone."""
+    anchors, tdoa = flight.anchors, flight.tdoa
+    few = Anchors(anchors.ids[:4], anchors.positions[:4], anchors.orientations[:4], anchors.frame)
+    kept = np.isin(tdoa.a, few.ids) & np.isin(tdoa.b, few.ids)
+    return replace(flight, anchors=few, tdoa=Tdoas(*(column[kept] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))))
+
+
+def bounds(flights, height_std):
+    """(4,) m, along x, y, z and in space: the bound of `plan` for one round of TDOAs, and a height if height_std, m, is
+    finite, at the places that were flown; roots of means over each flight, averaged over the flights."""
+    rows = []
+    for flight in flights:
+        first, last = airborne(flight.truth)
+        places = position_at(np.arange(first, last, 0.5), flight.truth)
+        covariance = bound(information(places, Installation(flight.anchors, height_std=height_std)))
+        variance = np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0)
+        rows.append(np.sqrt([*variance, variance.sum()]))
+    return np.mean(rows, axis=0)
+
+
+def _worth(flights, config, sets):
     print("| aids | x | y | z | 3D | largest 3D | at take-off | NEES | coverage |\n|---|" + 8 * "---:|")
-    for names in SETS:
+    for names in sets:
         scores = [evaluate(only(flight, names), config)[0] for flight in flights]
         rows = [score.row() for score in scores]
         take_off = max(np.linalg.norm(s.error[s.t < s.first + TAKE_OFF], axis=1).max() for s in scores)
@@ -68,6 +148,9 @@ def worth(flights, config):
         cells = [f"{value:.3f}" for value in (*means, max(row["rmse_3d"] for row in rows), take_off)]
         cells += [f"{min(nees):.1f} - {max(nees):.1f}", f"{least:.3f}"]
         print(f"| {', '.join(names) or 'none'} | {' | '.join(cells)} |")
+    for words, std in (("", np.inf), (", with a height", config.height_std)):
+        cells = [f"{value:.3f}" for value in bounds(flights, std)]
+        print(f"| *bound of one round{words}* | {' | '.join(cells)} | | | | |")
 
 
 def faults(flights, config):

@@ -3,9 +3,12 @@
 from .accel import Accel
 from .base import Channel, ChannelResidual, Comparison, Rows
 from .gyro import Gyro
+from .height import Height
+from .pressure import Pressure
 from .tdoa import Tdoa
+from .velocity import Velocity
 
-CHANNELS = {channel.name: channel for channel in (Tdoa(), Gyro(), Accel())}
+CHANNELS = {channel.name: channel for channel in (Tdoa(), Gyro(), Accel(), Height(), Pressure(), Velocity())}
 
 __all__ = ["CHANNELS", "Channel", "ChannelResidual", "Comparison", "Rows", "residuals"]
 

@@ -37,7 +37,7 @@ class Accel(Inertial):
         measured = to_body.apply(_triangular_means(imu.t[flown], world, edges))
         features = means(imu.t, features_of(imu), edges)
         samples = self._samples(comparison, middles, true, 0.5 * (features[1:] + features[:-1]))
-        measured = measured - sum(effect.uncorrected(samples) for effect in comparison.effects.effects)
+        measured = measured - comparison.effects.uncorrected(samples)
         return ImuResidual(samples, measured - true, self.unit)
 
 

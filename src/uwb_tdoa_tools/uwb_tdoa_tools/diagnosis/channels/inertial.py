@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects import ImuSamples, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, imu_covariate
+from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, sensor_covariate
 
 from .base import Channel, ChannelResidual, Rows
 from .figures import figures
@@ -48,7 +48,7 @@ class Inertial(Channel):
     def smooth_terms(self, residuals):
         out = []
         for name in (*OF_IMU, *OF_POSE):
-            knots = knots_of(np.concatenate([imu_covariate(name, part.samples) for part in residuals]), name)
+            knots = knots_of(np.concatenate([sensor_covariate(name, part.samples) for part in residuals]), name)
             if knots is not None:
                 out += [SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots) for axis in self.axes]
         return out

@@ -23,6 +23,7 @@ class Detector:
     """
 
     effect: ClassVar[type]
+    disguises: ClassVar[bool] = False  # what it searches for dominates its channel: unless found first, it counts as noise
 
     def search(self, table, model, chosen):
         """[Candidate] for the residual of `model`, a Fit of the chosen Candidates to the Table."""

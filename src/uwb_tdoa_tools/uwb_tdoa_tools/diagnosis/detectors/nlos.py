@@ -6,13 +6,10 @@ from uwb_tdoa_bias.effects import EFFECTS
 
 from ..regression.terms import Candidate, Term
 from .base import Detector
+from .intervals import LEAST_GAIN, LONGEST, best_interval
 
-BIN = 1.0  # s
-SHORTEST = 2  # bins
-LONGEST = 0.7  # share of a flight; what lasts longer is a delay of the anchor
 RADII = (0.6, 1.0, 1.5)  # m
 CENTRES = 60
-LEAST_GAIN = 10.0  # twice a log-likelihood
 PRIOR = 4.0  # information, 1/m^2, of what delays are plausible
 
 
@@ -36,30 +33,12 @@ class NlosDetector(Detector):
             score, power = x * information * residual, x * x * information
             searches = [_region(table.place[rows], score, power)]
             if table.flights == 1:  # only a flight alone has a time of its own
-                searches.append(_interval(table.t[rows], score, power))
+                searches.append(best_interval(table.t[rows], score, power, PRIOR))
             for gain, limits, price in searches:
                 if gain > LEAST_GAIN:
                     values = {f"{anchor}.{name}": value for name, value in limits.items()}
                     out.append(Candidate((Term(self.effect(values, source="diagnose"), (key,)),), price))
         return out
-
-
-def _interval(t, score, power):
-    """Best (gain, {limit: value}, price of the search) over intervals."""
-    first = t.min()
-    bins = ((t - first) / BIN).astype(int)
-    n = bins.max() + 1
-    total = np.concatenate([[0.0], np.cumsum(np.bincount(bins, score, n))])
-    known = np.concatenate([[0.0], np.cumsum(np.bincount(bins, power, n))])
-    i, j = np.triu_indices(n + 1, SHORTEST)
-    short = (j - i) <= LONGEST * n
-    i, j = i[short], j[short]
-    gain = np.maximum(total[j] - total[i], 0.0) ** 2 / (known[j] - known[i] + PRIOR)
-    if not len(gain):
-        return 0.0, {}, 0.0
-    best = int(np.argmax(gain))
-    limits = {"start": float(first + i[best] * BIN), "end": float(first + j[best] * BIN)}
-    return gain[best], limits, 2.0 * np.log(len(gain))
 
 
 def _region(place, score, power):

@@ -8,6 +8,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_ekf.debias import fit
 
 from ...readers import inputs
@@ -78,15 +79,15 @@ def _case(task, data, diagnosed):
     case, split, to_fit, to_judge = task
     rows, about = {}, {}
     for words, effects in _corrections(split, diagnosed).items():
-        fitted, judged = ([_fly(data, path, effects) for path in paths] for paths in (to_fit, to_judge))
+        fitted, judging = ([flown(data, path, effects) for path in paths] for paths in (to_fit, to_judge))
         parts = [part_of(score, odometry) for _, score, odometry in fitted]
         kinds = MAPS if effects is None else {"thin plate": MAPS["thin plate"]}
         prefix = f"{words} + " if words else ""
         maps = {prefix + name: fit(parts, step, LEAST, planar, how) for name, (how, step, planar) in kinds.items()}
-        for flown in judged:
-            row = rows.setdefault(flown[1].name, {})
-            row[words or "before"] = _figures(flown[1])
-            row |= {name: _figures(judge(flown, one, effects)) for name, one in maps.items()}
+        for run in judging:
+            row = rows.setdefault(run[1].name, {})
+            row[words or "before"] = _figures(run[1])
+            row |= {name: _figures(judge(run, one, effects)) for name, one in maps.items()}
         about |= {name: about_figures(one) for name, one in maps.items()}
     return {
         "case": case,
@@ -108,10 +109,10 @@ def _effects_file(diagnosed, split):
     return diagnosed / split.replace(" ", "-") / "effects.yaml"
 
 
-def _fly(data, path, effects):
-    reading = inputs.Reading(data / "surveys")
-    (recording,) = reading.find([data / path])
-    return fly(reading.read(recording), effects=effects)
+def flown(data, path, effects=None):
+    """What `fly` gives for a flight of the data, without height, pressure and velocity."""
+    (flight,) = inputs.Reading(data / "surveys").flights([data / path])
+    return fly(flight.without(*AIDS), effects=effects)
 
 
 def _figures(score):

@@ -2,6 +2,7 @@
 
 import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...scoring.evaluation import evaluate
 from ...simulation import ImuErrors, SimulationConfig, simulate
@@ -39,7 +40,19 @@ SIZES = {
     "noise_level": ({"P": 0.1}, {"P": 0.3}),
     "noise_correlation": ({"std": 0.08, "time": 0.5}, {"std": 0.2, "time": 0.5}),
     "outlier_rate": ({"share": 0.05}, {"share": 0.15}),
-}
+    "height_offset": ({"offset": 0.02}, {"offset": 0.1}),
+    "height_scale": ({"scale": 0.02}, {"scale": 0.1}),
+    "floor_step": (
+        {"1.height": 0.1, "1.start": 20.0, "1.end": 32.0}, {"1.height": 0.5, "1.start": 20.0, "1.end": 32.0},
+    ),
+    "barometer_drift": ({"rate": 0.01}, {"rate": 0.05}),
+    "velocity_scale": ({"scale": 0.03}, {"scale": 0.15}),
+    "velocity_misalignment": ({"yaw": 0.03}, {"yaw": 0.3}),
+    "velocity_delay": ({"offset": 0.04}, {"offset": 0.15}),
+    "velocity_slip": (
+        {"1.share": 0.3, "1.start": 20.0, "1.end": 26.0}, {"1.share": 1.0, "1.start": 20.0, "1.end": 26.0},
+    ),
+}  # fmt: skip
 PAIRS = (
     ("anchor_delay", "tag_lever_arm"),
     ("anchor_delay", "gyro_bias"),
@@ -62,10 +75,12 @@ INVISIBLE = (
     "imu_misalignment",
     "imu_gravity",
 )
+AIDED = tuple(name for name in SIZES if set(EFFECTS[name].channels) <= set(AIDS))  # effects on height, pressure, velocity
+NOISES = {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
 
 
-def clean_flight(seed, duration=50.0):
-    """A simulated flight without any effect."""
+def clean_flight(seed, duration=50.0, aided=False):
+    """A simulated flight without any effect. aided : with height, pressure and velocity."""
     return simulate(
         SimulationConfig(
             seed=seed,
@@ -74,6 +89,7 @@ def clean_flight(seed, duration=50.0):
             yaw=("along_track", "rotating")[seed % 2],
             protocol=("tdoa2", "tdoa3")[seed // 2 % 2],
             **CLEAN,
+            **(NOISES if aided else {}),
         )
     )
 
@@ -98,13 +114,13 @@ def names_found(attribution):
     return [f.effect.name for f in declared] + [f"{effect.channel}/{effect.covariate}" for effect in unnamed]
 
 
-def diagnose_case(effects, seed, truth=True):
+def diagnose_case(effects, seed, truth=True, aided=False):
     """dict of one case: what was put in, found, how near the parameters, and the errors of the filter on a second
     flight with the same effects: before, corrected as found, corrected as it is."""
     rng = np.random.default_rng([seed, 77])
 
     def flown(number):
-        flight = clean_flight(number)
+        flight = clean_flight(number, aided=aided)
         for effect in effects:
             flight = effect.inject(flight, rng)
         return flight
@@ -140,7 +156,7 @@ def _right(effects, attribution):
         for key, value in effect.values.items():
             if effect.name == "outlier_rate":
                 value = value + (1.0 - value) * SimulationConfig.outlier_probability  # on top of what is nominal
-            if effect.name == "nlos" and not key.endswith(".delay"):
+            if key.endswith((".start", ".end")):
                 continue
             error = abs(other.values.get(key, 0.0) - value)
             if error > max(0.1 * abs(value), 3.0 * other.std.get(key, 0.0)):
@@ -148,10 +164,11 @@ def _right(effects, attribution):
     return True
 
 
-def cases(seeds):
-    """[(kind, effects, seed)] of the whole bank: small, large, pair, clean."""
+def cases(seeds, aided=False):
+    """[(kind, effects, seed)] of the whole bank: small, large, pair, clean. aided : of effects on height, pressure and
+    velocity, for flights that have these."""
     out = []
-    for name in SIZES:
+    for name in (name for name in SIZES if (name in AIDED) == aided):
         out += [
             ("small" if not large else "large", (effect_of(name, large, s),), 100 + s)
             for large in (False, True)
@@ -159,7 +176,7 @@ def cases(seeds):
         ]
     out += [
         ("pair", (effect_of(a, True, s), effect_of(b, True, s + 1)), 200 + s)
-        for a, b in PAIRS
+        for a, b in (() if aided else PAIRS)
         for s in range(min(seeds, 2))
     ]
     out += [("clean", (), 300 + s) for s in range(8 * seeds)]

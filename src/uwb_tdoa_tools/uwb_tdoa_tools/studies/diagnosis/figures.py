@@ -9,6 +9,7 @@ import time
 import numpy as np
 from tqdm import tqdm
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...diagnosis import diagnose
 from ...diagnosis.attribution import attribute
@@ -16,7 +17,7 @@ from ...diagnosis.references import GroundTruth
 from ...scoring.plots import plt
 from . import bank, measured, undeclared
 
-PARTS = ("bank", "no-truth", "undeclared", "injected", "measured", "speed")
+PARTS = ("bank", "aids", "no-truth", "undeclared", "injected", "measured", "measured-aids", "speed")
 
 
 def add_options(add):
@@ -31,16 +32,18 @@ def add_options(add):
 def run(args):
     """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
-    for option in {"undeclared": ("cases",), "injected": ("data",), "measured": ("data",)}.get(args.part, ()):
+    for option in {"undeclared": ("cases",), **dict.fromkeys(("injected", "measured", "measured-aids"), ("data",))}.get(args.part, ()):
         if getattr(args, option) is None:
             raise InputError(f"--{option}: {args.part} needs it.")
     started = time.monotonic()
     result = {
         "bank": _bank,
+        "aids": _aids,
         "no-truth": _no_truth,
         "undeclared": _undeclared,
         "injected": _injected,
         "measured": _measured,
+        "measured-aids": _measured_aids,
         "speed": _speed,
     }[args.part](args)
     result["seconds"] = round(time.monotonic() - started, 1)
@@ -60,6 +63,14 @@ def _bank(args):
         bank.cases(args.seeds), lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed)}
     )
     _confusion(results, args.out / "confusion.png")
+    return {"figures": bank.figures(results), "cases": results}
+
+
+def _aids(args):
+    results = _each(
+        bank.cases(args.seeds, aided=True),
+        lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed, aided=True)},
+    )
     return {"figures": bank.figures(results), "cases": results}
 
 
@@ -105,6 +116,11 @@ def _measured(args):
     return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
 
 
+def _measured_aids(args):
+    results = _each([(name,) for name in measured.AIDED], lambda name: measured.run(args.data, name, args.out, AIDS))
+    return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
+
+
 def _speed(args):
     flight = bank.effect_of("anchor_delay", True, 1).inject(bank.clean_flight(500, 126.0))
     attribute([bank.clean_flight(501, 30.0)], GroundTruth())  # compile
@@ -115,7 +131,7 @@ def _speed(args):
 
 def _confusion(results, path):
     """Rows: what was put in; columns: the first thing found; small and large together."""
-    names = list(bank.SIZES)
+    names = [name for name in bank.SIZES if name not in bank.AIDED]
     columns = [*names, "something without a name", "nothing"]
     count = np.zeros((len(names) + 1, len(columns)))
     for r in results:

@@ -5,12 +5,14 @@ import time
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.flight import AIDS
+
 from ...readers import inputs
 from ...diagnosis import diagnose
 from ...diagnosis.attribution import attribute
 from ...diagnosis.findings import usable
 from ...diagnosis.references import GroundTruth
-from .bank import SIZES, effect_of
+from .bank import AIDED as ON_AIDS, SIZES, effect_of
 
 _T2, _T3 = "flights/0425/TDOA2/0425-traj", "flights/0425/TDOA3/0425-traj"
 # {name: (to fit, to judge)}; a swap of both judges the others.
@@ -51,6 +53,7 @@ SPLITS = {
         [f"util/const4-trial3-tdoa2-traj{k}.csv.gz" for k in (2, 3)],
     ),
 }
+AIDED = ("0425 a", "0425 b")  # all of whose flights hold height and pressure
 INTO = (
     "flights/0425/TDOA2/0425-traj2",
     "flights/0425/TDOA3/0425-traj17",
@@ -64,15 +67,17 @@ PRESENT = (
 )  # in every measured flight, and cannot be taken out first
 
 
-def _load(data, paths):
-    return inputs.Reading(data / "surveys").flights([data / path for path in paths])
+def _load(data, paths, aids=()):
+    flights = inputs.Reading(data / "surveys").flights([data / path for path in paths])
+    return [flight.without(*(name for name in AIDS if name not in aids)) for flight in flights]
 
 
-def run(data, name, out):
-    """Diagnose one split; writes its report and effects.yaml. Returns dict of the summary and all findings."""
+def run(data, name, out, aids=()):
+    """Diagnose one split; writes its report and effects.yaml. aids : streams that are used where flights hold them. Returns
+    dict of the summary and all findings."""
     fit, judge = SPLITS[name]
     started = time.monotonic()
-    result = diagnose(_load(data, fit), _load(data, judge))
+    result = diagnose(_load(data, fit, aids), _load(data, judge, aids))
     folder = out / name.replace(" ", "-")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.html").write_text(result.as_html())
@@ -103,7 +108,7 @@ def run(data, name, out):
 
 def injected(data, each):
     """Put large effects into measured flights whose own effects were diagnosed before: [dict], with "hit"."""
-    cases = [(path, name) for path in INTO for name in SIZES if name not in PRESENT]
+    cases = [(path, name) for path in INTO for name in SIZES if name not in (*PRESENT, *ON_AIDS)]
     known = {}
 
     def one(path, name):

@@ -10,6 +10,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...readers import inputs
 from ...training import models, simulated
@@ -61,9 +62,14 @@ def _measured(args):
     for name, *paths in args.test:
         if not paths:
             raise InputError(f"--test: {name} names no flight; write --test NAME FLIGHT...")
-        tests[name] = inputs.Reading(args.survey).flights(paths)
-    train = inputs.Reading(args.survey).flights(args.train)
+        tests[name] = _read(paths, args.survey)
+    train = _read(args.train, args.survey)
     both = {flight.name for flight in train} & {flight.name for group in tests.values() for flight in group}
     if both:
         raise InputError(f"--test: {sorted(both)[0]} is among the flights to train on; test on others.")
     return train, tests
+
+
+def _read(paths, survey):
+    """Flights without height, pressure and velocity: models are of TDOAs alone."""
+    return [flight.without(*AIDS) for flight in inputs.Reading(survey).flights(paths)]

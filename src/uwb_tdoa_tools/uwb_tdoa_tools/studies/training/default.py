@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...readers import inputs
 from ...scoring.evaluation import evaluate
@@ -36,7 +37,7 @@ def run(args):
     days = {}
     reading = inputs.Reading(args.survey)
     for path, survey in reading.find(args.flights):
-        days.setdefault(Path(survey).stem, []).append(reading.read((path, survey)))
+        days.setdefault(Path(survey).stem, []).append(reading.read((path, survey)).without(*AIDS))
     model, meta = learn(FLIGHTS)
     known = {day: [labelling.labels(flight) for flight in flights] for day, flights in days.items()}
     for day, flights in days.items():

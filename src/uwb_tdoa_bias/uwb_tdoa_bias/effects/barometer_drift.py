@@ -1,0 +1,50 @@
+"""The barometer drifts."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .aid_error import need_stream, values_of, with_values
+from .base import Effect
+from .wording import significant, size
+
+
+class BarometerDrift(Effect):
+    """The altitude of the barometer grows by `rate` metres a second beyond the true one, counted from the first TDOA. The
+    filter estimates offset and drift of a barometer itself."""
+
+    name = "barometer_drift"
+    unit = "m/s"
+    bound = 10.0
+    negligible = 0.002
+    typical = 0.02
+    example = "rate"
+    physics = "the sensor warms up, the weather or the pressure in the hall changes"
+    reference = "BMP388 data sheet: 0.75 Pa/K, that is 6 cm per degree; 10 Pa, 0.8 m, a quarter of an hour of weather"
+    portable = False
+    usable = False  # the filter estimates it while it flies
+    channels = ("pressure",)
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [("rate",)]
+
+    def uncorrected(self, samples):
+        return self.values.get("rate", 0.0) * (samples.t - samples.start)[:, None]
+
+    def regressors(self, samples, keys):
+        return np.repeat((samples.t - samples.start)[:, None, None], len(keys), axis=2)
+
+    def inject(self, flight, rng=None):
+        part = need_stream(self, flight, "pressure")
+        extra = self.values.get("rate", 0.0) * (part.t - float(flight.tdoa.t[0]))
+        return replace(flight, pressure=with_values(part, values_of(part) + extra[:, None]))
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        way = "upwards" if self.values["rate"] > 0.0 else "downwards"
+        return (
+            f"Let the barometer warm up, and shield it from wind and light: it drifts {way} by "
+            f"{size(self, 'rate', 'm a minute', 60.0)}.",
+        )

@@ -1,0 +1,37 @@
+"""The range finder measures with a wrong length."""
+
+import numpy as np
+
+from .affine import Affine
+from .aid_error import AidEffect
+from .wording import significant, size
+
+
+class HeightScale(AidEffect):
+    """Measured range = (1 + `scale`) true one."""
+
+    name = "height_scale"
+    unit = "1"
+    bound = 0.5
+    negligible = 0.005
+    typical = 0.05
+    example = "scale"
+    physics = "a wrong unit or speed of propagation: of ultrasound, with the temperature of the air"
+    confounded_with = ("height_offset",)
+    distinguished_by = {"height_offset": "a flight at several heights: a scale grows with height"}
+    reference = "speed of sound: 0.18 % per degree"
+    channels = ("height",)
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [("scale",)]
+
+    def aid(self):
+        return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(1), np.zeros(1))
+
+    def advice(self):
+        if not significant(self):
+            return ()
+        way = "long" if self.values["scale"] > 0.0 else "short"
+        scale = size(self, "scale", "%", 100.0)
+        return (f"Check the unit and the calibration of the range finder: it reads {scale} too {way}.",)

@@ -1,0 +1,86 @@
+"""What the effects share that a stream has for a while, several times in a flight."""
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from ..foundation.errors import InputError
+from .aid_error import need_stream, values_of, with_values
+from .base import Effect, need_truth
+from .samples import Track, aid_samples
+from .wording import measured, significant
+
+LIMITS = ("start", "end")  # s after the first TDOA
+
+
+class IntervalEffect(Effect):
+    """An effect on one stream, its only channel, of the size "N.<part>" from "N.start" to "N.end" seconds after the first
+    TDOA; N counts from 1; a limit that is not given does not limit it."""
+
+    part: ClassVar[str]
+    portable = False
+    fitted = False
+    usable = False  # of another flight it tells nothing; the filter's own judgement is the remedy
+
+    def per_unit(self, samples):
+        """What a unit of its size adds to the readings of AidSamples: (n, k)."""
+        raise NotImplementedError
+
+    @classmethod
+    def check_key(cls, key):
+        number, _, part = key.partition(".")
+        if not number.isdigit() or part not in (cls.part, *LIMITS):
+            raise InputError(
+                f"effects: {cls.name}: parameter {key!r} is not a number and {cls.part}, start or end, as 1.{cls.part}."
+            )
+
+    @classmethod
+    def bound_of(cls, key):
+        return 1e6 if key.endswith(LIMITS) else cls.bound
+
+    @classmethod
+    def groups(cls, anchors, pairs):
+        return [()]
+
+    @property
+    def identity(self):
+        return (self.name, *sorted((key, value) for key, value in self.values.items() if key.endswith(LIMITS)))
+
+    @property
+    def sizes(self):
+        """{parameter: value} without limits."""
+        return {key: value for key, value in self.values.items() if not key.endswith(LIMITS)}
+
+    def regressors(self, samples, keys):
+        get, since, unit = self.values.get, samples.t - samples.start, self.per_unit(samples)
+        out = np.zeros((*unit.shape, len(keys)))
+        for column, key in enumerate(keys):
+            number = key.partition(".")[0]
+            inside = (since >= get(f"{number}.start", -np.inf)) & (since <= get(f"{number}.end", np.inf))
+            out[inside, :, column] = unit[inside]
+        return out
+
+    def uncorrected(self, samples):
+        return self.regressors(samples, list(self.sizes)) @ np.array(list(self.sizes.values()))
+
+    def inject(self, flight, rng=None):
+        (stream,) = self.channels
+        part = need_stream(self, flight, stream)
+        need_truth(self, flight)
+        samples = aid_samples(stream, part.t, Track(flight.truth), float(flight.tdoa.t[0]))
+        extra = self.uncorrected(samples)
+        if not np.isfinite(extra).all():
+            raise InputError(f"{flight.name}: has no attitude in its ground truth, which {self.name} needs.")
+        return replace(flight, **{stream: with_values(part, values_of(part) + extra)})
+
+    def told(self, unit, factor=1.0):
+        """[(signed size, its words, when, in words)] of those sizes that the data tell, the most certain first."""
+        out = []
+        for key, value in significant(self).items():
+            if key in self.sizes:
+                number, std = key.partition(".")[0], self.std.get(key, 0.0)
+                start, end = (self.values.get(f"{number}.{limit}") for limit in LIMITS)
+                when = "" if start is None or end is None else f" from {start:.0f} to {end:.0f} s after the first TDOA"
+                out.append((value, measured(abs(value) * factor, std * factor, unit), when))
+        return out

@@ -1,0 +1,97 @@
+"""Faults of docs/aids.md put into simulated flights: ekf_node names the sensor."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from uwb_tdoa_bias.effects import Track, aid_samples  # noqa: E402
+from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
+from uwb_tdoa_ekf.estimator import VERDICTS  # noqa: E402
+from uwb_tdoa_ekf.monitoring.health import OK, WARN, Health  # noqa: E402
+from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
+from uwb_tdoa_tools.scoring.metrics import airborne  # noqa: E402
+from uwb_tdoa_tools.studies.aids import COUNTS, FAULTS, ONSET, bounds, of_four, only, with_flow  # noqa: E402
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight  # noqa: E402
+
+# What the filter copes with is no reason to warn: steps, single wrong ranges, and a barometer that drifts.
+COPED_WITH = ("height: steps of 0.3 to 0.8 m", "height: one in five 1 m too long", "pressure: drifts 1 m per minute")
+RUNNING = type("Estimator", (), {"running": True, "anchors": None})
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return clean_flight(100, 40.0, aided=True)
+
+
+def said(flight, monkeypatch):
+    """[(level, text)] of ekf_node's status, second by second of a Flight."""
+    run, judge, out = run_offline(flight), Health(FilterConfig(), 0.25), []
+    begin, end = flight.imu.t[[0, -1]]
+    for now in np.arange(begin + 1.0, end):
+        monkeypatch.setattr("time.monotonic", lambda: now)
+        judge.imu, judge.tdoa = (int(np.sum(stream.t < now)) for stream in (flight.imu, flight.tdoa))
+        counts = Counter()
+        for name, outcome in run.aids.items():
+            heard = getattr(flight, name).t < now
+            judge.aids[name] = int(np.sum(heard))
+            counts.update({f"{name}_{word}": int(np.sum(outcome["verdict"][heard] == v)) for v, word in VERDICTS.items()})
+        out.append(judge.report(None, RUNNING, counts)[:2])
+    return out
+
+
+def test_sound_sensors_are_not_complained_of(flight, monkeypatch):
+    assert set(said(flight, monkeypatch)) == {(OK, "running")}
+
+
+@pytest.mark.parametrize("name", [name for name in FAULTS if name not in COPED_WITH])
+def test_a_faulty_sensor_is_named(flight, monkeypatch, name):
+    aid, from_start, change = FAULTS[name]
+    begin = airborne(flight.truth)[0] + (0.0 if from_start else ONSET)
+    sound = only(flight, (aid,))
+    told = [text for level, text in said(replace(sound, **{aid: change(getattr(sound, aid), begin)}), monkeypatch) if level == WARN]
+    assert told and all(text.startswith(f"more than half of the messages on {aid} ") for text in told)
+
+
+@pytest.mark.parametrize("name", COPED_WITH)
+def test_what_the_filter_copes_with_leaves_the_estimate_sound(flight, name):
+    aid, from_start, change = FAULTS[name]
+    sound = only(flight, (aid,))
+    begin = airborne(flight.truth)[0] + (0.0 if from_start else ONSET)
+    run = run_offline(replace(sound, **{aid: change(getattr(sound, aid), begin)}))
+    inside = (run.odometry.t > begin + 3.0) & (run.odometry.t < airborne(flight.truth)[1])
+    true = np.interp(run.odometry.t[inside], flight.truth.t, flight.truth.p[:, 2])
+    assert np.sqrt(np.mean((run.odometry.p[inside, 2] - true) ** 2)) < 0.05
+
+
+def test_pixel_counts_become_the_velocity_that_made_them():
+    """Counts of a sensor that looks down, by the geometry of a pinhole: a point of the ground at X in the body frame is seen at
+    X / depth, and moves by -(v + omega x X)."""
+    flight = clean_flight(101, 40.0, aided=True)
+    t = np.arange(100, 3900) / 100.0 + flight.imu.t[0]
+    track = Track(flight.truth)
+    v, depth = aid_samples("velocity", t - 0.005, track).reading, aid_samples("height", t - 0.005, track).reading[:, 0]
+    omega = np.stack([np.interp(t - 0.005, flight.imu.t, flight.imu.gyro[:, k]) for k in range(3)], axis=1)
+    below = np.stack([0.0 * t, 0.0 * t, -depth], axis=1)
+    passing = -(v + np.cross(omega, below))[:, :2] / depth[:, None]  # rad/s, of the ground
+    counts = {"motion.deltaX": COUNTS * passing[:, 1], "motion.deltaY": COUNTS * passing[:, 0], "t": t}
+    made = with_flow(replace(flight, extra={"estFlow": counts})).velocity
+    first, last = airborne(flight.truth)
+    air = (made.t > first + 0.5) & (made.t < last - 0.5)
+    true = aid_samples("velocity", made.t[air], track).reading
+    assert np.isinf(made.std[:, 2]).all() and np.isfinite(made.std[:, :2]).all()
+    error = np.sqrt(np.mean((made.v[air, :2] - true[:, :2]) ** 2, axis=0))  # of ranges with 1 cm of noise
+    assert (np.std(true[:, :2], axis=0) > 0.2).all() and (error < 0.015).all()
+
+
+def test_four_anchors_keep_their_tdoas_and_a_height_makes_their_bound_smaller(flight):
+    few = of_four(flight)
+    assert few.anchors.ids.tolist() == flight.anchors.ids[:4].tolist()
+    assert set(few.tdoa.a) | set(few.tdoa.b) == set(few.anchors.ids.tolist()) and 0 < len(few.tdoa) < len(flight.tdoa)
+    plain, aided, all_of_them = bounds([few], np.inf), bounds([few], 0.02), bounds([flight], np.inf)
+    assert (aided < plain).all() and aided[2] < 0.02 and all_of_them[3] < plain[3]
+    assert plain[3] == pytest.approx(np.linalg.norm(plain[:3]))

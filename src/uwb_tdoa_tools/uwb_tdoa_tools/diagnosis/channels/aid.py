@@ -1,0 +1,126 @@
+"""What heights, pressures and velocities share: residuals of their medians over cells."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import AidSamples, SmoothTerm, aid_samples
+from uwb_tdoa_bias.effects.aid_error import values_of
+from uwb_tdoa_bias.effects.covariates import OF_IMU, sensor_covariate
+
+from .base import Channel, ChannelResidual, Rows
+from .figures import figures
+from .inertial import CELL, features_of
+from .knots import knots_of
+from .pairs import APART
+
+COVARIATES = ("time", "x", "y", "height", "speed", "climb_rate", "acceleration", "turning_rate", "vibration")
+FEWEST_ATTITUDES, FEWEST_CELLS = 10, 8
+
+
+@dataclass(frozen=True)
+class AidResidual(ChannelResidual):
+    """samples : AidSamples, cells; residual (n, k), NaN where an axis was not measured; labels : k texts, its axes; unit of
+    the channel; floating : whether a constant tells nothing, and its mean is taken out of rows and columns."""
+
+    samples: AidSamples
+    residual: np.ndarray
+    labels: tuple
+    unit: str
+    floating: bool
+
+    @property
+    def _known(self):
+        return np.isfinite(self.residual.T.ravel())
+
+    def rows(self):
+        samples, (n, k), known = self.samples, self.residual.shape, self._known
+        y, t = self.residual.T.ravel()[known], np.tile(samples.t - samples.start, k)[known]
+        place = np.tile(samples.p, (k, 1))[known]
+        return Rows(self._free(y), np.repeat(np.arange(k), n)[known], t, np.ones(len(y)), place)
+
+    def columns(self, effect, keys):
+        values = effect.regressors(self.samples, list(keys))
+        return self._free(values.transpose(1, 0, 2).reshape(-1, len(keys))[self._known])
+
+    def series(self):
+        return {f"{label} [{self.unit}]": (self.samples.t, self.residual[:, k]) for k, label in enumerate(self.labels)}
+
+    def _free(self, values):
+        return values - values.mean(axis=0) if self.floating else values
+
+
+class Aid(Channel):
+    """A channel of a stream of the same name that a flight may have."""
+
+    axes: ClassVar[tuple] = ("",)  # what is added to its name in labels
+    floating: ClassVar[bool] = False
+    of_attitude: ClassVar[bool] = True
+    positions: ClassVar[tuple] = (2,)  # coordinates that the reference must know
+
+    @property
+    def labels(self):
+        """Of its axes: tuple."""
+        return tuple(self.name + axis for axis in self.axes)
+
+    def residual(self, comparison):
+        part, reference = getattr(comparison.flight, self.name), comparison.reference
+        known = all(reference.positions_known[k] for k in self.positions)
+        if part is None or not known or (self.of_attitude and not self._attitude(comparison)):
+            return None
+        poses, (first, last) = comparison.poses, comparison.span
+        inside = (part.t >= max(first, poses.t[0])) & (part.t <= min(last, poses.t[-1]))
+        t, values = part.t[inside], self._values(part)[inside]
+        cell = np.unique((t / CELL).astype(int), return_inverse=True)[1]
+        if not len(t) or cell.max() < FEWEST_CELLS:
+            return None
+        error = values - aid_samples(self.name, t, comparison.track, comparison.start).reading
+        edges = np.flatnonzero(np.diff(cell)) + 1
+        middles = np.array([some.mean() for some in np.split(t, edges)])
+        error = np.stack([_median(some) for some in np.split(error, edges)])
+        samples = aid_samples(
+            self.name, middles, comparison.track, comparison.start, _vibration(comparison.flight.imu, middles)
+        )
+        error = error - comparison.effects.uncorrected(samples)
+        return AidResidual(samples, error, self.labels, self.unit, self.floating)
+
+    def smooth_terms(self, residuals):
+        out = []
+        for name in COVARIATES:
+            values = [sensor_covariate(name, part.samples) for part in residuals]
+            knots = None if any(some is None for some in values) else knots_of(np.concatenate(values), name)
+            if knots is not None:
+                out += [SmoothTerm(channel=label, covariate=name, knots=knots) for label in self.labels]
+        return out
+
+    def health(self, residuals):
+        out = []
+        t = np.concatenate([part.samples.t + APART * number for number, part in enumerate(residuals)])
+        for k, label in enumerate(self.labels):
+            r = np.concatenate([part.residual[:, k] for part in residuals])
+            known = np.isfinite(r)
+            if known.any():
+                out.append({"axis": label, **figures(t[known], r[known])})
+        return {"axes": out}
+
+    def _attitude(self, comparison):
+        known = np.isfinite(comparison.poses.q).all(axis=1).sum()
+        return comparison.reference.attitude_known and known > FEWEST_ATTITUDES
+
+    def _values(self, part):
+        """(n, k) of a stream, NaN for what was not measured."""
+        values = values_of(part)
+        return np.where(np.isfinite(values), values, np.nan)
+
+
+def _median(values):
+    known = np.isfinite(values).any(axis=0)
+    return np.where(known, np.nanmedian(np.where(known, values, 0.0), axis=0), np.nan)
+
+
+def _vibration(imu, t):
+    """(n,) m/s^2; None without an IMU."""
+    if imu is None:
+        return None
+    return np.interp(t, imu.t, features_of(imu)[:, OF_IMU.index("vibration")])

@@ -1,0 +1,57 @@
+"""Searches for intervals of a flight."""
+
+import numpy as np
+
+from ..regression.terms import Candidate, Term
+from .base import Detector
+
+BIN = 1.0  # s
+SHORTEST = 2  # bins
+LONGEST = 0.7  # share of a flight; what lasts longer is constant
+LEAST_GAIN = 10.0  # twice a log-likelihood
+
+
+def best_interval(t, score, power, prior, signed=False):
+    """Best (gain, {limit: value}, price of the search) over intervals of t (n,), s.
+
+    score, power (n,): products with the residual and with itself of a regressor, both weighted; prior : information of what
+    sizes are plausible; signed : whether sizes below 0 are.
+    """
+    first = t.min()
+    bins = ((t - first) / BIN).astype(int)
+    n = bins.max() + 1
+    total = np.concatenate([[0.0], np.cumsum(np.bincount(bins, score, n))])
+    known = np.concatenate([[0.0], np.cumsum(np.bincount(bins, power, n))])
+    i, j = np.triu_indices(n + 1, SHORTEST)
+    short = (j - i) <= LONGEST * n
+    i, j = i[short], j[short]
+    inside = total[j] - total[i]
+    gain = (inside if signed else np.maximum(inside, 0.0)) ** 2 / (known[j] - known[i] + prior)
+    if not len(gain):
+        return 0.0, {}, 0.0
+    best = int(np.argmax(gain))
+    limits = {"start": float(first + i[best] * BIN), "end": float(first + j[best] * BIN)}
+    return gain[best], limits, 2.0 * np.log(len(gain))
+
+
+class IntervalDetector(Detector):
+    """Tries all intervals of one flight for an IntervalEffect."""
+
+    disguises = True
+
+    def search(self, table, model, chosen):
+        (channel,) = self.effect.channels
+        if table.flights != 1 or channel not in table.present:  # only a flight alone has a time of its own
+            return []
+        mine = [key for candidate in chosen if candidate.name == self.effect.name for key in candidate.terms[0].keys]
+        number = 1 + max((int(key.partition(".")[0]) for key in mine), default=0)
+        rows, key = table.rows_of(channel), f"{number}.{self.effect.part}"
+        part = next(part for _, name, _, part in table.parts if name == channel)
+        x = part.columns(self.effect(), (key,))[:, 0]
+        information = model.information(table)[rows]
+        score, power = x * information * model.residual[rows], x * x * information
+        gain, limits, price = best_interval(table.t[rows], score, power, self.effect.typical**-2, signed=True)
+        if gain <= LEAST_GAIN + price:
+            return []
+        effect = self.effect({f"{number}.{limit}": value for limit, value in limits.items()}, source="diagnose")
+        return [Candidate((Term(effect, (key,)),), price)]
