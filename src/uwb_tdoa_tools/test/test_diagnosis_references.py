@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.truth_time_offset import TruthTimeOffset
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.diagnosis import diagnose
-from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
+from uwb_tdoa_tools.diagnosis.references import REFERENCES, GroundTruth, Heights, Nothing
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
 
 NONSENSE = np.array([100.0, -50.0, 7.0])
@@ -16,6 +16,11 @@ NONSENSE = np.array([100.0, -50.0, 7.0])
 @pytest.fixture(scope="module")
 def flight():
     return effect_of("anchor_delay", True, 4).inject(clean_flight(100, 30.0))
+
+
+@pytest.fixture(scope="module")
+def aided():
+    return clean_flight(100, 30.0, aided=True)
 
 
 def with_wrong_truth(flight):
@@ -39,6 +44,33 @@ def test_without_truth_a_wrong_one_changes_nothing(flight):
     contents = [case.as_json() for case in cases]
     assert contents[0] == contents[1] == contents[2]
     assert contents[0]["after"]["pooled"]["rmse_3d"] is None
+
+
+@pytest.mark.parametrize("reference", [Nothing, Heights])
+def test_what_a_reference_does_without_is_taken_out_first(aided, reference):
+    prepared = [reference().prepare(each) for each in (aided, with_wrong_truth(aided), replace(aided, truth=None))]
+    if reference is Nothing:
+        assert [each.truth for each in prepared] == [None] * 3
+    else:
+        for each in prepared:
+            np.testing.assert_array_equal(each.truth.p, prepared[0].truth.p)
+            assert each.height is None
+
+
+def test_a_path_by_heights_is_at_the_right_height(aided):
+    path = Heights().prepare(EFFECTS["anchor_delay"]({"0": 0.5, "5": -0.3}).inject(aided, np.random.default_rng(0))).truth
+    z = np.interp(path.t, aided.truth.t, aided.truth.p[:, 2])
+    flown = z > 0.5
+    assert np.sqrt(np.mean((path.p[flown, 2] - z[flown]) ** 2)) < 0.03
+
+
+def test_a_flight_without_a_range_finder_cannot_be_compared_with_heights(flight):
+    with pytest.raises(InputError, match="holds no height.*--no-truth"):
+        diagnose([flight], reference=Heights())
+
+
+def test_every_reference_is_made_of_a_filter_configuration():
+    assert all(make(None).words for make in REFERENCES.values())
 
 
 def test_the_truth_that_is_missing_is_asked_for(flight):

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.wording import measured
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.findings import Finding, Refused
-from uwb_tdoa_tools.diagnosis.references import Nothing
+from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative, Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.report import curves, maps, pictures, room, sections
@@ -135,6 +135,13 @@ def test_nothing_found_and_nothing_added_are_told_apart(result):
     assert "10.0 cm, 95 % interval 9.0 to 11.0 cm" in " ".join(verdict(nothing).more)
     useless = replace(nothing, findings=[finding(delay(), added=False, worth=None)])
     assert verdict(useless).kind == "same" and "One effect was found" in verdict(useless).headline
+
+
+def test_what_errors_are_against_is_said_where_only_heights_are_known(result):
+    by_height = replace(result, reference=Heights())
+    for found in (verdict(by_height), verdict(replace(by_height, findings=[]))):
+        assert any("x and y are the filter's own" in sentence for sentence in found.more)
+    assert not any("Errors are against" in sentence for sentence in verdict(result).more)
 
 
 def test_without_ground_truth_no_error_is_claimed(without_truth):

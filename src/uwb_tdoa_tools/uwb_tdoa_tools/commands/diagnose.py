@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
 from ..diagnosis import diagnose
-from ..diagnosis.references import GroundTruth, Nothing
+from ..diagnosis.references import REFERENCES
 from ..progress import Progress
 
 DESCRIPTION = """Find out what is wrong with the measurements of some flights, and put it right.
@@ -32,13 +32,20 @@ def parser():
         "diagnose flight.bag --out diagnosis/",
         "diagnose 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out diagnosis/",
         "diagnose flight.bag --effects effects.yaml --out second/",
+        "diagnose flight.bag --reference heights --out by-height/",
         "diagnose flight.bag --no-truth --out without/",
     )
     options.add_recordings(made)
     options.add_filter(made, "effects.yaml: what is in the model already")
     add = made.add_argument
     add("--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit")
-    add("--no-truth", action="store_true", help="do without ground truth, even where there is one")
+    known = made.add_mutually_exclusive_group().add_argument
+    known(
+        "--reference", choices=tuple(REFERENCES), default="truth",
+        help="what flights are compared with: their ground truth (default), the heights of a range finder, or nothing; "
+        "what is not named is not read",
+    )  # fmt: skip
+    known("--no-truth", dest="reference", action="store_const", const="nothing", help="short for --reference nothing")
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
 
@@ -53,7 +60,7 @@ def _diagnose(args):
     shared = {f.name for f in flights} & {f.name for f in holdout}
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
-    reference = Nothing(config) if args.no_truth else GroundTruth()
+    reference = REFERENCES[args.reference](config)
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress)
     out.mkdir(parents=True, exist_ok=True)

@@ -146,7 +146,7 @@ def _declared(found, reference, kinds, installation):
     chosen = [
         effect
         for effect in effects
-        if (kinds is None or effect.name in kinds) and (reference.judges or not effect.needs_reference)
+        if (kinds is None or effect.name in kinds) and (all(reference.positions_known) or not effect.needs_reference)
     ]
     return [candidate for effect in chosen for candidate in candidates_of(effect(), *installation)]
 

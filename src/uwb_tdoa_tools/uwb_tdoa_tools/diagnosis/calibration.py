@@ -15,8 +15,6 @@ from .regression.select import Selection
 from .regression.table import BLOCK, table_of
 from .regression.terms import columns_of
 
-CHANNEL = "tdoa"
-PRIOR = {"anchor_position": 0.1, "anchor_delay": 0.1}  # m
 FEWEST = 4  # TDOAs in a cell; noise of fewer hides what is slow
 SYSTEMATIC = 10.0  # by which the information is divided beside what blocks tell: errors that last are no noise
 LEFT = 0.055  # m that may be left of slow innovations
@@ -50,16 +48,18 @@ class Calibration:
 
 def calibrate(residuals, candidates):
     """Calibration from [{channel: ChannelResidual}] that are innovations, and the declared Candidates."""
-    chosen = tuple(next(each for each in candidates if each.name == name) for name in PRIOR)
+    whole = {candidate.name: candidate for candidate in reversed(candidates)}  # the first of an effect is all of it
+    chosen = tuple(each for each in whole.values() if each.terms[0].effect.calibration_prior is not None)
+    channel = chosen[0].channels[0]
     table = table_of(residuals).with_terms([term for candidate in candidates for term in candidate.terms])
     columns = columns_of(chosen)
-    sizes = np.array([PRIOR[candidate.name] for candidate in chosen for _ in candidate.columns])
-    crowded = _rows(table, (table.channel == table.channels.index(CHANNEL)) & (table.count >= FEWEST))
+    sizes = np.array([term.effect.calibration_prior for each in chosen for term in each.terms for _ in term.columns])
+    crowded = _rows(table, (table.channel == table.channels.index(channel)) & (table.count >= FEWEST))
     inflation = fit(crowded, columns, sizes=sizes).inflation
     fitted = fit(crowded, columns, SYSTEMATIC * inflation, sizes)
     before, after = (np.mean(np.clip(values, -1.0, 1.0) ** 2) for values in (crowded.y, fitted.residual))
     selection = Selection(crowded, chosen, fitted, (0.0,) * len(chosen), ((),) * len(chosen))
-    left = float(fitted.scale[crowded.channels.index(CHANNEL)])
+    left = float(fitted.scale[crowded.channels.index(channel)])
     return Calibration(selection, left, float(1.0 - after / before), len(np.unique(crowded.block)) >= MIN_BLOCKS)
 
 

@@ -2,6 +2,9 @@
 
 from .base import Reference, View
 from .ground_truth import GroundTruth
+from .heights import Heights
 from .nothing import Nothing
 
-__all__ = ["GroundTruth", "Nothing", "Reference", "View"]
+REFERENCES = {"truth": GroundTruth, "heights": Heights, "nothing": Nothing}  # made of a FilterConfig
+
+__all__ = ["REFERENCES", "GroundTruth", "Heights", "Nothing", "Reference", "View"]

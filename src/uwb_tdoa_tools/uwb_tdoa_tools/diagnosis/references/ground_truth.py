@@ -11,6 +11,9 @@ class GroundTruth(Reference):
 
     words = "the recorded ground truth"
 
+    def __init__(self, config=None):
+        """config : FilterConfig, which no known pose needs."""
+
     def prepare(self, flight):
         if flight.truth is None or len(flight.truth) < 2:
             raise InputError(f"{flight.name}: holds no ground truth to compare with; give --no-truth.")

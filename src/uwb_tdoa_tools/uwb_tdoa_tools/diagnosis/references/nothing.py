@@ -11,6 +11,12 @@ from .base import Reference, View
 TRUTHS = "_truth"  # how streams are called in which a simulation tells what was true
 
 
+def without_truth(flight):
+    """The Flight without anything of where it really was."""
+    extra = {name: stream for name, stream in flight.extra.items() if not name.endswith(TRUTHS)}
+    return replace(flight, truth=None, extra=extra)
+
+
 class Nothing(Reference):
     """Residuals are the innovations of the filter; what the path follows of an effect is taken out of its regressors, with all
     that the filter knows of the path."""
@@ -25,8 +31,7 @@ class Nothing(Reference):
         self._config = config
 
     def prepare(self, flight):
-        extra = {name: stream for name, stream in flight.extra.items() if not name.endswith(TRUTHS)}
-        return replace(flight, truth=None, extra=extra)
+        return without_truth(flight)
 
     def view(self, flight, effects):
         innovations = record_innovations(flight, self._config, Corrector(flight.anchors, effects))

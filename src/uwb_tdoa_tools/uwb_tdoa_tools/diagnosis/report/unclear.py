@@ -67,7 +67,7 @@ def _what(item):
 
 def _told_by(item, diagnosis):
     effect = EFFECTS[item.effect]
-    alone = not diagnosis.reference.judges
+    alone = not all(diagnosis.reference.positions_known)
     if item.direction is None:
         return GROUND_TRUTH if alone and effect.needs_reference else CHANNELS[effect.channels[0]].needs
     size, parts = _contribution(item, diagnosis)

@@ -55,7 +55,7 @@ def _judged(diagnosis):
     gain, interval = 1.0 - after["rmse_3d"] / before["rmse_3d"], after.get("rmse_3d_gain_ci")
     change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
     more = [_intervals(before, after, interval), f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}."]
-    more += [*_caveats(diagnosis), *_worse(diagnosis), *_diverged(diagnosis)]
+    more += [*_shared(diagnosis), *_caveats(diagnosis), *_worse(diagnosis), *_diverged(diagnosis)]
     if interval and interval[0] > 0.0:
         return Verdict(f"{ERROR} falls {change}: {_share(gain)} of it is gone.", tuple(more), "better")
     more.append(
@@ -77,7 +77,8 @@ def _intervals(before, after, gain):
 def _nothing_added(diagnosis):
     pooled, found = diagnosis.before["pooled"], len({finding.key for finding in diagnosis.findings})
     interval = f"95 % interval {_bounds(pooled['rmse_3d_ci'])} cm"
-    more = (f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {_flights(diagnosis)}.", *_diverged(diagnosis))
+    error = f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {_flights(diagnosis)}."
+    more = (error, *_shared(diagnosis), *_diverged(diagnosis))
     if not found:
         return Verdict(
             "Nothing was found: what the model leaves of the measurements looks like noise.", more, "nothing"
@@ -124,6 +125,13 @@ def _flights(diagnosis):
     count = len(_names(diagnosis))
     seconds = sum(score.last - score.first for score in diagnosis.before["scores"])
     return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s in the air"
+
+
+def _shared(diagnosis):
+    """What errors against a reference that knows only a part do not tell."""
+    if all(diagnosis.reference.positions_known):
+        return []
+    return [f"Errors are against {diagnosis.reference.words}: an error that both share is not in them."]
 
 
 def _caveats(diagnosis):

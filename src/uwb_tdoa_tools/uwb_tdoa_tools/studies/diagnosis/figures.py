@@ -15,9 +15,9 @@ from ...diagnosis import diagnose
 from ...diagnosis.attribution import attribute
 from ...diagnosis.references import GroundTruth
 from ...scoring.plots import plt
-from . import bank, measured, undeclared
+from . import bank, measured, referenced, undeclared
 
-PARTS = ("bank", "aids", "no-truth", "undeclared", "injected", "measured", "measured-aids", "speed")
+PARTS = ("bank", "aids", "no-truth", "undeclared", "injected", "measured", "measured-aids", "references", "speed")
 
 
 def add_options(add):
@@ -32,7 +32,8 @@ def add_options(add):
 def run(args):
     """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
-    for option in {"undeclared": ("cases",), **dict.fromkeys(("injected", "measured", "measured-aids"), ("data",))}.get(args.part, ()):
+    on_data = dict.fromkeys(("injected", "measured", "measured-aids", "references"), ("data",))
+    for option in {"undeclared": ("cases",), **on_data}.get(args.part, ()):
         if getattr(args, option) is None:
             raise InputError(f"--{option}: {args.part} needs it.")
     started = time.monotonic()
@@ -44,6 +45,7 @@ def run(args):
         "injected": _injected,
         "measured": _measured,
         "measured-aids": _measured_aids,
+        "references": _references,
         "speed": _speed,
     }[args.part](args)
     result["seconds"] = round(time.monotonic() - started, 1)
@@ -119,6 +121,11 @@ def _measured(args):
 def _measured_aids(args):
     results = _each([(name,) for name in measured.AIDED], lambda name: measured.run(args.data, name, args.out, AIDS))
     return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
+
+
+def _references(args):
+    results = _each(referenced.cases(), lambda *case: referenced.run(args.data, *case))
+    return {"figures": referenced.figures(results), "cases": results}
 
 
 def _speed(args):

@@ -67,7 +67,8 @@ PRESENT = (
 )  # in every measured flight, and cannot be taken out first
 
 
-def _load(data, paths, aids=()):
+def load(data, paths, aids=()):
+    """Flights of paths below the folder `data`, with those of their AIDS that are named."""
     flights = inputs.Reading(data / "surveys").flights([data / path for path in paths])
     return [flight.without(*(name for name in AIDS if name not in aids)) for flight in flights]
 
@@ -77,7 +78,7 @@ def run(data, name, out, aids=()):
     dict of the summary and all findings."""
     fit, judge = SPLITS[name]
     started = time.monotonic()
-    result = diagnose(_load(data, fit, aids), _load(data, judge, aids))
+    result = diagnose(load(data, fit, aids), load(data, judge, aids))
     folder = out / name.replace(" ", "-")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.html").write_text(result.as_html())
@@ -113,7 +114,7 @@ def injected(data, each):
 
     def one(path, name):
         if path not in known:
-            flight = _load(data, [path])[0]
+            flight = load(data, [path])[0]
             known[path] = flight, usable(attribute([flight], GroundTruth()).effects)
         flight, base = known[path]
         effect = effect_of(name, True, len(path) + len(name))
