@@ -111,6 +111,9 @@ def useful(attribution, flights, base, config=None, progress=lambda: None):
     return Kept(attribution.selection.only(candidates), tuple(detections), tuple(refused), worth)
 
 
+_NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
+
+
 def borne_out(attribution, flights, base, config=None, progress=lambda: None):
     """Kept, where the reference tells no errors: positions and delays of anchors together, or nothing.
 
@@ -123,7 +126,10 @@ def borne_out(attribution, flights, base, config=None, progress=lambda: None):
     calibration = calibrate(attribution.residuals, attribution.candidates)
     progress()
     if calibration.why_not is None:
-        return Kept(calibration.selection, (), (), {})
+        applied = {candidate.name for candidate in calibration.selection.chosen}
+        labels = [candidate.label for candidate in selection.chosen if candidate.name not in applied]
+        labels += [detection.effect.label for detection in attribution.detections]
+        return Kept(calibration.selection, (), tuple(Refused(label, _NOT_TOLD) for label in labels), {})
     label = " + ".join(candidate.label for candidate in selection.chosen)
     return nothing(attribution, [Refused(label, calibration.why_not)])
 
