@@ -19,10 +19,10 @@ from .calibration import calibrate
 from .findings import Refused, usable
 from .regression.fit import refit
 from .regression.select import Selection
+from .regression.table import BLOCK
 from .regression.terms import columns_of
 
 BOOTSTRAPS = 400
-BLOCK = 5.0  # s
 JUDGES = 3  # flights, or halves of one, on which trials are judged
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
 USED = next(value for value, name in VERDICTS.items() if name == "used")

@@ -107,7 +107,7 @@ def _without_truth(diagnosis):
     headline = "What was found makes measurements agree better; what that is worth for the position is unknown."
     borne_out = (
         "It is added because what is slow in the innovations becomes small: what it leaves is not above "
-        f"{100 * LEFT:.1f} cm. On measured flights a correction that left more made the position worse."
+        f"{100 * LEFT:.1f} cm, a limit that was set on measured flights."
     )
     change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
     return Verdict(headline, (_UNKNOWN, borne_out, change), "unknown")
