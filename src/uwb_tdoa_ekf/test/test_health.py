@@ -120,7 +120,9 @@ def test_an_aid_that_stops_is_told_and_so_is_one_that_contradicts(clock):
         assert second(clock, judge, RUNNING, **counts)[:2] == (OK, "running")
     said = [second(clock, judge, RUNNING, **counts) for _ in range(3)]
     assert said[-1][0] == WARN and "no messages on height any more" in said[-1][1]
-    judge.aids["height"] += 25
-    counts.update(used=400, height_rejected=25)
-    level, text, _ = second(clock, judge, RUNNING, **counts)
-    assert level == WARN and "more than half of the messages on height" in text
+    for expected in (OK, WARN):  # for a second even a sound one may contradict
+        judge.aids["height"] += 25
+        counts.update(used=400, height_rejected=25)
+        level, text, _ = second(clock, judge, RUNNING, **counts)
+        assert level == expected
+    assert "more than half of the messages on height" in text

@@ -67,3 +67,5 @@ def test_a_component_of_the_velocity_that_is_not_measured_has_no_rows():
     rows = part.rows()
     assert set(rows.series) == {0, 1} and np.isfinite(rows.y).all()
     assert len(part.columns(EFFECTS["velocity_scale"](), ("scale",))) == len(rows.y)
+    series = part.series()
+    assert len(series) == 2 and all(np.isfinite(values).all() for _, values in series.values())

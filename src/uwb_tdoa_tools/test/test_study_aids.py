@@ -9,13 +9,12 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from uwb_tdoa_bias.effects import Track, aid_samples  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.estimator import VERDICTS  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import OK, WARN, Health  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_tools.scoring.metrics import airborne  # noqa: E402
-from uwb_tdoa_tools.studies.aids import COUNTS, FAULTS, ONSET, bounds, of_four, only, with_flow  # noqa: E402
+from uwb_tdoa_tools.studies.aids import FAULTS, ONSET, bounds, of_four, only  # noqa: E402
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight  # noqa: E402
 
 # What the filter copes with is no reason to warn: steps, single wrong ranges, and a barometer that drifts.
@@ -66,26 +65,6 @@ def test_what_the_filter_copes_with_leaves_the_estimate_sound(flight, name):
     inside = (run.odometry.t > begin + 3.0) & (run.odometry.t < airborne(flight.truth)[1])
     true = np.interp(run.odometry.t[inside], flight.truth.t, flight.truth.p[:, 2])
     assert np.sqrt(np.mean((run.odometry.p[inside, 2] - true) ** 2)) < 0.05
-
-
-def test_pixel_counts_become_the_velocity_that_made_them():
-    """Counts of a sensor that looks down, by the geometry of a pinhole: a point of the ground at X in the body frame is seen at
-    X / depth, and moves by -(v + omega x X)."""
-    flight = clean_flight(101, 40.0, aided=True)
-    t = np.arange(100, 3900) / 100.0 + flight.imu.t[0]
-    track = Track(flight.truth)
-    v, depth = aid_samples("velocity", t - 0.005, track).reading, aid_samples("height", t - 0.005, track).reading[:, 0]
-    omega = np.stack([np.interp(t - 0.005, flight.imu.t, flight.imu.gyro[:, k]) for k in range(3)], axis=1)
-    below = np.stack([0.0 * t, 0.0 * t, -depth], axis=1)
-    passing = -(v + np.cross(omega, below))[:, :2] / depth[:, None]  # rad/s, of the ground
-    counts = {"motion.deltaX": COUNTS * passing[:, 1], "motion.deltaY": COUNTS * passing[:, 0], "t": t}
-    made = with_flow(replace(flight, extra={"estFlow": counts})).velocity
-    first, last = airborne(flight.truth)
-    air = (made.t > first + 0.5) & (made.t < last - 0.5)
-    true = aid_samples("velocity", made.t[air], track).reading
-    assert np.isinf(made.std[:, 2]).all() and np.isfinite(made.std[:, :2]).all()
-    error = np.sqrt(np.mean((made.v[air, :2] - true[:, :2]) ** 2, axis=0))  # of ranges with 1 cm of noise
-    assert (np.std(true[:, :2], axis=0) > 0.2).all() and (error < 0.015).all()
 
 
 def test_four_anchors_keep_their_tdoas_and_a_height_makes_their_bound_smaller(flight):

@@ -12,6 +12,7 @@ START_TIMEOUT = 5.0  # s of data without a start position before it becomes a wa
 BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is a recording
 STOPPED = 2.0  # s without a message of an aid that was there, before it becomes a warning
 LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it becomes a warning
+REPEATS = 2  # reports in a row in which that is so of an aid; optical flow contradicts everything else for a second at times
 
 REMEDY = {  # of each aid, what to check
     "height": "its unit, height_arm and ground_height",
@@ -40,6 +41,7 @@ class Health:
         self._volume = VolumeCheck(volume)
         self._imu_rate, self._tdoa_rate = Rate(), Rate()
         self._aids_before = {}  # messages of each, received and not used, by the last report
+        self._aids_bad = {}  # reports in a row in which most messages of an aid were not used for a reason
         self._aids_heard = {}  # messages of each so far, and since when no more of them, time.monotonic(), s
         self._starting = None
         self._counts = {}
@@ -108,7 +110,9 @@ class Health:
                 judgement = WARN, f"no messages on {aid} any more: done without; check the sensor and its driver"
                 continue
             for reason, words in reasons.items():
-                if recent[reason] > LARGEST_UNUSED * recent["received"]:
+                bad = recent[reason] > LARGEST_UNUSED * recent["received"]
+                repeats = self._aids_bad[aid, reason] = self._aids_bad.get((aid, reason), 0) + 1 if bad else 0
+                if repeats >= REPEATS:
                     judgement = WARN, f"more than half of the messages on {aid} {words}"
         return judgement
 

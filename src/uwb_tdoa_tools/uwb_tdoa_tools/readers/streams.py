@@ -6,6 +6,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth
 from uwb_tdoa_bias.foundation.pressure import pressure_at
 
+from .optical_flow import velocity_of
+
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
 LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
@@ -46,7 +48,7 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
         "tdoa": a, b, d (m); "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw.
-        "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere).
+        "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow": x, y (pixel counts), which become a velocity where "tof" and IMU are.
     extra : the same of everything else, for `Flight.extra`.
     meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps
         of each stream fell before they were sorted), "imu_accel_interpolated" and "remarks" (list of sentences).
@@ -78,7 +80,7 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
     if "pose" in streams:
         pose = streams["pose"]
         truth = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
-    height = pressure = None
+    height = pressure = velocity = None
     if "tof" in streams:
         tof = streams["tof"]
         ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(float)  # as a sensor_msgs/Range holds it
@@ -86,9 +88,12 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
     if "baro" in streams:
         baro = _readings(streams["baro"], "baro")
         pressure = Pressure(baro["t"], pressure_at(baro["baro"]))
+    if "flow" in streams and imu is not None and height is not None and np.isfinite(height.range).sum() > 1:
+        velocity = velocity_of(*(np.asarray(streams["flow"][name], dtype=float) for name in "txy"), height, imu)
+        velocity = velocity if len(velocity.t) else None
     if not meta["remarks"]:
         del meta["remarks"]
-    return Flight(name, anchors, tdoas, imu, truth, extra, meta, height, pressure)
+    return Flight(name, anchors, tdoas, imu, truth, extra, meta, height, pressure, velocity)
 
 
 def _sound(key, columns, meta, salvage):

@@ -25,6 +25,7 @@ _STREAMS = {  # event name: our stream, {column in the log: column of the stream
     "estPose": ("pose", {f"locSrv.{axis}": axis for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")}),
     "estTOF": ("tof", {"range.zrange": "tof"}),
     "estBarometer": ("baro", {"baro.asl": "baro"}),
+    "estFlow": ("flow", {"motion.deltaX": "x", "motion.deltaY": "y"}),
 }
 
 
@@ -32,8 +33,8 @@ def read_usd_log(path, anchors, salvage=False):
     """Flight of a micro-SD event log.
 
     TDOAs come from estTDOA, the IMU from estGyroscope (deg/s to rad/s) and estAcceleration (g to m/s^2), the ground
-    truth from estPose, the height from estTOF (mm to m) and the pressure from estBarometer (altitude to Pa). Other
-    events that occur are in `Flight.extra` under the names and in the units of the log.
+    truth from estPose, the height from estTOF (mm to m), the pressure from estBarometer (altitude to Pa) and the
+    velocity from estFlow (pixel counts, with range and gyroscope). Other events that occur are in `Flight.extra` under the names and in the units of the log.
     Raises InputError for a file that is empty, foreign, cut or damaged (the checksum is always verified), and for
     records that are not finite.
     salvage : read a cut or damaged log up to there, as the power of a vehicle that fell leaves it; `meta["remarks"]`

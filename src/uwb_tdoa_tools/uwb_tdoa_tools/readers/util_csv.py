@@ -22,20 +22,19 @@ _STREAMS = {  # our stream: {column of the file: column of the stream}, the time
     "acc": {"t_acc": "t", "acc_x": "x", "acc_y": "y", "acc_z": "z"},
     "gyro": {"t_gyro": "t", "gyro_x": "x", "gyro_y": "y", "gyro_z": "z"},
     "tof": {"t_tof": "t", "tof": "tof"},
-    "flow": {"t_flow": "t", "deltaX": "deltaX", "deltaY": "deltaY"},
+    "flow": {"t_flow": "t", "deltaX": "x", "deltaY": "y"},
     "baro": {"t_baro": "t", "baro": "baro"},
     "pose": {"t_pose": "t", "pose_x": "x", "pose_y": "y", "pose_z": "z"},
 }
 _QUATERNION = {"pose_qx": "qx", "pose_qy": "qy", "pose_qz": "qz", "pose_qw": "qw"}
-_EXTRA = ("flow",)
 TDOA_COLUMNS = tuple(_STREAMS["tdoa"])
 
 
 def read_util_csv(path, anchors, salvage=False):
     """Flight of a CSV file in the UTIL schema; it must hold at least t_tdoa, idA, idB and tdoa_meas.
 
-    Acceleration g to m/s^2, rates deg/s to rad/s, tof mm to m, baro m of altitude to Pa. Ground truth without quaternion
-    columns has NaN for q. flow is in `Flight.extra` as it is; `meta["ignored_columns"]` names columns that the schema
+    Acceleration g to m/s^2, rates deg/s to rad/s, tof mm to m, baro m of altitude to Pa, flow (pixel
+    counts) to velocity. Ground truth without quaternion columns has NaN for q; `meta["ignored_columns"]` names columns that the schema
     does not know.
     Raises InputError with the line for a file that is empty, foreign or cut and for a cell that is not a finite number.
     A plain file that was cut exactly between two lines cannot be told from a shorter one; a gzip file can.
@@ -71,8 +70,7 @@ def read_util_csv(path, anchors, salvage=False):
     if ignored := [name for name in header if name not in known]:
         meta["ignored_columns"] = ignored
     name = Path(path).name.removesuffix(".gz").removesuffix(".csv")
-    extra = {key: streams.pop(key) for key in _EXTRA if key in streams}
-    return make_flight(name, anchors, streams, extra, meta, salvage)
+    return make_flight(name, anchors, streams, {}, meta, salvage)
 
 
 def is_util_csv(line):

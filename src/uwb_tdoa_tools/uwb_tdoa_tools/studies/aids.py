@@ -1,4 +1,4 @@
-"""Height, pressure and velocity on measured flights: what each is worth, what faults put into them do, and optical flow."""
+"""Height, pressure and velocity on measured flights: what each is worth, and what faults put into them do."""
 
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import AIDS, Tdoas, Velocity
 from uwb_tdoa_bias.foundation.pressure import altitude_of, pressure_at
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.estimator import VERDICTS
 
 from .. import options
 from ..diagnosis.attribution import attribute
@@ -23,21 +24,19 @@ from ..scoring.metrics import airborne, position_at
 
 SETS = (), ("height",), ("pressure",), ("height", "pressure"), ("velocity",), ("height", "velocity")
 VELOCITY_RATE, VELOCITY_STD = 25.0, 0.1  # Hz, m/s: of a velocity made of the ground truth, where none was recorded
-FLOW_SETS = (), ("height",), ("velocity",), ("height", "velocity")
-COUNTS = 4.7  # of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, told in tenths: 4.2 to 4.9
-FLOW_TIME = 0.01  # s that one reading counts over
-WILD = 40.0  # counts, beyond which a reading is clipped
 TAKE_OFF = 0.2  # s into the airborne part, whose largest error is told
 GRACE = 3.0  # s after the beginning of a fault that do not count
 ONSET = 8.0  # s into the airborne part at which a fault begins that is not there from the start
 STEPS = 0.3, -0.5, 0.8  # m, of the ground below, one after the other,
+LARGEST_UNUSED = 0.5  # share of the messages of each of two seconds, as the status of ekf_node judges them
+NAMED = tuple(value for value, name in VERDICTS.items() if name in ("rejected", "invalid"))
 STEP_PERIOD, STEP_LENGTH = 6.0, 3.0  # s between their beginnings, and of each
 
 
 def add_options(add):
     """add : add_argument of a parser."""
-    tables = "what each aid is worth, what faults put into them do, or a velocity made of pixel counts (estFlow)"
-    add("table", choices=("worth", "faults", "flow"), help=tables)
+    tables = "what each aid is worth, what faults put into them do, or what is wrong with the velocity"
+    add("table", choices=("worth", "faults", "velocity"), help=tables)
     add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
     add("-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[], help="one filter parameter")
@@ -46,13 +45,14 @@ def add_options(add):
 def run(args):
     """Print one of the tables."""
     config = options.with_parameters(FilterConfig(), args.parameters)
-    prepare = with_flow if args.table == "flow" else with_velocity
-    flights = [prepare(flight) for flight in inputs.Reading(args.survey).flights(args.flights)]
-    {"worth": worth, "faults": faults, "flow": flow}[args.table](flights, config)
+    flights = [with_velocity(flight) for flight in inputs.Reading(args.survey).flights(args.flights)]
+    {"worth": worth, "faults": faults, "velocity": velocity}[args.table](flights, config)
 
 
 def with_velocity(flight):
-    """The flight with a velocity in the body frame, made of its ground truth and noise."""
+    """The flight with a velocity in the body frame, made of its ground truth and noise where none was recorded."""
+    if flight.velocity is not None:
+        return flight
     truth = flight.truth
     t = np.arange(truth.t[0] + 0.1, truth.t[-1] - 0.1, 1.0 / VELOCITY_RATE)
     ends = [np.stack([np.interp(t + s, truth.t, truth.p[:, k]) for k in range(3)], axis=1) for s in (-0.05, 0.05)]
@@ -62,34 +62,13 @@ def with_velocity(flight):
     return replace(flight, velocity=Velocity(t, v + noise, np.full(v.shape, VELOCITY_STD)))
 
 
-def with_flow(flight):
-    """The flight with the velocity in the body frame, x and y, that pixel counts, range finder and gyroscope tell.
-
-    A sensor that looks down sees the ground turn and pass: with the height h along its axis,
-    deltaX = -COUNTS (v_y / h + omega_x), deltaY = -COUNTS (v_x / h - omega_y), as in the flow deck's driver.
-    """
-    stream = flight.extra["estFlow"]
-    cell = np.unique((stream["t"] * VELOCITY_RATE).astype(int), return_inverse=True)[1]
-    columns = (stream["t"], *(np.clip(stream[f"motion.delta{axis}"], -WILD, WILD) for axis in "XY"))
-    t, x, y = (np.bincount(cell, column) / np.bincount(cell) for column in columns)
-    t = t - 0.5 * FLOW_TIME
-    seen = np.isfinite(flight.height.range)
-    h = np.interp(t, flight.height.t[seen], flight.height.range[seen])
-    turns = np.cumsum(flight.imu.gyro[:, :2] * np.gradient(flight.imu.t)[:, None], axis=0)
-    ends = [np.stack([np.interp(t + s, flight.imu.t, turns[:, k]) for k in range(2)], axis=1) for s in (-0.02, 0.02)]
-    rate = (ends[1] - ends[0]) / 0.04
-    v = np.stack([h * (rate[:, 1] - y / COUNTS), -h * (rate[:, 0] + x / COUNTS), np.zeros(len(t))], axis=1)
-    std = np.tile([VELOCITY_STD, VELOCITY_STD, np.inf], (len(t), 1))
-    return replace(flight, velocity=Velocity(t, v, std))
-
-
 def only(flight, names):
     """The flight with no other aids than those of these names."""
     return flight.without(*(name for name in AIDS if name not in names))
 
 
-def flow(flights, config):
-    """What diagnose finds in the velocity of `with_flow`, and the table of `worth` with it."""
+def velocity(flights, config):
+    """Table of the noise of the velocity, and of what diagnose finds in it."""
     print("| flight | noise x, y [m/s] | found |\n|---|---|---|")
     for flight in flights:
         error = residuals(flight, GroundTruth(), EffectSet())["velocity"].residual
@@ -98,8 +77,6 @@ def flow(flights, config):
         found = attribute([flight], GroundTruth(), kinds=kinds, undeclared=False).effects
         words = "; ".join(f"{e.name} {', '.join(f'{k} {v:.3g}' for k, v in e.values.items())}" for e in found)
         print(f"| {flight.name} | {spread[0]:.3f}, {spread[1]:.3f} | {words or 'nothing'} |")
-    print()
-    _worth(flights, config, FLOW_SETS)
 
 
 def worth(flights, config):
@@ -154,22 +131,37 @@ def _worth(flights, config, sets):
 
 
 def faults(flights, config):
-    """Table of the 3D RMSE with a faulty aid over that without the aid: one row per fault."""
-    print("| fault | mean 3D without | sound | faulty | largest faulty / without |\n|---|---:|---:|---:|---:|")
+    """Table of the 3D RMSE with a faulty aid over that without the aid, and of the flights in which the status of ekf_node
+    would name the aid: one row per fault."""
+    print("| fault | mean 3D without | sound | faulty | largest faulty / without | named | sound, named |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
     plain = [evaluate(only(flight, ()), config)[0] for flight in flights]
     for name, (aid, from_start, change) in FAULTS.items():
-        rows = []
+        rows, named = [], []
         for flight, none in zip(flights, plain):
             begin = airborne(flight.truth)[0] + (0.0 if from_start else ONSET)
             sound = only(flight, (aid,))
             faulty = replace(sound, **{aid: change(getattr(sound, aid), begin)})
-            scores = none, *(evaluate(each, config)[0] for each in (sound, faulty))
+            scores, runs = zip((none, None), *(evaluate(each, config) for each in (sound, faulty)))
             rows.append([_rmse(score, begin) for score in scores])
+            named.append([is_named(each, aid, run) for each, run in zip((sound, faulty), runs[1:])])
         rows = np.array(rows)
         without, with_sound, with_faulty = rows.mean(axis=0)
         worst = int(np.argmax(rows[:, 2] / rows[:, 0]))
         ratio = rows[worst, 2] / rows[worst, 0]
-        print(f"| {name} | {without:.3f} | {with_sound:.3f} | {with_faulty:.3f} | {ratio:.2f} ({flights[worst].name}) |")
+        calm, told = np.sum(named, axis=0)
+        means = f"{without:.3f} | {with_sound:.3f} | {with_faulty:.3f}"
+        print(f"| {name} | {means} | {ratio:.2f} ({flights[worst].name}) | {told} of {len(named)} | {calm} |")
+
+
+def is_named(flight, aid, run):
+    """Whether, for two seconds of a Run, most messages of an aid contradict everything else or are invalid."""
+    second = (getattr(flight, aid).t - flight.tdoa.t[0]).astype(int)
+    unused = np.isin(run.aids[aid]["verdict"], NAMED)
+    first = second.min()
+    count, bad = np.bincount(second - first), np.bincount(second - first, unused)
+    most = bad > LARGEST_UNUSED * count
+    return bool(np.any(most[1:] & most[:-1]))
 
 
 def _rmse(score, begin):

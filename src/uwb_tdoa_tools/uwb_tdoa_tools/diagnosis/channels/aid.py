@@ -45,7 +45,9 @@ class AidResidual(ChannelResidual):
         return self._free(values.transpose(1, 0, 2).reshape(-1, len(keys))[self._known])
 
     def series(self):
-        return {f"{label} [{self.unit}]": (self.samples.t, self.residual[:, k]) for k, label in enumerate(self.labels)}
+        columns = {f"{label} [{self.unit}]": self.residual[:, k] for k, label in enumerate(self.labels)}
+        measured = {label: np.isfinite(column) for label, column in columns.items()}  # optical flow tells no vertical velocity
+        return {label: (self.samples.t[m], columns[label][m]) for label, m in measured.items() if m.any()}
 
     def _free(self, values):
         return values - values.mean(axis=0) if self.floating else values
