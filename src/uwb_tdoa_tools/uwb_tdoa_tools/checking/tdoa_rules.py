@@ -41,10 +41,15 @@ class Trial:
     finding: object
 
 
+def in_metres(case):
+    """Whether the TDOAs scatter as metres do. (In nanoseconds those of a quiet radio do, too.)"""
+    return NOISE[0] <= successive(case.tdoa) <= NOISE[1]
+
+
 def units(case):
     """In metres? The noise of the radio is known, and that a motion explains most of it. Yields (Finding, Case)."""
     noise = successive(case.tdoa)
-    if not noise > 0.0 or (NOISE[0] <= noise <= NOISE[1] and case.part(LONG).unexplained().mean < WELL):
+    if not noise > 0.0 or (in_metres(case) and case.part(LONG).unexplained().mean < WELL):
         return
     near = sorted(UNITS.items(), key=lambda unit: abs(np.log(unit[1] * noise / USUAL)))[:2]
     (name, scale), (other, its) = near
@@ -211,19 +216,23 @@ def gained(fit):
 
 
 def best(case, others=()):
-    """(Finding, Case with it undone), or (None, case): of all that can be tried, what explains the most, if it is certain."""
-    for found in units(case):
-        return found
+    """(Finding, Case with it undone), or (None, case): of all that can be tried, what explains the most, if it is certain.
+
+    Smaller TDOAs are always explained better: another unit is believed at once where the noise speaks against metres,
+    and else only where nothing different helps."""
+    if not in_metres(case):
+        for found in units(case):
+            return found
     base, trials = case.part(LONG).unexplained(), []
     for rule in (sign, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
         for trial in rule(case):
             ratio, z = compare(base, trial.case.part(LONG).unexplained())
             if ratio < RATIO and z > DEVIATIONS:
                 trials.append((ratio, z, trial))
-    if not trials:
-        return None, case
-    ratio, z, trial = min(trials, key=lambda entry: entry[0])
-    return trial.finding(ratio, z), trial.case
+    if trials:
+        ratio, z, trial = min(trials, key=lambda entry: entry[0])
+        return trial.finding(ratio, z), trial.case
+    return next(units(case), (None, case))
 
 
 def _says(rule, cause, line):

@@ -16,7 +16,7 @@ DESCRIPTION = """Check recordings against a survey, before anything else.
 
 Finds what a driver, a survey or a clock may have got wrong: sign and unit of the TDOAs, ids of the anchors, the survey of another
 room, units and axes of the IMU, stamps, rates, repeats, two senders, frames. Each finding has its evidence, and a line to copy.
-Ground truth is not needed, and not used.
+Where --survey is a folder, the survey that fits is named, too. Ground truth is not needed, and not used.
 
 Exit code: 0 nothing is wrong (there may be warnings), 1 there are errors, 2 bad input."""
 
@@ -33,7 +33,7 @@ def parser():
         DESCRIPTION,
         "check flight.bag",
         "check 0425-traj2 --survey anchor_0425.txt",
-        "check flights/ --survey surveys/                       # says which survey fits, where another does",
+        "check flights/ --survey surveys/",
         "check flight.bag --survey surveyed_again.yaml --json findings.json",
         "check tags.bag --topic uwb/tdoa=/tag1/tdoa --topic imu/data=/tag1/imu",
     )
