@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.checking import tdoa_rules
-from uwb_tdoa_tools.checking.case import Case
+from uwb_tdoa_tools.checking.case import LONG, Case
+from uwb_tdoa_tools.checking.survey_fit import SPREAD, spread
 
 from checking_flights import recording
 
@@ -16,6 +17,7 @@ def healthy():
     return Case.of(recording())
 
 
+@pytest.mark.slow
 def test_nothing_is_better_than_what_is_right(healthy):
     shifted = Anchors(healthy.anchors.ids, healthy.anchors.positions * 1.3, healthy.anchors.orientations)
     finding, same = tdoa_rules.best(healthy, [("other.yaml", shifted)])
@@ -37,6 +39,7 @@ def test_a_unit_is_undone(healthy, scale, unit):
     assert np.allclose(undone.tdoa.d, healthy.tdoa.d)
 
 
+@pytest.mark.slow
 def test_swapped_ids_are_undone(healthy):
     one, two = healthy.anchors.ids[[2, 5]].tolist()
     swapped = tdoa_rules._relabelled(healthy, {one: two, two: one})
@@ -77,3 +80,21 @@ def test_the_part_that_is_tried_is_where_the_tag_moves():
         and part.tdoa.t[-1] - part.tdoa.t[0] == pytest.approx(14.0, abs=0.1)
     )
     assert still.part(200.0) is still
+
+
+def test_ids_are_not_tried_where_the_tag_stands():
+    hovering = Case.of(recording(10, trajectory="hover"))
+    assert spread(tdoa_rules.survey_fit(hovering).places) < SPREAD
+    assert list(tdoa_rules.swapped(hovering)) == []
+
+
+@pytest.mark.parametrize("gain, believed", [(0.5, True), (2.0, False)])
+def test_what_systematic_errors_could_explain_is_no_evidence(healthy, monkeypatch, gain, believed):
+    """The same trial, judged where systematic errors are said to be small, and where they are said to be large."""
+    flipped = tdoa_rules._flipped(healthy, np.ones(len(healthy.tdoa), dtype=bool))
+    least = gain * (flipped.part(LONG).unexplained().mean - healthy.part(LONG).unexplained().mean)
+    monkeypatch.setattr(tdoa_rules, "BY_ERRORS", least)
+    for rule in ("swapped", "contrary", "moved", "units"):
+        monkeypatch.setattr(tdoa_rules, rule, lambda *_: iter(()))
+    finding, _ = tdoa_rules.best(flipped)
+    assert (finding is not None and finding.rule == "tdoa_sign") == believed

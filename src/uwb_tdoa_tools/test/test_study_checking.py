@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.study import main
 from uwb_tdoa_tools.readers import read_survey
@@ -14,6 +15,7 @@ from uwb_tdoa_tools.studies.checking.mistakes import MISTAKES
 from checking_flights import QUICK, recording
 
 
+@pytest.mark.slow
 def test_mistakes_are_put_in_and_named(tmp_path, capsys):
     (tmp_path / "flights").mkdir()
     flight = simulate(SimulationConfig(seed=0, **QUICK))

@@ -34,7 +34,8 @@ from .mcap import Damaged
 from .message_types import check_type, typestore
 
 __all__ = [
-    "Names", "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry", "write_bag",
+    "Names", "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry",
+    "write_bag",
 ]  # fmt: skip
 
 _AIDS = {  # topic and field of Flight: its type, messages of it, a row of a message, what may be in rows, it of rows

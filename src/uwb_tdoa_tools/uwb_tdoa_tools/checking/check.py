@@ -151,7 +151,8 @@ def _facts(recording, streams):
 
 
 def different_surveys(recordings):
-    """Findings about Recordings whose surveys differ: anchors of one id that are elsewhere. Their flights do not belong together."""
+    """Findings about Recordings whose surveys differ: anchors of one id that are elsewhere. Their flights do not belong
+    together."""
     for one, two in zip(recordings, recordings[1:]):
         off = furthest(one.anchors, two.anchors)
         if off > SAME:

@@ -6,18 +6,19 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from .streams import NOTE, WARNING, Finding
+from .survey_fit import SPREAD, spread
 
 RARE = 0.2  # of what the anchors are heard in the middle; healthy 0.54 at least
 SILENT = 5.0  # s for which an anchor that is heard otherwise is not
 FLAT = 0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
 OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the box of the anchors
-MOVED = 0.5  # m between places of the tag, below which next to nothing can be tried
 SHORT = 10.0  # s
 
 
 @dataclass(frozen=True)
 class View:
-    """anchors : Anchors; windows : [TdoaWindow]; places (k, 3) m, where the tag was located, none if that was not tried."""
+    """anchors : Anchors; windows : [TdoaWindow]; places (k, 3) m, where the tag was located, none if that was not
+    tried."""
 
     anchors: Anchors
     windows: list
@@ -123,10 +124,10 @@ def still(view):
     """A recording of which little can be learned."""
     if not len(view.places):
         return
-    moved = float(np.linalg.norm(np.subtract(*np.percentile(view.places, [90.0, 10.0], axis=0))))
+    moved = spread(view.places)
     duration = view.windows[-1].stamps.end - view.windows[0].stamps.begin
-    if duration < SHORT or moved < MOVED:
-        evidence = f"{duration:.0f} s, {moved:.1f} m of motion"
+    if duration < SHORT or moved < SPREAD:
+        evidence = f"{duration:.0f} s, {moved:.2f} m (rms) off a straight line"
         remedy = "record a minute in which the tag is carried through the whole room, turned, lifted and lowered"
         yield Finding(
             "little_motion",

@@ -1,7 +1,7 @@
 """How well can any motion explain a stream of TDOAs? A filter without inertial sensor says so by its innovations.
 
-Two hypotheses about one stream, e.g. that its signs are right or all wrong, are compared by what they leave unexplained, block by
-block: systematic errors disturb both alike, so that their difference tells more than either.
+Two hypotheses about one stream, e.g. that its signs are right or all wrong, are compared by what they leave
+unexplained, block by block: systematic errors disturb both alike, so that their difference tells more than either.
 """
 
 from dataclasses import dataclass
@@ -49,8 +49,8 @@ class Unexplained:
 
 
 def compare(one, other):
-    """(ratio, z): the mean loss of Unexplained `other` over that of `one`, and by how many standard errors `other` leaves less
-    unexplained; over the blocks that both have. (NaN, 0) with fewer than four of them."""
+    """(ratio, z): the mean loss of Unexplained `other` over that of `one`, and by how many standard errors `other`
+    leaves less unexplained; over the blocks that both have. (NaN, 0) with fewer than four of them."""
     both = one.blocks.keys() & other.blocks.keys()
     if len(both) < LEAST:
         return math.nan, 0.0

@@ -1,8 +1,8 @@
-"""Does the inertial sensor fit the TDOAs? Its axes are tried in every arrangement, its rates in other units: a filter that leans
-on the sensor says by its innovations what fits.
+"""Does the inertial sensor fit the TDOAs? Its axes are tried in every arrangement, its rates in other units: a filter
+that leans on the sensor says by its innovations what fits.
 
-What turns both sensors about the vertical cannot be seen, for nobody told the yaw; nor can a sign about an axis about which
-the tag did not turn.
+What turns both sensors about the vertical cannot be seen, for nobody told the yaw; nor can a sign about an axis about
+which the tag did not turn.
 """
 
 from dataclasses import replace
@@ -16,11 +16,8 @@ from .streams import ERROR, Finding
 from .explain import Unexplained, compare
 from uwb_tdoa_ekf.offline import run_offline
 
-PART, BRIEF, RATE = (
-    30.0,
-    14.0,
-    200.0,
-)  # s that are tried, to be sure and to choose; Hz to which the samples are averaged
+# s that are tried, to be sure and to choose; Hz to which the samples are averaged
+PART, BRIEF, RATE = 30.0, 14.0, 200.0
 SLOWEST = 50.0  # Hz; of fewer samples nothing is alleged
 # The filter leans on the IMU: TDOAs count for little, and the bias of the accelerometer may be large.
 LEANING = FilterConfig(tdoa_correlation_length=100.0, initial_accel_bias_std=0.5)
@@ -88,7 +85,8 @@ def _scaled(trials):
 
 
 def _all(case, base):
-    """Trials of all arrangements of the gyroscope against the accelerometer, and its mirror image; the yaw is free anyway."""
+    """Trials of all arrangements of the gyroscope against the accelerometer, and its mirror image; the yaw is free
+    anyway."""
     short = case.part(BRIEF)
     of_short = _unexplained(short)
     arrangements = []

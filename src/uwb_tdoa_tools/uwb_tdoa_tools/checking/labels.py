@@ -1,4 +1,5 @@
-"""What the messages of a bag say about themselves: frames, topics, anchors. A rule takes a Recording and yields Findings."""
+"""What the messages of a bag say about themselves: frames, topics, anchors. A rule takes a Recording and yields
+Findings."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,7 +25,8 @@ def frames(recording):
 def _frame(topic, frame, known):
     if known is None:
         cause = f"{topic} is in the frame {frame}, and nothing says how that sits on {BODY}"
-        line = f"ros2 run tf2_ros static_transform_publisher --frame-id {BODY} --child-frame-id {frame} --roll 0 --pitch 0 --yaw 0"
+        line = f"ros2 run tf2_ros static_transform_publisher --frame-id {BODY} --child-frame-id {frame}"
+        line += " --roll 0 --pitch 0 --yaw 0"
         yield Finding("frame_unknown", WARNING, cause, f"no transform to {frame} in /tf_static", line, np.nan)
         return
     parent, q, shift = known
@@ -32,7 +34,8 @@ def _frame(topic, frame, known):
     if parent.split("/")[-1] == BODY and angle < TURNED and np.linalg.norm(shift) < SHIFTED:
         return
     roll, pitch, yaw = Rotation.from_quat(q).as_euler("xyz", degrees=True)
-    evidence = f"roll {roll:.0f}, pitch {pitch:.0f}, yaw {yaw:.0f} degrees and ({shift[0]:.2f}, {shift[1]:.2f}, {shift[2]:.2f}) m from {parent}"
+    evidence = f"roll {roll:.0f}, pitch {pitch:.0f}, yaw {yaw:.0f} degrees and "
+    evidence += f"({shift[0]:.2f}, {shift[1]:.2f}, {shift[2]:.2f}) m from {parent}"
     line = f"samples = Rotation.from_quat({[round(v, 4) for v in q]}).apply(samples)  # and frame_id {BODY}"
     yield Finding(
         "frame_turned",

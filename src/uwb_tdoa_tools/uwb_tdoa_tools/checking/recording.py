@@ -49,7 +49,8 @@ class Recording:
 
 
 def read_recording(reading, path, survey=None):
-    """Recording of a log, a CSV file or a bag, as a Reading says; survey : path of a survey, or None. Raises InputError."""
+    """Recording of a log, a CSV file or a bag, as a Reading says; survey : path of a survey, or None. Raises
+    InputError."""
     if is_bag(path):
         return _read_bag(reading, Path(path), survey)
     return of_flight(reading.read((path, survey)))

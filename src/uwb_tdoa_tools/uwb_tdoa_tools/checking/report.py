@@ -35,7 +35,8 @@ def lines(finding):
 
 
 def as_dict(reports, together):
-    """For JSON: {"recordings": [{"recording", "facts", "findings"}], "together": [findings about several recordings]}."""
+    """For JSON: {"recordings": [{"recording", "facts", "findings"}], "together": [findings about several
+    recordings]}."""
     return {
         "recordings": [
             {"recording": r.recording, "facts": r.facts, "findings": [_finding(f) for f in r.findings]} for r in reports

@@ -1,6 +1,7 @@
 """Where would the anchors have to be? Positions of tag and anchors together, from windows of TDOAs and nothing else.
 
-Systematic errors move the anchors by some decimetres too; only what moving them explains beyond that speaks against a survey.
+Systematic errors move the anchors by some decimetres too; only what moving them explains beyond that speaks against a
+survey.
 """
 
 import numpy as np
@@ -17,6 +18,7 @@ TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about where it was loca
 STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; TDOAs of a window that count as independent at most
 ROBUST = 0.4  # m, scale of the Geman-McClure weight
 SWEEPS, STEP = 12, 1.0  # Gauss-Newton steps, and the longest of an anchor, m
+SPREAD = 0.3  # m of `spread`; measured flights 0.50 at least, also with ids swapped, a hovering tag 0.16 at most
 
 
 class SurveyFit:
@@ -54,7 +56,8 @@ class SurveyFit:
         return np.array([x[:3] for x in self._start]).reshape(-1, 3)
 
     def solve(self, free=None):
-        """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows; None for all) moved."""
+        """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows; None for all)
+        moved."""
         moved = np.ones(len(self.positions), dtype=bool) if free is None else np.isin(range(len(self.positions)), free)
         free = np.flatnonzero(np.repeat(moved, 3))
         anchors, start = self.positions.copy(), [x.copy() for x in self._start]
@@ -88,11 +91,20 @@ class SurveyFit:
 
 
 def displacement(surveyed, fitted):
-    """(N,) m, how far each anchor has moved, after the best rotation and shift of all of them (Kabsch, Acta Cryst. A 32, 1976)."""
+    """(N,) m, how far each anchor has moved, after the best rotation and shift of all of them (Kabsch, Acta Cryst. A
+    32, 1976)."""
     one, two = surveyed - surveyed.mean(axis=0), fitted - fitted.mean(axis=0)
     U, _, V = np.linalg.svd(two.T @ one)
     turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
     return np.linalg.norm(two @ turn - one, axis=1)
+
+
+def spread(places):
+    """m by which places of a tag (k, 3) are off the straight line that fits them best (second largest standard
+    deviation): a tag that stands, or moves along one line, does not tell one anchor from its mirror image."""
+    if not len(places):
+        return 0.0
+    return float(np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places)))
 
 
 def _residual(x, window, anchors):

@@ -1,5 +1,5 @@
-"""What is wrong with all TDOAs, or with the ids of the anchors? Found by what fits: each mistake is undone, and the recording
-says whether more of it is explained then.
+"""What is wrong with all TDOAs, or with the ids of the anchors? Found by what fits: each mistake is undone, and the
+recording says whether more of it is explained then.
 
 A rule takes a Case and yields Trials: the case with one mistake undone, and the Finding if that was it.
 """
@@ -12,11 +12,11 @@ import numpy as np
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.config import FilterConfig
 from .streams import ERROR, Finding
-from .explain import compare
+from .explain import SCALE, compare
 from uwb_tdoa_ekf.offline import run_offline
 
 from .case import LONG, SHORT, Case
-from .survey_fit import SurveyFit
+from .survey_fit import SPREAD, SurveyFit, spread
 
 RATIO, DEVIATIONS = 0.93, 2.5  # of what stays unexplained; healthy recordings: 1.02 at least for anything that is tried
 UNITS = {  # m in one
@@ -25,7 +25,8 @@ UNITS = {  # m in one
 }  # fmt: skip
 NOISE, USUAL = (0.02, 0.2), 0.063  # m, median difference of successive TDOAs of a pair; healthy 0.047 - 0.084
 WELL = 0.4  # of the loss; healthy 0.31 at most
-GAIN, CLEAR_GAIN, CLEAR_RATIO = 0.08, 0.03, 0.5  # of the loss by moving anchors; healthy 0.071, or to 0.57, at most
+BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # of the loss: what systematic errors of 0.1 m leave unexplained
+GAIN = 0.08  # of the loss by moving all anchors; healthy 0.071 at most, with 0.3 m of delay of one of them, too
 ALONE = 0.85  # share of the gain that one anchor explains
 FEWEST = 10  # windows in which the tag was located
 CONTRARY, FAR = 0.7, 0.5  # share of a pair's TDOAs that fit the other sign, of those longer than that, m
@@ -35,10 +36,12 @@ SAME = 0.2  # m at most between the places of an anchor in two surveys of one in
 
 @dataclass(frozen=True)
 class Trial:
-    """case : Case with a mistake undone; finding : callable of the ratio, its standard errors -> Finding."""
+    """case : Case with a mistake undone; finding : callable of the ratio, its standard errors -> Finding; share : of
+    the TDOAs that it changes."""
 
     case: Case
     finding: object
+    share: float = 1.0
 
 
 def in_metres(case):
@@ -56,8 +59,8 @@ def units(case):
     trial = case.with_tdoa(d=case.tdoa.d * scale)
     if not NOISE[0] <= scale * noise <= NOISE[1] or not trial.part(LONG).unexplained().mean < WELL:
         return
-    evidence = f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, {its * noise:.2g} m as {other}; "
-    evidence += "radios have 0.05 - 0.1 m"
+    evidence = f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
+    evidence += f"{its * noise:.2g} m as {other}; radios have 0.05 - 0.1 m"
     line = f"message.distance_difference *= {scale:.10g}"
     yield Finding("tdoa_unit", ERROR, f"TDOAs are in {name}, not in metres", evidence, line, scale), trial
 
@@ -110,12 +113,16 @@ def renumbered(case):
     table = dict(zip(heard.tolist(), known.tolist()))
     shift = heard[0] - known[0]
     line = f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]"
-    cause = f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} is {known[0]} ... {known[-1]} there"
+    cause = f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} "
+    cause += f"is {known[0]} ... {known[-1]} there"
     yield Trial(_relabelled(case, table), _says("ids_renumbered", cause, line))
 
 
 def swapped(case):
-    """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more is explained."""
+    """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more is explained.
+    Not along a line: in a room that is symmetrical about it, anchors differ by their systematic errors alone."""
+    if spread(survey_fit(case).places) < SPREAD:
+        return
     table, trial, brief = {}, case, case.part(SHORT)
     ids = np.intersect1d(case.anchors.ids, np.r_[case.tdoa.a, case.tdoa.b]).tolist()
     for _ in range(len(ids) - 1):
@@ -130,8 +137,8 @@ def swapped(case):
         table = {i: swap.get(table.get(i, i), table.get(i, i)) for i in ids}
         table = {i: k for i, k in table.items() if i != k}
         brief, trial = _relabelled(brief, swap), _relabelled(trial, swap)
-    if not table:
-        return
+    if not table or (len(table) > 2 and gained(survey_fit(trial)) is not None):
+        return  # a survey of another room is explained better by exchanging many ids, and still does not fit
     names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
     cause = "the ids of two anchors are swapped" if len(table) == 2 else "the ids of anchors are mixed up"
     yield Trial(
@@ -143,7 +150,8 @@ def swapped(case):
 
 
 def contrary(case):
-    """Single pairs with the other sign: a filter that hardly believes them knows. Or all pairs that name the larger id first."""
+    """Single pairs with the other sign: a filter that hardly believes them knows. Or all pairs that name the larger id
+    first."""
     tdoa = case.tdoa
     pairs = np.unique(np.column_stack([tdoa.a, tdoa.b]), axis=0)
     backward = tdoa.a > tdoa.b
@@ -159,7 +167,7 @@ def contrary(case):
         flip |= (tdoa.a == a) & (tdoa.b == b)
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
     line = f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why"
-    yield Trial(_flipped(case, flip), _says("pair_sign", f"the sign of the pairs {names} is wrong", line))
+    yield Trial(_flipped(case, flip), _says("pair_sign", f"the sign of the pairs {names} is wrong", line), flip.mean())
 
 
 def _contrary(case, pairs):
@@ -193,7 +201,8 @@ def moved(case):
         return
     shift = alone[row][1][row] - fit.positions[row]
     number = int(case.anchors.ids[row])
-    cause = f"anchor {number} is not where the survey has it, but about ({shift[0]:+.1f}, {shift[1]:+.1f}, {shift[2]:+.1f}) m from there"
+    where = ", ".join(f"{s:+.1f}" for s in shift)
+    cause = f"anchor {number} is not where the survey has it, but about ({where}) m from there"
     line = f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
     anchors = Anchors(case.anchors.ids, alone[row][1], case.anchors.orientations, case.anchors.frame)
     yield Trial(replace(case, anchors=anchors), _says("anchor_moved", cause, line))
@@ -210,13 +219,14 @@ def gained(fit):
     """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording."""
     if len(fit) < FEWEST:
         return None
-    left, _ = fit.solve()
-    gain = fit.before - left
-    return gain if gain > GAIN or (gain > CLEAR_GAIN and left < CLEAR_RATIO * fit.before) else None
+    gain = fit.before - fit.solve()[0]
+    return gain if gain > GAIN else None
 
 
 def best(case, others=()):
-    """(Finding, Case with it undone), or (None, case): of all that can be tried, what explains the most, if it is certain.
+    """(Finding, Case with it undone), or (None, case): of all that can be tried, what explains the most, if it is
+    certain, and more than systematic errors could: along a line, in a room that is symmetrical about it, swapped ids
+    differ by these alone.
 
     Smaller TDOAs are always explained better: another unit is believed at once where the noise speaks against metres,
     and else only where nothing different helps."""
@@ -226,8 +236,9 @@ def best(case, others=()):
     base, trials = case.part(LONG).unexplained(), []
     for rule in (sign, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
         for trial in rule(case):
-            ratio, z = compare(base, trial.case.part(LONG).unexplained())
-            if ratio < RATIO and z > DEVIATIONS:
+            other = trial.case.part(LONG).unexplained()
+            ratio, z = compare(base, other)
+            if ratio < RATIO and z > DEVIATIONS and base.mean - other.mean > BY_ERRORS * trial.share:
                 trials.append((ratio, z, trial))
     if trials:
         ratio, z, trial = min(trials, key=lambda entry: entry[0])

@@ -14,9 +14,10 @@ from ..readers import read_survey
 
 DESCRIPTION = """Check recordings against a survey, before anything else.
 
-Finds what a driver, a survey or a clock may have got wrong: sign and unit of the TDOAs, ids of the anchors, the survey of another
-room, units and axes of the IMU, stamps, rates, repeats, two senders, frames. Each finding has its evidence, and a line to copy.
-Where --survey is a folder, the survey that fits is named, too. Ground truth is not needed, and not used.
+Finds what a driver, a survey or a clock may have got wrong: sign and unit of the TDOAs, ids of the anchors, the survey
+of another room, units and axes of the IMU, stamps, rates, repeats, two senders, frames. Each finding has its evidence,
+and a line to copy. Where --survey is a folder, the survey that fits is named, too. Ground truth is not needed, and not
+used.
 
 Exit code: 0 nothing is wrong (there may be warnings), 1 there are errors, 2 bad input."""
 

@@ -2,18 +2,15 @@
 
 from dataclasses import dataclass
 
-ERROR, WARNING, NOTE = (
-    "error",
-    "warning",
-    "note",
-)  # the estimate is wrong; it may be worse than it could be; good to know
+# the estimate is wrong; it may be worse than it could be; good to know
+ERROR, WARNING, NOTE = "error", "warning", "note"
 SEVERITIES = (ERROR, WARNING, NOTE)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """rule : its name, for machines; severity : of SEVERITIES; cause : what is wrong, a clause; evidence : the numbers that
-    show it; remedy : a line to copy; value : the number that decided, in SI units."""
+    """rule : its name, for machines; severity : of SEVERITIES; cause : what is wrong, a clause; evidence : the numbers
+    that show it; remedy : a line to copy; value : the number that decided, in SI units."""
 
     rule: str
     severity: str

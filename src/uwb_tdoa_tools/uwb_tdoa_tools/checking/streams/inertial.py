@@ -31,8 +31,8 @@ class ImuWindow(NamedTuple):
 
     mean, deviation, vibration (6,) : of gyroscope x y z and accelerometer x y z; vibration is the rms of what is
     faster than VIBRATION_CORNER; still (6,) : share of samples that equal the one before, per channel;
-    repeated : share of samples in which all six do; clipped (6,) : samples at the same far end of what the channel showed,
-    and limit (6,) that end; invalid : share of samples that are no numbers.
+    repeated : share of samples in which all six do; clipped (6,) : samples at the same far end of what the channel
+    showed, and limit (6,) that end; invalid : share of samples that are no numbers.
     """
 
     stamps: StampWindow
@@ -104,7 +104,8 @@ def note_imu(counters, t, arrival, wx, wy, wz, fx, fy, fz, length):
 
 @compiled
 def feed_imu(counters, t, arrival, gyro, force, first, length):
-    """`note_imu` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it is)."""
+    """`note_imu` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it
+    is)."""
     for i in range(first, len(t)):
         w, f = gyro[i], force[i]
         if note_imu(counters, t[i], arrival[i], w[0], w[1], w[2], f[0], f[1], f[2], length):

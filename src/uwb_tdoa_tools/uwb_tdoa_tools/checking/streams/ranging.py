@@ -24,8 +24,8 @@ GRID = 15
 
 
 class TdoaCounters(NamedTuple):
-    """stamps : see stamps.py; counts; heard (N,) per anchor; d, before, t (N, N) : last value, the one before and the last stamp
-    of each pair, which outlive a window; baseline (N, N) : m."""
+    """stamps : see stamps.py; counts; heard (N,) per anchor; d, before, t (N, N) : last value, the one before and the
+    last stamp of each pair, which outlive a window; baseline (N, N) : m."""
 
     stamps: np.ndarray
     counts: np.ndarray
@@ -39,13 +39,13 @@ class TdoaCounters(NamedTuple):
 class TdoaWindow(NamedTuple):
     """One window of TDOAs. Counts, unless it says otherwise.
 
-    known : finite and between two known anchors; unknown : with an anchor that the survey does not have; of_one : of one
-    anchor with itself; invalid : no number; impossible : longer than the anchors are apart; duplicates : same pair, stamp and
-    value as the one before of its pair; successive : that follow one of their pair within FOLLOWING; repeated : of those, with
-    the same value; leaps : of those, by more than LEAP; returns : leaps that go back to the value before; opposed : pairs that came in both orders, one soon after the other; even : of
-    those, with the same sign in both; size : mean |d|, m; ceiling, hits : largest |d|, m, and how many have it; grids (7,) :
-    share of the values on multiples of GRIDS;
-    heard (N,) : TDOAs in which an anchor takes part.
+    known : finite and between two known anchors; unknown : with an anchor that the survey does not have; of_one : of
+    one anchor with itself; invalid : no number; impossible : longer than the anchors are apart; duplicates : same pair,
+    stamp and value as the one before of its pair; successive : that follow one of their pair within FOLLOWING; repeated
+    : of those, with the same value; leaps : of those, by more than LEAP; returns : leaps that go back to the value
+    before; opposed : pairs that came in both orders, one soon after the other; even : of those, with the same sign in
+    both; size : mean |d|, m; ceiling, hits : largest |d|, m, and how many have it; grids (7,) : share of the values on
+    multiples of GRIDS; heard (N,) : TDOAs in which an anchor takes part.
     """
 
     stamps: StampWindow
@@ -86,8 +86,8 @@ def restart_tdoa(counters):
 
 @compiled
 def note_tdoa(counters, t, arrival, a, b, d, length):
-    """Take one TDOA: stamp and arrival, s (NaN: not known); a, b rows of its anchors, negative if unknown; d as received.
-    Returns whether the window is complete, `length` s long."""
+    """Take one TDOA: stamp and arrival, s (NaN: not known); a, b rows of its anchors, negative if unknown; d as
+    received. Returns whether the window is complete, `length` s long."""
     note_stamp(counters.stamps, t, arrival)
     _count(counters, t, a, b, d)
     return complete(counters.stamps, length)
@@ -147,7 +147,8 @@ def _compare(counters, t, a, b, d):
 
 @compiled
 def feed_tdoa(counters, t, arrival, a, b, d, first, length):
-    """`note_tdoa` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it is)."""
+    """`note_tdoa` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it
+    is)."""
     for i in range(first, len(t)):
         if note_tdoa(counters, t[i], arrival[i], a[i], b[i], d[i], length):
             return i + 1, True

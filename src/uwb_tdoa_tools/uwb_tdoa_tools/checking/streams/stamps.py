@@ -7,25 +7,23 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-JUMP_LIMIT = (
-    1.0  # s by which a stamp is ahead of what the arrival allows, or behind the newest: no late packet any more
-)
+JUMP_LIMIT = 1.0  # s by which a stamp is ahead of what the arrival allows, or behind the newest: no late packet
 ABSURD = 1e12  # s; no clock says that
 MINIMUM = 10  # messages of a window
 MAXIMUM = 5000  # messages of a window, for streams whose stamps stand still
 
 # places in the counters; the first three outlive a window
-(NEWEST, LAST, LAST_ARRIVAL, COUNT, BEGIN, NOW, FALLS, DEPTH, JUMPS, JUMP, GAP, SAME, ZEROS, STEPS, STEP_SUM, STEP_SQUARES,
- LATENCY_MIN, LATENCY_MAX, ARRIVAL_BEGIN, STAMP_BEGIN) = range(20)  # fmt: skip
+(NEWEST, LAST, LAST_ARRIVAL, COUNT, BEGIN, NOW, FALLS, DEPTH, JUMPS, JUMP, GAP, SAME, ZEROS, STEPS, STEP_SUM,
+ STEP_SQUARES, LATENCY_MIN, LATENCY_MAX, ARRIVAL_BEGIN, STAMP_BEGIN) = range(20)  # fmt: skip
 
 
 class StampWindow(NamedTuple):
     """The stamps of one window of messages, in the order of their arrival.
 
     count : messages; begin, end : s, arrival (or stamp, where the arrival is not known) of the first and the last;
-    falls : messages stamped before the newest, and depth, s, by how much at most; jumps : stamps that leapt by more than
-    JUMP_LIMIT, and jump, s, the farthest; gap : s, longest step forward; same : messages with the stamp of the one before;
-    zeros : stamps of 0; step : s, mean step forward; scatter : standard deviation of the steps over their mean;
+    falls : messages stamped before the newest, and depth, s, by how much at most; jumps : stamps that leapt by more
+    than JUMP_LIMIT, and jump, s, the farthest; gap : s, longest step forward; same : messages with the stamp of the one
+    before; zeros : stamps of 0; step : s, mean step forward; scatter : standard deviation of the steps over their mean;
     latency, spread : s, smallest arrival minus stamp, and largest minus smallest, NaN where the arrival is not known;
     pace : seconds of stamps per second of arrival.
     """

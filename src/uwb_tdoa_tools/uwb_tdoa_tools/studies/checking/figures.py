@@ -1,4 +1,5 @@
-"""Mistakes of drivers, surveys and clocks put into flights, and what `check` says of them; and of the flights as they are."""
+"""Mistakes of drivers, surveys and clocks put into flights, and what `check` says of them; and of the flights as they
+are."""
 
 import json
 from functools import partial
@@ -57,10 +58,11 @@ def _partner(number, found, kinds):
 
 
 def judge_flight(task, reading, surveys, only=None):
-    """[{"flight", "live", "mistake", "said": {rule: severity}, "named": bool}] of one flight: (number, recording, partner).
+    """[{"flight", "live", "mistake", "said": {rule: severity}, "named": bool}] of one flight: (number, recording,
+    partner).
 
-    Every other flight is judged as a bag recorded live, with the times at which its messages arrived, the others as a log that
-    knows nothing but stamps."""
+    Every other flight is judged as a bag recorded live, with the times at which its messages arrived, the others as a
+    log that knows nothing but stamps."""
     number, recording, partner = task
     flight = of_flight(reading.read(recording))
     other = of_flight(reading.read(partner)) if partner else None
@@ -95,7 +97,8 @@ def _possible(mistake, flight, other, rooms):
 
 
 def table(rows):
-    """Markdown: a line for each mistake, with how often it was named, and what was said besides that is not said without it."""
+    """Markdown: a line for each mistake, with how often it was named, and what was said besides that is not said
+    without it."""
     lines = ["| mistake | named | flights | what else was said |", "| --- | ---: | ---: | --- |"]
     for name in dict.fromkeys(row["mistake"] for row in rows):
         mine = [row for row in rows if row["mistake"] == name]

@@ -8,7 +8,8 @@ LATENCY, JITTER = 2e-3, 1e-3  # s, of a message on its way, the least and the me
 
 
 def arriving(recording, seed):
-    """The Recording with arrival times: every message a few milliseconds after its stamp, none before the one before it."""
+    """The Recording with arrival times: every message a few milliseconds after its stamp, none before the one before
+    it."""
     rng = np.random.default_rng([seed, 1])
     out = {"tdoa_arrival": _arrival(recording.tdoa.t, rng)}
     if recording.imu is not None:

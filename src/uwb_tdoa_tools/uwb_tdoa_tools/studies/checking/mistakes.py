@@ -1,4 +1,5 @@
-"""Mistakes of drivers, surveys and clocks, put into recordings: what each does to the streams, and by what name it is found."""
+"""Mistakes of drivers, surveys and clocks, put into recordings: what each does to the streams, and by what name it is
+found."""
 
 from dataclasses import dataclass, replace
 
@@ -16,9 +17,9 @@ MISTAKES = {}
 
 @dataclass(frozen=True)
 class Mistake:
-    """text : for the table; named : rules of `check` that name it; needs : "imu", "tdoa3", "rooms" (other surveys) or "";
-    make : callable of (Recording, Generator, other Recording of the same room or None) -> Recording; alone : no other survey may
-    be tried."""
+    """text : for the table; named : rules of `check` that name it; needs : "imu", "tdoa3", "rooms" (other surveys) or
+    ""; make : callable of (Recording, Generator, other Recording of the same room or None) -> Recording; alone : no
+    other survey may be tried."""
 
     text: str
     named: tuple
