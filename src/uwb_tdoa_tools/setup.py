@@ -38,6 +38,7 @@ setup(
     entry_points={
         "console_scripts": [
             "bench = uwb_tdoa_tools.executables:bench",
+            "check = uwb_tdoa_tools.executables:check",
             "convert = uwb_tdoa_tools.executables:convert",
             "debias = uwb_tdoa_tools.executables:debias",
             "demo = uwb_tdoa_tools.executables:demo",

@@ -34,7 +34,8 @@ from .mcap import Damaged
 from .message_types import check_type, typestore
 
 __all__ = [
-    "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry", "write_bag",
+    "Names", "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry",
+    "write_bag",
 ]  # fmt: skip
 
 _AIDS = {  # topic and field of Flight: its type, messages of it, a row of a message, what may be in rows, it of rows
@@ -156,7 +157,7 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):
         connections = _connections(reader)
         about = _about(path)
         meta = {**about["meta"], "bag": str(path)}
-        remarks, name_of = list(reader.remarks), _Names(namespace, topics)
+        remarks, name_of = list(reader.remarks), Names(namespace, topics)
 
         def stream(topic, msgtype, row, make, sound=np.isfinite):
             found = _find(path, connections, name_of(topic), msgtype)
@@ -192,7 +193,7 @@ def read_odometry(path, namespace="", salvage=False, topics=None):
     NaN: that is for who judges it. namespace, salvage, topics : see `read_bag`.
     """
     with open_bag(path, salvage) as reader:
-        topic = _Names(namespace, topics)("odometry")
+        topic = Names(namespace, topics)("odometry")
         names = _connections(reader)
         found = _find(path, names, topic, "nav_msgs/msg/Odometry")
         t, rows, _ = _table(path, reader, found, bag_messages.odometry_row)
@@ -210,7 +211,7 @@ def late_tdoas(path, namespace="", salvage=False, topics=None):
     """How many TDOAs came too late for the filter that made the odometry of a bag, by the uwb/residual beside it.
 
     0 where that was not recorded. Arguments as of `read_odometry`. Raises InputError."""
-    beside = _Names(namespace, topics)("odometry").rpartition("/")[0]
+    beside = Names(namespace, topics)("odometry").rpartition("/")[0]
     with open_bag(path, salvage) as reader:
         found = _find(path, _connections(reader), f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual")
         residuals = (deserialize(path, c, data) for c, _, data in messages(path, reader, found))
@@ -224,7 +225,7 @@ def read_fields(path, topic, namespace=""):
     stamps; raises InputError.
     """
     with open_bag(path) as reader:
-        topic = _Names(namespace)(topic)
+        topic = Names(namespace)(topic)
         found = _find(path, _connections(reader), topic)
         if not found:
             raise InputError(f"{path}: has no topic {topic}; record it.")
@@ -269,13 +270,15 @@ def _not_finite(path, topic, stamps, rows, sound):
     )
 
 
-class _Names:
+class Names:
     """Absolute names of our topics in a bag."""
 
     def __init__(self, namespace="", topics=None):
+        """namespace, topics : see `read_bag`."""
         self._namespace, self._topics = namespace.strip("/"), topics or {}
 
     def __call__(self, topic):
+        """Where a topic of ours is, e.g. "uwb/tdoa"."""
         name = self._topics.get(topic, topic)
         absolute = name.startswith("/") or not self._namespace
         return f"/{name.strip('/')}" if absolute else f"/{self._namespace}/{name.strip('/')}"

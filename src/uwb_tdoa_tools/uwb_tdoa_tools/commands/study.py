@@ -5,12 +5,14 @@ import sys
 
 from .. import cli
 from ..studies import aids
+from ..studies.checking import figures as checking
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
 from ..studies.training import compare, default, spin
 
 STUDIES = {
     "aids": aids,
+    "checking": checking,
     "compare-models": compare,
     "debias-measured": measured,
     "debias-set-up": set_up,
@@ -22,6 +24,7 @@ DESCRIPTION = """Make the figures of the documentation anew. Nothing here is nee
 of measured flights: flights/, util/, surveys/.
 
   aids             height, pressure and velocity on measured flights, and their faults (docs/aids.md)
+  checking         mistakes put into flights, and what check says of them (docs/connect.md)
   compare-models   bias models side by side on flights that took no part in training (docs/bias.md)
   debias-measured  bias maps of positions on measured flights (docs/debiasing.md)
   debias-set-up    a simulated copy of the set-up of Grasso et al. (docs/debiasing.md)
@@ -42,6 +45,7 @@ def parser():
         "study",
         DESCRIPTION,
         "study aids worth DATA/flights/0425 --survey DATA/surveys",
+        "study checking DATA/flights DATA/util --survey DATA/surveys --only nothing",
         "study compare-models --train DATA/flights/0425 --test 0426 DATA/flights/0426 --survey DATA/surveys --out out/",
         "study compare-models --simulated 20 --out out/",
         "study debias-measured --data DATA --diagnosed bench/ --out measured/",

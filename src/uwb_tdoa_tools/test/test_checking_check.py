@@ -1,0 +1,111 @@
+"""What `check` says of whole recordings: nothing of healthy ones, and the mistake where there is one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from uwb_tdoa_tools.checking.check import check, different_surveys, upright
+from uwb_tdoa_tools.checking.recording import of_flight
+from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.simulation.constellations import constellation
+from uwb_tdoa_tools.studies.checking.mistakes import MISTAKES
+
+from checking_flights import QUICK, recording
+
+OTHER_ROOM = constellation("random-5")
+NOTHING_TRIED = ["stamp_zero", "clipped", "jump"]  # with these, nothing but the streams themselves is judged
+HARMLESS = "clipped_accel"  # nothing is cut off in a smooth simulated flight
+
+
+def rules(report):
+    return {finding.rule for finding in report.findings}
+
+
+def with_mistake(name, seed=0):
+    mistake = MISTAKES[name]
+    protocol = "tdoa3" if mistake.needs == "tdoa3" else "tdoa2"
+    healthy = recording(seed, live="live" in mistake.needs, protocol=protocol)
+    other = OTHER_ROOM if mistake.needs == "rooms" else recording(seed + 1, protocol=protocol, trajectory="circle")
+    made = mistake.make(healthy, np.random.default_rng([seed, *name.encode()]), other)
+    others = [] if mistake.alone else [("right.yaml", healthy.anchors), ("wrong.yaml", OTHER_ROOM)]
+    return check(made, others)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["tdoa2", "tdoa3"])
+@pytest.mark.parametrize("live", [False, True])
+def test_nothing_is_said_of_a_healthy_flight(protocol, live):
+    assert check(recording(0, live=live, protocol=protocol)).findings == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trajectory", ["circle", "square", "line_x", "rising_circle", "hover"])
+@pytest.mark.parametrize("room", ["corners", "random-3", "random-8-6"])
+def test_no_error_is_alleged_of_healthy_flights(trajectory, room):
+    for seed in range(2):
+        report = check(recording(seed, trajectory=trajectory, constellation=room), [("other.yaml", OTHER_ROOM)])
+        assert not report.faulty, report.findings
+
+
+@pytest.mark.parametrize("name", NOTHING_TRIED)
+def test_a_mistake_is_named(name):
+    assert rules(with_mistake(name)) & set(MISTAKES[name].named)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in MISTAKES if name not in (*NOTHING_TRIED, HARMLESS)])
+def test_a_mistake_that_takes_trials_is_named(name):
+    report = with_mistake(name)
+    assert rules(report) & set(MISTAKES[name].named), report.findings
+
+
+@pytest.mark.slow
+def test_two_mistakes_at_once_are_both_named():
+    made = MISTAKES["in_g"].make(MISTAKES["sign"].make(recording(), None, None), None, None)
+    assert {"imu_force_unit", "tdoa_sign"} <= rules(check(made))
+
+
+@pytest.mark.slow
+def test_ground_truth_is_not_read():
+    flight = simulate(SimulationConfig(seed=3, **QUICK))
+    wrong = replace(flight, truth=replace(flight.truth, p=flight.truth.p + 100.0))
+    first, second, none = (check(of_flight(f)) for f in (flight, wrong, replace(flight, truth=None, extra={})))
+    assert first == second == none
+
+
+def test_the_errors_come_first():
+    report = with_mistake("three_anchors")
+    severities = [finding.severity for finding in report.findings]
+    assert severities == sorted(severities, key=["error", "warning", "note"].index) and report.faulty
+
+
+def test_recordings_of_two_rooms_do_not_belong_together():
+    one = recording()
+    two = replace(one, anchors=OTHER_ROOM)
+    (finding,) = different_surveys([one, one, two])
+    assert finding.rule == "surveys_differ" and finding.value > 0.1
+    assert list(different_surveys([one, one])) == []
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_what_brings_an_axis_upwards_is_a_rotation(axis, sign):
+    up = sign * 9.81 * np.eye(3)[axis] + 0.3
+    turn = upright(up)
+    assert np.allclose(turn @ turn.T, np.eye(3)) and np.linalg.det(turn) == pytest.approx(1.0)
+    assert (turn @ up)[2] > 9.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["flights/0426/0426-traj5", "util/const3-trial3-tdoa2.csv.gz"])
+def test_measured_flights_and_their_mistakes(shared_data, name):
+    """Two flights that took no part in choosing the limits; the table of all is in docs/connect.md."""
+    ((path, survey),) = inputs.find_flights([shared_data / name], shared_data / "surveys")
+    surveys = [(str(path), read_survey(path)) for path in sorted((shared_data / "surveys").glob("anchor_?*"))]
+    measured = of_flight(read_flight(path, survey))
+    assert check(measured, surveys).findings == []
+    for mistake in ("sign", "swapped", "another_room"):
+        other = dict((p.rsplit("/")[-1], a) for p, a in surveys)["anchor_const1.csv"]
+        made = MISTAKES[mistake].make(measured, np.random.default_rng(1), other)
+        assert rules(check(made, surveys)) & set(MISTAKES[mistake].named)

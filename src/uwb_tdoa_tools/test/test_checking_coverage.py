@@ -1,0 +1,70 @@
+"""What anchors and motion let anybody know."""
+
+import numpy as np
+import pytest
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_tools.checking.streams import StreamRules
+from uwb_tdoa_tools.checking import coverage
+
+BOX = np.array([[x, y, z] for x in (0.0, 6.0) for y in (0.0, 7.0) for z in (0.2, 3.0)])
+PLACES = np.random.default_rng(0).uniform([1.0, 1.0, 0.5], [5.0, 6.0, 2.5], (40, 3))
+
+
+def windows(anchors, heard, seconds=20):
+    """TdoaWindows of 100 TDOAs a second; heard(t, a, b) (n,) bool says which come through."""
+    t = np.arange(0.0, seconds, 0.01)
+    a = np.arange(len(t)) % len(anchors)
+    b = (a + 1) % len(anchors)
+    rows = heard(t, a, b)
+    rules = StreamRules(anchors)
+    rules.feed_tdoa(
+        t[rows], np.full(rows.sum(), np.nan), anchors.ids[a[rows]], anchors.ids[b[rows]], 0.1 * np.sin(t[rows])
+    )
+    rules.finish()
+    return list(rules.tdoa)
+
+
+def said(positions=BOX, places=PLACES, heard=lambda t, a, b: t >= 0.0, seconds=20):
+    anchors = Anchors.from_positions(positions)
+    view = coverage.View(anchors, windows(anchors, heard, seconds), places)
+    return {finding.rule: finding for rule in coverage.RULES for finding in rule(view)}
+
+
+def test_a_room_with_anchors_around_it_is_healthy():
+    assert said() == {}
+
+
+def test_an_anchor_that_is_never_heard():
+    assert "3" in said(heard=lambda t, a, b: (a != 3) & (b != 3))["anchor_missing"].cause
+
+
+def test_an_anchor_that_is_hardly_heard():
+    found = said(heard=lambda t, a, b: ((a != 3) & (b != 3)) | (np.floor(t * 100) % 32 == 3))
+    assert "anchor 3" in found["anchor_rare"].cause and found["anchor_rare"].severity == "note"
+
+
+def test_an_anchor_that_falls_silent():
+    found = said(heard=lambda t, a, b: ((a != 3) & (b != 3)) | (t < 8.0) | (t > 16.0))["anchor_silent"]
+    assert found.value == pytest.approx(8.0, abs=1.0) and "anchor 3" in found.cause
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_anchors_in_a_plane(axis):
+    flat = BOX.copy()
+    flat[:, axis] = 1.0 + 0.01 * np.arange(8)
+    assert "anchors_flat" in said(positions=flat)
+
+
+def test_anchors_with_z_down():
+    assert "survey_z_down" in said(positions=BOX * [1.0, 1.0, -1.0], places=PLACES * [1.0, 1.0, -1.0])
+
+
+def test_a_tag_outside():
+    assert "outside" in said(places=PLACES + [5.0, 0.0, 0.0])
+    assert "outside" not in said(places=PLACES + [0.0, 0.0, 0.2])
+
+
+def test_a_tag_that_does_not_move():
+    assert said(places=PLACES[:1] + 0.01 * PLACES)["little_motion"].severity == "note"
+    assert "little_motion" in said(seconds=5)
+    assert said(places=np.empty((0, 3))) == {}  # it was not tried

@@ -1,0 +1,60 @@
+"""Arrangements of the axes of the IMU, tried on a tag that turns."""
+
+import numpy as np
+import pytest
+from uwb_tdoa_tools.checking import imu_rules
+from uwb_tdoa_tools.checking.case import Case
+
+from checking_flights import recording
+
+
+@pytest.fixture(scope="module")
+def healthy():
+    return Case.of(recording())
+
+
+def test_a_right_imu_is_left_alone(healthy):
+    assert imu_rules.fit(healthy) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", range(3))
+def test_a_sign_of_the_gyroscope(healthy, axis):
+    signs = np.where(np.arange(3) == axis, -1.0, 1.0)
+    finding = imu_rules.fit(healthy.with_imu(gyro=healthy.imu.gyro * signs))
+    assert finding.rule == "imu_axes" and "gyroscope" in finding.cause
+
+
+@pytest.mark.slow
+def test_a_turn_about_the_vertical_cannot_be_seen(healthy):
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = healthy.with_imu(gyro=healthy.imu.gyro @ quarter.T, accel=healthy.imu.accel @ quarter.T)
+    assert imu_rules.fit(turned) is None
+
+
+def test_means_of_samples_keep_rate_and_mean(healthy):
+    thin = imu_rules.averaged(healthy.imu)
+    assert 1.0 / np.median(np.diff(thin.t)) == pytest.approx(imu_rules.RATE, rel=0.01)
+    assert np.allclose(thin.accel.mean(axis=0), healthy.imu.accel.mean(axis=0), atol=1e-2)
+    assert imu_rules.averaged(None) is None
+
+
+@pytest.mark.parametrize(
+    "accel, gyro, words",
+    [
+        (np.eye(3), np.diag([1.0, -1.0, 1.0]), "w.x, w.y, w.z = w.x, -w.y, w.z"),
+        (imu_rules.MIRROR, imu_rules.MIRROR, "a.x, a.y, a.z = a.x, -a.y, a.z; w.x, w.y, w.z = w.x, -w.y, w.z"),
+        (np.eye(3), np.eye(3)[[1, 2, 0]], "w.x, w.y, w.z = w.y, w.z, w.x"),
+    ],
+)
+def test_the_remedy_is_the_matrix_in_words(accel, gyro, words):
+    assert imu_rules._finding(accel, gyro, "", 0.5).remedy == words
+
+
+def test_simple_explanations_come_first():
+    simple = imu_rules._complexity(np.eye(3), np.diag([1.0, -1.0, 1.0]))
+    both, odd = (
+        imu_rules._complexity(imu_rules.MIRROR, imu_rules.MIRROR),
+        imu_rules._complexity(np.eye(3), -np.eye(3)[[1, 2, 0]]),
+    )
+    assert 0.0 == imu_rules._complexity(np.eye(3), np.eye(3)) < simple < both < odd

@@ -1,0 +1,54 @@
+"""Frames, senders, topics and anchors of a bag."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from uwb_tdoa_tools.checking import labels
+from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight
+
+from recordings import ANCHORS, small_flight
+
+
+def said(**changes):
+    made = replace(of_flight(small_flight()), **changes)
+    return {finding.rule: finding for rule in labels.RULES for finding in rule(made)}
+
+
+@pytest.mark.parametrize("frame", ["base_link", "tag1/base_link", ""])
+def test_the_body_frame_is_healthy(frame):
+    assert said(frames={IMU: {frame: 5}, TDOA: {frame: 5}}) == {}
+
+
+def test_a_frame_that_nobody_knows():
+    assert said(frames={IMU: {"imu_link": 5}})["frame_unknown"].severity == "warning"
+
+
+@pytest.mark.parametrize("angle, shift, severity", [(90.0, 0.0, "error"), (0.0, 0.1, "note"), (0.5, 0.0, None)])
+def test_a_frame_that_is_known(angle, shift, severity):
+    q = tuple(Rotation.from_euler("z", angle, degrees=True).as_quat())
+    found = said(frames={IMU: {"imu_link": 5}}, turns={"imu_link": ("base_link", q, (shift, 0.0, 0.0))})
+    assert {name: finding.severity for name, finding in found.items()} == (
+        {"frame_turned": severity} if severity else {}
+    )
+    if angle == 90.0:
+        assert found["frame_turned"].value == pytest.approx(np.pi / 2) and "yaw 90" in found["frame_turned"].evidence
+
+
+def test_two_frames_are_two_senders():
+    assert "senders" in said(frames={TDOA: {"tag1/base_link": 5, "tag2/base_link": 4}})
+
+
+def test_an_imu_on_another_topic():
+    found = said(imu=None, topics={"/uwb/tdoa": "uwb_tdoa_msgs/msg/Tdoa", "/imu/raw": "sensor_msgs/msg/Imu"})
+    assert "/imu/raw:=/imu/data" in found["imu_elsewhere"].remedy
+    assert "imu_missing" in said(imu=None, topics={"/uwb/tdoa": "uwb_tdoa_msgs/msg/Tdoa"})
+    assert said(imu=None) == {}  # a CSV file has no topics
+
+
+def test_other_anchors_in_the_bag():
+    moved = replace(ANCHORS, positions=ANCHORS.positions + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    assert said(recorded=moved)["survey_differs"].value == pytest.approx(1.0)
+    assert said(recorded=ANCHORS) == {}
+    assert "no id in common" in said(recorded=replace(ANCHORS, ids=[7, 8, 9]))["survey_differs"].evidence

@@ -1,0 +1,200 @@
+"""Every rule over the streams: silent where nothing is wrong, and named where it is."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_tools.checking.streams import SEVERITIES, StreamRules
+from uwb_tdoa_tools.simulation.constellations import corners
+
+GRAVITY = 9.81
+ANCHORS = Anchors.from_positions(corners().positions, ids=10 + np.arange(8)[::-1])  # no id is its row
+RADIO = 0.05  # m, noise of a TDOA
+
+
+def streams(seconds=20.0, imu_rate=500.0, tdoa_rate=300.0, seed=0):
+    """Healthy columns: imu (t, arrival, gyro, force) of a tag that sways, tdoa (t, arrival, a, b, d) of the same."""
+    rng = np.random.default_rng(seed)
+    t = 100.0 + np.arange(int(seconds * imu_rate)) / imu_rate
+    gyro = 0.2 * np.sin(np.outer(t, [0.9, 1.1, 0.4])) + 0.02 * rng.normal(size=(len(t), 3))
+    force = 0.5 * np.sin(np.outer(t, [1.1, 0.7, 0.9])) + 0.2 * rng.normal(size=(len(t), 3)) + [0.0, 0.0, GRAVITY]
+    imu = t, _arrival(t, rng), gyro, force
+    t = 100.0 + (np.arange(int(seconds * tdoa_rate)) + rng.uniform(0.1, 0.9, int(seconds * tdoa_rate))) / tdoa_rate
+    a = np.arange(len(t)) % 8
+    b = (a + 1) % 8
+    p = ANCHORS.positions.mean(axis=0) + np.sin(np.outer(t, [0.5, 0.7, 0.3])) * [1.5, 1.5, 0.8]
+    d = tdoa(p, ANCHORS.positions[a], ANCHORS.positions[b]) + RADIO * rng.normal(size=len(t))
+    return imu, (t, _arrival(t, rng), ANCHORS.ids[a], ANCHORS.ids[b], d)
+
+
+def _arrival(t, rng):
+    return np.maximum.accumulate(t + 0.002 + rng.exponential(0.001, len(t)))
+
+
+def judged(imu, tdoa, arrivals=True):
+    """{rule: Finding}; without arrivals, as of a log."""
+    rules = StreamRules(ANCHORS)
+    for feed, (t, arrival, *values) in ((rules.feed_imu, imu), (rules.feed_tdoa, tdoa)):
+        if len(t):
+            feed(t, arrival if arrivals else np.full(len(t), np.nan), *values)
+    rules.finish()
+    return {finding.rule: finding for finding in rules.findings()}
+
+
+def put(columns, place, value):
+    """The columns with one of them replaced."""
+    return (*columns[:place], value, *columns[place + 1 :])
+
+
+T, ARRIVAL, GYRO, FORCE = range(4)
+A, B, D = 2, 3, 4
+
+
+@pytest.mark.parametrize("arrivals", [True, False])
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_is_said_of_a_healthy_recording(seed, arrivals):
+    assert judged(*streams(seed=seed), arrivals) == {}
+
+
+IMU_FAULTS = {
+    "imu_force_unit": lambda c, rng: put(c, FORCE, c[FORCE] / GRAVITY),
+    "imu_rate_unit": lambda c, rng: put(c, GYRO, np.rad2deg(c[GYRO])),
+    "imu_no_gravity": lambda c, rng: put(c, FORCE, c[FORCE] - [0.0, 0.0, GRAVITY]),
+    "imu_turned": lambda c, rng: put(c, FORCE, c[FORCE][:, [2, 0, 1]]),
+    "imu_tilted": lambda c, rng: put(c, FORCE, c[FORCE] @ np.array([[1, 0, 0], [0, 0.7, 0.7], [0, -0.7, 0.7]])),
+    "imu_silent": lambda c, rng: put(put(c, FORCE, 0.0 * c[FORCE]), GYRO, 0.0 * c[GYRO]),
+    "imu_repeated": lambda c, rng: put(put(c, FORCE, _held(c[FORCE])), GYRO, _held(c[GYRO])),
+    "imu_axis_dead": lambda c, rng: put(c, GYRO, c[GYRO] * [1.0, 0.0, 1.0]),
+    "imu_invalid": lambda c, rng: put(c, GYRO, np.where(rng.random(c[GYRO].shape) < 0.01, np.nan, c[GYRO])),
+    "imu_shaking": lambda c, rng: put(c, FORCE, c[FORCE] + 3.0 * rng.normal(size=c[FORCE].shape)),
+    "imu_clipped": lambda c, rng: put(c, FORCE, np.clip(c[FORCE] + _bumps(c[T]), None, 19.6)),
+    "stamps_zero": lambda c, rng: put(c, T, 0.0 * c[T]),
+    "stamps_stand": lambda c, rng: put(c, T, 7.0 + 0.0 * c[T]),
+    "stamps_coarse": lambda c, rng: put(c, T, np.floor(c[T] / 0.05) * 0.05),
+    "stamps_fall": lambda c, rng: put(c, T, c[T] + 0.02 * rng.random(len(c[T]))),
+    "stamps_jump": lambda c, rng: put(c, T, np.where(c[T] > 110.0, c[T] - 3.0, c[T])),
+    "stamps_unit": lambda c, rng: put(c, T, 1e3 * c[T]),
+    "stamps_apart": lambda c, rng: put(c, T, c[T] - 0.3),
+    "clock_drift": lambda c, rng: put(c, T, c[T] + 0.003 * (c[T] - c[T][0])),
+    "gap": lambda c, rng: tuple(column[(c[T] < 107.0) | (c[T] > 107.4)] for column in c),
+    "rate": lambda c, rng: tuple(column[::20] for column in c),
+    "blocks": lambda c, rng: put(c, ARRIVAL, np.ceil(2.0 * c[ARRIVAL]) / 2.0),
+}
+TDOA_FAULTS = {
+    "tdoa_large": lambda c, rng: put(c, D, 1e3 * c[D]),
+    "tdoa_outliers": lambda c, rng: put(c, D, np.where(rng.random(len(c[D])) < 0.1, 30.0, c[D])),
+    "tdoa_of_one": lambda c, rng: put(c, A, np.where(rng.random(len(c[D])) < 0.1, c[B], c[A])),
+    "tdoa_invalid": lambda c, rng: put(c, D, np.where(rng.random(len(c[D])) < 0.1, np.nan, c[D])),
+    "tdoa_twice": lambda c, rng: tuple(np.repeat(column, 2, axis=0) for column in c),
+    "tdoa_repeated": lambda c, rng: _repeated(c),
+    "two_tags": lambda c, rng: put(c, D, c[D] + np.where(rng.random(len(c[D])) < 0.5, 1.5, 0.0)),
+    "tdoa_one_sign": lambda c, rng: _both_orders(c, 1.0),
+    "tdoa_rounded": lambda c, rng: put(c, D, np.round(c[D], 1)),
+    "tdoa_clipped": lambda c, rng: put(c, D, np.clip(c[D], -1.0, 1.0)),
+    "few_anchors": lambda c, rng: put(put(c, A, np.full(len(c[D]), 10)), B, np.full(len(c[D]), 11)),
+    "ids_unknown": lambda c, rng: put(c, A, np.where(c[A] == 12, 99, c[A])),
+    "stamps_apart": lambda c, rng: put(c, T, c[T] + 10.0),
+    "gap": lambda c, rng: tuple(column[(c[T] < 107.0) | (c[T] > 107.8)] for column in c),
+    "rate": lambda c, rng: tuple(column[::30] for column in c),
+}
+
+
+def _held(values):
+    return values[np.arange(len(values)) // 5 * 5]
+
+
+def _bumps(t):
+    return 12.0 * (np.sin(6.0 * t) > 0.8)[:, None] * [0.0, 0.0, 1.0]
+
+
+def _repeated(columns):
+    """Each TDOA once more, 2 ms later."""
+    both = [np.concatenate([column, column]) for column in columns]
+    n = len(columns[0])
+    both[T][n:] += 0.002
+    both[ARRIVAL][n:] += 0.002
+    rows = np.argsort(both[T], kind="stable")
+    return tuple(column[rows] for column in both)
+
+
+def _both_orders(columns, sign):
+    """Every second TDOA with its anchors the other way round, and `sign` times the value."""
+    t, arrival, a, b, d = columns
+    odd = (np.arange(len(t)) // 8) % 2 == 1
+    return t, arrival, np.where(odd, b, a), np.where(odd, a, b), np.where(odd, sign * d, d)
+
+
+@pytest.mark.parametrize("rule", IMU_FAULTS)
+def test_a_fault_of_the_imu_is_named(rule):
+    imu, tdoa = streams()
+    found = judged(IMU_FAULTS[rule](imu, np.random.default_rng(1)), tdoa)
+    assert rule in found, found
+    _is_whole(found[rule])
+
+
+@pytest.mark.parametrize("rule", TDOA_FAULTS)
+def test_a_fault_of_the_tdoas_is_named(rule):
+    imu, tdoa = streams()
+    found = judged(imu, TDOA_FAULTS[rule](tdoa, np.random.default_rng(1)))
+    assert rule in found, found
+    _is_whole(found[rule])
+
+
+def _is_whole(finding):
+    assert finding.severity in SEVERITIES
+    assert finding.cause and finding.evidence and finding.remedy
+    assert math.isfinite(finding.value)
+
+
+def test_pairs_in_both_orders_with_both_signs_are_healthy():
+    imu, tdoa = streams()
+    assert judged(imu, _both_orders(tdoa, -1.0)) == {}
+
+
+def test_a_log_shows_an_offset_by_where_its_streams_begin_and_end():
+    imu, tdoa = streams()
+    assert judged(put(imu, T, imu[T] + 0.4), tdoa, arrivals=False)["stamps_apart"].value == pytest.approx(0.4, abs=0.02)
+    late = tuple(column[imu[T] > 104.0] for column in imu)  # switched on later, and no offset
+    assert judged(late, tdoa, arrivals=False) == {}
+
+
+def test_both_streams_on_another_clock_than_the_recorder_is_a_note():
+    imu, tdoa = streams()
+    found = judged(put(imu, ARRIVAL, imu[ARRIVAL] + 1e6), put(tdoa, ARRIVAL, tdoa[ARRIVAL] + 1e6))
+    assert {name: finding.severity for name, finding in found.items()} == {"other_clock": "note"}
+
+
+def test_a_driver_that_sends_seconds_alone_is_unmasked_by_the_pace():
+    imu, tdoa = streams()
+    nanoseconds_for_microseconds = np.floor(imu[T]) + 1e-3 * (imu[T] % 1.0)
+    assert "stamps_coarse" in judged(put(imu, T, nanoseconds_for_microseconds), tdoa)
+
+
+def test_a_stray_stamp_far_ahead_does_no_harm():
+    imu, tdoa = streams()
+    t = tdoa[T].copy()
+    t[3000] += 1e9
+    assert judged(imu, put(tdoa, T, t)).keys() == {"stamps_jump"}
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(ANY, ANY, st.integers(0, 12), st.integers(0, 12), ANY), max_size=60),
+    st.lists(st.tuples(*[ANY] * 8), max_size=60),
+)
+def test_nothing_that_arrives_breaks_it(tdoas, samples):
+    rules = StreamRules(ANCHORS)
+    columns = [np.array(column) for column in zip(*tdoas)] or [np.empty(0)] * 5
+    rules.feed_tdoa(*columns[:2], columns[2].astype(int), columns[3].astype(int), columns[4])
+    table = np.array(samples, dtype=float).reshape(-1, 8)
+    rules.feed_imu(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5:])
+    rules.finish()
+    for finding in rules.findings():
+        assert finding.severity in SEVERITIES and finding.cause

@@ -1,0 +1,100 @@
+"""What is undone, and whether that explains more."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_tools.checking import tdoa_rules
+from uwb_tdoa_tools.checking.case import LONG, Case
+from uwb_tdoa_tools.checking.survey_fit import SPREAD, spread
+
+from checking_flights import recording
+
+
+@pytest.fixture(scope="module")
+def healthy():
+    return Case.of(recording())
+
+
+@pytest.mark.slow
+def test_nothing_is_better_than_what_is_right(healthy):
+    shifted = Anchors(healthy.anchors.ids, healthy.anchors.positions * 1.3, healthy.anchors.orientations)
+    finding, same = tdoa_rules.best(healthy, [("other.yaml", shifted)])
+    assert finding is None and same is healthy
+
+
+@pytest.mark.parametrize(
+    "scale, unit",
+    [
+        (1e3, "millimetres"),
+        (1.0 / 0.0046917639, "ticks"),
+        (1.0 / 0.299792458, "nanoseconds"),
+        (1e-6 / 299.792458, "seconds"),
+    ],
+)
+def test_a_unit_is_undone(healthy, scale, unit):
+    finding, undone = tdoa_rules.best(healthy.with_tdoa(d=scale * healthy.tdoa.d))
+    assert finding.rule == "tdoa_unit" and unit in finding.cause
+    assert np.allclose(undone.tdoa.d, healthy.tdoa.d)
+
+
+@pytest.mark.slow
+def test_swapped_ids_are_undone(healthy):
+    one, two = healthy.anchors.ids[[2, 5]].tolist()
+    swapped = tdoa_rules._relabelled(healthy, {one: two, two: one})
+    finding, undone = tdoa_rules.best(swapped)
+    assert finding.rule == "ids_swapped" and finding.severity == "error"
+    assert np.array_equal(undone.tdoa.a, healthy.tdoa.a) and np.array_equal(undone.tdoa.b, healthy.tdoa.b)
+    assert str({one: two, two: one}) in finding.remedy
+
+
+def test_surveys_of_one_room_are_named_together(healthy):
+    wrong = replace(
+        healthy, anchors=Anchors(healthy.anchors.ids, healthy.anchors.positions[::-1], healthy.anchors.orientations)
+    )
+    by_millimetres = Anchors(healthy.anchors.ids, healthy.anchors.positions + 0.004, healthy.anchors.orientations)
+    trials = list(tdoa_rules.survey(wrong, [("monday.yaml", healthy.anchors), ("tuesday.yaml", by_millimetres)]))
+    assert len(trials) == 1 and "monday.yaml or tuesday.yaml" in trials[0].finding(0.5, 9.0).cause
+    assert list(tdoa_rules.survey(healthy, [("monday.yaml", by_millimetres)])) == []
+
+
+@pytest.mark.parametrize("table", [{1: 2, 2: 1}, {0: 3, 3: 5, 5: 0}])
+def test_ids_are_replaced_all_at_once(healthy, table):
+    back = {new: old for old, new in table.items()}
+    there = tdoa_rules._relabelled(healthy, table)
+    again = tdoa_rules._relabelled(there, back)
+    assert np.array_equal(again.tdoa.a, healthy.tdoa.a) and not np.array_equal(there.tdoa.a, healthy.tdoa.a)
+
+
+def test_the_part_that_is_tried_is_where_the_tag_moves():
+    t = np.arange(0.0, 100.0, 0.01)
+    d = np.where((t > 60.0) & (t < 80.0), np.sin(t), 0.0)
+    zeros = np.zeros(len(t), dtype=int)
+    case = Case.of(recording())
+    still = replace(case, tdoa=replace(case.tdoa, t=t, a=zeros, b=zeros + 1, d=d), imu=None)
+    part = still.part(14.0)
+    assert (
+        58.0 < part.tdoa.t[0]
+        and part.tdoa.t[-1] < 82.0
+        and part.tdoa.t[-1] - part.tdoa.t[0] == pytest.approx(14.0, abs=0.1)
+    )
+    assert still.part(200.0) is still
+
+
+def test_ids_are_not_tried_where_the_tag_stands():
+    hovering = Case.of(recording(10, trajectory="hover"))
+    assert spread(tdoa_rules.survey_fit(hovering).places) < SPREAD
+    assert list(tdoa_rules.swapped(hovering)) == []
+
+
+@pytest.mark.parametrize("gain, believed", [(0.5, True), (2.0, False)])
+def test_what_systematic_errors_could_explain_is_no_evidence(healthy, monkeypatch, gain, believed):
+    """The same trial, judged where systematic errors are said to be small, and where they are said to be large."""
+    flipped = tdoa_rules._flipped(healthy, np.ones(len(healthy.tdoa), dtype=bool))
+    least = gain * (flipped.part(LONG).unexplained().mean - healthy.part(LONG).unexplained().mean)
+    monkeypatch.setattr(tdoa_rules, "BY_ERRORS", least)
+    for rule in ("swapped", "contrary", "moved", "units"):
+        monkeypatch.setattr(tdoa_rules, rule, lambda *_: iter(()))
+    finding, _ = tdoa_rules.best(flipped)
+    assert (finding is not None and finding.rule == "tdoa_sign") == believed

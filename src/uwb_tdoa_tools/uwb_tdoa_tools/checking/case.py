@@ -1,0 +1,87 @@
+"""A recording in order, as the rules that try things see it, and what is found unexplained in it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
+from .explain import unexplained
+
+LONG, SHORT = 60.0, 14.0  # s of the recording that are tried: to be sure, and to choose what is worth being sure of
+PERIOD = 1.0  # s over which the motion is measured that says which part is tried
+
+
+@dataclass(frozen=True)
+class Case:
+    """anchors : Anchors; tdoa : Tdoas and imu : Imu or None, in order of their stamps and finite."""
+
+    anchors: Anchors
+    tdoa: Tdoas
+    imu: Imu | None
+
+    @classmethod
+    def of(cls, recording):
+        """Case of a Recording."""
+        tdoa, imu = recording.tdoa, recording.imu
+        good = np.flatnonzero(np.isfinite(tdoa.t) & np.isfinite(tdoa.d))
+        tdoa = _rows(tdoa, good[np.argsort(tdoa.t[good], kind="stable")])
+        if imu is not None:
+            good = np.flatnonzero(np.isfinite(np.column_stack([imu.t, imu.gyro, imu.accel])).all(axis=1))
+            imu = _rows(imu, good[np.argsort(imu.t[good], kind="stable")])
+        return cls(recording.anchors, tdoa, imu if imu is not None and len(imu) else None)
+
+    def part(self, length):
+        """The `length` s in which the TDOAs move most; the whole if it is not longer."""
+        t = self.tdoa.t
+        if not len(t) or t[-1] - t[0] <= length:
+            return self
+        begin = _busiest(self, length)
+        first, end = np.searchsorted(t, [begin, begin + length])
+        imu = self.imu
+        if imu is not None:
+            imu = _rows(imu, slice(*np.searchsorted(imu.t, [begin, begin + length])))
+        return replace(
+            self, tdoa=_rows(self.tdoa, slice(first, end)), imu=imu if imu is not None and len(imu) else None
+        )
+
+    def with_tdoa(self, **columns):
+        """The same with other columns of the TDOAs."""
+        return replace(self, tdoa=replace(self.tdoa, **columns))
+
+    def with_imu(self, **columns):
+        """The same with other columns of the inertial samples."""
+        return replace(self, imu=replace(self.imu, **columns))
+
+    def rows(self):
+        """Rows of the anchors of each TDOA: two (n,) arrays, -1 where an id is unknown."""
+        return self.anchors.index(self.tdoa.a), self.anchors.index(self.tdoa.b)
+
+    def unexplained(self):
+        """Unexplained of the TDOAs alone."""
+        return unexplained(self.tdoa.t, *self.rows(), self.tdoa.d, self.anchors.positions)
+
+    def flight(self):
+        """Flight without ground truth."""
+        return Flight("checked", self.anchors, self.tdoa, self.imu)
+
+
+def _rows(stream, rows):
+    """Some rows of a stream of arrays."""
+    return type(stream)(*(np.ascontiguousarray(column[rows]) for column in vars(stream).values()))
+
+
+def _busiest(case, length):
+    """Stamp at which the `length` s begin in which the TDOAs of each pair change most from second to second."""
+    t, d = case.tdoa.t, case.tdoa.d
+    pair = case.tdoa.a * 65536 + case.tdoa.b
+    second = np.floor((t - t[0]) / PERIOD).astype(np.int64)
+    keys, inverse = np.unique(np.column_stack([pair, second]), axis=0, return_inverse=True)
+    inverse = inverse.reshape(-1)
+    mean = np.bincount(inverse, d) / np.bincount(inverse)
+    next_one = (keys[1:, 0] == keys[:-1, 0]) & (keys[1:, 1] == keys[:-1, 1] + 1)
+    motion = np.zeros(second[-1] + 2)
+    np.add.at(motion, keys[1:, 1][next_one], np.minimum(np.abs(np.diff(mean))[next_one], 1.0))
+    total, n = np.concatenate([[0.0], np.cumsum(motion)]), int(length / PERIOD)
+    best = int(np.argmax(total[n:] - total[:-n]))
+    return t[0] + min(best * PERIOD, t[-1] - t[0] - length)

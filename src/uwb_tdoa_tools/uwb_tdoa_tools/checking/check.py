@@ -1,0 +1,162 @@
+"""check: all rules over one recording, in the order in which one mistake hides another."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .streams import ERROR, NOTE, WARNING, Finding, StreamRules, most_severe_first
+
+from ..readers.streams import protocol
+from . import coverage, imu_rules, labels, tdoa_rules
+from .case import Case
+from .survey_fit import displacement
+from .tdoa_rules import SAME, furthest
+
+ROUNDS = 3  # mistakes that are undone one after the other
+# Where one of these stands, nothing, or not the IMU, can be tried.
+HOPELESS = {
+    "stamps_zero",
+    "stamps_stand",
+    "stamps_unit",
+    "stamps_jump",
+    "two_tags",
+    "few_anchors",
+    "senders",
+    "tdoa_clipped",
+}
+WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "imu_clipped"}
+# What a finding explains that the stream itself only shows.
+EXPLAINS = {
+    "tdoa_unit": {"tdoa_large", "tdoa_outliers", "tdoa_rounded"},
+    "ids_renumbered": {"ids_unknown", "anchor_missing"},
+    "ids_swapped": {"tdoa_large", "tdoa_outliers"},
+    "survey_other": {"tdoa_large", "tdoa_outliers"},
+    "tdoa_one_sign": {"tdoa_one_sign"},
+}
+
+
+@dataclass(frozen=True)
+class Report:
+    """recording : its name; findings : [Finding], most severe first; facts : {what: text}, what was heard."""
+
+    recording: str
+    findings: list
+    facts: dict
+
+    @property
+    def faulty(self):
+        """True if there is an error."""
+        return any(finding.severity == ERROR for finding in self.findings)
+
+
+def check(recording, others=()):
+    """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one."""
+    streams = _fed(recording)
+    found = streams.findings()
+    for rule in labels.RULES:
+        found += rule(recording)
+    names = {finding.rule for finding in found}
+    places, explained = np.empty((0, 3)), set()
+    if names & HOPELESS:
+        cause, remedy = (
+            "sign, ids, survey and axes were not tried",
+            "put the errors right, record again, and check again",
+        )
+        found.append(Finding("not_tried", NOTE, cause, "the streams are of no use for that", remedy, np.nan))
+    else:
+        tried, places = _tried(_undone(Case.of(recording), found), names, others)
+        explained = set().union(*(EXPLAINS.get(finding.rule, ()) for finding in tried))
+        found = [finding for finding in found if finding.rule not in explained] + tried
+    view = coverage.View(recording.anchors, list(streams.tdoa), places)
+    for rule in coverage.RULES:
+        found += (finding for finding in rule(view) if finding.rule not in explained)
+    return Report(recording.name, most_severe_first(found), _facts(recording, streams))
+
+
+def _fed(recording):
+    """StreamRules that have seen all of a Recording."""
+    streams, imu, tdoa = StreamRules(recording.anchors), recording.imu, recording.tdoa
+    if imu is not None:
+        streams.feed_imu(imu.t, recording.imu_arrival, imu.gyro, imu.accel)
+    streams.feed_tdoa(tdoa.t, recording.tdoa_arrival, tdoa.a, tdoa.b, tdoa.d)
+    streams.finish()
+    return streams
+
+
+def _undone(case, found):
+    """The case without the mistakes that the streams show themselves, so that it can be tried."""
+    for finding in found if case.imu is not None else ():
+        if finding.rule == "imu_force_unit":
+            case = case.with_imu(accel=case.imu.accel * finding.value)
+        elif finding.rule == "imu_rate_unit":
+            case = case.with_imu(gyro=np.deg2rad(case.imu.gyro))
+        elif finding.rule == "imu_turned":
+            turn = upright(np.median(case.imu.accel, axis=0))
+            case = case.with_imu(accel=case.imu.accel @ turn.T, gyro=case.imu.gyro @ turn.T)
+        elif finding.rule == "stamps_apart":
+            case = case.with_imu(t=case.imu.t - finding.value)
+    return case
+
+
+def upright(force):
+    """(3, 3) rotation by quarter turns that brings the axis along which `force` (3,) is largest to +z."""
+    k = int(np.argmax(np.abs(force)))
+    up = np.sign(force[k]) * np.eye(3)[k]
+    side = np.eye(3)[(k + 1) % 3]
+    return np.stack([side, np.cross(up, side), up])
+
+
+def _tried(case, names, others):
+    """([Finding], places of the tag (k, 3) m): what is found by undoing it."""
+    found = []
+    for _ in range(ROUNDS):
+        finding, case = tdoa_rules.best(case, others)
+        if finding is None:
+            break
+        found.append(finding)
+    fit = tdoa_rules.survey_fit(case)
+    if not found:
+        found += _misfit(fit)
+    if case.imu is not None and not names & WITHOUT_IMU and not any(f.rule == "survey_misfit" for f in found):
+        finding = imu_rules.fit(case)
+        found += [finding] if finding else []
+    return found, fit.places
+
+
+def _misfit(fit):
+    """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
+    gain = tdoa_rules.gained(fit)
+    if gain is not None:
+        _, anchors = fit.solve()
+        evidence = f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
+        evidence += f"by {np.median(displacement(fit.positions, anchors)):.1f} m in the median"
+        cause = "the survey does not fit: of another room, or anchors have been moved"
+        remedy = "--survey FOLDER  # with all surveys: check says which one fits; or survey the anchors again"
+        yield Finding("survey_misfit", ERROR, cause, evidence, remedy, gain)
+
+
+def _facts(recording, streams):
+    """What was heard, for people."""
+    facts = {}
+    for name, windows, unit in (("TDOAs", streams.tdoa, "Hz"), ("IMU", streams.imu, "Hz")):
+        if windows:
+            step = float(np.median([window.stamps.step for window in windows]))
+            facts[name] = f"{1.0 / step:.0f} {unit}" if step > 0.0 else "no rate"
+    if streams.tdoa:
+        windows = list(streams.tdoa)
+        facts["duration"] = f"{windows[-1].stamps.end - windows[0].stamps.begin:.1f} s"
+        facts["anchors"] = f"{np.count_nonzero(sum(w.heard for w in windows))} of {len(recording.anchors)} heard"
+        facts["protocol"] = protocol(recording.tdoa).replace("tdoa", "TDoA")
+    return facts
+
+
+def different_surveys(recordings):
+    """Findings about Recordings whose surveys differ: anchors of one id that are elsewhere. Their flights do not belong
+    together."""
+    for one, two in zip(recordings, recordings[1:]):
+        off = furthest(one.anchors, two.anchors)
+        if off > SAME:
+            evidence = f"the same ids are up to {off:.2f} m apart" if np.isfinite(off) else "they have no id in common"
+            cause = f"{one.name} and {two.name} have different surveys"
+            remedy = "diagnose, train and fit maps for each installation by itself"
+            yield Finding("surveys_differ", WARNING, cause, evidence, remedy, off)

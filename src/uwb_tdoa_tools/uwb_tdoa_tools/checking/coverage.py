@@ -1,0 +1,142 @@
+"""What the anchors and the motion of the tag let anybody know. A rule takes a View and yields Findings."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from .streams import NOTE, WARNING, Finding
+from .survey_fit import SPREAD, spread
+
+RARE = 0.2  # of what the anchors are heard in the middle; healthy 0.54 at least
+SILENT = 5.0  # s for which an anchor that is heard otherwise is not
+FLAT = 0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
+OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the box of the anchors
+SHORT = 10.0  # s
+
+
+@dataclass(frozen=True)
+class View:
+    """anchors : Anchors; windows : [TdoaWindow]; places (k, 3) m, where the tag was located, none if that was not
+    tried."""
+
+    anchors: Anchors
+    windows: list
+    places: np.ndarray
+
+
+def missing(view):
+    """Anchors of the survey that are never, hardly ever or for a while not heard."""
+    heard = np.array([window.heard for window in view.windows])
+    counts = heard.sum(axis=0)
+    lost = view.anchors.ids[counts == 0].tolist()
+    if lost:
+        cause = f"anchors of the survey that the tag never hears: {', '.join(map(str, lost))}"
+        remedy = "switch them on, or take them out of the survey"
+        yield Finding("anchor_missing", WARNING, cause, f"{len(lost)} of {len(counts)}", remedy, float(len(lost)))
+    for row in np.flatnonzero(counts > 0):
+        share = counts[row] / np.median(counts[counts > 0])
+        number = int(view.anchors.ids[row])
+        if share < RARE:
+            evidence = f"{100.0 * share:.0f} % of what is heard of the one in the middle"
+            yield Finding(
+                "anchor_rare",
+                NOTE,
+                f"anchor {number} is hardly heard",
+                evidence,
+                f"look at anchor {number}: power, line of sight",
+                share,
+            )
+            continue
+        since, until = _silence(view.windows, heard[:, row])
+        if until - since > SILENT:
+            evidence = f"{until - since:.0f} s from {since:.1f} s on"
+            remedy = f"look at anchor {number}: power, line of sight"
+            yield Finding("anchor_silent", WARNING, f"anchor {number} falls silent", evidence, remedy, until - since)
+
+
+def _silence(windows, heard):
+    """(first, last stamp or arrival) of the longest run of windows without the anchor; (0, 0) if there is none."""
+    longest, begin = (0.0, 0.0), None
+    for window, count in zip(windows, heard):
+        if count:
+            begin = None
+            continue
+        begin = window.stamps.begin if begin is None else begin
+        longest = max(longest, (begin, window.stamps.end), key=lambda run: run[1] - run[0])
+    return longest
+
+
+def flat(view):
+    """Anchors in one plane tell next to nothing about the distance from it, and nothing about the side."""
+    p = view.anchors.positions
+    if len(p) < 4:
+        return
+    size, thickness = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)[[0, 2]] / np.sqrt(len(p))
+    if thickness < FLAT * size:
+        evidence = f"they are within {thickness:.2f} m (rms) of a plane and {size:.1f} m across"
+        remedy = "plan anchors.yaml --improve move  # half of the anchors low, half of them high"
+        yield Finding(
+            "anchors_flat",
+            WARNING,
+            "the anchors lie in a plane: the direction across it is hardly told",
+            evidence,
+            remedy,
+            thickness,
+        )
+
+
+def below(view):
+    """Everything below zero: z down."""
+    z = view.anchors.positions[:, 2]
+    if z.max() <= 0.05 and np.ptp(z) > 0.5:
+        evidence = f"heights from {z.min():.2f} to {z.max():.2f} m"
+        yield Finding(
+            "survey_z_down",
+            WARNING,
+            "all anchors are below zero: z seems to point down in the survey",
+            evidence,
+            "x, y, z = y, x, -z  # of every anchor",
+            float(z.max()),
+        )
+
+
+def outside(view):
+    """A tag beyond its anchors."""
+    p = view.anchors.positions
+    if not len(view.places):
+        return
+    low, high = p.min(axis=0) - MARGIN, p.max(axis=0) + MARGIN
+    share = float(np.mean(((view.places < low) | (view.places > high)).any(axis=1)))
+    if share > OUTSIDE:
+        evidence = f"{100.0 * share:.0f} % of the places are more than {MARGIN} m beyond the anchors"
+        yield Finding(
+            "outside",
+            WARNING,
+            "the tag is outside of its anchors, where it is hardly located",
+            evidence,
+            "plan anchors.yaml --volume --out maps  # where it is",
+            share,
+        )
+
+
+def still(view):
+    """A recording of which little can be learned."""
+    if not len(view.places):
+        return
+    moved = spread(view.places)
+    duration = view.windows[-1].stamps.end - view.windows[0].stamps.begin
+    if duration < SHORT or moved < SPREAD:
+        evidence = f"{duration:.0f} s, {moved:.2f} m (rms) off a straight line"
+        remedy = "record a minute in which the tag is carried through the whole room, turned, lifted and lowered"
+        yield Finding(
+            "little_motion",
+            NOTE,
+            "sign, ids, survey and axes can hardly be told from this recording",
+            evidence,
+            remedy,
+            moved,
+        )
+
+
+RULES = (missing, flat, below, outside, still)

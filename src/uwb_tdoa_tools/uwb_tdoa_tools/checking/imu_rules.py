@@ -1,0 +1,148 @@
+"""Does the inertial sensor fit the TDOAs? Its axes are tried in every arrangement, its rates in other units: a filter
+that leans on the sensor says by its innovations what fits.
+
+What turns both sensors about the vertical cannot be seen, for nobody told the yaw; nor can a sign about an axis about
+which the tag did not turn.
+"""
+
+from dataclasses import replace
+from itertools import permutations, product
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.flight import Imu
+from uwb_tdoa_ekf.core.config import FilterConfig
+from .streams import ERROR, Finding
+from .explain import Unexplained, compare
+from uwb_tdoa_ekf.offline import run_offline
+
+# s that are tried, to be sure and to choose; Hz to which the samples are averaged
+PART, BRIEF, RATE = 30.0, 14.0, 200.0
+SLOWEST = 50.0  # Hz; of fewer samples nothing is alleged
+# The filter leans on the IMU: TDOAs count for little, and the bias of the accelerometer may be large.
+LEANING = FilterConfig(tdoa_correlation_length=100.0, initial_accel_bias_std=0.5)
+RATIO, DEVIATIONS = 0.9, 2.5  # of what stays unexplained; healthy flights: 0.98 at least for anything that is tried
+TIE = 0.03  # ratios this close say the same: the simplest arrangement is taken
+CHOSEN = 8  # arrangements that are tried on the longer part
+UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
+# Of the gyroscope, and what it would be. (Degrees/s are seen in the stream itself.)
+SCALES = {180.0 / np.pi: "rad/s, divided by 57.3 once too often", 2.0 * np.pi: "revolutions/s, not rad/s"}
+
+
+def fit(case):
+    """What does not fit about the IMU: Finding or None. case : Case whose TDOAs are right."""
+    brief = replace(case, imu=averaged(case.imu)).part(PART)
+    if brief.imu is None or len(brief.imu) < SLOWEST * PART / 2.0:
+        return None
+    base = _unexplained(brief)
+    trials = [(*compare(base, _unexplained(_arranged(brief, a, g))), a, g) for a, g in _usual()]
+    if not min(ratio for ratio, _, _, _ in trials) < RATIO:
+        return None
+    scale = _scaled(trials)
+    if scale is None:
+        trials += _all(brief, base)
+    least = min(ratio for ratio, _, _, _ in trials)
+    near = [trial for trial in trials if trial[0] < least + TIE and trial[1] > DEVIATIONS]
+    if not near or not least < RATIO:
+        return None
+    ratio, z, accel, gyro = min(near, key=lambda trial: _complexity(trial[2], trial[3]))
+    evidence = f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
+    if len(near) > 1:
+        evidence += f"; {len(near) - 1} other arrangements fit about as well"
+    return _finding(accel, gyro, evidence, ratio)
+
+
+def averaged(imu):
+    """Imu with the means of as many samples each as make about RATE, or as it is; None stays None."""
+    if imu is None or len(imu) < 2:
+        return None
+    count = max(1, round((len(imu) - 1) / max(imu.t[-1] - imu.t[0], 1e-9) / RATE))
+    rows = len(imu) // count * count
+    columns = (
+        column[:rows].reshape(-1, count, *column.shape[1:]).mean(axis=1) for column in (imu.t, imu.gyro, imu.accel)
+    )
+    return Imu(*map(np.ascontiguousarray, columns))
+
+
+def _usual():
+    """The mistakes that are made most: (accelerometer, gyroscope) as (3, 3) matrices that undo them."""
+    for signs in product((1.0, -1.0), repeat=3):
+        if signs != (1.0, 1.0, 1.0):
+            yield UPRIGHT, np.diag(signs)
+    exchanged = UPRIGHT[[1, 0, 2]]
+    yield UPRIGHT, exchanged
+    yield MIRROR, UPRIGHT
+    yield MIRROR, MIRROR
+    yield MIRROR, -MIRROR
+    for scale in SCALES:
+        yield UPRIGHT, scale * UPRIGHT
+
+
+def _scaled(trials):
+    """The matrix of the gyroscope of the best trial if that is another unit, else None."""
+    gyro = min(trials, key=lambda trial: trial[0])[3]
+    return gyro if abs(abs(np.linalg.det(gyro)) - 1.0) > 0.1 else None
+
+
+def _all(case, base):
+    """Trials of all arrangements of the gyroscope against the accelerometer, and its mirror image; the yaw is free
+    anyway."""
+    short = case.part(BRIEF)
+    of_short = _unexplained(short)
+    arrangements = []
+    for accel in (UPRIGHT, MIRROR):
+        for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+            gyro = np.zeros((3, 3))
+            gyro[range(3), order] = signs
+            ratio, _ = compare(of_short, _unexplained(_arranged(short, accel, gyro)))
+            arrangements.append((ratio, accel, gyro))
+    arrangements.sort(key=lambda entry: entry[0] if np.isfinite(entry[0]) else np.inf)
+    return [(*compare(base, _unexplained(_arranged(case, a, g))), a, g) for _, a, g in arrangements[:CHOSEN]]
+
+
+def _arranged(case, accel, gyro):
+    """The samples turned by (3, 3) matrices."""
+    return case.with_imu(
+        accel=np.ascontiguousarray(case.imu.accel @ accel.T), gyro=np.ascontiguousarray(case.imu.gyro @ gyro.T)
+    )
+
+
+def _unexplained(case):
+    residuals = run_offline(case.flight(), LEANING).residuals
+    return Unexplained.of(residuals.t, residuals.innovation)
+
+
+def _complexity(accel, gyro):
+    """How many things must have gone wrong."""
+    if np.array_equal(accel, MIRROR) and (np.array_equal(gyro, MIRROR) or np.array_equal(gyro, -MIRROR)):
+        return 1.5
+    wrong_signs = np.count_nonzero(gyro.sum(axis=1) < 0.0)
+    moved = np.count_nonzero(np.diag(gyro) == 0.0)
+    return wrong_signs + moved + 1.0 * np.array_equal(accel, MIRROR)
+
+
+def _finding(accel, gyro, evidence, ratio):
+    scale = abs(np.linalg.det(gyro)) ** (1.0 / 3.0)
+    unit = next((name for value, name in SCALES.items() if abs(value / scale - 1.0) < 1e-6), None)
+    if unit:
+        line = f"for axis in 'xyz': setattr(w, axis, {scale:.6g} * getattr(w, axis))  # w = message.angular_velocity"
+        return Finding("imu_rate_unit", ERROR, f"the gyroscope is in {unit}", evidence, line, scale)
+    if np.array_equal(accel, MIRROR) and np.array_equal(gyro, -MIRROR):
+        cause = (
+            "the survey is the mirror image of the room: an axis has the wrong sign, e.g. z down, or two are exchanged"
+        )
+        line = "x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = -z"
+        return Finding("survey_mirrored", ERROR, cause, evidence, line, ratio)
+    parts = []
+    for name, variable, matrix in (("accelerometer", "a", accel), ("gyroscope", "w", gyro)):
+        if not np.array_equal(matrix, UPRIGHT):
+            parts.append((name, variable, matrix))
+    who = " and ".join(name for name, _, _ in parts)
+    line = "; ".join(f"{v}.x, {v}.y, {v}.z = {', '.join(_axis(v, row) for row in matrix)}" for _, v, matrix in parts)
+    cause = f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed"
+    return Finding("imu_axes", ERROR, cause, evidence, line, ratio)
+
+
+def _axis(variable, row):
+    k = int(np.argmax(np.abs(row)))
+    return ("-" if row[k] < 0.0 else "") + f"{variable}.{'xyz'[k]}"

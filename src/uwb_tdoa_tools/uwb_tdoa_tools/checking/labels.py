@@ -1,0 +1,117 @@
+"""What the messages of a bag say about themselves: frames, topics, anchors. A rule takes a Recording and yields
+Findings."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .streams import ERROR, NOTE, WARNING, Finding
+
+from .recording import IMU
+from .tdoa_rules import furthest, same_place
+
+BODY = "base_link"
+TURNED, SHIFTED = np.deg2rad(2.0), 0.02  # rad and m that a frame may be off the body frame
+
+
+def frames(recording):
+    """A frame that is not the body's: turned or shifted by what /tf_static says, or by nobody knows what."""
+    for topic, counts in recording.frames.items():
+        for frame in sorted(counts):
+            if frame.split("/")[-1] in (BODY, ""):
+                continue
+            yield from _frame(topic, frame, recording.turns.get(frame))
+
+
+def _frame(topic, frame, known):
+    if known is None:
+        cause = f"{topic} is in the frame {frame}, and nothing says how that sits on {BODY}"
+        line = f"ros2 run tf2_ros static_transform_publisher --frame-id {BODY} --child-frame-id {frame}"
+        line += " --roll 0 --pitch 0 --yaw 0"
+        yield Finding("frame_unknown", WARNING, cause, f"no transform to {frame} in /tf_static", line, np.nan)
+        return
+    parent, q, shift = known
+    angle = Rotation.from_quat(q).magnitude()
+    if parent.split("/")[-1] == BODY and angle < TURNED and np.linalg.norm(shift) < SHIFTED:
+        return
+    roll, pitch, yaw = Rotation.from_quat(q).as_euler("xyz", degrees=True)
+    evidence = f"roll {roll:.0f}, pitch {pitch:.0f}, yaw {yaw:.0f} degrees and "
+    evidence += f"({shift[0]:.2f}, {shift[1]:.2f}, {shift[2]:.2f}) m from {parent}"
+    line = f"samples = Rotation.from_quat({[round(v, 4) for v in q]}).apply(samples)  # and frame_id {BODY}"
+    yield Finding(
+        "frame_turned",
+        ERROR if angle > TURNED else NOTE,
+        f"{topic} is in the frame {frame}, which is not {BODY}",
+        evidence,
+        line,
+        angle,
+    )
+
+
+def senders(recording):
+    """Two frames on one topic: two tags, or two sensors."""
+    for topic, counts in recording.frames.items():
+        if len(counts) > 1:
+            names = ", ".join(f"{frame or '(none)'}: {count}" for frame, count in sorted(counts.items()))
+            line = "ros2 run DRIVER --ros-args -r __ns:=/tag2  # a namespace for each tag"
+            yield Finding(
+                "senders",
+                ERROR,
+                f"{topic} comes from several senders",
+                f"messages by frame_id: {names}",
+                line,
+                float(len(counts)),
+            )
+
+
+def no_imu(recording):
+    """No inertial samples, or under another name."""
+    if recording.imu is not None:
+        return
+    there = sorted(topic for topic, kind in recording.topics.items() if kind == "sensor_msgs/msg/Imu")
+    if there:
+        line = f"ros2 bag play BAG --remap {there[0]}:=/{IMU}"
+        yield Finding(
+            "imu_elsewhere", WARNING, f"no inertial samples on {IMU}", f"but on {', '.join(there)}", line, 0.0
+        )
+    elif recording.topics:
+        yield Finding(
+            "imu_missing",
+            WARNING,
+            f"no inertial samples on {IMU}",
+            "no topic of the type sensor_msgs/Imu",
+            "-p use_imu:=false  # of ekf_node, if there is no IMU",
+            0.0,
+        )
+
+
+def anchors(recording):
+    """The anchors in the bag, which the nodes use, against the survey."""
+    if recording.recorded is None or same_place(recording.anchors, recording.recorded):
+        return
+    off = furthest(recording.anchors, recording.recorded)
+    evidence = f"the same ids are up to {off:.2f} m apart" if np.isfinite(off) else "no id in common"
+    line = "convert BAG --survey SURVEY --out NEW.bag  # puts the survey into the bag"
+    yield Finding(
+        "survey_differs",
+        WARNING,
+        "the bag brings other anchors than the survey has, and the nodes take those",
+        evidence,
+        line,
+        off,
+    )
+
+
+def sorted_file(recording):
+    """A file whose stamps fall: the reader has put them in order."""
+    if recording.falls:
+        yield Finding(
+            "stamps_fall",
+            WARNING,
+            "messages in the file are out of order",
+            f"the stamps fall {recording.falls} times",
+            "-p reorder:=0.02 -p lag:=0.3  # of ekf_node, for the same driver live",
+            float(recording.falls),
+        )
+
+
+RULES = (frames, senders, no_imu, anchors, sorted_file)

@@ -1,0 +1,141 @@
+"""What `check` judges: the streams of a recording as they came, in the order in which they arrived."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
+
+from ..bags import messages as bag_messages
+from ..bags.bag import Names, is_bag
+from ..bags.files import deserialize, messages, open_bag
+from ..bags.message_types import check_type
+from ..readers import read_survey
+
+IMU, TDOA = "imu/data", "uwb/tdoa"
+_ROWS = {
+    IMU: ("sensor_msgs/msg/Imu", bag_messages.imu_row),
+    TDOA: ("uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row),
+}
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Nothing here is sorted, and ground truth is not read.
+
+    name : short; anchors : Anchors to check against; tdoa : Tdoas; imu : Imu or None;
+    tdoa_arrival, imu_arrival : (n,) s, when the recorder received them, NaN where that is not known;
+    frames : {topic: {frame_id: messages}}; turns : {frame: (parent, quaternion x y z w, translation m)} of /tf_static;
+    topics : {topic: type} of a bag; recorded : Anchors that the bag itself holds, or None; falls : how often the stamps
+    fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a damaged one.
+    """
+
+    name: str
+    anchors: Anchors
+    tdoa: Tdoas
+    imu: Imu | None
+    tdoa_arrival: np.ndarray
+    imu_arrival: np.ndarray
+    frames: dict = field(default_factory=dict)
+    turns: dict = field(default_factory=dict)
+    topics: dict = field(default_factory=dict)
+    recorded: Anchors | None = None
+    falls: int = 0
+    remarks: tuple = ()
+
+
+def read_recording(reading, path, survey=None):
+    """Recording of a log, a CSV file or a bag, as a Reading says; survey : path of a survey, or None. Raises
+    InputError."""
+    if is_bag(path):
+        return _read_bag(reading, Path(path), survey)
+    return of_flight(reading.read((path, survey)))
+
+
+def of_flight(flight):
+    """Recording of a Flight. When its messages arrived is not known."""
+    unknown = (np.full(len(stream) if stream is not None else 0, np.nan) for stream in (flight.tdoa, flight.imu))
+    falls = sum(flight.meta.get("reordered", {}).values())
+    return Recording(flight.name, flight.anchors, flight.tdoa, flight.imu, *unknown, falls=falls)
+
+
+def _read_bag(reading, path, survey):
+    name_of = Names(reading.namespace, reading.topics)
+    with open_bag(path, reading.salvage) as reader:
+        topics = {connection.topic: connection.msgtype for connection in reader.connections}
+        tdoa, imu = (_stream(path, reader, name_of(topic), *_ROWS[topic]) for topic in (TDOA, IMU))
+        recorded = _last(path, reader, name_of("uwb/anchors"), Anchors.from_message)
+        turns = _last(path, reader, "/tf_static", _turns) or {}
+        remarks = tuple(reader.remarks)
+    if not len(tdoa.stamps):
+        there = sorted(topic for topic, kind in topics.items() if kind == _ROWS[TDOA][0])
+        places = " or ".join(f"--topic {TDOA}={topic}" for topic in there)
+        hint = f"say where they are ({places})" if there else "record the TDOAs of the tag"
+        raise InputError(f"{path}: has no message on {name_of(TDOA)}; {hint}.")
+    anchors = read_survey(survey) if survey else recorded
+    if anchors is None:
+        raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
+    return Recording(
+        name=path.stem,
+        anchors=anchors,
+        tdoa=bag_messages.tdoas_of(tdoa.stamps, tdoa.rows),
+        imu=bag_messages.imu_of(imu.stamps, imu.rows) if len(imu.stamps) else None,
+        tdoa_arrival=tdoa.arrival,
+        imu_arrival=imu.arrival,
+        frames={topic: dict(stream.frames) for topic, stream in ((TDOA, tdoa), (IMU, imu)) if len(stream.stamps)},
+        turns=turns,
+        topics=topics,
+        recorded=recorded,
+        remarks=remarks,
+    )
+
+
+@dataclass
+class _Stream:
+    stamps: np.ndarray
+    arrival: np.ndarray
+    rows: np.ndarray
+    frames: Counter
+
+
+def _stream(path, reader, topic, kind, row):
+    """Messages of one topic in the order of the bag. A bag whose times are the stamps themselves tells no arrivals."""
+    connections = [c for c in reader.connections if c.topic == topic]
+    for connection in connections:
+        if connection.msgtype != kind:
+            raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {kind} is needed there.")
+        check_type(path, connection)
+    arrivals, rows, frames = [], [], Counter()
+    for connection, received, data in messages(path, reader, connections):
+        message = deserialize(path, connection, data)
+        arrivals.append(received)
+        rows.append(row(message))
+        frames[message.header.frame_id] += 1
+    stamps, arrivals = np.array([r[0] for r in rows], dtype=np.int64), np.array(arrivals, dtype=np.int64)
+    table = np.array([r[1:] for r in rows], dtype=float)
+    known = bool((stamps != arrivals).any())
+    return _Stream(stamps / 1e9, arrivals / 1e9 if known else np.full(len(rows), np.nan), table, frames)
+
+
+def _last(path, reader, topic, make):
+    """make(the last message of a topic), or None."""
+    found = None
+    for connection, _, data in messages(path, reader, [c for c in reader.connections if c.topic == topic]):
+        check_type(path, connection)
+        try:
+            found = make(deserialize(path, connection, data))
+        except InputError as error:
+            raise InputError(f"{path}: {topic}: {error}") from error
+    return found
+
+
+def _turns(message):
+    turns = {}
+    for transform in message.transforms:
+        v, q = transform.transform.translation, transform.transform.rotation
+        turns[transform.child_frame_id] = transform.header.frame_id, (q.x, q.y, q.z, q.w), (v.x, v.y, v.z)
+    return turns

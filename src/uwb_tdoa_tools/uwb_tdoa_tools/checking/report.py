@@ -1,0 +1,49 @@
+"""What `check` says: text for people, a dict for machines."""
+
+from dataclasses import asdict
+
+from ..scoring.metrics import as_json
+
+SYMBOL = {"error": "ERROR", "warning": "warning", "note": "note"}
+
+
+def text(report):
+    """Lines about one Report: the verdict first, then the findings, most severe first."""
+    facts = ", ".join(f"{name} {value}" if name in ("TDOAs", "IMU") else value for name, value in report.facts.items())
+    out = [f"{report.recording}: {verdict(report.findings)}  ({facts})"]
+    for finding in report.findings:
+        out += lines(finding)
+    return "\n".join(out)
+
+
+def verdict(findings):
+    """In a few words."""
+    counts = {severity: sum(f.severity == severity for f in findings) for severity in SYMBOL}
+    if not counts["error"] and not counts["warning"]:
+        return "OK" if not counts["note"] else "OK, with a remark"
+    return ", ".join(f"{count} {severity}{'s' * (count > 1)}" for severity, count in counts.items() if count)
+
+
+def lines(finding):
+    """Lines of text about one Finding."""
+    yield f"  {SYMBOL[finding.severity]}: {finding.cause}"
+    yield f"      seen:   {finding.evidence}"
+    first, *more = finding.remedy.splitlines()
+    yield f"      remedy: {first}"
+    for line in more:
+        yield f"              {line}"
+
+
+def as_dict(reports, together):
+    """For JSON: {"recordings": [{"recording", "facts", "findings"}], "together": [findings about several
+    recordings]}."""
+    return {
+        "recordings": [
+            {"recording": r.recording, "facts": r.facts, "findings": [_finding(f) for f in r.findings]} for r in reports
+        ],
+        "together": [_finding(f) for f in together],
+    }
+
+
+def _finding(finding):
+    return as_json(asdict(finding))

@@ -1,0 +1,25 @@
+"""What a rule says when it finds something wrong."""
+
+from dataclasses import dataclass
+
+# the estimate is wrong; it may be worse than it could be; good to know
+ERROR, WARNING, NOTE = "error", "warning", "note"
+SEVERITIES = (ERROR, WARNING, NOTE)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """rule : its name, for machines; severity : of SEVERITIES; cause : what is wrong, a clause; evidence : the numbers
+    that show it; remedy : a line to copy; value : the number that decided, in SI units."""
+
+    rule: str
+    severity: str
+    cause: str
+    evidence: str
+    remedy: str
+    value: float
+
+
+def most_severe_first(findings):
+    """The findings in order of severity; within one in the order in which they came."""
+    return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))

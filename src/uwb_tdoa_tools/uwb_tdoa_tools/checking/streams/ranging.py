@@ -1,0 +1,171 @@
+"""Counters of the values of a stream of TDOAs, and what they amount to over a window."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+from .stamps import StampWindow, complete, new_stamps, note_stamp, restart_stamps, stamp_window
+
+ABSURD = 1e15  # in any unit: no number that a radio gives
+FOLLOWING = 0.1  # s between two TDOAs of a pair that count as successive
+LEAP = 0.5  # m between successive TDOAs of a pair that no tag flies in that time
+BEYOND = 1.0  # m by which a TDOA may exceed the distance of its anchors before it counts as impossible
+GRIDS = np.array(
+    [1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01]
+)  # m, to which a driver might round; the radio's tick is 4.69 mm
+ON_GRID = 1e-6  # m
+
+# places in the counters; those of the grids come after
+(KNOWN, UNKNOWN, SELF, INVALID, IMPOSSIBLE, DUPLICATES, SUCCESSIVE, REPEATED, LEAPS, RETURNS, OPPOSED, EVEN, SUM, HIGH,
+ HIGH_HITS) = range(15)  # fmt: skip
+GRID = 15
+
+
+class TdoaCounters(NamedTuple):
+    """stamps : see stamps.py; counts; heard (N,) per anchor; d, before, t (N, N) : last value, the one before and the
+    last stamp of each pair, which outlive a window; baseline (N, N) : m."""
+
+    stamps: np.ndarray
+    counts: np.ndarray
+    heard: np.ndarray
+    d: np.ndarray
+    before: np.ndarray
+    t: np.ndarray
+    baseline: np.ndarray
+
+
+class TdoaWindow(NamedTuple):
+    """One window of TDOAs. Counts, unless it says otherwise.
+
+    known : finite and between two known anchors; unknown : with an anchor that the survey does not have; of_one : of
+    one anchor with itself; invalid : no number; impossible : longer than the anchors are apart; duplicates : same pair,
+    stamp and value as the one before of its pair; successive : that follow one of their pair within FOLLOWING; repeated
+    : of those, with the same value; leaps : of those, by more than LEAP; returns : leaps that go back to the value
+    before; opposed : pairs that came in both orders, one soon after the other; even : of those, with the same sign in
+    both; size : mean |d|, m; ceiling, hits : largest |d|, m, and how many have it; grids (7,) : share of the values on
+    multiples of GRIDS; heard (N,) : TDOAs in which an anchor takes part.
+    """
+
+    stamps: StampWindow
+    known: int
+    unknown: int
+    of_one: int
+    invalid: int
+    impossible: int
+    duplicates: int
+    successive: int
+    repeated: int
+    leaps: int
+    returns: int
+    opposed: int
+    even: int
+    size: float
+    ceiling: float
+    hits: int
+    grids: np.ndarray
+    heard: np.ndarray
+
+
+def new_tdoa(anchors):
+    """TdoaCounters of a stream of which nothing was received; anchors : Anchors."""
+    n, p = len(anchors), anchors.positions
+    baseline = np.linalg.norm(p[:, None] - p[None, :], axis=2)
+    pairs = (np.full((n, n), np.nan) for _ in range(3))
+    return TdoaCounters(new_stamps(), np.zeros(GRID + len(GRIDS)), np.zeros(n), *pairs, baseline)
+
+
+@compiled
+def restart_tdoa(counters):
+    """Begin a new window."""
+    restart_stamps(counters.stamps)
+    counters.counts[:] = 0.0
+    counters.heard[:] = 0.0
+
+
+@compiled
+def note_tdoa(counters, t, arrival, a, b, d, length):
+    """Take one TDOA: stamp and arrival, s (NaN: not known); a, b rows of its anchors, negative if unknown; d as
+    received. Returns whether the window is complete, `length` s long."""
+    note_stamp(counters.stamps, t, arrival)
+    _count(counters, t, a, b, d)
+    return complete(counters.stamps, length)
+
+
+@compiled
+def _count(counters, t, a, b, d):
+    c = counters.counts
+    if a < 0 or b < 0:
+        c[UNKNOWN] += 1.0
+        return
+    if a == b:
+        c[SELF] += 1.0
+        return
+    if not abs(d) < ABSURD:
+        c[INVALID] += 1.0
+        return
+    c[KNOWN] += 1.0
+    c[SUM] += abs(d)
+    counters.heard[a] += 1.0
+    counters.heard[b] += 1.0
+    if abs(d) > counters.baseline[a, b] + BEYOND:
+        c[IMPOSSIBLE] += 1.0
+    if abs(d) > c[HIGH]:
+        c[HIGH], c[HIGH_HITS] = abs(d), 1.0
+    elif abs(d) == c[HIGH]:
+        c[HIGH_HITS] += 1.0
+    for k in range(len(GRIDS)):
+        if abs(d - GRIDS[k] * round(d / GRIDS[k])) < ON_GRID:
+            c[GRID + k] += 1.0
+    _compare(counters, t, a, b, d)
+
+
+@compiled
+def _compare(counters, t, a, b, d):
+    """Against what was received of this pair before, and of the same in the other order."""
+    c = counters.counts
+    since = t - counters.t[a, b]
+    if since == 0.0 and d == counters.d[a, b]:
+        c[DUPLICATES] += 1.0
+        return
+    if 0.0 <= since < FOLLOWING:
+        c[SUCCESSIVE] += 1.0
+        if d == counters.d[a, b]:
+            c[REPEATED] += 1.0
+        if abs(d - counters.d[a, b]) > LEAP:
+            c[LEAPS] += 1.0
+            if abs(d - counters.before[a, b]) < 0.5 * LEAP:
+                c[RETURNS] += 1.0
+    if 0.0 <= t - counters.t[b, a] < FOLLOWING and abs(d) > LEAP:
+        c[OPPOSED] += 1.0
+        if abs(d - counters.d[b, a]) < abs(d + counters.d[b, a]):
+            c[EVEN] += 1.0
+    counters.before[a, b] = counters.d[a, b]
+    counters.d[a, b], counters.t[a, b] = d, t
+
+
+@compiled
+def feed_tdoa(counters, t, arrival, a, b, d, first, length):
+    """`note_tdoa` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it
+    is)."""
+    for i in range(first, len(t)):
+        if note_tdoa(counters, t[i], arrival[i], a[i], b[i], d[i], length):
+            return i + 1, True
+    return len(t), False
+
+
+def tdoa_window(counters):
+    """TdoaWindow of what was counted since the window began."""
+    c = counters.counts
+    known = max(c[KNOWN], 1.0)
+    whole = [int(value) for value in c[:SUM]]
+    return TdoaWindow(
+        stamp_window(counters.stamps),
+        *whole,
+        size=float(c[SUM] / known),
+        ceiling=float(c[HIGH]),
+        hits=int(c[HIGH_HITS]),
+        grids=c[GRID:] / known,
+        heard=counters.heard.copy(),
+    )

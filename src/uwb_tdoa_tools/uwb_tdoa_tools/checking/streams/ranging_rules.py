@@ -1,0 +1,128 @@
+"""Rules for the values of a stream of TDOAs. A rule takes windows and returns a Finding or None."""
+
+import numpy as np
+
+from .finding import ERROR, NOTE, WARNING, Finding
+from .ranging import GRIDS
+
+LARGE = 0.2  # share of TDOAs longer than their anchors are apart; healthy 0.008 at most
+OUTLIERS = 0.05
+DUPLICATES = 0.02  # share; healthy 0
+REPEATS = 0.15  # share; healthy 0.026
+RETURNS = 0.08  # share of TDOAs that leap by more than 0.5 m and back; healthy 0.04 at most
+EVEN = 0.6  # share of the pairs, heard in both orders, that have one sign; healthy 0.1
+ON_GRID = 0.95  # share; healthy 0.005
+CLIPPED = 0.02  # share at the largest value
+FEW = 3.9  # anchors heard in a second, below which there is no position
+
+
+def share_of(windows, field, among="known"):
+    """Sum of one count over the windows divided by that of another."""
+    return sum(getattr(w, field) for w in windows) / max(sum(getattr(w, among) for w in windows), 1)
+
+
+def impossible(windows):
+    share = share_of(windows, "impossible")
+    size = float(np.median([w.size for w in windows]))
+    evidence = f"{100.0 * share:.1f} % are longer than their anchors are apart, mean size {size:.3g}"
+    if share > LARGE:
+        remedy = "message.distance_difference = ...  # metres: seconds times 299792458, DW1000 ticks times 0.0046918"
+        return Finding(
+            "tdoa_large",
+            ERROR,
+            "TDOAs are impossibly large: not in metres, or of another room",
+            evidence,
+            remedy,
+            share,
+        )
+    if share > OUTLIERS:
+        remedy = "keep radio and anchors clear of metal; drop TDOAs that the radio marks as doubtful"
+        return Finding("tdoa_outliers", WARNING, "many TDOAs are outliers", evidence, remedy, share)
+
+
+def of_one(windows):
+    share = share_of(windows, "of_one")
+    if share > 1e-3:
+        remedy = "message.anchor_a, message.anchor_b = ...  # the two anchors of the difference"
+        return Finding("tdoa_of_one", ERROR, "TDOAs name one anchor twice", f"{100.0 * share:.1f} %", remedy, share)
+
+
+def invalid(windows):
+    share = share_of(windows, "invalid")
+    if share > 1e-3:
+        remedy = "do not publish what is not finite"
+        return Finding("tdoa_invalid", WARNING, "TDOAs are not finite", f"{100.0 * share:.1f} %", remedy, share)
+
+
+def duplicates(windows):
+    share = share_of([w for w in windows if w.stamps.same < 0.9 * w.stamps.count], "duplicates")
+    if share > DUPLICATES:
+        evidence = f"{100.0 * share:.0f} % come twice with stamp and value"
+        remedy = "ros2 topic info --verbose uwb/tdoa  # one publisher only"
+        return Finding("tdoa_twice", ERROR, "TDOAs are published twice", evidence, remedy, share)
+
+
+def repeated(windows):
+    share = share_of(windows, "repeated", "successive")
+    if share > REPEATS and rounded(windows) is None and clipped(windows) is None:
+        evidence = f"{100.0 * share:.0f} % have the value that their pair had before"
+        remedy = "publish a TDOA when there is a new one, not by a timer"
+        return Finding(
+            "tdoa_repeated", WARNING, "TDOAs are sampled faster than they are measured", evidence, remedy, share
+        )
+
+
+def two_tags(windows):
+    share = share_of(windows, "returns", "successive")
+    if share > RETURNS:
+        evidence = f"{100.0 * share:.0f} % leap by more than 0.5 m and back within 0.1 s"
+        remedy = "ros2 run DRIVER --ros-args -r __ns:=/tag2  # a namespace for each tag"
+        return Finding("two_tags", ERROR, "two tags share uwb/tdoa", evidence, remedy, share)
+
+
+def one_sign(windows):
+    share = share_of(windows, "even", "opposed")
+    if share > EVEN and sum(w.opposed for w in windows) > 20:
+        evidence = f"{100.0 * share:.0f} % of the pairs that come as (a, b) and (b, a) have the same sign"
+        remedy = "message.distance_difference = distance_b - distance_a  # for the anchors in this order"
+        return Finding(
+            "tdoa_one_sign",
+            ERROR,
+            "the sign of the TDOAs does not follow the order of the anchors",
+            evidence,
+            remedy,
+            share,
+        )
+
+
+def rounded(windows):
+    shares = np.median([w.grids for w in windows], axis=0)
+    on = np.flatnonzero(shares > ON_GRID)
+    if not len(on) or sum(w.known for w in windows) < 100:
+        return None
+    grid = float(GRIDS[on[0]])
+    severity = WARNING if grid >= 0.05 else NOTE
+    evidence = f"{100.0 * shares[on[0]]:.0f} % are multiples of {grid:g} m"
+    return Finding(
+        "tdoa_rounded", severity, "TDOAs are rounded", evidence, "publish them as float64, as measured", grid
+    )
+
+
+def clipped(windows):
+    ceiling = max(w.ceiling for w in windows)
+    share = sum(w.hits for w in windows if w.ceiling == ceiling) / max(sum(w.known for w in windows), 1)
+    if share > CLIPPED and rounded(windows) is None and ceiling > 0.0:
+        evidence = f"{100.0 * share:.0f} % are {ceiling:.3f} m or its negative"
+        return Finding("tdoa_clipped", ERROR, "TDOAs are clipped", evidence, "widen the limit of the driver", ceiling)
+
+
+def heard(windows):
+    """Anchors heard in a window, on average."""
+    count = float(np.median([np.count_nonzero(w.heard) for w in windows]))
+    if count < FEW:
+        evidence = f"{count:.0f} anchors in a second; four are needed, five or more are good"
+        remedy = "switch on more anchors, or bring the tag among them"
+        return Finding("few_anchors", ERROR, "too few anchors are heard for a position", evidence, remedy, count)
+
+
+RULES = (impossible, of_one, invalid, duplicates, repeated, two_tags, one_sign, rounded, clipped, heard)

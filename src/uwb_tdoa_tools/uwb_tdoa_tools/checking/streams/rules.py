@@ -1,0 +1,92 @@
+"""StreamRules: counters of both streams, their windows, and all rules over them."""
+
+from collections import Counter
+
+import numpy as np
+
+from . import inertial, inertial_rules, ranging, ranging_rules, stamp_rules, stamps
+from .finding import ERROR, Finding, most_severe_first
+
+LENGTH = 1.0  # s of a window
+FULL = 20  # messages without which a window says little of values
+
+
+class StreamRules:
+    """Judges the inertial samples and the TDOAs of one tag by themselves.
+
+    Windows of a second of arrival (of stamps, where the arrival is not known) are counted as they come; the rules judge
+    windows.
+    """
+
+    def __init__(self, anchors):
+        """anchors : Anchors."""
+        self.anchors, self.imu, self.tdoa = anchors, [], []  # windows
+        self.unknown = Counter()  # ids that the survey does not have
+        self._imu, self._tdoa = inertial.new_imu(), ranging.new_tdoa(anchors)
+
+    def feed_imu(self, t, arrival, gyro, force):
+        """Take many samples in the order of their arrival: t, arrival (n,), gyro, force (n, 3)."""
+        columns = [np.ascontiguousarray(column, dtype=float) for column in (t, arrival, gyro, force)]
+        row = 0
+        while row < len(t):
+            row, complete = inertial.feed_imu(self._imu, *columns, row, LENGTH)
+            if complete:
+                self._close_imu()
+
+    def feed_tdoa(self, t, arrival, a, b, d):
+        """Take many TDOAs in the order of their arrival: all (n,), a and b ids."""
+        rows = [self.anchors.index(ids) for ids in (a, b)]
+        for ids, known in zip((a, b), rows):
+            values, counts = np.unique(np.asarray(ids)[known < 0], return_counts=True)
+            self.unknown.update(dict(zip(values.tolist(), counts.tolist())))
+        t, arrival, d = (np.ascontiguousarray(column, dtype=float) for column in (t, arrival, d))
+        row = 0
+        while row < len(t):
+            row, complete = ranging.feed_tdoa(self._tdoa, t, arrival, *rows, d, row, LENGTH)
+            if complete:
+                self._close_tdoa()
+
+    def finish(self):
+        """Close the windows at the end of a recording, unless they hold next to nothing."""
+        for counters, close in ((self._imu, self._close_imu), (self._tdoa, self._close_tdoa)):
+            if counters.stamps[stamps.COUNT] >= FULL:
+                close()
+
+    def findings(self):
+        """What stands: a list of Finding, most severe first."""
+        found = []
+        for name, windows, rules in (
+            ("imu/data", self.imu, inertial_rules.RULES),
+            ("uwb/tdoa", self.tdoa, ranging_rules.RULES),
+        ):
+            if windows:
+                stamped = [window.stamps for window in windows]
+                found += [rule(name, stamped) for rule in stamp_rules.OF_ONE]
+                found += [rule(windows) for rule in rules]
+        if self.imu and self.tdoa:
+            both = [window.stamps for window in self.imu], [window.stamps for window in self.tdoa]
+            found += [rule(*both) for rule in stamp_rules.OF_BOTH]
+        found.append(self._unknown(self.tdoa))
+        return most_severe_first(finding for finding in found if finding is not None)
+
+    def _unknown(self, windows):
+        count = sum(window.unknown for window in windows)
+        if not count:
+            return None
+        share = count / sum(window.stamps.count for window in windows)
+        ids = ", ".join(map(str, sorted(self.unknown)))
+        evidence = (
+            f"{100.0 * share:.1f} % of the TDOAs are with {ids}; the survey has {', '.join(map(str, self.anchors.ids))}"
+        )
+        line = "".join(f"  {number}: {{position: [x, y, z]}}\n" for number in sorted(self.unknown)).rstrip("\n")
+        return Finding(
+            "ids_unknown", ERROR, "the tag hears anchors that the survey does not have", evidence, line, share
+        )
+
+    def _close_imu(self):
+        self.imu.append(inertial.imu_window(self._imu))
+        inertial.restart_imu(self._imu)
+
+    def _close_tdoa(self):
+        self.tdoa.append(ranging.tdoa_window(self._tdoa))
+        ranging.restart_tdoa(self._tdoa)

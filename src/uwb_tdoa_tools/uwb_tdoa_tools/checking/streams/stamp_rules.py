@@ -1,0 +1,219 @@
+"""Rules for the stamps of one stream, and of two against each other.
+
+A rule takes (name of the topic, its windows) and returns a Finding or None. The healthy values beside the limits are
+the extremes of 37 measured recordings of a Crazyflie, all with one clock and without arrival times.
+"""
+
+import math
+
+import numpy as np
+
+from .finding import ERROR, NOTE, WARNING, Finding
+
+STAMP_LINE = "message.header.stamp = ...  # when the sample was measured, ROS time, in seconds and nanoseconds"
+SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
+LONGEST_GAP = {"imu/data": 0.1, "uwb/tdoa": 0.5}  # s; healthy 0.012 and 0.116 at most
+SCATTER = 3.0  # standard deviation of the steps over their mean; healthy 1.4 at most
+REPEATED, LEAP = 0.3, 0.005  # share of stamps that equal the one before, healthy 0, and s between those that do not
+PACE = 0.05  # by which the pace of the stamps may differ from that of the clock
+BLOCK = 0.1  # s between the soonest and the latest arrival of a window, beyond the lag of the first
+APART = 0.1  # s between two streams
+DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording
+LAG, REORDER = 0.25, 0.003  # s: what ekf_node waits for, as its parameters of these names say by default
+UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+
+
+def total(windows, field):
+    """Sum of a field of StampWindow over windows."""
+    return sum(getattr(window, field) for window in windows)
+
+
+def median(windows, field):
+    """Median of a field of StampWindow over windows, NaN left out; NaN if there is none."""
+    values = [value for window in windows if math.isfinite(value := getattr(window, field))]
+    return float(np.median(values)) if values else math.nan
+
+
+def orderly(windows):
+    """False for stamps with which nothing else can be told: of 0, standing still, leaping, or of another unit."""
+    count, ratio = total(windows, "count"), median(windows, "pace")
+    broken = total(windows, "zeros") > 0.01 * count or total(windows, "same") > 0.98 * count or total(windows, "jumps")
+    return not broken and not abs(ratio - 1.0) > PACE
+
+
+def zeros(name, windows):
+    share = total(windows, "zeros") / total(windows, "count")
+    if share > 0.01:
+        evidence = f"{100.0 * share:.0f} % of the stamps are 0"
+        return Finding("stamps_zero", ERROR, f"{name} is not stamped", evidence, STAMP_LINE, share)
+
+
+def standing(name, windows):
+    """One stamp for many messages, or many stamps in a short time and then none."""
+    share = total(windows, "same") / total(windows, "count")
+    if total(windows, "zeros") > 0.01 * total(windows, "count"):
+        return None
+    if share > 0.98:
+        cause = f"the stamps of {name} stand still"
+        return Finding("stamps_stand", ERROR, cause, f"{100.0 * share:.0f} % repeat the one before", STAMP_LINE, share)
+    scatter, step = median(windows, "scatter"), median(windows, "gap")
+    packets = share > REPEATED and step > LEAP
+    if not (packets or scatter > SCATTER):
+        return None
+    evidence = f"{100.0 * share:.0f} % repeat the one before, then they leap by {step:.3f} s"
+    if packets:
+        cause = (
+            f"the stamps of {name} come in steps of {step:.3f} s: a coarse clock, or one stamp for a packet of samples"
+        )
+    else:
+        cause = f"the messages of {name} are stamped when they are read, in bursts, or nanosec holds microseconds"
+        evidence = f"steps of {median(windows, 'step'):.4f} s on average scatter by {scatter:.1f} times that"
+    severity = ERROR if step > LAG else WARNING
+    return Finding("stamps_coarse", severity, cause, evidence, STAMP_LINE, step)
+
+
+def falls(name, windows):
+    share = total(windows, "falls") / total(windows, "count")
+    depth = max(window.depth for window in windows)
+    if share < 1e-3 or depth <= REORDER:
+        return None
+    severity = WARNING if depth < LAG else ERROR
+    evidence = f"{100.0 * share:.1f} % come after a later one, by up to {depth:.3f} s"
+    remedy = (
+        f"-p reorder:={1.2 * depth:.3f} -p lag:={max(LAG, 2.0 * depth):.2f}  # of ekf_node, or publish them in order"
+    )
+    return Finding("stamps_fall", severity, f"messages of {name} are out of order", evidence, remedy, depth)
+
+
+def jumps(name, windows):
+    count = total(windows, "jumps")
+    if not count or abs(median(windows, "pace") - 1.0) > PACE:
+        return None
+    farthest = max((window.jump for window in windows), key=abs)
+    evidence = f"{count} leaps, the farthest of {farthest:+.3f} s"
+    return Finding("stamps_jump", ERROR, f"the clock of {name} jumps", evidence, STAMP_LINE, farthest)
+
+
+def gaps(name, windows):
+    longest, limit = max(window.gap for window in windows), LONGEST_GAP[name]
+    if (
+        longest <= limit
+        or median(windows, "scatter") > SCATTER
+        or median(windows, "step") > limit
+        or not orderly(windows)
+    ):
+        return None
+    count = sum(window.gap > limit for window in windows)
+    evidence = f"{count} gaps, the longest of {longest:.2f} s; more than {limit:.1f} s is coasted over"
+    remedy = f"ros2 topic hz {name}  # check the radio, the load of the machine and the depth of the queue"
+    return Finding("gap", WARNING, f"{name} falls silent in between", evidence, remedy, longest)
+
+
+def rate(name, windows):
+    """Too few per second of stamps; far too few: the stamps are in another unit."""
+    step = median(windows, "step")
+    if not step > 1.0 / SLOWEST[name]:
+        return None
+    for scale, unit in UNITS.items():
+        if 1e-5 < step / scale < 1.0 / SLOWEST[name] and step > 0.5:
+            line = f"stamp = rclpy.time.Time(seconds=ticks / {scale:.0e}).to_msg()  # the clock counts {unit}"
+            evidence = f"{step:.3g} s from one stamp to the next"
+            return Finding("stamps_unit", ERROR, f"the stamps of {name} are in {unit}", evidence, line, scale)
+    evidence = f"{1.0 / step:.1f} Hz; below {SLOWEST[name]:.0f} Hz the estimate gets worse"
+    return Finding("rate", WARNING, f"{name} is slow", evidence, "raise the rate of the driver", 1.0 / step)
+
+
+def pace(name, windows):
+    """Seconds of stamps per second of arrival."""
+    ratio = median(windows, "pace")
+    if (
+        not abs(ratio - 1.0) > PACE
+        or total(windows, "zeros")
+        or total(windows, "same") > 0.98 * total(windows, "count")
+    ):
+        return None
+    unit = next((unit for scale, unit in UNITS.items() if 0.5 < ratio / scale < 2.0), None)
+    cause = f"the stamps of {name} " + (f"are in {unit}" if unit else "do not run with the clock")
+    return Finding("stamps_unit", ERROR, cause, f"{ratio:.4g} s of stamps in 1 s", STAMP_LINE, ratio)
+
+
+def blocks(name, windows):
+    """Late by very different times: kept together and sent in blocks."""
+    spread = median(windows, "spread")
+    if not spread > BLOCK or median(windows, "scatter") > SCATTER or not orderly(windows):
+        return None
+    severity = ERROR if spread > LAG else WARNING
+    cause = f"the messages of {name} arrive in blocks"
+    evidence = f"the latency swings by {spread:.2f} s within a second; the nodes wait {LAG:.2f} s"
+    return Finding(
+        "blocks",
+        severity,
+        cause,
+        evidence,
+        f"-p lag:={1.5 * spread:.2f}  # of ekf_node; or send them one by one",
+        spread,
+    )
+
+
+def drift(name, windows):
+    """A clock that is slower or faster than that of the arrivals (Theil-Sen slope of the smallest latencies)."""
+    known = [(window.begin, window.latency) for window in windows if math.isfinite(window.latency)]
+    if len(known) < 10 or not orderly(windows):
+        return None
+    t, latency = np.array(known[:: max(1, len(known) // 200)]).T
+    i, k = np.triu_indices(len(t), len(t) // 3)
+    slope = float(np.median((latency[k] - latency[i]) / (t[k] - t[i])))
+    if abs(slope) < DRIFT or abs(slope) * np.ptp(t) < DRIFTED:
+        return None
+    evidence = f"{1e3 * slope:+.2f} ms/s, {1e3 * slope * np.ptp(t):+.0f} ms in {np.ptp(t):.0f} s"
+    cause = f"the clock of {name} runs {'slow' if slope > 0.0 else 'fast'} of that of this machine"
+    return Finding(
+        "clock_drift",
+        WARNING,
+        cause,
+        evidence,
+        "chronyc tracking  # synchronise the clocks, or stamp on arrival",
+        slope,
+    )
+
+
+OF_ONE = (zeros, standing, falls, jumps, gaps, rate, pace, blocks, drift)
+
+
+def offset(imu, tdoa):
+    """The streams against each other: by their latencies where arrivals are known, else by where they begin and end."""
+    if not (orderly(imu) and orderly(tdoa)):
+        return None
+    by_arrival = median(tdoa, "latency") - median(imu, "latency")
+    if math.isfinite(by_arrival):
+        ahead, evidence = by_arrival, f"stamp minus arrival: {-median(imu, 'latency'):+.3f} s of the IMU, "
+        evidence += f"{-median(tdoa, 'latency'):+.3f} s of the TDOAs"
+    else:
+        begin, end = imu[0].begin - tdoa[0].begin, imu[-1].end - tdoa[-1].end
+        ahead = 0.5 * (begin + end)
+        evidence = f"the IMU begins {begin:+.3f} s and ends {end:+.3f} s after the TDOAs"
+        if min(abs(begin), abs(end)) < APART or begin * end < 0.0 or abs(end - begin) > 0.3 * abs(ahead):
+            return None
+    if abs(ahead) < APART:
+        return None
+    severity = ERROR if abs(ahead) > LAG else WARNING
+    cause = f"the stamps of imu/data are {abs(ahead):.3f} s {'ahead of' if ahead > 0.0 else 'behind'} those of uwb/tdoa"
+    line = f"t_imu {'-' if ahead > 0.0 else '+'}= {abs(ahead):.3f}  # s; or stamp both with the clock of one machine"
+    return Finding("stamps_apart", severity, cause, evidence, line, ahead)
+
+
+def other_clock(imu, tdoa):
+    """Both streams of one clock, but not of the recorder's."""
+    latency = median(tdoa, "latency")
+    if not (orderly(imu) and orderly(tdoa)):
+        return None
+    if not abs(latency) > 1.0 or abs(latency - median(imu, "latency")) > LAG:
+        return None
+    evidence = f"they arrive {latency:.3f} s after their stamps"
+    line = "message.header.stamp = node.get_clock().now().to_msg()  # or what you measured, on that clock"
+    return Finding(
+        "other_clock", NOTE, "the stamps are not of the clock of the machine that records", evidence, line, latency
+    )
+
+
+OF_BOTH = (offset, other_clock)

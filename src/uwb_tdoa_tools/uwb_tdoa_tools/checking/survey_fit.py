@@ -1,0 +1,128 @@
+"""Where would the anchors have to be? Positions of tag and anchors together, from windows of TDOAs and nothing else.
+
+Systematic errors move the anchors by some decimetres too; only what moving them explains beyond that speaks against a
+survey.
+"""
+
+import numpy as np
+
+from uwb_tdoa_ekf.core import workspace
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
+from uwb_tdoa_ekf.core.startup import locate
+from .explain import SCALE
+
+WINDOWS, LENGTH, FEWEST = 40, 0.5, 30  # windows over the recording, s each, and TDOAs that one must have
+PRIOR = 0.5  # m, by which an anchor may be off the survey; of no anchor in particular is more believed
+TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about where it was located
+STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; TDOAs of a window that count as independent at most
+ROBUST = 0.4  # m, scale of the Geman-McClure weight
+SWEEPS, STEP = 12, 1.0  # Gauss-Newton steps, and the longest of an anchor, m
+SPREAD = 0.3  # m of `spread`; measured flights 0.50 at least, also with ids swapped, a hovering tag 0.16 at most
+
+
+class SurveyFit:
+    """Windows of TDOAs, located with the anchors as surveyed."""
+
+    def __init__(self, t, a, b, d, positions):
+        """t (n,) s, rising; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
+        self.positions = positions
+        self._windows, self._start = [], []
+        config, records, box, covariance = (
+            FilterConfig(),
+            new_memory(positions).anchors,
+            np.empty((2, 3)),
+            np.empty((6, 6)),
+        )
+        workspace.set_bounds(records, config.workspace_margin, box)
+        rows = structured(TDOA, t, a, b, d, np.zeros(len(t)))
+        for begin in np.linspace(t[0], t[-1] - LENGTH, WINDOWS) if len(t) else ():
+            first, end = np.searchsorted(t, [begin, begin + LENGTH])
+            if end - first < FEWEST:
+                continue
+            window, x = tuple(column[first:end] for column in (t, a, b, d)), np.empty(6)
+            locate(rows[first:end], records, box, config.tdoa_std, np.nan, np.nan, x, covariance)
+            self._windows.append(window)
+            self._start.append(x)
+        self.before = self._loss(self._start, positions)
+
+    def __len__(self):
+        """Windows that tell something."""
+        return len(self._windows)
+
+    @property
+    def places(self):
+        """(k, 3) m: where the tag was located in the windows."""
+        return np.array([x[:3] for x in self._start]).reshape(-1, 3)
+
+    def solve(self, free=None):
+        """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows; None for all)
+        moved."""
+        moved = np.ones(len(self.positions), dtype=bool) if free is None else np.isin(range(len(self.positions)), free)
+        free = np.flatnonzero(np.repeat(moved, 3))
+        anchors, start = self.positions.copy(), [x.copy() for x in self._start]
+        for _ in range(SWEEPS):
+            H = np.eye(len(free)) / PRIOR**2
+            g = (self.positions - anchors).reshape(-1)[free] / PRIOR**2
+            eliminated = []
+            for x, window in zip(start, self._windows):
+                by_tag, by_anchors, residual = _linearised(x, window, anchors)
+                by_anchors = by_anchors[:, free]
+                weight = min(1.0, TOGETHER / len(residual)) / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
+                left = by_tag * weight[:, None]
+                A = left.T @ by_tag + np.diag([TAG**-2] * 3 + [SPEED**-2] * 3)
+                B = left.T @ by_anchors
+                c = left.T @ residual - np.r_[np.zeros(3), x[3:] / SPEED**2]
+                solved = np.linalg.solve(A, np.column_stack([B, c]))
+                H += by_anchors.T @ (weight[:, None] * by_anchors) - B.T @ solved[:, :-1]
+                g += by_anchors.T @ (weight * residual) - B.T @ solved[:, -1]
+                eliminated.append(solved)
+            step = np.linalg.solve(H, g)
+            step *= min(1.0, STEP / max(np.abs(step).max(), 1e-9))
+            anchors.reshape(-1)[free] += step
+            for x, solved in zip(start, eliminated):
+                x += np.clip(solved[:, -1] - solved[:, :-1] @ step, -2.0, 2.0)
+        return self._loss(start, anchors), anchors
+
+    def _loss(self, states, anchors):
+        """Mean Geman-McClure loss over the windows."""
+        squares = (_residual(x, window, anchors)[0] ** 2 for x, window in zip(states, self._windows))
+        return float(np.mean([np.mean(square / (square + SCALE**2)) for square in squares])) if states else np.nan
+
+
+def displacement(surveyed, fitted):
+    """(N,) m, how far each anchor has moved, after the best rotation and shift of all of them (Kabsch, Acta Cryst. A
+    32, 1976)."""
+    one, two = surveyed - surveyed.mean(axis=0), fitted - fitted.mean(axis=0)
+    U, _, V = np.linalg.svd(two.T @ one)
+    turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
+    return np.linalg.norm(two @ turn - one, axis=1)
+
+
+def spread(places):
+    """m by which places of a tag (k, 3) are off the straight line that fits them best (second largest standard
+    deviation): a tag that stands, or moves along one line, does not tell one anchor from its mirror image."""
+    if not len(places):
+        return 0.0
+    return float(np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places)))
+
+
+def _residual(x, window, anchors):
+    """(residuals (n,) m, unit vectors (n, 3) from a, and from b, to the tag, time (n,) before the end, s)."""
+    t, a, b, d = window
+    before = t - t[-1]
+    tag = x[:3] + before[:, None] * x[3:]
+    from_a, from_b = tag - anchors[a], tag - anchors[b]
+    ra, rb = (np.maximum(np.linalg.norm(v, axis=1), 1e-6) for v in (from_a, from_b))
+    return d - (rb - ra), from_a / ra[:, None], from_b / rb[:, None], before
+
+
+def _linearised(x, window, anchors):
+    """Jacobians of the TDOAs by position and velocity (n, 6) and by the anchors (n, 3 N), and the residuals (n,)."""
+    residual, from_a, from_b, before = _residual(x, window, anchors)
+    by_position = from_b - from_a
+    by_anchors, rows = np.zeros((len(residual), len(anchors), 3)), np.arange(len(residual))
+    by_anchors[rows, window[1]] += from_a
+    by_anchors[rows, window[2]] -= from_b
+    by_tag = np.column_stack([by_position, before[:, None] * by_position])
+    return by_tag, by_anchors.reshape(len(residual), -1), residual

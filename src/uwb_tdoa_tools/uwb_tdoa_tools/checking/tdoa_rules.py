@@ -1,0 +1,264 @@
+"""What is wrong with all TDOAs, or with the ids of the anchors? Found by what fits: each mistake is undone, and the
+recording says whether more of it is explained then.
+
+A rule takes a Case and yields Trials: the case with one mistake undone, and the Finding if that was it.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.core.config import FilterConfig
+from .streams import ERROR, Finding
+from .explain import SCALE, compare
+from uwb_tdoa_ekf.offline import run_offline
+
+from .case import LONG, SHORT, Case
+from .survey_fit import SPREAD, SurveyFit, spread
+
+RATIO, DEVIATIONS = 0.93, 2.5  # of what stays unexplained; healthy recordings: 1.02 at least for anything that is tried
+UNITS = {  # m in one
+    "nanoseconds": 0.299792458, "centimetres": 0.01, "DW1000 ticks": 0.0046917639, "millimetres": 0.001,
+    "kilometres": 1000.0, "microseconds": 299.792458, "milliseconds": 299792.458, "seconds": 299792458.0,
+}  # fmt: skip
+NOISE, USUAL = (0.02, 0.2), 0.063  # m, median difference of successive TDOAs of a pair; healthy 0.047 - 0.084
+WELL = 0.4  # of the loss; healthy 0.31 at most
+BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # of the loss: what systematic errors of 0.1 m leave unexplained
+GAIN = 0.08  # of the loss by moving all anchors; healthy 0.071 at most, with 0.3 m of delay of one of them, too
+ALONE = 0.85  # share of the gain that one anchor explains
+FEWEST = 10  # windows in which the tag was located
+CONTRARY, FAR = 0.7, 0.5  # share of a pair's TDOAs that fit the other sign, of those longer than that, m
+MOST_PAIRS = 4  # that may be wrong by themselves
+SAME = 0.2  # m at most between the places of an anchor in two surveys of one installation
+
+
+@dataclass(frozen=True)
+class Trial:
+    """case : Case with a mistake undone; finding : callable of the ratio, its standard errors -> Finding; share : of
+    the TDOAs that it changes."""
+
+    case: Case
+    finding: object
+    share: float = 1.0
+
+
+def in_metres(case):
+    """Whether the TDOAs scatter as metres do. (In nanoseconds those of a quiet radio do, too.)"""
+    return NOISE[0] <= successive(case.tdoa) <= NOISE[1]
+
+
+def units(case):
+    """In metres? The noise of the radio is known, and that a motion explains most of it. Yields (Finding, Case)."""
+    noise = successive(case.tdoa)
+    if not noise > 0.0 or (in_metres(case) and case.part(LONG).unexplained().mean < WELL):
+        return
+    near = sorted(UNITS.items(), key=lambda unit: abs(np.log(unit[1] * noise / USUAL)))[:2]
+    (name, scale), (other, its) = near
+    trial = case.with_tdoa(d=case.tdoa.d * scale)
+    if not NOISE[0] <= scale * noise <= NOISE[1] or not trial.part(LONG).unexplained().mean < WELL:
+        return
+    evidence = f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
+    evidence += f"{its * noise:.2g} m as {other}; radios have 0.05 - 0.1 m"
+    line = f"message.distance_difference *= {scale:.10g}"
+    yield Finding("tdoa_unit", ERROR, f"TDOAs are in {name}, not in metres", evidence, line, scale), trial
+
+
+def successive(tdoa):
+    """Median difference of successive TDOAs of a pair, in the unit of the file."""
+    order = np.lexsort((tdoa.t, tdoa.b, tdoa.a))
+    a, b, t, d = tdoa.a[order], tdoa.b[order], tdoa.t[order], tdoa.d[order]
+    follows = (np.diff(a) == 0) & (np.diff(b) == 0) & (np.diff(t) < 0.1)
+    return float(np.median(np.abs(np.diff(d))[follows])) if follows.any() else 0.0
+
+
+def sign(case):
+    """All signs the other way."""
+    line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
+    yield Trial(case.with_tdoa(d=-case.tdoa.d), _says("tdoa_sign", "the sign of all TDOAs is wrong", line))
+
+
+def survey(case, others):
+    """Another survey. others : [(name, Anchors)]. Those of one installation, of different days, count as one."""
+    while others:
+        (name, anchors), *rest = others
+        alike = [other for other, its in rest if same_place(anchors, its)]
+        others = [(other, its) for other, its in rest if other not in alike]
+        if same_place(anchors, case.anchors):
+            continue
+        names = " or ".join([name, *alike])
+        cause = f"the survey is of another room or day: {names} fits"
+        yield Trial(replace(case, anchors=anchors), _says("survey_other", cause, f"--survey {name}"))
+
+
+def same_place(one, other):
+    """True if two Anchors have the same ids at the same places."""
+    rows = other.index(one.ids)
+    return len(one) == len(other) and (rows >= 0).all() and furthest(one, other) < SAME
+
+
+def furthest(one, other):
+    """m between the two places of an id that two Anchors have furthest apart; infinite if they have none in common."""
+    rows = other.index(one.ids)
+    off = np.linalg.norm(one.positions - other.positions[rows], axis=1)[rows >= 0]
+    return float(off.max()) if len(off) else np.inf
+
+
+def renumbered(case):
+    """Ids that the survey does not have: the same anchors in the same order, with other numbers?"""
+    heard, known = np.unique(np.r_[case.tdoa.a, case.tdoa.b]), np.sort(case.anchors.ids)
+    if len(heard) != len(known) or np.isin(heard, known).all():
+        return
+    table = dict(zip(heard.tolist(), known.tolist()))
+    shift = heard[0] - known[0]
+    line = f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]"
+    cause = f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} "
+    cause += f"is {known[0]} ... {known[-1]} there"
+    yield Trial(_relabelled(case, table), _says("ids_renumbered", cause, line))
+
+
+def swapped(case):
+    """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more is explained.
+    Not along a line: in a room that is symmetrical about it, anchors differ by their systematic errors alone."""
+    if spread(survey_fit(case).places) < SPREAD:
+        return
+    table, trial, brief = {}, case, case.part(SHORT)
+    ids = np.intersect1d(case.anchors.ids, np.r_[case.tdoa.a, case.tdoa.b]).tolist()
+    for _ in range(len(ids) - 1):
+        base = brief.unexplained()
+        ratios = []
+        for one, two in combinations(ids, 2):
+            swap = {one: two, two: one}
+            ratios.append((compare(base, _relabelled(brief, swap).unexplained())[0], swap))
+        ratio, swap = min(ratios, key=lambda entry: entry[0] if np.isfinite(entry[0]) else np.inf)
+        if not ratio < 1.0 - 0.02 * (1 + len(table)):
+            break
+        table = {i: swap.get(table.get(i, i), table.get(i, i)) for i in ids}
+        table = {i: k for i, k in table.items() if i != k}
+        brief, trial = _relabelled(brief, swap), _relabelled(trial, swap)
+    if not table or (len(table) > 2 and gained(survey_fit(trial)) is not None):
+        return  # a survey of another room is explained better by exchanging many ids, and still does not fit
+    names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
+    cause = "the ids of two anchors are swapped" if len(table) == 2 else "the ids of anchors are mixed up"
+    yield Trial(
+        trial,
+        _says(
+            "ids_swapped", f"{cause}: what is called {names}", f"id = {table}.get(id, id)  # or swap them in the survey"
+        ),
+    )
+
+
+def contrary(case):
+    """Single pairs with the other sign: a filter that hardly believes them knows. Or all pairs that name the larger id
+    first."""
+    tdoa = case.tdoa
+    pairs = np.unique(np.column_stack([tdoa.a, tdoa.b]), axis=0)
+    backward = tdoa.a > tdoa.b
+    if 0.2 < backward.mean() < 0.8:
+        line = "message.distance_difference = distance_to_b - distance_to_a  # in the order of the message's ids"
+        cause = "the sign of the TDOAs does not follow the order of the anchors"
+        yield Trial(_flipped(case, backward), _says("tdoa_one_sign", cause, line))
+    wrong = _contrary(case.part(LONG), pairs)
+    if not 0 < len(wrong) <= MOST_PAIRS:
+        return
+    flip = np.zeros(len(tdoa), dtype=bool)
+    for a, b in wrong:
+        flip |= (tdoa.a == a) & (tdoa.b == b)
+    names = ", ".join(f"({a}, {b})" for a, b in wrong)
+    line = f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why"
+    yield Trial(_flipped(case, flip), _says("pair_sign", f"the sign of the pairs {names} is wrong", line), flip.mean())
+
+
+def _contrary(case, pairs):
+    """The pairs, [(a, b)], most of whose TDOAs are nearer to the negative of what the filter predicts."""
+    tdoa, run = case.tdoa, run_offline(case.flight(), FilterConfig(use_imu=False)).residuals
+    predicted = tdoa.d - run.innovation
+    counted = np.isfinite(predicted) & (np.abs(tdoa.d) > FAR) & (np.abs(predicted) > FAR)
+    other = np.abs(tdoa.d + predicted) < np.abs(tdoa.d - predicted)
+    wrong = []
+    for a, b in pairs.tolist():
+        mine = counted & (tdoa.a == a) & (tdoa.b == b)
+        if mine.sum() > 20 and other[mine].mean() > CONTRARY:
+            wrong.append((a, b))
+    return wrong
+
+
+def _flipped(case, rows):
+    return case.with_tdoa(d=np.where(rows, -case.tdoa.d, case.tdoa.d))
+
+
+def moved(case):
+    """An anchor that is not where the survey has it: there, TDOAs are explained that no motion explains otherwise."""
+    fit = survey_fit(case)
+    gain = gained(fit)
+    if gain is None:
+        return
+    alone = [fit.solve([row]) for row in range(len(case.anchors))]
+    row = int(np.argmin([loss for loss, _ in alone]))
+    share = (fit.before - alone[row][0]) / gain
+    if share < ALONE:
+        return
+    shift = alone[row][1][row] - fit.positions[row]
+    number = int(case.anchors.ids[row])
+    where = ", ".join(f"{s:+.1f}" for s in shift)
+    cause = f"anchor {number} is not where the survey has it, but about ({where}) m from there"
+    line = f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
+    anchors = Anchors(case.anchors.ids, alone[row][1], case.anchors.orientations, case.anchors.frame)
+    yield Trial(replace(case, anchors=anchors), _says("anchor_moved", cause, line))
+
+
+def survey_fit(case):
+    """SurveyFit of the TDOAs between known anchors."""
+    a, b = case.rows()
+    known = (a >= 0) & (b >= 0) & (a != b)
+    return SurveyFit(case.tdoa.t[known], a[known], b[known], case.tdoa.d[known], case.anchors.positions)
+
+
+def gained(fit):
+    """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording."""
+    if len(fit) < FEWEST:
+        return None
+    gain = fit.before - fit.solve()[0]
+    return gain if gain > GAIN else None
+
+
+def best(case, others=()):
+    """(Finding, Case with it undone), or (None, case): of all that can be tried, what explains the most, if it is
+    certain, and more than systematic errors could: along a line, in a room that is symmetrical about it, swapped ids
+    differ by these alone.
+
+    Smaller TDOAs are always explained better: another unit is believed at once where the noise speaks against metres,
+    and else only where nothing different helps."""
+    if not in_metres(case):
+        for found in units(case):
+            return found
+    base, trials = case.part(LONG).unexplained(), []
+    for rule in (sign, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
+        for trial in rule(case):
+            other = trial.case.part(LONG).unexplained()
+            ratio, z = compare(base, other)
+            if ratio < RATIO and z > DEVIATIONS and base.mean - other.mean > BY_ERRORS * trial.share:
+                trials.append((ratio, z, trial))
+    if trials:
+        ratio, z, trial = min(trials, key=lambda entry: entry[0])
+        return trial.finding(ratio, z), trial.case
+    return next(units(case), (None, case))
+
+
+def _says(rule, cause, line):
+    def finding(ratio, z):
+        evidence = f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
+        return Finding(rule, ERROR, cause, evidence, line, ratio)
+
+    return finding
+
+
+def _relabelled(case, table):
+    """Ids replaced as the dict `table` says, all at once."""
+    columns = {}
+    for name, ids in (("a", case.tdoa.a), ("b", case.tdoa.b)):
+        columns[name] = ids.copy()
+        for one, two in table.items():
+            columns[name][ids == one] = two
+    return case.with_tdoa(**columns)
