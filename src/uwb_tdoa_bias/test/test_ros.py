@@ -4,11 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
-pytest.importorskip("rclpy")
+rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from geometry_msgs.msg import Quaternion  # noqa: E402
 from rclpy.qos import QoSCompatibility, QoSPresetProfiles, QoSProfile, qos_check_compatible  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
 from uwb_tdoa_bias.foundation import ros  # noqa: E402
 
 NANOSECONDS = st.integers(0, 10**9 - 1)
@@ -51,3 +53,23 @@ def test_every_usual_subscriber_matches_what_is_published():
     for subscriber in [*usual, ros.STREAM_QOS]:
         assert qos_check_compatible(ros.OUTPUT_QOS, subscriber)[0] != QoSCompatibility.ERROR
     assert ros.OUTPUT_QOS.reliability == ros.ReliabilityPolicy.RELIABLE
+
+
+def test_simulated_time_that_stands_still_or_is_missing_is_said():
+    rclpy.init(args=["--ros-args", "-p", "use_sim_time:=true"])
+    node, other = rclpy.create_node("on_simulated_time"), rclpy.create_node("player", use_global_arguments=False)
+    try:
+        clock, source = ros.SimulatedClock(node), other.create_publisher(Clock, "/clock", 10)
+        level, text = clock.judge()
+        assert level == DiagnosticStatus.WARN and "nobody publishes /clock" in text
+        for second, expected in ((5, None), (6, None), (6, (DiagnosticStatus.OK, "paused: /clock stands still")), (7, None)):
+            for _ in range(200):
+                source.publish(Clock(clock=ros.Time(sec=second)))
+                rclpy.spin_once(node, timeout_sec=0.05)
+                if node.get_clock().now().nanoseconds == second * 10**9:
+                    break
+            assert clock.judge() == expected
+    finally:
+        for each in (node, other):
+            each.destroy_node()
+        rclpy.shutdown()

@@ -35,6 +35,11 @@ PARAMETERS = {  # in the order of config/ekf_node.yaml
 }  # fmt: skip
 
 
+def names_of_parameters():
+    """Names of all."""
+    return {field.name for field in fields(FilterConfig)} | {*PARAMETERS}
+
+
 def declare_parameters(node):
     """Declare all; returns (FilterConfig, {name: value} of the others). What was given under an old name counts, with a
     warning."""
