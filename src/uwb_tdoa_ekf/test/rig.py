@@ -113,8 +113,9 @@ class Rig:
     received : {topic: messages in order of arrival}, for the streams and "/tf".
     """
 
-    def __init__(self, namespace, listen=(*STREAMS, "/tf"), reliable=True):
-        """listen : topics to keep; reliable : make the streams so, for a test that cannot bear the loss of a message."""
+    def __init__(self, namespace, listen=(*STREAMS, "/tf"), reliable=True, latched=True):
+        """listen : topics to keep; reliable : make the streams so, for a test that cannot bear the loss of a message;
+        latched : have a latched publisher of anchors."""
         self.namespace = namespace
         self.node = rclpy.create_node("rig", namespace=namespace)
         self._reliable, self._qos = reliable, copy(ros.STREAM_QOS)
@@ -124,7 +125,7 @@ class Rig:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._processes, self._publishers, self._status, self._since = {}, {}, {}, 0.0
-        self._anchors = None
+        self._anchors = self.node.create_publisher(AnchorArray, "uwb/anchors", ANCHORS_QOS) if latched else None
         self._subscriptions = {
             topic: self.node.create_subscription(STREAMS.get(topic, TFMessage), topic, store.append, self._qos)
             for topic, store in self.received.items()
@@ -256,12 +257,8 @@ class Rig:
 
     def send_anchors(self, anchors, publisher=None):
         """anchors : Anchors, or an AnchorArray to be sent as it is; publisher : another than the latched one."""
-        if publisher is None:
-            publisher = self._anchors = self._anchors or self._latched_anchors()
+        publisher = publisher or self._anchors
         publisher.publish(anchors if isinstance(anchors, AnchorArray) else anchors_to_message(anchors))
-
-    def _latched_anchors(self):
-        return self.node.create_publisher(AnchorArray, "uwb/anchors", ANCHORS_QOS)
 
     def send(self, topic, message, t, frame="base_link", epoch=EPOCH):
         """Publish a message with the stamp of t s after the epoch."""

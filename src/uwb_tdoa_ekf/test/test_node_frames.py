@@ -104,7 +104,7 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
 def test_what_a_robot_does_to_a_running_filter(make_rig):
     """Volatile anchors, both kinds of subscribers, an unknown frame, parameters in flight, initialpose, reset."""
     flight = recording(2.0)
-    rig = make_rig(reliable=False)
+    rig = make_rig(reliable=False, latched=False)
     counts = {}
     (process,) = rig.start("ekf_node")
     for policy in (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE):
