@@ -31,6 +31,7 @@ setup(
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [
+            "anchors_node = uwb_tdoa_bias.executables:anchors_node",
             "bias_node = uwb_tdoa_bias.executables:bias_node",
         ]
     },

@@ -24,6 +24,7 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", glob("config/*.yaml")),
         (f"share/{NAME}/launch", glob("launch/*.py")),
+        (f"share/{NAME}/rviz", glob("rviz/*.rviz")),
     ],
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={

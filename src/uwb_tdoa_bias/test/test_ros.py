@@ -2,16 +2,15 @@ import math
 
 from hypothesis import given
 from hypothesis import strategies as st
-import numpy as np
 import pytest
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
 
-pytest.importorskip("rclpy")
+rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from geometry_msgs.msg import Quaternion  # noqa: E402
 from rclpy.qos import QoSCompatibility, QoSPresetProfiles, QoSProfile, qos_check_compatible  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
 from uwb_tdoa_bias.foundation import ros  # noqa: E402
 
 NANOSECONDS = st.integers(0, 10**9 - 1)
@@ -42,43 +41,6 @@ def test_an_orientation_of_zeros_is_not_known():
     assert all(map(math.isnan, ros.orientation_of(Quaternion(w=0.0))))
 
 
-def test_anchors_survive_the_message():
-    anchors = Anchors([7, 3], [[1, 2, 3], [4, 5, 6]], [[0, 0, 0.6, 0.8], [np.nan] * 4], frame="hall")
-    message = ros.anchors_to_message(anchors)
-    unknown = message.anchors[1].pose.orientation
-    assert (unknown.x, unknown.y, unknown.z, unknown.w) == (0.0, 0.0, 0.0, 0.0)
-    assert ros.same_anchors(Anchors.from_message(message), anchors)
-
-
-def test_a_message_without_a_frame_is_in_the_map():
-    message = ros.anchors_to_message(Anchors.from_positions(np.eye(3)))
-    message.header.frame_id = ""
-    assert Anchors.from_message(message).frame == "map"
-
-
-def test_same_anchors_notices_every_difference():
-    anchors = Anchors([7, 3], [[1, 2, 3], [4, 5, 6]], [[0, 0, 0.6, 0.8], [np.nan] * 4], frame="hall")
-    ids, positions, orientations = anchors.ids, anchors.positions, anchors.orientations
-    for other in (
-        Anchors([7, 4], positions, orientations, "hall"),
-        Anchors(ids, positions + [0, 0, 1e-6], orientations, "hall"),
-        Anchors(ids, positions, orientations[::-1], "hall"),
-        Anchors(ids, positions, orientations, "map"),
-        Anchors(ids[:1], positions[:1], orientations[:1], "hall"),
-    ):
-        assert not ros.same_anchors(anchors, other)
-
-
-def test_bad_anchors_are_refused():
-    message = ros.anchors_to_message(Anchors.from_positions(np.eye(3)))
-    message.anchors[1].id = 0
-    with pytest.raises(InputError, match="id 0 is given twice"):
-        Anchors.from_message(message)
-    message.anchors.clear()
-    with pytest.raises(InputError, match="empty"):
-        Anchors.from_message(message)
-
-
 def test_stream_subscriptions_match_every_usual_publisher():
     usual = [QoSPresetProfiles.SENSOR_DATA.value, QoSPresetProfiles.SYSTEM_DEFAULT.value, QoSProfile(depth=10)]
     for publisher in [*usual, ros.STREAM_QOS]:
@@ -86,6 +48,28 @@ def test_stream_subscriptions_match_every_usual_publisher():
     assert ros.STREAM_QOS.reliability == ros.ReliabilityPolicy.BEST_EFFORT
 
 
-def test_anchors_need_a_publisher_that_keeps_them():
-    assert qos_check_compatible(ros.ANCHORS_QOS, ros.ANCHORS_QOS)[0] != QoSCompatibility.ERROR
-    assert qos_check_compatible(QoSProfile(depth=1), ros.ANCHORS_QOS)[0] == QoSCompatibility.ERROR
+def test_every_usual_subscriber_matches_what_is_published():
+    usual = [QoSPresetProfiles.SENSOR_DATA.value, QoSPresetProfiles.SYSTEM_DEFAULT.value, QoSProfile(depth=10)]
+    for subscriber in [*usual, ros.STREAM_QOS]:
+        assert qos_check_compatible(ros.OUTPUT_QOS, subscriber)[0] != QoSCompatibility.ERROR
+    assert ros.OUTPUT_QOS.reliability == ros.ReliabilityPolicy.RELIABLE
+
+
+def test_simulated_time_that_stands_still_or_is_missing_is_said():
+    rclpy.init(args=["--ros-args", "-p", "use_sim_time:=true"])
+    node, other = rclpy.create_node("on_simulated_time"), rclpy.create_node("player", use_global_arguments=False)
+    try:
+        clock, source = ros.SimulatedClock(node), other.create_publisher(Clock, "/clock", 10)
+        level, text = clock.judge()
+        assert level == DiagnosticStatus.WARN and "nobody publishes /clock" in text
+        for second, expected in ((5, None), (6, None), (6, (DiagnosticStatus.OK, "paused: /clock stands still")), (7, None)):
+            for _ in range(200):
+                source.publish(Clock(clock=ros.Time(sec=second)))
+                rclpy.spin_once(node, timeout_sec=0.05)
+                if node.get_clock().now().nanoseconds == second * 10**9:
+                    break
+            assert clock.judge() == expected
+    finally:
+        for each in (node, other):
+            each.destroy_node()
+        rclpy.shutdown()

@@ -1,6 +1,6 @@
 """bias_node: raw TDOAs in, corrected TDOAs out.
 
-uwb/tdoa (Tdoa), odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray)
+uwb/tdoa (Tdoa), odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray), /tf_static
   -> uwb/tdoa_corrected (TdoaCorrected: one for each Tdoa), /diagnostics (diagnostic_msgs/DiagnosticArray).
 Every parameter is documented in config/bias_node.yaml.
 """
@@ -19,12 +19,34 @@ from .foundation import ros
 from .foundation.anchors import Anchors
 from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
 from .effects import EffectSet
+from .effects.tag_lever_arm import TagLeverArm
 from .foundation.errors import InputError
+from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
+from .foundation.ros_frames import FramesInput, unknown_frame
+from .foundation.ros_parameters import Parameter, declare_all, refuse_unknown, say_unused
 from .correction.pose_queue import PoseQueue
 from .correction.network import SHIPPED, load_network
 from .correction.poses import known_yaw_std
 from .foundation.stamps import StampGate
 
+PARAMETERS = {  # in the order of config/bias_node.yaml
+    "anchors_file": ANCHORS_FILE,
+    "effects_file": Parameter(
+        "", 'path of an effects.yaml: which systematic effects to remove, with which values; "" for none'
+    ),
+    "model_file": Parameter(
+        SHIPPED, 'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 modules'
+    ),
+    "pose_lag": Parameter(
+        0.05, "s; a TDOA is corrected at the newest pose at least this much older than the TDOA before it", 0.001, 10.0
+    ),
+    "hold": Parameter(
+        0.225, "s of stamps; longest wait for that pose: above ekf_node's lag - pose_lag, below its lag", 0.001, 100.0
+    ),
+    "body_frame": Parameter(
+        "base_link", "frame of the odometry's body; TDOAs in another frame are of an antenna that /tf_static places in it"
+    ),
+}
 ROTATIONS = [21, 28, 35]  # places of the variances about the axes in the covariance of a pose
 EARLY = 2000  # TDOAs kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
@@ -35,17 +57,13 @@ class BiasNode(Node):
 
     NAME = "bias_node"
 
-    def __init__(self):
+    def __init__(self, files=()):
+        """files : parameter files that were given, to say which do not match."""
         super().__init__(self.NAME)
-        effects_file = ros.parameter(self, "effects_file", "", "effects.yaml to correct with; empty for none")
-        model_file = ros.parameter(
-            self, "model_file", SHIPPED, "ONNX model to correct with; default for the one shipped, empty for none"
-        )
-        self._lag = ros.parameter(self, "pose_lag", 0.05, "the pose used is this much older than the TDOA before, s")
-        self._limit = ros.parameter(self, "hold", 0.225, "longest wait of a TDOA for its pose, s of stamps")
-        for name, value in (("pose_lag", self._lag), ("hold", self._limit)):
-            if not 0.0 < value < math.inf:
-                raise InputError(f"{name}: {value!r} must be a number of seconds above 0.")
+        own = declare_all(self, PARAMETERS)
+        refuse_unknown(self)
+        effects_file, model_file = own["effects_file"], own["model_file"]
+        self._lag, self._limit, self._body = own["pose_lag"], own["hold"], own["body_frame"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._late = self._effects.stamp_offset("tdoa")  # s
         self._network = load_network(model_file)
@@ -58,13 +76,18 @@ class BiasNode(Node):
         self._reported_unready = 0
         self._message = TdoaCorrected()  # one for all: what is published is copied
 
+        self._frame, self._frame_trouble = self._body, None  # of the TDOAs
+        self._declared = self._effects  # without the arm of the antenna
         self._publisher = ros.publish_stream(self, TdoaCorrected, "uwb/tdoa_corrected")
-        self._anchors = ros.AnchorsInput(self, self._on_anchors)
+        self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
+        self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self._inputs = {
             "odometry": ros.subscribe_stream(self, Odometry, "odometry", self._on_odometry),
             "uwb/tdoa": ros.subscribe_stream(self, Tdoa, "uwb/tdoa", self._on_tdoa),
         }
+        say_unused(self, files)
         self._diagnostics = ros.Diagnostics(self, self._report)
+        self._anchors.start()
         self.get_logger().info(f"ready; correcting with: {self._model[NETWORK]}")
 
     def _warm_up(self):
@@ -85,6 +108,33 @@ class BiasNode(Node):
         early, self._early = self._early, deque()
         for message in early:
             self._take(message)
+
+    def _on_frames(self):
+        """A constant transform is new, or another."""
+        if self._frame != self._body:
+            self._place_antenna(self._frame)
+
+    def _place_antenna(self, frame):
+        """Find out where the antenna of this frame is on the body, and take out what that does to TDOAs."""
+        self._frame, self._frame_trouble, effects = frame, None, self._declared
+        if frame not in ("", self._body):
+            between = self._frames.frames.between(self._body, frame)
+            if any(effect.name == TagLeverArm.name for effect in effects.effects):
+                self.get_logger().info(f"{TagLeverArm.name} of effects_file counts, not the transform of '{frame}'")
+            elif between is None:
+                self._frame_trouble = unknown_frame("uwb/tdoa", frame, self._body)
+                self.get_logger().warning(self._frame_trouble)
+            elif between[1].any():
+                arm = TagLeverArm(values=dict(zip("xyz", between[1].tolist())))
+                effects = EffectSet((*effects.effects, arm))
+        if effects.effects == self._effects.effects:
+            return
+        self._effects = effects
+        self._model = self._warm_up()
+        self._idle = self._model[NETWORK] == "none"
+        self.get_logger().info(f"'{frame}' is placed by /tf_static; correcting with: {self._model[NETWORK]}")
+        if self._anchors.anchors is not None:
+            self._start_over()
 
     def _on_odometry(self, message):
         self._counts["poses"] += 1
@@ -113,6 +163,8 @@ class BiasNode(Node):
 
     def _on_tdoa(self, message):
         self._counts["received"] += 1
+        if message.header.frame_id != self._frame:
+            self._place_antenna(message.header.frame_id)
         if self._idle:
             self._publish(message, 0.0, 0.0, PASSED)
         elif self._corrector is None:
@@ -186,6 +238,8 @@ class BiasNode(Node):
         return *self._health(rate, unready), values
 
     def _health(self, rate, unready):
+        if self._frame_trouble:
+            return DiagnosticStatus.WARN, self._frame_trouble
         if self._idle:
             return DiagnosticStatus.OK, "passing TDOAs on: neither effects_file nor model_file is set"
         if self._anchors.refused:

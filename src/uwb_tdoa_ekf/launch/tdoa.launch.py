@@ -1,31 +1,52 @@
-"""Both nodes of one tag:  ros2 launch uwb_tdoa_ekf tdoa.launch.py namespace:=tag1 bias_params:=my_bias.yaml"""
+"""All nodes of one tag.
 
-from ament_index_python.packages import get_package_share_directory
+ros2 launch uwb_tdoa_ekf tdoa.launch.py anchors_file:=anchors.yaml
+ros2 launch uwb_tdoa_ekf tdoa.launch.py namespace:=tag1 ekf_params:=my_ekf.yaml publish_tf:=odom rviz:=true
+ros2 launch uwb_tdoa_ekf tdoa.launch.py --show-args
+"""
+
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from uwb_tdoa_ekf.launching import start, tag, typed
+from uwb_tdoa_ekf.launching_actions import node_action, rviz_action
+
+VALUES = {  # parameters of the nodes; one that is not given is what the files say, or the node's default
+    "anchors_file": "survey of the anchors; without it they come on uwb/anchors",
+    "effects_file": "effects.yaml that diagnose wrote",
+    "model_file": "ONNX bias model",
+    "map": "map.npz that debias wrote; starts debias_node",
+    "world_frame": "frame of the odometry",
+    "body_frame": "frame of the robot",
+    "publish_tf": "none, base (map -> base_link) or odom (map -> odom, REP 105)",
+    "odom_frame": "frame of the robot's own odometry, for publish_tf odom",
+    "use_sim_time": "true for bags that are played with --clock",
+}
+OTHERS = {
+    "namespace": ("", "one per tag; the topics are relative to it"),
+    "bias_params": ("", "parameter file of bias_node, which the values above override"),
+    "ekf_params": ("", "parameter file of ekf_node, which the values above override"),
+    "log_level": ("info", "debug, info, warn, error"),
+    "rviz": ("false", "true opens RViz with the tag, its covariance and the anchors"),
+}
 
 
 def generate_launch_description():
-    """The nodes read their documented defaults unless another parameter file is given."""
-    bias, ekf = (get_package_share_directory(f"uwb_tdoa_{name}") for name in ("bias", "ekf"))
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("namespace", default_value="", description="one per tag; the topics are relative to it"),
-            DeclareLaunchArgument("bias_params", default_value=f"{bias}/config/bias_node.yaml"),
-            DeclareLaunchArgument("ekf_params", default_value=f"{ekf}/config/ekf_node.yaml"),
-            Node(
-                package="uwb_tdoa_bias",
-                executable="bias_node",
-                namespace=LaunchConfiguration("namespace"),
-                parameters=[LaunchConfiguration("bias_params")],
-            ),
-            Node(
-                package="uwb_tdoa_ekf",
-                executable="ekf_node",
-                namespace=LaunchConfiguration("namespace"),
-                parameters=[LaunchConfiguration("ekf_params")],
-            ),
-        ]
-    )
+    """Arguments, and what follows from them."""
+    arguments = [DeclareLaunchArgument(name, default_value="", description=text) for name, text in VALUES.items()]
+    arguments += [
+        DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()
+    ]
+    return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
+
+
+def _nodes(context):
+    values = typed({name: LaunchConfiguration(name).perform(context) for name in VALUES})
+    given = {name: LaunchConfiguration(name).perform(context) for name in OTHERS}
+    files = {node: [given[key]] for node, key in (("bias_node", "bias_params"), ("ekf_node", "ekf_params")) if given[key]}
+    starts = tag(given["namespace"], values, files, given["log_level"])
+    if "anchors_file" in values:
+        starts.append(start("anchors_node", given["namespace"], values, (), given["log_level"]))
+    actions = [node_action(Node, each) for each in starts]
+    return actions + ([rviz_action(Node, values.get("use_sim_time", False))] if given["rviz"] == "true" else [])

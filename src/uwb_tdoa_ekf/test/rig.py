@@ -21,6 +21,7 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
 EPOCH = 1_700_000_000  # s; stamps of today's size
@@ -112,8 +113,9 @@ class Rig:
     received : {topic: messages in order of arrival}, for the streams and "/tf".
     """
 
-    def __init__(self, namespace, listen=(*STREAMS, "/tf"), reliable=True):
-        """listen : topics to keep; reliable : make the streams so, for a test that cannot bear the loss of a message."""
+    def __init__(self, namespace, listen=(*STREAMS, "/tf"), reliable=True, latched=True):
+        """listen : topics to keep; reliable : make the streams so, for a test that cannot bear the loss of a message;
+        latched : have a latched publisher of anchors."""
         self.namespace = namespace
         self.node = rclpy.create_node("rig", namespace=namespace)
         self._reliable, self._qos = reliable, copy(ros.STREAM_QOS)
@@ -123,7 +125,7 @@ class Rig:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._processes, self._publishers, self._status, self._since = {}, {}, {}, 0.0
-        self._anchors = self.node.create_publisher(AnchorArray, "uwb/anchors", ros.ANCHORS_QOS)
+        self._anchors = self.node.create_publisher(AnchorArray, "uwb/anchors", ANCHORS_QOS) if latched else None
         self._subscriptions = {
             topic: self.node.create_subscription(STREAMS.get(topic, TFMessage), topic, store.append, self._qos)
             for topic, store in self.received.items()
@@ -253,21 +255,25 @@ class Rig:
         self.wait(arrived, f"{name} to count {expected}", 60.0)
         return {key: int(value) for key, value in self.values(name).items() if value.isdigit()}
 
-    def send_anchors(self, anchors):
-        """anchors : Anchors, or an AnchorArray to be sent as it is."""
-        self._anchors.publish(anchors if isinstance(anchors, AnchorArray) else ros.anchors_to_message(anchors))
+    def send_anchors(self, anchors, publisher=None):
+        """anchors : Anchors, or an AnchorArray to be sent as it is; publisher : another than the latched one."""
+        publisher = publisher or self._anchors
+        publisher.publish(anchors if isinstance(anchors, AnchorArray) else anchors_to_message(anchors))
 
     def send(self, topic, message, t, frame="base_link", epoch=EPOCH):
         """Publish a message with the stamp of t s after the epoch."""
         message.header.stamp, message.header.frame_id = stamp(t, epoch), frame
         self._publishers[topic].publish(message)
 
-    def send_imu(self, t, gyro=(0.0, 0.0, 0.0), accel=(0.0, 0.0, 9.81), epoch=EPOCH):
+    def imu_message(self, gyro=(0.0, 0.0, 0.0), accel=(0.0, 0.0, 9.81)):
         message = Imu()
         rate, acceleration = message.angular_velocity, message.linear_acceleration
         rate.x, rate.y, rate.z = map(float, gyro)
         acceleration.x, acceleration.y, acceleration.z = map(float, accel)
-        self.send("imu/data", message, t, epoch=epoch)
+        return message
+
+    def send_imu(self, t, gyro=(0.0, 0.0, 0.0), accel=(0.0, 0.0, 9.81), epoch=EPOCH):
+        self.send("imu/data", self.imu_message(gyro, accel), t, epoch=epoch)
 
     def send_tdoa(self, t, a, b, d, epoch=EPOCH):
         self.send("uwb/tdoa", Tdoa(anchor_a=int(a), anchor_b=int(b), distance_difference=float(d)), t, epoch=epoch)

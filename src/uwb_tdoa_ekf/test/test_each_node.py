@@ -16,7 +16,7 @@ from rig import MODULES, make_rig, recording, seconds_of, stamp  # noqa: E402, F
 from sensor_msgs.msg import Imu  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
-from uwb_tdoa_bias.foundation import ros  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message  # noqa: E402
 from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
@@ -241,7 +241,7 @@ def test_other_anchors_start_the_filter_anew_and_the_same_do_not(make_rig, tmp_p
 def test_bad_anchors_are_told(make_rig):
     rig = make_rig()
     rig.start("ekf_node")
-    message = ros.anchors_to_message(ANCHORS)
+    message = anchors_to_message(ANCHORS)
     message.anchors[2].pose.position.z = float("nan")
     rig.send_anchors(message)
     rig.wait(lambda: f"anchor {ANCHORS.ids[2]} " in rig.fresh_status("ekf_node").message, "the reason")

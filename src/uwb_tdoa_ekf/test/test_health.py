@@ -88,7 +88,8 @@ def test_odometry_that_falls_behind_the_clock_is_a_warning(clock, behind, level)
     judge.behind = behind
     said, text, values = second(clock, judge, RUNNING, used=400)
     assert said == level and ("too slow" in text) == (level == WARN)
-    assert values["odometry behind the clock"] == f"{behind:.3f} s"
+    expected = f"{behind:.3f} s" if behind < 60.0 else "not comparable: the stamps are of another time"
+    assert values["odometry behind the clock"].startswith(expected)
     judge.behind = 2.0
     assert "invalid" in second(clock, judge, RUNNING, used=400, invalid=400)[1]  # what matters more is said
 

@@ -122,15 +122,15 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what):
 
 def test_quality_of_service(make_rig):
     rig = make_rig(listen=["odometry", "uwb/tdoa_corrected", "uwb/residual"], reliable=False)
-    reliable = f"qos_overrides./{rig.namespace}/odometry.publisher.reliability:=reliable"
-    rig.start("bias_node", "ekf_node", ekf_node=["-p", reliable])
+    other = f"qos_overrides./{rig.namespace}/odometry.publisher.reliability:=best_effort"
+    rig.start("bias_node", "ekf_node", ekf_node=["-p", other])
     best_effort = (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
     always = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
     latched = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
     publishers = {
-        "uwb/tdoa_corrected": {"bias_node": best_effort},
-        "uwb/residual": {"ekf_node": best_effort},
-        "odometry": {"ekf_node": always},  # by the parameter above
+        "uwb/tdoa_corrected": {"bias_node": always},
+        "uwb/residual": {"ekf_node": always},
+        "odometry": {"ekf_node": best_effort},  # by the parameter above
         "/tf": {"ekf_node": always},
         "/diagnostics": {"bias_node": always, "ekf_node": always},
     }

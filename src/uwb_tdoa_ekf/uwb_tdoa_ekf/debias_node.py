@@ -17,11 +17,25 @@ from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all, refuse_unknown, say_unused
 
 from .debias import BiasMap, LayerConfig, Layers
 
 GAP = 1.0  # s; after a longer silence, or when time goes back, the layers start anew
 LARGEST_OUTSIDE = 0.5  # share of positions outside of the map, before it becomes a warning
+PARAMETERS = {  # in the order of config/debias_node.yaml; the layers are those of Grasso et al., appendix C
+    "map": Parameter("", "file that `debias` wrote; must be given"),
+    "saturate": Parameter(False, "limit the steps of velocity and position"),
+    "max_speed": Parameter([3.0, 3.0, 3.0], "m/s along x, y, z", constraint="three numbers above 0"),
+    "max_acceleration": Parameter(10.0, "m/s^2", 0.0, 1e6),
+    "smooth": Parameter(1.0, "share of the newest position in the weighted mean, above 0; 1.0 for no smoothing", 0.0, 1.0),
+    "history": Parameter(4, "earlier positions in that mean", 1, 1000),
+    "adams_moulton": Parameter(False, "mix in what the velocities predict"),
+    "flipping_speed": Parameter(
+        [1.0, 1.0, 1.0], "m/s along x, y, z at which the prediction begins to count", constraint="three numbers above 0"
+    ),
+    "least_weight": Parameter(0.5, "share that the estimate keeps at high speed", 0.0, 1.0),
+}
 
 
 class DebiasNode(Node):
@@ -29,23 +43,21 @@ class DebiasNode(Node):
 
     NAME = "debias_node"
 
-    def __init__(self):
+    def __init__(self, files=()):
+        """files : parameter files that were given, to say which do not match."""
         super().__init__(self.NAME)
-        file = ros.parameter(self, "map", "", "file of `debias`: the bias of every measured position")
+        layers = declare_all(self, PARAMETERS)
+        refuse_unknown(self)
+        file = layers.pop("map")
         if not file:
             raise InputError("map: is empty; give a file that `debias` wrote.")
-        self._map, defaults = BiasMap.load(file), LayerConfig()
-        about = "of appendix C of Grasso et al.; see config/debias_node.yaml"
-        layers = {
-            name: ros.parameter(self, name, list(value) if isinstance(value, tuple) else value, about)
-            for name, value in vars(defaults).items()
-        }
-        self._layers = Layers(LayerConfig(**layers))
+        self._map, self._layers = BiasMap.load(file), Layers(LayerConfig(**layers))
         self._epoch, self._counts, self._rate, self._counts_before = ros.Epoch(), Counter(), ros.Rate(), Counter()
         self._newest = -math.inf
         self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
         self._publisher = ros.publish_stream(self, Odometry, "odometry/debiased")
         self._input = ros.subscribe_stream(self, Odometry, "odometry", self._on_odometry)
+        say_unused(self, files)
         self._diagnostics = ros.Diagnostics(self, self._report)
         self.get_logger().info(f"ready; {len(self._map.at)} markers, {self._map.interpolator}")
 

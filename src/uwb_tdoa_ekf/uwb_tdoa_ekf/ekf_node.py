@@ -1,61 +1,51 @@
 """ekf_node: inertial samples and corrected TDOAs in, odometry out.
 
-imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray); if they are there: height
+imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray), /tf_static; if they are there: height
 (sensor_msgs/Range, REP 117), pressure (sensor_msgs/FluidPressure), velocity (geometry_msgs/TwistWithCovarianceStamped, in the
-body frame), velocity/odometry (the twist of another nav_msgs/Odometry)
+body frame), velocity/odometry (the twist of another nav_msgs/Odometry), initialpose (geometry_msgs/PoseWithCovarianceStamped)
   -> odometry (nav_msgs/Odometry), /tf (tf2_msgs/TFMessage), uwb/residual (TdoaResidual: one for each TdoaCorrected),
      /diagnostics (diagnostic_msgs/DiagnosticArray).
+Service ~/reset (std_srvs/Trigger): start anew.
 Every parameter is documented in config/ekf_node.yaml.
 """
 
 from collections import Counter, deque
-from dataclasses import fields
 from functools import partial
 import math
 import sys
 import time
 
-from geometry_msgs.msg import TransformStamped, TwistWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import FluidPressure, Imu, Range
-from tf2_msgs.msg import TFMessage
+from std_srvs.srv import Trigger
+from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
-from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual
+from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
+from uwb_tdoa_bias.foundation.ros_frames import FramesInput, unknown_frame
+from uwb_tdoa_bias.foundation.ros_parameters import refuse_unknown, say_unused
+from uwb_tdoa_msgs.msg import TdoaCorrected
 
 from .core import aids
-from .core.config import RENAMED, FilterConfig, current_names
+from .core.config import RENAMED
 from .core.verdicts import INVALID
+from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import STREAMS, VERDICTS, Estimator
 from .frames import to_odometry
+from .imu_mount import ImuMount
 from .monitoring.health import OK, WARN, Health
 from .monitoring.monitor import Monitor
+from .outputs import Outputs
+from .told_pose import told_pose
 
-PARAMETERS = {  # beside those of FilterConfig: default and meaning, as in config/ekf_node.yaml
-    "world_frame": ("", 'frame of the odometry and the parent on /tf; "" for the frame of uwb/anchors'),
-    "body_frame": (
-        "base_link", "frame of tag and IMU, whose axes must agree with it: the child on /tf; one per tag"
-    ),
-    "publish_tf": (True, "world -> body on /tf"),
-    "flyable_volume": (
-        "", 'flyable.npz of plan; a warning on /diagnostics while the tag is outside; "" for none'
-    ),
-    "effects_file": (
-        "", "effects.yaml, the same as bias_node's: what it says of gyroscope, accelerometer, height and velocity is taken out"
-    ),
-    "reorder": (0.003, "s of stamps; how long a TDOA waits for older ones that are still on their way"),
-    "lag": (0.25, "s of stamps; how long a silent stream is waited for; what comes later than that is late"),
-}  # fmt: skip
 EARLY = 5000  # messages kept while there are no anchors
 UNKNOWN_VARIANCE = 1e6  # (m/s)^2, at which and above a velocity is not measured
-UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
 
 
 class EkfNode(Node):
@@ -63,19 +53,18 @@ class EkfNode(Node):
 
     NAME = "ekf_node"
 
-    def __init__(self):
+    def __init__(self, files=()):
+        """files : parameter files that were given, to say which do not match."""
         super().__init__(self.NAME)
-        self._config = _declare_filter_config(self)
-        others = {name: ros.parameter(self, name, value, text) for name, (value, text) in PARAMETERS.items()}
-        self._reorder, self._lag, self._world = (others[name] for name in ("reorder", "lag", "world_frame"))
-        volume, effects_file = others["flyable_volume"], others["effects_file"]
+        self._config, own = declare_parameters(self)
+        self._reorder, self._lag, self._world, self._body = (
+            own[name] for name in ("reorder", "lag", "world_frame", "body_frame")
+        )
+        if not self._reorder < self._lag:
+            raise InputError(f"reorder, lag: {self._reorder!r}, {self._lag!r} must be seconds with 0 <= reorder < lag.")
+        volume, effects_file = own["flyable_volume"], own["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._aid_corrector = AidCorrector(self._effects.effects)
-        if not 0.0 <= self._reorder < self._lag < math.inf:
-            raise InputError(f"reorder, lag: {self._reorder!r}, {self._lag!r} must be seconds with 0 <= reorder < lag.")
-        self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute")
-        _warm_up(self._config)
-
         self._invalid = {  # how a message counts that none has received
             self._take_imu: "imu_invalid", self._take_tdoa: "invalid", self._take_height: "height_invalid",
             self._take_pressure: "pressure_invalid", self._take_velocity: "velocity_invalid",
@@ -84,17 +73,27 @@ class EkfNode(Node):
         self._epoch = ros.Epoch()
         self._early = deque()
         self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
+        self._imu_frame, self._imu_mount, self._frame_trouble = own["body_frame"], None, None
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
-        # One message object each, for all: what is published is copied.
-        self._odometry = Odometry(child_frame_id=others["body_frame"])
-        self._transform = TransformStamped(child_frame_id=others["body_frame"])
-        self._tf, self._residual = TFMessage(transforms=[self._transform]), TdoaResidual()
+        refuse_unknown(self, RENAMED)
+        self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute")
+        _warm_up(self._config)
+        moving = own["publish_tf"] == ODOM
+        self._frames = FramesInput(self, self._epoch.seconds, self._on_frames, moving)
+        self._outputs = Outputs(self, self._epoch, self._frames.frames, self._body, own["publish_tf"], own["odom_frame"])
+        self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
+        self._inputs = self._subscribe()
+        self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
+        self._reset = self.create_service(Trigger, "~/reset", self._on_reset)
+        follow_changes(self, lambda: self._config, self._on_config)
+        say_unused(self, files)
+        self._diagnostics = ros.Diagnostics(self, self._report)
+        self._anchors.start()
+        self.get_logger().info("ready")
 
-        self._odometry_publisher = ros.publish_stream(self, Odometry, "odometry")
-        self._residual_publisher = ros.publish_stream(self, TdoaResidual, "uwb/residual")
-        self._tf_publisher = self.create_publisher(TFMessage, "/tf", ros.TF_QOS) if others["publish_tf"] else None
-        self._anchors = ros.AnchorsInput(self, self._on_anchors)
-        self._inputs = {
+    def _subscribe(self):
+        """{topic: subscription} of all streams."""
+        inputs = {
             "imu/data": ros.subscribe_stream(self, Imu, "imu/data", self._on_imu),
             "uwb/tdoa_corrected": ros.subscribe_stream(self, TdoaCorrected, "uwb/tdoa_corrected", self._on_tdoa),
         }
@@ -108,9 +107,8 @@ class EkfNode(Node):
         }
         for aid in aids.STREAMS:
             for topic, kind, take in topics[aid] if getattr(self._config, f"use_{aid}") else ():
-                self._inputs[topic] = ros.subscribe_stream(self, kind, topic, partial(self._on_aid, aid, take))
-        self._diagnostics = ros.Diagnostics(self, self._report)
-        self.get_logger().info("ready")
+                inputs[topic] = ros.subscribe_stream(self, kind, topic, partial(self._on_aid, aid, take))
+        return inputs
 
     def _on_anchors(self, anchors):
         if self._estimator is not None:
@@ -118,13 +116,57 @@ class EkfNode(Node):
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
         self._estimator = Estimator(anchors, self._config, self._reorder, self._lag)
         self._imu_corrector, self._monitor = ImuCorrector(self._effects.effects), Monitor(anchors)
-        world = self._world or anchors.frame
-        for message in (self._odometry, self._transform, self._residual):
-            message.header.frame_id = world
+        self._outputs.set_world(self._world or anchors.frame)
         early, self._early = self._early, deque()
         for take, message in early:
             take(message)
         self._publish(*self._estimator.advance())
+
+    def _on_config(self, config):
+        self._config = config
+        if self._estimator is not None:
+            self._estimator.retune(config)
+
+    def _on_reset(self, _, response):
+        response.success = self._estimator is not None
+        response.message = "starting over" if response.success else "there are no anchors yet: nothing has started"
+        if response.success:
+            self._start_over()
+        return response
+
+    def _start_over(self):
+        self._publish(*self._estimator.reset())
+        self._monitor = Monitor(self._estimator.anchors)
+
+    def _on_pose(self, message):
+        try:
+            if self._estimator is None:
+                raise InputError("there are no anchors yet; give the pose again when there are.")
+            self._estimator.tell_pose(*told_pose(message, self._outputs.world, self._epoch, self._estimator.newest))
+        except InputError as error:
+            self.get_logger().warning(f"initialpose: not taken: {error}")
+
+    def _on_frames(self):
+        """A constant transform is new, or another."""
+        if self._imu_frame == self._body:
+            return
+        before = self._frame_trouble, self._imu_mount
+        self._place_imu(self._imu_frame)
+        if before != (self._frame_trouble, self._imu_mount) and self._estimator is not None:
+            self.get_logger().warning(f"the transform of '{self._imu_frame}' is new: starting over")
+            self._start_over()
+
+    def _place_imu(self, frame):
+        """Find out how an IMU of this frame sits on the body."""
+        self._imu_frame, self._imu_mount, self._frame_trouble = frame, None, None
+        if frame in ("", self._body):
+            return
+        between = self._frames.frames.between(self._body, frame)
+        if between is None:
+            self._frame_trouble = unknown_frame("imu/data", frame, self._body)
+            self.get_logger().warning(self._frame_trouble)
+        else:
+            self._imu_mount = ImuMount(*between)
 
     def _on_imu(self, message):
         self._health.imu += 1
@@ -149,10 +191,13 @@ class EkfNode(Node):
             self._past[self._invalid[take]] += 1
             if take == self._take_tdoa:
                 t = self._epoch.seconds(message.header.stamp)
-                self._publish_residual(t, message.anchor_a, message.anchor_b, math.nan, math.nan, 0.0, INVALID)
+                a, b = message.anchor_a, message.anchor_b
+                self._outputs.publish_residual(t, a, b, math.nan, math.nan, 0.0, INVALID)
 
     def _take_imu(self, message):
         t = self._epoch.seconds(message.header.stamp)
+        if message.header.frame_id != self._imu_frame:
+            self._place_imu(message.header.frame_id)
         rate, force = message.angular_velocity, message.linear_acceleration  # the specific force, says REP 145
         gyro, accel = (rate.x, rate.y, rate.z), (force.x, force.y, force.z)
         if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
@@ -164,6 +209,8 @@ class EkfNode(Node):
             gyro = (math.nan,) * 3
         if not self._imu_corrector.idle:
             gyro, accel = (x[0].tolist() for x in self._imu_corrector.correct(*map(np.array, ([t], [gyro], [accel]))))
+        if self._imu_mount is not None:
+            gyro, accel = self._imu_mount.in_body(t, gyro, accel)
         self._estimator.add_imu(t, gyro, accel)
 
     def _take_tdoa(self, message):
@@ -195,61 +242,21 @@ class EkfNode(Node):
 
     def _publish(self, odometry, residuals):
         if len(odometry.t):
-            self._publish_odometry(odometry)
+            # the variance is that of the mean over one odometry interval
+            variance = self._config.gyro_noise**2 * self._config.odometry_rate
+            self._outputs.publish_odometry(odometry, self._estimator.rates_at(odometry.t) - odometry.gyro_bias, variance)
+            self._health.last_odometry = time.monotonic()
+            self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
             self._monitor.add_odometry(odometry)
         if len(residuals.t):
             self._monitor.add(residuals)
-            columns = (
-                residuals.t, residuals.a, residuals.b, residuals.innovation, residuals.variance, residuals.weight,
-                residuals.verdict,
-            )  # fmt: skip
-            for row in zip(*(column.tolist() for column in columns)):
-                self._publish_residual(*row)
-
-    def _publish_residual(self, t, a, b, innovation, variance, weight, verdict):
-        out = self._residual
-        out.header.stamp = self._epoch.stamp(t)
-        out.anchor_a, out.anchor_b = a, b
-        out.innovation, out.innovation_variance = innovation, variance
-        out.weight, out.verdict = weight, verdict
-        self._residual_publisher.publish(out)
-
-    def _publish_odometry(self, odometry):
-        n = len(odometry)
-        velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
-        pose, twist = covariance[:, :6, :6].reshape(n, 36), np.zeros((n, 6, 6))
-        twist[:, :3, :3] = covariance[:, 6:, 6:]
-        rates = self._estimator.rates_at(odometry.t) - odometry.gyro_bias
-        known = np.isfinite(rates[:, 0])
-        rate_variance = (
-            self._config.gyro_noise**2 * self._config.odometry_rate
-        )  # of the mean over one odometry interval
-        twist[:, [3, 4, 5], [3, 4, 5]] = np.where(known, rate_variance, UNKNOWN_RATE)[:, None]
-        twist = twist.reshape(n, 36)
-        out, tf = self._odometry, self._transform.transform
-        columns = (odometry.t, odometry.p, odometry.q, velocity, np.where(known[:, None], rates, 0.0))
-        for i, (t, p, q, u, rate) in enumerate(zip(*(column.tolist() for column in columns))):
-            out.header.stamp = self._transform.header.stamp = self._epoch.stamp(t)
-            position, orientation, twist_out = out.pose.pose.position, out.pose.pose.orientation, out.twist.twist
-            position.x, position.y, position.z = p
-            orientation.x, orientation.y, orientation.z, orientation.w = q
-            twist_out.linear.x, twist_out.linear.y, twist_out.linear.z = u
-            twist_out.angular.x, twist_out.angular.y, twist_out.angular.z = rate
-            out.pose.covariance, out.twist.covariance = pose[i], twist[i]
-            self._odometry_publisher.publish(out)
-            if self._tf_publisher is not None:
-                tf.translation.x, tf.translation.y, tf.translation.z = p
-                tf.rotation = orientation
-                self._tf_publisher.publish(self._tf)
-        self._health.odometry += n
-        self._health.last_odometry = time.monotonic()
-        self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
+            self._outputs.publish_residuals(residuals)
 
     def _behind(self):
         """s from the stamp of the newest odometry to now, by the clock of the node; None without odometry."""
-        if not self._health.odometry:
+        if not self._outputs.published:
             return None
-        return 1e-9 * (self.get_clock().now().nanoseconds - Time.from_msg(self._odometry.header.stamp).nanoseconds)
+        return 1e-9 * (self.get_clock().now().nanoseconds - Time.from_msg(self._outputs.stamp).nanoseconds)
 
     def _report(self):
         counts, estimator = Counter(self._past), self._estimator
@@ -261,38 +268,22 @@ class EkfNode(Node):
         self._health.behind = self._behind()
         level, text, values = self._health.report(self._anchors.refused, estimator, counts)
         alarms = self._monitor.alarms if estimator is not None else []
-        if alarms and level == OK:
-            level, text = WARN, alarms[0]
+        troubles = [self._frame_trouble, self._outputs.trouble, *alarms]
+        if level == OK and any(troubles):
+            level, text = WARN, next(filter(None, troubles))
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
         values |= {"TDOAs received": self._health.tdoa} | {name: counts[name] for name in VERDICTS.values()}
         values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.imu}
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
-        values |= {"imu_waiting": waiting["imu"], "odometry published": self._health.odometry}
+        values |= {"imu_waiting": waiting["imu"], "odometry published": self._outputs.published}
         values |= {name: counts[name] for name in ("recoveries", "restarts")}
         for aid, received in self._health.aids.items():
             values |= {f"{aid}_received": received, f"{aid}_waiting": waiting[aid]}
             values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}
         values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._inputs.items()}
-        values |= {"subscribers of odometry": self._odometry_publisher.get_subscription_count()}
-        values |= {"subscribers of uwb/residual": self._residual_publisher.get_subscription_count()}
+        values |= {"subscribers of odometry": self._outputs.odometry.get_subscription_count()}
+        values |= {"subscribers of uwb/residual": self._outputs.residual.get_subscription_count()}
         return level, text, values
-
-
-def _declare_filter_config(node):
-    """Declare every parameter of FilterConfig; what was given under an old name counts, with a warning."""
-    old = {name: _value_of_old(node, name) for name in RENAMED}
-    given = {name: value for name, value in old.items() if value is not None}
-    defaults = {field.name: field.default for field in fields(FilterConfig)}
-    defaults |= current_names(given, node.get_logger().warning)
-    texts = {field.name: field.metadata["text"] for field in fields(FilterConfig)}
-    return FilterConfig(**{name: ros.parameter(node, name, value, texts[name]) for name, value in defaults.items()})
-
-
-def _value_of_old(node, name):
-    """What was given for a parameter that the node does not have any more, or None."""
-    value = node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True)).value
-    node.undeclare_parameter(name)
-    return value
 
 
 def _warm_up(config):
@@ -306,6 +297,8 @@ def _warm_up(config):
         estimator.add_velocity(0.01 * step, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
         odometry, _ = estimator.advance()
     to_odometry(odometry.q, odometry.v, odometry.covariance)
+    estimator.tell_pose(2.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
+    estimator.finish()
 
 
 def main(argv=None):

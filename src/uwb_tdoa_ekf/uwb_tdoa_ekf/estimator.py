@@ -1,19 +1,20 @@
 """The filter for live streams: messages in any order in, odometry that depends on their stamps alone out."""
 
 from bisect import bisect_right, insort
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 import math
 from operator import itemgetter
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.stamps import StampGate
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, StampGate
 
 from .aid_rows import ROWS
 from .core import aids
 from .core.config import FilterConfig
-from .core.engine import feed
-from .core.memory import AID, IMU_SAMPLE, ODOMETRY, RESIDUAL, TDOA, Measurements, new_memory
+from .core.engine import feed, tell_pose
+from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, Measurements, new_memory
 from .core.validity import MAX_ACCEL, MAX_RATE, usable
 from .core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
 
@@ -87,12 +88,18 @@ class Estimator:
         self._waiting = [[] for _ in STREAMS]  # items of each stream in order of their stamps
         self._gates = [StampGate() for _ in STREAMS]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
+        self._poses = []  # (1,) of POSE, told and not reached yet
         self._fed_imu = [np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)]  # lately, after the one before them
 
     @property
     def running(self):
         """True once a start position was found."""
         return bool(self._memory.record.running)
+
+    @property
+    def newest(self):
+        """Stamp of the newest measurement, s; -inf before the first."""
+        return max(gate.newest for gate in self._gates)
 
     @property
     def recoveries(self):
@@ -146,6 +153,33 @@ class Estimator:
         else:
             self.counts[f"{name}_invalid"] += 1
             self._gates[FIRST_AID + kind].note(t)
+
+    def tell_pose(self, t, p, covariance, yaw=math.nan, yaw_std=math.nan):
+        """Take a pose that somebody tells: t s; p (3,) m, NaN where it is not known; covariance (3, 3) m^2; yaw and yaw_std rad,
+        or NaN. It holds from its stamp on; if the filter has passed that, from the next measurement on.
+
+        Raises InputError for a stamp that is not of the time of the streams.
+        """
+        newest = self.newest
+        if newest > -math.inf and not newest - LARGEST_STEP_BACK <= t <= newest + LARGEST_STEP_AHEAD:
+            raise InputError(
+                f"pose: its stamp is {t - newest:+.3f} s from that of the newest measurement; give one from "
+                f"-{LARGEST_STEP_BACK:g} to {LARGEST_STEP_AHEAD:g} s."
+            )
+        self._poses.append(np.array([(max(t, self._fed_until), p, covariance, yaw, yaw_std)], POSE))
+        self._poses.sort(key=lambda pose: pose["t"][0])
+
+    def retune(self, config):
+        """Go on with another FilterConfig, which differs in nothing that is fixed (see FilterConfig)."""
+        self.config, self._tuning = config, config.tuning()
+
+    def reset(self):
+        """Use everything that still waits, and forget it: what comes next starts the filter anew. Returns
+        (Odometry, Residuals)."""
+        out = self.finish()
+        self.counts["restarts"] += 1
+        self._clear()
+        return out
 
     def advance(self):
         """Use every message that nothing earlier can precede any more. Returns (Odometry, Residuals), possibly empty."""
@@ -209,6 +243,21 @@ class Estimator:
             self._take(other, t, item)
 
     def _feed(self, until):
+        """Use what is stamped up to `until`, s, and between it what poses were told."""
+        parts = []
+        while self._poses and self._poses[0]["t"][0] <= until and self._has_begun():
+            pose = self._poses.pop(0)
+            pose["t"] = max(pose["t"][0], self._fed_until)
+            parts.append(self._feed_measurements(pose["t"][0]))
+            tell_pose(self._memory, self._tuning, pose)
+            self._fed_until = pose["t"][0]
+        parts.append(self._feed_measurements(until))
+        return parts[0] if len(parts) == 1 else tuple(_joined(column) for column in zip(*parts))
+
+    def _has_begun(self):
+        return any(self._waiting) or self._fed_until > -math.inf
+
+    def _feed_measurements(self, until):
         counts = [bisect_right(waiting, until, key=itemgetter(0)) for waiting in self._waiting]
         if not (any(counts) or self._refused):
             return NOTHING
@@ -246,6 +295,13 @@ class Estimator:
 
 NO_AIDS = np.empty(0, AID)
 NOTHING = Odometry.from_rows(np.empty(0, ODOMETRY)), Residuals(*(np.empty(0) for _ in range(7)))
+
+
+def _joined(parts):
+    """One Odometry, or Residuals, of several."""
+    parts = [part for part in parts if len(part.t)] or parts[:1]
+    kind = type(parts[0])
+    return kind(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind)))
 
 
 def _insert(item, waiting):

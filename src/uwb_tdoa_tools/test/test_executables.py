@@ -23,6 +23,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
 
 NODES = {
+    "anchors_node": "uwb_tdoa_bias.anchors_node",
     "bias_node": "uwb_tdoa_bias.bias_node",
     "debias_node": "uwb_tdoa_ekf.debias_node",
     "ekf_node": "uwb_tdoa_ekf.ekf_node",

@@ -14,8 +14,12 @@ ORDER = ("uwb_tdoa_msgs", "uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")  # 
 PACKAGES = ORDER[1:]
 # Who talks ROS. Everything else can be imported and tested without it.
 ROS = """
-    uwb_tdoa_bias.bias_node uwb_tdoa_bias.foundation.ros
-    uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.monitoring.health
+    uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
+    uwb_tdoa_bias.foundation.ros uwb_tdoa_bias.foundation.ros_anchors uwb_tdoa_bias.foundation.ros_frames
+    uwb_tdoa_bias.foundation.ros_parameters
+    uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters uwb_tdoa_ekf.launching
+    uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.outputs
+    uwb_tdoa_ekf.monitoring.health
     uwb_tdoa_tools.benchmark.nodes uwb_tdoa_tools.benchmark.rates uwb_tdoa_tools.benchmark.source
     uwb_tdoa_tools.benchmark.suite uwb_tdoa_tools.commands.bench uwb_tdoa_tools.commands.demo
     uwb_tdoa_tools.commands.record uwb_tdoa_tools.commands.replay uwb_tdoa_tools.live.demo uwb_tdoa_tools.live.follow

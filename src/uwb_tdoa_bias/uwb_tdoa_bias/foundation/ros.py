@@ -1,4 +1,4 @@
-"""What everything that talks ROS shares: QoS, stamps, anchors, parameters, diagnostics, and the life of a node."""
+"""What everything that talks ROS shares: QoS, stamps, diagnostics, and the life of a node."""
 
 import argparse
 from copy import copy
@@ -11,45 +11,37 @@ import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, Pose, Quaternion
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterTypeException, ParameterUninitializedException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
-from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
-from .anchors import Anchors
 from .errors import InputError
 from .executable import interrupt
+from .ros_parameters import files_of
 
 try:  # not in rclpy before 7.1.4; takes a third of the CPU time
     from rclpy.experimental import EventsExecutor
 except ImportError:
     EventsExecutor = SingleThreadedExecutor
 
-# Streams are sensor data: best effort. Deep, because a node that was not scheduled for a moment must find all of it:
-# 10 s of a 1 kHz IMU, or 2.5 s of it replayed four times as fast. Takes memory only where it is used.
+# What comes in is sensor data: best effort, which hears every publisher. Deep, because a node that was not scheduled for a
+# moment must find all of it: 10 s of a 1 kHz IMU, or 2.5 s of it replayed four times as fast. Takes memory only where it
+# is used. What goes out is reliable, which every subscriber hears: RViz and most others ask for it.
 STREAM_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
-ANCHORS_QOS = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-TF_QOS = QoSProfile(depth=100)  # what tf2 listens with
+OUTPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LONGEST_WAIT = 0.2  # s, until a node that receives nothing sees a signal
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
-
-
 OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])  # written into the given profile
 
 
 def publish_stream(node, kind, topic):
     """Publisher of a stream; QoS by parameter: qos_overrides.<topic>.publisher.reliability and .depth."""
-    return node.create_publisher(kind, topic, copy(STREAM_QOS), qos_overriding_options=OVERRIDES)
+    return node.create_publisher(kind, topic, copy(OUTPUT_QOS), qos_overriding_options=OVERRIDES)
 
 
 def subscribe_stream(node, kind, topic, callback):
@@ -84,61 +76,6 @@ def orientation_of(q):
     return values if any(values) else (np.nan,) * 4
 
 
-def anchors_to_message(anchors):
-    """AnchorArray of Anchors, with a stamp of 0: anchors do not age."""
-    message = AnchorArray()
-    message.header.frame_id = anchors.frame
-    known = np.where(np.isfinite(anchors.orientations), anchors.orientations, 0.0)
-    for i, (x, y, z), q in zip(anchors.ids.tolist(), anchors.positions.tolist(), known.tolist()):
-        orientation = Quaternion(x=q[0], y=q[1], z=q[2], w=q[3])
-        message.anchors.append(Anchor(id=i, pose=Pose(position=Point(x=x, y=y, z=z), orientation=orientation)))
-    return message
-
-
-def same_anchors(one, other):
-    """True if two Anchors are equal in everything."""
-    return (
-        one.frame == other.frame
-        and np.array_equal(one.ids, other.ids)
-        and np.array_equal(one.positions, other.positions)
-        and np.array_equal(one.orientations, other.orientations, equal_nan=True)
-    )
-
-
-class AnchorsInput:
-    """Subscribes to uwb/anchors. anchors : Anchors or None; refused : why the last message was of no use, or None."""
-
-    def __init__(self, node, on_change):
-        """on_change(anchors) is called with the first Anchors, and with others that differ."""
-        self.anchors = self.refused = None
-        self._node, self._on_change = node, on_change
-        node.create_subscription(AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS)
-
-    def _on_message(self, message):
-        try:
-            anchors, self.refused = Anchors.from_message(message), None
-        except InputError as error:
-            self.refused = str(error)
-            return
-        if self.anchors is not None:
-            if same_anchors(anchors, self.anchors):
-                return
-            self._node.get_logger().warning("the anchors have changed: starting over")
-        self.anchors = anchors
-        self._on_change(anchors)
-
-
-def parameter(node, name, default, description):
-    """Declare a parameter that is read once, at the start, and return its value; raises InputError."""
-    try:
-        descriptor = ParameterDescriptor(description=description, read_only=True)
-        return node.declare_parameter(name, default, descriptor).value
-    except (InvalidParameterTypeException, ParameterUninitializedException) as error:
-        kind = {float: "a number with a decimal point, e.g. 1.0", int: "a whole number", bool: "true or false"}
-        reason = str(error).rsplit(":", 1)[0]
-        raise InputError(f"{name}: {reason}; give {kind.get(type(default), 'text')}.") from error
-
-
 class Diagnostics:
     """Publishes one status on /diagnostics each second of the wall clock, and logs it whenever its text changes.
 
@@ -147,12 +84,14 @@ class Diagnostics:
 
     def __init__(self, node, report):
         self._node, self._report, self._said = node, report, None
+        self._clock = SimulatedClock(node)
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS_QOS)
         node.create_timer(1.0, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def publish(self):
         """Publish now."""
         level, text, values = self._report()
+        level, text = self._clock.judge() or (level, text)
         if text != self._said:
             logger = self._node.get_logger()
             if level == DiagnosticStatus.OK:
@@ -166,6 +105,24 @@ class Diagnostics:
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
+
+
+class SimulatedClock:
+    """Whether simulated time goes on; of the clock of a node, asked once a second."""
+
+    def __init__(self, node):
+        self._node, self._before = node, None
+
+    def judge(self):
+        """(level, text) while nothing else can be said, because time stands still; None otherwise."""
+        clock = self._node.get_clock()
+        if not clock.ros_time_is_active:
+            return None
+        before, self._before = self._before, clock.now().nanoseconds
+        if self._before == 0:
+            remedy = "play the bag with --clock, or set use_sim_time to false"
+            return DiagnosticStatus.WARN, f"use_sim_time is set, and nobody publishes /clock: {remedy}"
+        return (DiagnosticStatus.OK, "paused: /clock stands still") if self._before == before else None
 
 
 class Rate:
@@ -186,7 +143,8 @@ def run(node_class, description, argv=None):
     """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an InputError, or 128 and the
     number of a signal that came before the node was ready.
 
-    node_class() makes the node, in an initialised rclpy, and has the executable's NAME; description : for --help.
+    node_class(files) makes the node, in an initialised rclpy, of parameter files that were given; it has the executable's
+    NAME. description : for --help.
     """
     name = node_class.NAME
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
@@ -206,7 +164,7 @@ def run(node_class, description, argv=None):
     node = executor = None
     try:
         _init(parser, arguments)
-        node = node_class()
+        node = node_class(files_of(arguments))
         executor = EventsExecutor()
         executor.add_node(node)
         gc.collect()

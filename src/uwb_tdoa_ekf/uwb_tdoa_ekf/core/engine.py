@@ -58,6 +58,19 @@ def run(memory, tuning, measurements, output):
     return rows
 
 
+@compiled
+def _tell(memory, tuning, poses, records):
+    ekf, pose = memory.ekf[0], poses[0]
+    if ekf.running:
+        _advance(ekf, tuning[0], pose.t, records)
+    initialization.place(ekf, memory.anchors, tuning[0], pose.t, pose, records)
+
+
+def tell_pose(memory, tuning, pose):
+    """Put the filter at a pose, (1,) of POSE, that is not before what was fed earlier. Is not recorded in a history."""
+    _tell(memory, tuning, pose, history.NOTHING)
+
+
 def most_records(measurements):
     """Room that a history needs for Measurements that are fed at once."""
     imu, tdoa, aid = measurements

@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from . import height, hypotheses, inertial, workspace
 from .history import add_reset
 from .memory import HYPOTHESES, WINDOW
-from .startup import level, locate, share_of_inliers
+from .startup import SPEED, level, locate, share_of_inliers
 from .state import GRAVITY
 
 MINIMUM = 12  # TDOAs a search needs
@@ -45,21 +45,86 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance)
     if not anyhow and (share < AGREE or not workspace.contains(ekf.workspace, x)):
         return
-    unknown = tuning.use_imu and tuning.initial_yaw_std > hypotheses.YAW_STD
+    _begin(ekf, tuning, t, x, covariance, tuning.initial_yaw, tuning.initial_yaw_std)
+    add_reset(ekf, t, history)
+
+
+@compiled
+def place(ekf, anchors, tuning, t, pose, history):
+    """Go to the pose that one of POSE tells; begin there, if the filter does not run.
+
+    What is not told stays as it is; before the filter runs, it is anywhere in the workspace. Tilt, velocity and biases
+    stay as they are too: gravity and TDOAs know them better than who tells a pose.
+    """
+    x, covariance = np.zeros(6), np.zeros((6, 6))
+    if ekf.running:
+        best = ekf.hypotheses[ekf.best]
+        x[:] = best.x[:6]
+        covariance[:, :] = best.P[:6, :6]
+    else:
+        workspace.set_bounds(anchors, tuning.workspace_margin, ekf.workspace)
+        for k in range(3):
+            x[k] = 0.5 * (ekf.workspace[0, k] + ekf.workspace[1, k])
+            covariance[k, k] = (0.5 * (ekf.workspace[1, k] - ekf.workspace[0, k])) ** 2
+            covariance[3 + k, 3 + k] = SPEED**2
+    for k in range(3):
+        if math.isnan(pose.p[k]):
+            continue
+        x[k] = pose.p[k]
+        covariance[k, :] = 0.0
+        covariance[:, k] = 0.0
+        for j in range(3):
+            if not math.isnan(pose.p[j]):
+                covariance[k, j] = covariance[j, k] = pose.covariance[k, j]
+    told = not math.isnan(pose.yaw)
+    if not ekf.running:
+        yaw, std = (pose.yaw, pose.yaw_std) if told else (tuning.initial_yaw, tuning.initial_yaw_std)
+        _begin(ekf, tuning, t, x, covariance, yaw, std)
+    else:
+        for h in range(HYPOTHESES):
+            hypothesis = ekf.hypotheses[h]
+            hypothesis.P[:6, 6:] = 0.0
+            hypothesis.P[6:, :6] = 0.0
+            _put(hypothesis, x, covariance)
+            if told:
+                _turn(hypothesis, pose.yaw, pose.yaw_std)
+                if h != ekf.best:
+                    hypothesis.log_weight = -np.inf
+    ekf.consistency = 1.0
+    add_reset(ekf, t, history)
+
+
+@compiled
+def _begin(ekf, tuning, t, x, covariance, yaw, yaw_std):
+    """Start every hypothesis at position and velocity x (6,), level, with the yaws that are possible."""
+    accel = _mean_accel(ekf.imu, tuning)
+    unknown = tuning.use_imu and yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):
         hypothesis, offset = ekf.hypotheses[h], hypotheses.yaw_offset(h)
         nearest = min(offset, 2.0 * math.pi - offset)
-        hypothesis.log_weight = -0.5 * (nearest / tuning.initial_yaw_std) ** 2 if unknown or h == 0 else -np.inf
-        level(accel, tuning.initial_yaw + offset, hypothesis.x)
+        hypothesis.log_weight = -0.5 * (nearest / yaw_std) ** 2 if unknown or h == 0 else -np.inf
+        level(accel, yaw + offset, hypothesis.x)
         hypothesis.x[10:] = 0.0
         hypothesis.P[:] = 0.0
         _put(hypothesis, x, covariance)
-        _spread_attitude(hypothesis.P, tuning)
+        _spread_attitude(hypothesis.P, tuning, yaw_std)
     ekf.best = 0
     ekf.t = ekf.last_tdoa = t
     ekf.consistency = 1.0
     ekf.running = True
-    add_reset(ekf, t, history)
+
+
+@compiled
+def _turn(hypothesis, yaw, std):
+    """Give a hypothesis another yaw, rad, about the vertical, and its standard deviation."""
+    x, y, z, w = hypothesis.x[6], hypothesis.x[7], hypothesis.x[8], hypothesis.x[9]
+    half = 0.5 * (yaw - math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    s, c = math.sin(half), math.cos(half)
+    hypothesis.x[6], hypothesis.x[7] = c * x - s * y, c * y + s * x
+    hypothesis.x[8], hypothesis.x[9] = c * z + s * w, c * w - s * z
+    hypothesis.P[8, :] = 0.0
+    hypothesis.P[:, 8] = 0.0
+    hypothesis.P[8, 8] = std**2
 
 
 @compiled
@@ -124,10 +189,10 @@ def _put(hypothesis, x, covariance):
 
 
 @compiled
-def _spread_attitude(P, tuning):
+def _spread_attitude(P, tuning, yaw_std):
     """The variances of attitude and biases at the start."""
     P[6, 6] = P[7, 7] = TILT_STD**2
-    P[8, 8] = min(tuning.initial_yaw_std, hypotheses.YAW_STD) ** 2
+    P[8, 8] = min(yaw_std, hypotheses.YAW_STD) ** 2
     for k in range(3):
         P[9 + k, 9 + k] = tuning.initial_accel_bias_std**2
         P[12 + k, 12 + k] = tuning.initial_gyro_bias_std**2

@@ -47,6 +47,15 @@ IMU_STATE = _record(
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
 )
 
+# A pose that is told. NaN for what is not.
+POSE = _record(
+    ("t", float),  # s
+    ("p", float, 3),  # m, of the body in the world,
+    ("covariance", float, (3, 3)),  # m^2, and its covariance
+    ("yaw", float),  # rad,
+    ("yaw_std", float),  # rad, and its standard deviation
+)
+
 # What is known of an anchor.
 ANCHOR = _record(
     ("position", float, 3),  # m

@@ -9,7 +9,7 @@ from ..core import aids
 from .volume import VolumeCheck
 
 START_TIMEOUT = 5.0  # s of data without a start position before it becomes a warning
-BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is a recording
+BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is of another time
 STOPPED = 2.0  # s without a message of an aid that was there, before it becomes a warning
 LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it becomes a warning
 REPEATS = 2  # reports in a row in which that is so of an aid; optical flow contradicts everything else for a second at times
@@ -32,7 +32,7 @@ class Health:
 
     def __init__(self, config, lag, volume=None):
         """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
-        self.imu = self.tdoa = self.odometry = 0  # messages received, and published
+        self.imu = self.tdoa = 0  # messages received
         self.aids = dict.fromkeys(aids.STREAMS, 0)  # messages received of each
         self.last_odometry = None  # time.monotonic(), s
         self.last_position = None  # (3,) m and its covariance (3, 3) m^2
@@ -85,7 +85,7 @@ class Health:
             judgement = WARN, f"the odometry is {self.behind:.1f} s behind: {reason}"
         age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
         values = {"state": "running" if running else "starting", "age of last odometry": age}
-        values |= {"odometry behind the clock": "unknown" if self.behind is None else f"{self.behind:.3f} s"}
+        values |= {"odometry behind the clock": _behind(self.behind)}
         values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
         return *judgement, values | at_position
 
@@ -129,3 +129,11 @@ class Health:
             if recent[name] > LARGEST_UNUSED * sum(recent.values()):
                 return WARN, f"more than half of the TDOAs {reason}"
         return OK, "running"
+
+
+def _behind(seconds):
+    if seconds is None:
+        return "unknown"
+    if abs(seconds) > BEHIND[1]:
+        return "not comparable: the stamps are of another time than the clock; for a recording set use_sim_time"
+    return f"{seconds:.3f} s"

@@ -9,6 +9,7 @@ from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
 from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa
 
 HEADER_STAMP = struct.Struct("<iI")  # of a little-endian CDR message that begins with a header, after 4 bytes
@@ -27,7 +28,7 @@ class Source:
         self.publishers = {
             kind: ros.publish_stream(node, kind, topic) for kind, topic in ((Imu, "/imu/data"), (Tdoa, "/uwb/tdoa"))
         }
-        self._anchors = node.create_publisher(AnchorArray, "/uwb/anchors", ros.ANCHORS_QOS)
+        self._anchors = node.create_publisher(AnchorArray, "/uwb/anchors", ANCHORS_QOS)
         # never spun, so that no callback runs
         self.subscriptions = [
             node.create_subscription(Odometry, f"{space}/odometry", lambda _: None, ros.STREAM_QOS, raw=True)
@@ -41,7 +42,7 @@ class Source:
         Returns (sent, stamps, late): of each TDOA when it was published and its stamp, (n,) ns since 1970; s by which
         each message was late.
         """
-        self._anchors.publish(ros.anchors_to_message(flight.anchors))
+        self._anchors.publish(anchors_to_message(flight.anchors))
         start = time.time_ns() // 10**9 + 1  # stamps are of now, too
         events = self._events(flight, start - flight.imu.t[0])
         began = time.perf_counter() + AHEAD

@@ -6,10 +6,10 @@ import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import read_head
 from uwb_tdoa_ekf.debias import Part
 from uwb_tdoa_ekf.offline import run_offline
 
-from ..readers.streams import read_head
 from ..readers.tables import number, read_table
 from ..scoring.evaluation import judging_truth
 from ..scoring.metrics import position_at

@@ -52,7 +52,7 @@ def publish(found):
     import rclpy
     from rclpy.serialization import deserialize_message
 
-    from uwb_tdoa_bias.foundation.ros import ANCHORS_QOS
+    from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
 
     from ..live.session import message_class, session
 

@@ -11,36 +11,8 @@ from .optical_flow import velocity_of
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
 LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
-MOST_BYTES = 1 << 30  # of a file; a flight of an hour has 300 MB
 SALVAGE = "read what is sound of it with --salvage"
 DAY = 86400.0  # s
-
-
-def read_bytes(path, most=MOST_BYTES):
-    """The content of a file; raises InputError if it cannot be read, is empty or has more than `most` bytes."""
-    content = read_head(path, most + 1)
-    if len(content) > most:
-        raise InputError(f"{path}: has more than {most} bytes, too many for one recording; is it the right file?")
-    return content
-
-
-def read_head(path, size):
-    """The first bytes of a file; raises InputError as `read_bytes`."""
-    try:
-        with open(path, "rb") as file:
-            content = b"".join(_blocks(file, size))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a recording.") from error
-    if not content:
-        raise InputError(f"{path}: is empty (0 bytes); copy the recording again.")
-    return content
-
-
-def _blocks(file, size):
-    """The first bytes of an open file, block by block: one read would take the memory of `size` at once."""
-    while size > 0 and (block := file.read(min(size, 1 << 24))):
-        size -= len(block)
-        yield block
 
 
 def make_flight(name, anchors, streams, extra, meta, salvage=False):

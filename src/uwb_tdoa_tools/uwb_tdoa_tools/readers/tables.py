@@ -5,8 +5,8 @@ import io
 import math
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import read_bytes
 
-from .streams import read_bytes
 
 MOST_BYTES = 100_000_000
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import read_bytes
 
-from .streams import SALVAGE, make_flight, read_bytes
+from .streams import SALVAGE, make_flight
 from .usd_scan import scan
 
 MAGIC = 0xBC

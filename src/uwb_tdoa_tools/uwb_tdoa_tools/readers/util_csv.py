@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import read_bytes
 
-from .streams import SALVAGE, make_flight, read_bytes
+from .streams import SALVAGE, make_flight
 
 GZIP_MAGIC = b"\x1f\x8b"
 MOST_TEXT = 200_000_000  # bytes; ten minutes of the full schema, and some GB in memory

@@ -5,10 +5,9 @@ import re
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import FARTHEST, Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-
-from .streams import read_bytes
+from .anchors import FARTHEST, Anchors
+from .errors import InputError
+from .files import read_bytes
 
 # The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z), arm 3 forward (x).
 # Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this makes a right-handed frame

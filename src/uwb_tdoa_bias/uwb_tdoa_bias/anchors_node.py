@@ -1,0 +1,92 @@
+"""anchors_node: the anchors of a survey file, for nodes, RViz and bags.
+
+  -> uwb/anchors (AnchorArray), /tf_static (tf2_msgs/TFMessage: the frame of the survey -> anchor_<id>),
+     uwb/anchors/markers (visualization_msgs/MarkerArray); all transient local.
+One for all tags of a room: remap their uwb/anchors to its own. Every parameter is documented in config/anchors_node.yaml.
+"""
+
+import sys
+
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from rclpy.node import Node
+from tf2_msgs.msg import TFMessage
+from uwb_tdoa_msgs.msg import AnchorArray
+from visualization_msgs.msg import Marker, MarkerArray
+
+from .foundation import ros
+from .foundation.errors import InputError
+from .foundation.ros_anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
+from .foundation.ros_frames import TF_STATIC_QOS
+from .foundation.ros_parameters import Parameter, declare_all, refuse_unknown, say_unused
+from .foundation.survey import read_survey
+
+PARAMETERS = {  # in the order of config/anchors_node.yaml
+    "anchors_file": Parameter(ANCHORS_FILE.default, "survey of the anchors, as the tools read it; must be given"),
+    "marker_size": Parameter(0.12, "m; edge of the cube that shows an anchor, and height of its number", 0.001, 10.0),
+}
+LEVEL = Quaternion(w=1.0)  # of an anchor whose orientation was not surveyed
+
+
+class AnchorsNode(Node):
+    """Publishes once, and stays for who comes later."""
+
+    NAME = "anchors_node"
+
+    def __init__(self, files=()):
+        """files : parameter files that were given, to say which do not match."""
+        super().__init__(self.NAME)
+        own = declare_all(self, PARAMETERS)
+        refuse_unknown(self)
+        if not own["anchors_file"]:
+            raise InputError("anchors_file: is empty; give a survey of the anchors, e.g. anchors.yaml.")
+        anchors = read_survey(own["anchors_file"])
+        message = anchors_to_message(anchors)
+        for topic, qos, content in (
+            ("uwb/anchors", ANCHORS_QOS, message),
+            ("/tf_static", TF_STATIC_QOS, transforms(message)),
+            ("uwb/anchors/markers", ANCHORS_QOS, markers(message, own["marker_size"])),
+        ):
+            self.create_publisher(type(content), topic, qos).publish(content)
+        say_unused(self, files)
+        self.get_logger().info(f"{len(anchors)} anchors of {own['anchors_file']} in frame '{anchors.frame}'")
+
+
+def transforms(message):
+    """TFMessage of an AnchorArray: a frame anchor_<id> for each, level where its orientation is not known."""
+    out = TFMessage()
+    for anchor in message.anchors:
+        p, q = anchor.pose.position, anchor.pose.orientation
+        transform = Transform(translation=Vector3(x=p.x, y=p.y, z=p.z), rotation=q if _known(q) else LEVEL)
+        out.transforms.append(
+            TransformStamped(header=message.header, child_frame_id=f"anchor_{anchor.id}", transform=transform)
+        )
+    return out
+
+
+def markers(message, size):
+    """MarkerArray of an AnchorArray: a cube and a number for each; size : m."""
+    out = MarkerArray()
+    for anchor in message.anchors:
+        for kind, name in ((Marker.CUBE, "anchors"), (Marker.TEXT_VIEW_FACING, "numbers")):
+            marker = Marker(header=message.header, ns=name, id=anchor.id, type=kind, text=str(anchor.id))
+            q, p = anchor.pose.orientation, anchor.pose.position
+            marker.pose.orientation = q if _known(q) else LEVEL
+            marker.pose.position.x, marker.pose.position.y = p.x, p.y
+            marker.pose.position.z = p.z + (1.5 * size if kind == Marker.TEXT_VIEW_FACING else 0.0)
+            marker.scale.x = marker.scale.y = marker.scale.z = size
+            marker.color.r, marker.color.g, marker.color.b, marker.color.a = 0.1, 0.4, 0.9, 1.0
+            out.markers.append(marker)
+    return out
+
+
+def _known(q):
+    return any((q.x, q.y, q.z, q.w))
+
+
+def main(argv=None):
+    """Run the node; returns the exit code."""
+    return ros.run(AnchorsNode, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

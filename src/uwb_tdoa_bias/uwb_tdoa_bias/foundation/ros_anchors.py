@@ -1,0 +1,90 @@
+"""Anchors as messages and frames, and where a node gets them from: a file, or uwb/anchors."""
+
+from geometry_msgs.msg import Point, Pose, Quaternion
+import numpy as np
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from uwb_tdoa_msgs.msg import Anchor, AnchorArray
+
+from .anchors import Anchors
+from .errors import InputError
+from .ros_parameters import Parameter
+from .survey import read_survey
+
+ANCHORS_QOS = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+ANY_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # gets from every publisher what is repeated
+ANCHORS_FILE = Parameter(
+    "", 'survey of the anchors, as the tools read it (YAML, CSV, total station); "" for those of uwb/anchors'
+)
+
+
+def anchors_to_message(anchors):
+    """AnchorArray of Anchors, with a stamp of 0: anchors do not age."""
+    message = AnchorArray()
+    message.header.frame_id = anchors.frame
+    known = np.where(np.isfinite(anchors.orientations), anchors.orientations, 0.0)
+    for i, (x, y, z), q in zip(anchors.ids.tolist(), anchors.positions.tolist(), known.tolist()):
+        orientation = Quaternion(x=q[0], y=q[1], z=q[2], w=q[3])
+        message.anchors.append(Anchor(id=i, pose=Pose(position=Point(x=x, y=y, z=z), orientation=orientation)))
+    return message
+
+
+def same_anchors(one, other):
+    """True if two Anchors are equal in everything."""
+    return (
+        one.frame == other.frame
+        and np.array_equal(one.ids, other.ids)
+        and np.array_equal(one.positions, other.positions)
+        and np.array_equal(one.orientations, other.orientations, equal_nan=True)
+    )
+
+
+class AnchorsInput:
+    """Anchors of a file, or of uwb/anchors: latched, or volatile when they are repeated.
+
+    anchors : Anchors or None; refused : what is wrong with what came on the topic, or None.
+    """
+
+    def __init__(self, node, on_change, file=""):
+        """on_change(anchors) is called with the first Anchors, and with others that differ; those of a file are the only
+        ones, and are given by `start`. Raises InputError for the file."""
+        self.anchors = self.refused = None
+        self._node, self._on_change, self._file = node, on_change, file
+        self._of_file = read_survey(file) if file else None
+        self._repeated = None  # the subscription to volatile ones
+        events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
+        self._latched = node.create_subscription(
+            AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events
+        )
+
+    def start(self):
+        """Give the anchors of the file, if there is one."""
+        if self._of_file is not None:
+            self.anchors = self._of_file
+            self._on_change(self.anchors)
+
+    def _on_incompatible(self, _):
+        if self._repeated is None:
+            self._node.get_logger().warning(
+                "uwb/anchors is not published reliable and transient local: taken when it is repeated"
+            )
+            self._repeated = self._node.create_subscription(AnchorArray, "uwb/anchors", self._on_message, ANY_QOS)
+
+    def _on_message(self, message):
+        try:
+            anchors, self.refused = Anchors.from_message(message), None
+        except InputError as error:
+            self.refused = str(error)
+            return
+        if self._of_file is not None:
+            if not same_anchors(anchors, self._of_file):
+                self.refused = f"uwb/anchors has other anchors than anchors_file, {self._file}, which counts: stop one"
+            return
+        if self.anchors is not None:
+            if same_anchors(anchors, self.anchors):
+                return
+            self._node.get_logger().warning("the anchors have changed: starting over")
+        self.anchors = anchors
+        self._on_change(anchors)

@@ -1,0 +1,76 @@
+"""Frames and how they lie to each other: what TF says, without ROS."""
+
+from bisect import bisect_right
+from collections import deque
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+KEPT = 1000  # transforms of a frame that moves
+HELD = 0.5  # s for which the last transform of a frame that moves holds
+DEEPEST = 100  # frames between a frame and its root
+
+
+class Frames:
+    """A tree of frames, each with a transform to its parent that is constant, or a course in time."""
+
+    def __init__(self):
+        self._static, self._moving = {}, {}  # {frame: (parent, Rotation, p)} and {frame: (parent, deque of (t, q, p))}
+
+    def set(self, parent, child, q, p):
+        """A constant transform: x_parent = R(q) x_child + p; q (4,) x y z w, p (3,) m. Returns whether it is new."""
+        before = self._static.get(child)
+        entry = parent, Rotation.from_quat(q), np.array(p, dtype=float)
+        self._static[child] = entry
+        if before is None or before[0] != parent:
+            return True
+        return not np.array_equal(before[2], entry[2]) or (before[1].inv() * entry[1]).magnitude() > 1e-9
+
+    def move(self, parent, child, q, p, t):
+        """The transform at stamp t, s. One that is not later than the last is passed over; another parent starts anew."""
+        known = self._moving.get(child)
+        if known is None or known[0] != parent:
+            known = self._moving[child] = parent, deque(maxlen=KEPT)
+        course = known[1]
+        if course and t < course[-1][0] - 1.0:
+            course.clear()  # time went back
+        if not course or t > course[-1][0]:
+            course.append((t, tuple(q), tuple(p)))
+
+    def between(self, target, source, t=None):
+        """(Rotation, p (3,) m) with x_target = R x_source + p, at stamp t, s, for frames that move; None if not known."""
+        ours, theirs = self._to_root(source, t), self._to_root(target, t)
+        common = next((frame for frame in ours if frame in theirs), None)
+        if common is None:
+            return None
+        (turn, p), (other_turn, other_p) = ours[common], theirs[common]
+        return other_turn.inv() * turn, other_turn.inv().apply(p - other_p)
+
+    def _to_root(self, frame, t):
+        """{ancestor: (Rotation, p)} of a frame, itself first."""
+        turn, p = Rotation.identity(), np.zeros(3)
+        found = {frame: (turn, p)}
+        for _ in range(DEEPEST):
+            step = self._static.get(frame) or self._at(frame, t)
+            if step is None or step[0] in found:
+                break
+            frame, between, offset = step
+            turn, p = between * turn, between.apply(p) + offset
+            found[frame] = turn, p
+        return found
+
+    def _at(self, frame, t):
+        """(parent, Rotation, p) of a frame that moves, interpolated; None where it is not known."""
+        if t is None or frame not in self._moving:
+            return None
+        parent, course = self._moving[frame]
+        stamps = [entry[0] for entry in course]
+        k = bisect_right(stamps, t)
+        if k == 0 or t > stamps[-1] + HELD:
+            return None
+        before, after = course[k - 1], course[min(k, len(course) - 1)]
+        if after is before:
+            return parent, Rotation.from_quat(before[1]), np.array(before[2])
+        share = (t - before[0]) / (after[0] - before[0])
+        turn = Slerp([0.0, 1.0], Rotation.from_quat([before[1], after[1]]))(share)
+        return parent, turn, (1.0 - share) * np.array(before[2]) + share * np.array(after[2])

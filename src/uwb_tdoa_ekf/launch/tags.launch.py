@@ -1,0 +1,39 @@
+"""Several tags of one YAML file, each in its own namespace and with its own frame.
+
+ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml
+
+    anchors_file: anchors.yaml        # what all share: any parameters of bias_node and ekf_node
+    tags:
+      tag1: {}                        # topics /tag1/imu/data ..., frame tag1/base_link
+      tag2: {effects_file: tag2.yaml, tdoa_std: 0.3}
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from uwb_tdoa_ekf.launching import tags, typed
+from uwb_tdoa_ekf.launching_actions import node_action, rviz_action
+
+OTHERS = {
+    "use_sim_time": ("", "true for bags that are played with --clock"),
+    "log_level": ("info", "debug, info, warn, error"),
+    "rviz": ("false", "true opens RViz with the frames and the anchors"),
+}
+
+
+def generate_launch_description():
+    """Arguments, and what follows from them and the file."""
+    arguments = [
+        DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()
+    ]
+    file = DeclareLaunchArgument("tags", description="YAML file of the tags")
+    return LaunchDescription([file, *arguments, OpaqueFunction(function=_nodes)])
+
+
+def _nodes(context):
+    path, *given = (LaunchConfiguration(name).perform(context) for name in ("tags", *OTHERS))
+    sim_time, log_level, rviz = given
+    values = typed({"use_sim_time": sim_time})
+    actions = [node_action(Node, each) for each in tags(path, values, log_level)]
+    return actions + ([rviz_action(Node, values.get("use_sim_time", False))] if rviz == "true" else [])

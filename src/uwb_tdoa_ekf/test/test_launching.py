@@ -1,0 +1,135 @@
+"""What the launch files start. launch itself is not needed: it is played by stubs that take notes where it is missing."""
+
+from pathlib import Path
+import runpy
+import sys
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import yaml
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_ekf.launching import NODES, start, tag, tags, typed  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[1]
+CONFIGS = {name: ROOT.parent / package / "config" / f"{name}.yaml" for name, (package, _) in NODES.items()}
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_the_parameters_of_a_node_are_those_of_its_file(name):
+    (content,) = yaml.safe_load(CONFIGS[name].read_text()).values()
+    assert NODES[name][1] == content["ros__parameters"].keys() | {"use_sim_time"}
+
+
+def test_a_value_goes_to_the_nodes_that_have_it_and_overrides_their_file():
+    bias, ekf = tag("tag1", {"anchors_file": "a.yaml", "tdoa_std": 0.3, "hold": 0.1}, {"ekf_node": ["mine.yaml"]}, "debug")
+    assert (bias.executable, bias.namespace, bias.parameters) == ("bias_node", "tag1", [{"anchors_file": "a.yaml", "hold": 0.1}])
+    assert ekf.parameters == ["mine.yaml", {"anchors_file": "a.yaml", "tdoa_std": 0.3}] and ekf.log_level == "debug"
+    assert [node.executable for node in tag("", {"map": "map.npz"})] == ["bias_node", "ekf_node", "debias_node"]
+    assert start("ekf_node", "", {"map": "map.npz"}).parameters == []
+    with pytest.raises(InputError, match="tdoa_sdt: is no parameter of .*; write tdoa_std"):
+        tag("", {"tdoa_sdt": 1.0})
+
+
+def test_texts_become_values():
+    assert typed({"use_sim_time": "true", "body_frame": "", "world_frame": "map"}) == {"use_sim_time": True, "world_frame": "map"}
+
+
+def test_tags_of_a_file(tmp_path):
+    file = tmp_path / "tags.yaml"
+    file.write_text("anchors_file: a.yaml\ntdoa_std: 0.3\ntags: {tag1: , tag2: {body_frame: base2, tdoa_std: 0.5}}")
+    nodes = tags(file, {"use_sim_time": True})
+    assert [(node.executable, node.namespace) for node in nodes] == [
+        ("bias_node", "tag1"), ("ekf_node", "tag1"), ("bias_node", "tag2"), ("ekf_node", "tag2"), ("anchors_node", ""),
+    ]  # fmt: skip
+    (first,), (second,), (anchors,) = (nodes[k].parameters for k in (1, 3, 4))
+    shared = {"anchors_file": str(tmp_path / "a.yaml"), "use_sim_time": True}
+    assert first == {"body_frame": "tag1/base_link", "tdoa_std": 0.3} | shared
+    assert second == {"body_frame": "base2", "tdoa_std": 0.5} | shared
+    assert anchors == shared
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [("{}", "expected a mapping 'tags'"), ("tags: {a: 1}", "a: 1 must be a mapping"), ("tags: {a: {gaet: 1}}", "gaet: .* write gate")],
+)
+def test_a_bad_file_is_refused(tmp_path, text, named):
+    file = tmp_path / "tags.yaml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=f"{file}: .*{named}"):
+        tags(file, {})
+
+
+class Noted(SimpleNamespace):
+    """What a launch file made: its class's name, and what it was given."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(args=args, **kwargs)
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """launched(file, **arguments): the actions of a launch file with such arguments, by stubs of launch."""
+    given = {}
+
+    class Configuration(Noted):
+        def perform(self, _):
+            return given.get(self.args[0], given["defaults"].get(self.args[0]))
+
+    kinds = {
+        "launch": ["LaunchDescription"],
+        "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction", "ExecuteProcess", "IncludeLaunchDescription"],
+        "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
+    }
+    for module, names in {**kinds, "launch.substitutions": []}.items():
+        stub = ModuleType(module)
+        for name in names:
+            setattr(stub, name, type(name, (Noted,), {}))
+        monkeypatch.setitem(sys.modules, module, stub)
+    sys.modules["launch.substitutions"].LaunchConfiguration = Configuration
+
+    def launch(name, **arguments):
+        found = runpy.run_path(str(ROOT / "launch" / name))["generate_launch_description"]().args[0]
+        declared = {each.args[0]: each for each in found if type(each).__name__ == "DeclareLaunchArgument"}
+        assert arguments.keys() <= declared.keys() and all(each.description for each in declared.values())
+        given.clear()
+        given.update(arguments, defaults={name: getattr(each, "default_value", None) for name, each in declared.items()})
+        (function,) = (each.function for each in found if type(each).__name__ == "OpaqueFunction")
+        return function(None)
+
+    return launch
+
+
+def test_one_tag(launched):
+    bias, ekf = launched("tdoa.launch.py")
+    assert (bias.executable, ekf.executable, ekf.parameters) == ("bias_node", "ekf_node", [])  # nothing set: can be overridden
+    told = dict(anchors_file="a.yaml", publish_tf="odom", ekf_params="e.yaml", use_sim_time="true", rviz="true", namespace="t")
+    bias, ekf, anchors, rviz = launched("tdoa.launch.py", **told)
+    assert ekf.parameters == ["e.yaml", {"anchors_file": "a.yaml", "publish_tf": "odom", "use_sim_time": True}]
+    assert bias.parameters == [{"anchors_file": "a.yaml", "use_sim_time": True}] and bias.namespace == "t"
+    assert (anchors.executable, rviz.executable) == ("anchors_node", "rviz2")
+    assert Path(rviz.arguments[1]).is_file() and rviz.parameters == [{"use_sim_time": True}]
+    assert ekf.arguments == ["--ros-args", "--log-level", "info"]
+
+
+def test_several_tags(launched, tmp_path):
+    (tmp_path / "tags.yaml").write_text("tags: {a: {}, b: {}}")
+    nodes = launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"))
+    assert [node.namespace for node in nodes] == ["a", "a", "b", "b"]
+
+
+def test_a_bag_is_played_on_its_time(launched):
+    found = runpy.run_path(str(ROOT / "launch" / "bag.launch.py"))["generate_launch_description"]().args[0]
+    include, play = found[2:]
+    assert dict(include.launch_arguments) == {"use_sim_time": "true"}
+    assert play.cmd[:3] == ["ros2", "bag", "play"] and "--clock" in play.cmd and "--delay" in play.cmd
+
+
+def test_the_layout_of_rviz_is_yaml():
+    content = yaml.safe_load((ROOT / "rviz" / "tdoa.rviz").read_text())
+    assert {each["Name"] for each in content["Visualization Manager"]["Displays"]} >= {"Odometry", "Anchors", "TF"}

@@ -1,0 +1,82 @@
+"""The parameters of ekf_node: those of FilterConfig, and what is the node's own."""
+
+from dataclasses import fields, replace
+
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_FILE
+from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare, declare_all
+
+from .core.config import CHOICES, RENAMED, FilterConfig, current_names
+
+PUBLISH_TF = NONE, BASE, ODOM = "none", "base", "odom"
+PARAMETERS = {  # in the order of config/ekf_node.yaml
+    "anchors_file": ANCHORS_FILE,
+    "world_frame": Parameter("", 'frame of the odometry and the parent on /tf; "" for the frame of the anchors'),
+    "body_frame": Parameter(
+        "base_link", "frame whose pose is estimated; sensors in other frames are placed in it by /tf_static; one per tag"
+    ),
+    "publish_tf": Parameter(
+        BASE, "on /tf: none, base (world -> body) or odom (world -> odom_frame, REP 105)", choices=PUBLISH_TF
+    ),
+    "odom_frame": Parameter("odom", "for publish_tf odom: the frame in which somebody else publishes the body on /tf"),
+    "flyable_volume": Parameter(
+        "", 'flyable.npz of plan; a warning on /diagnostics while the tag is outside; "" for none'
+    ),
+    "effects_file": Parameter(
+        "", "effects.yaml, the same as bias_node's: what it says of gyroscope, accelerometer, height and velocity is taken out"
+    ),
+    "reorder": Parameter(
+        0.003, "s of stamps; how long a TDOA waits for older ones that are still on their way", 0.0, 10.0
+    ),
+    "lag": Parameter(
+        0.25, "s of stamps; how long a silent stream is waited for; what comes later than that is late", 0.0, 100.0
+    ),
+}  # fmt: skip
+
+
+def names_of_parameters():
+    """Names of all."""
+    return {field.name for field in fields(FilterConfig)} | {*PARAMETERS}
+
+
+def declare_parameters(node):
+    """Declare all; returns (FilterConfig, {name: value} of the others). What was given under an old name counts, with a
+    warning."""
+    old = {name: _value_of_old(node, name) for name in RENAMED}
+    given = {name: value for name, value in old.items() if value is not None}
+    current = current_names(given, node.get_logger().warning)
+    values = {}
+    for field in fields(FilterConfig):
+        limits, default = field.metadata, current.get(field.name, field.default)
+        parameter = Parameter(
+            default, limits["text"], limits["low"], limits["high"], CHOICES.get(field.name, ()), settable=not limits["fixed"]
+        )
+        values[field.name] = declare(node, field.name, parameter)
+    return FilterConfig(**values), declare_all(node, PARAMETERS)
+
+
+def follow_changes(node, config, on_change):
+    """Let the parameters of FilterConfig that are not fixed be set in flight. config() : the present one; on_change(config)
+    is called with another."""
+
+    def changed(parameters):
+        names = {field.name for field in fields(FilterConfig)}
+        return replace(config(), **{p.name: p.value for p in parameters if p.name in names})
+
+    def judge(parameters):
+        try:
+            changed(parameters)
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(judge)
+    node.add_post_set_parameters_callback(lambda parameters: on_change(changed(parameters)))
+
+
+def _value_of_old(node, name):
+    """What was given for a parameter that the node does not have any more, or None."""
+    value = node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True)).value
+    node.undeclare_parameter(name)
+    return value

@@ -1,0 +1,39 @@
+"""An IMU that is turned and off the origin of the body: its samples as one in the origin would measure them."""
+
+import numpy as np
+
+SLOW = 0.02  # s; angular acceleration is the slope of the rate after a low pass of this time constant
+LONGEST_STEP = 0.1  # s between samples, above which there is no slope
+
+
+class ImuMount:
+    """rotation : Rotation, IMU to body; arm (3,) m, of the IMU in the body.
+
+    Specific force of the origin: f - dw/dt x arm - w x (w x arm), with everything in the body frame (rigid body kinematics,
+    e.g. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2013, section 2.3).
+    """
+
+    def __init__(self, rotation, arm):
+        self._matrix, self._arm = rotation.as_matrix(), np.asarray(arm, dtype=float)
+        self._centred = not self._arm.any()
+        self._t, self._slow = None, np.zeros(3)  # s, stamp of the last sample, and slow part of its rate, rad/s
+
+    def in_body(self, t, gyro, accel):
+        """gyro (3,) rad/s and accel (3,) m/s^2 in the body frame, of one sample at t s. Stamps rise, but for outliers."""
+        gyro, accel = self._matrix @ gyro, self._matrix @ accel
+        if not self._centred and np.isfinite(gyro).all():
+            accel = accel - np.cross(self._angular_acceleration(t, gyro), self._arm)
+            accel -= np.cross(gyro, np.cross(gyro, self._arm))
+        return gyro.tolist(), accel.tolist()
+
+    def _angular_acceleration(self, t, gyro):
+        """rad/s^2, (3,): slope of the slow part."""
+        dt = np.inf if self._t is None else t - self._t
+        if dt <= 0.0:
+            return np.zeros(3)
+        before, self._t = self._slow, t
+        if dt > LONGEST_STEP:
+            self._slow = gyro
+            return np.zeros(3)
+        self._slow = before + min(1.0, dt / SLOW) * (gyro - before)
+        return (self._slow - before) / dt
