@@ -46,10 +46,10 @@ class FilterConfig:
     loss: str = _parameter(
         "geman_mcclure", "weight function of innovation and m_estimation: geman_mcclure, huber, cauchy"
     )
-    measurement_scale: float = _parameter(2.5, "standard deviations of a measurement at which the loss bends", high=1000.0)
-    state_scale: float = _parameter(2.5, "the same for the prior's share in m_estimation", high=1000.0)
+    measurement_scale: float = _parameter(2.5, "standard deviations of a measurement at which the loss bends", high=1e8)
+    state_scale: float = _parameter(2.5, "the same for the prior's share in m_estimation", high=1e8)
     iterations: int = _parameter(2, "re-weightings per update of m_estimation", high=100)
-    gate: float = _parameter(3.0, "standard deviations beyond which gate rejects", high=1000.0)
+    gate: float = _parameter(3.0, "standard deviations beyond which gate rejects", high=1e8)
 
     # The motion
     use_imu: bool = _parameter(True, "false: constant velocity, for a tag without an IMU", fixed=True)
