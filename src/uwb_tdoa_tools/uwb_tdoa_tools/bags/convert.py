@@ -24,10 +24,11 @@ class Converted:
     meta: dict
 
 
-def convert(recording, reading, out, storage="mcap", force=False):
-    """Write a recording as a bag, see `Reading` and `write_bag`. Returns Converted. Raises InputError."""
+def convert(read, out, storage="mcap", force=False):
+    """Write a recording as a bag, see `write_bag`. read : callable, gives the Flight. Returns Converted. Raises
+    InputError."""
     check_output(out, force)  # before the work, not after it
-    flight = reading.one(recording)
+    flight = read()
     counts = write_bag(flight, out, storage, force)
     streams = [stream for stream in (flight.tdoa, flight.imu, flight.truth) if stream is not None and len(stream)]
     known = (flight.anchors.index(flight.tdoa.a) >= 0) & (flight.anchors.index(flight.tdoa.b) >= 0)

@@ -4,14 +4,18 @@ from dataclasses import asdict
 import json
 import sys
 
+from uwb_tdoa_bias.foundation.errors import InputError
+
 from .. import cli, options
 from ..bags.convert import convert
 from ..bags.files import STORAGES
+from ..readers import columns, read_survey
 
 DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
-IN is a Crazyflie micro-SD event log (versions 1 and 2), a UTIL CSV file (plain or gzip), or a bag. The new bag has
-imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_static. It appears only when it is complete.
+IN is a Crazyflie micro-SD event log (versions 1 and 2), a UTIL CSV file (plain or gzip), a bag, or, with --columns, one
+CSV file or several of any other tool. The new bag has imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_static.
+It appears only when it is complete.
 """
 
 
@@ -30,8 +34,11 @@ def parser():
         "convert flight.log --survey anchors.yaml --out flight.bag --force --json",
         "convert cut.log --survey anchors.yaml --salvage --out flight.bag",
         "convert theirs.bag --topic uwb/tdoa=/dwm/tdoa --topic imu/data=/fcu/imu --survey anchors.yaml --out our.bag",
+        "convert ranging.csv --columns time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm --survey anchors.yaml "
+        "--out our.bag",
     )
-    made.add_argument("input", metavar="IN", help="the recording; its kind is found by its content")
+    made.add_argument("input", metavar="IN", nargs="+", help="the recording; its kind is found by its content")
+    made.add_argument("--columns", metavar="MAP", help=columns.HELP)
     options.add_reading(made)
     made.add_argument("--out", metavar="BAG", required=True, help="the bag to write, a new directory")
     made.add_argument("--storage", choices=STORAGES, default="mcap", help="default: mcap")
@@ -41,7 +48,7 @@ def parser():
 
 
 def _convert(args):
-    made = convert(args.input, options.reading_of(args), args.out, args.storage, args.force)
+    made = convert(lambda: _read(args), args.out, args.storage, args.force)
     if args.json:
         print(json.dumps(asdict(made), indent=2, default=str))
         return
@@ -55,6 +62,18 @@ def _convert(args):
     if made.tdoa_unknown_anchor:
         print(f"  {made.tdoa_unknown_anchor} measurements name an anchor that the survey does not have")
     print(f"  -> {args.out}")
+
+
+def _read(args):
+    """The Flight."""
+    reading = options.reading_of(args)
+    if not args.columns:
+        if len(args.input) > 1:
+            raise InputError(f"IN: {len(args.input)} recordings are given; convert one by one, or name --columns.")
+        return reading.one(args.input[0])
+    if not args.survey:
+        raise InputError("--columns: CSV files do not say where the anchors are; give a survey file (--survey FILE).")
+    return columns.read_columns(args.input, columns.parse_columns(args.columns), read_survey(args.survey), args.salvage)
 
 
 if __name__ == "__main__":

@@ -11,14 +11,16 @@ from uwb_tdoa_bias.foundation.files import read_bytes
 MOST_BYTES = 100_000_000
 
 
-def read_table(path, columns):
-    """[(line, {column: text})] of a CSV file that has at least the columns, others passed over. Raises InputError."""
+def read_table(path, columns=None):
+    """[(line, {column: text})] of a CSV file that has at least the columns, others passed over; default: of all that it
+    has. Raises InputError."""
     try:
         text = read_bytes(path, MOST_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: byte {error.start} is not text; give a CSV file.") from error
     rows, found = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True), []
     try:
+        columns = columns if columns is not None else [name for name in rows.fieldnames or () if name]
         missing = [name for name in columns if name not in (rows.fieldnames or ())]
         if missing:
             raise InputError(f"{path}: has no column {missing[0]}; it needs columns {', '.join(columns)}.")
