@@ -37,6 +37,11 @@ def test_values_are_rounded_to_their_standard_deviation(value, std, text):
     assert measured(value, std, "m") == text
 
 
+def test_a_value_without_spread_comes_last():
+    late = EFFECTS["anchor_delay"]({"0": 0.3, "1": 0.2, "3": 0.4}, {"0": 0.0, "1": 0.01})
+    assert list(significant(late)) == ["1", "0", "3"]
+
+
 @given(st.floats(-100, 100), st.floats(1e-6, 10))
 def test_what_is_printed_is_the_value_within_half_a_digit_of_its_standard_deviation(value, std):
     shown, error = (float(number) for number in measured(value, std).split(" ± "))

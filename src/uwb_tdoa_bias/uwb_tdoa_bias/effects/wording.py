@@ -8,9 +8,9 @@ LARGEST = 3  # values that a sentence names
 
 def significant(effect):
     """{parameter: value} of those values of an Effect that the data tell, the largest first in standard deviations;
-    values without a standard deviation were set, not estimated, and come last."""
+    values without a standard deviation, or with none but 0, were set, not estimated, and come last."""
     known = {key: value for key, value in effect.values.items() if not _is_vague(value, effect.std.get(key))}
-    return dict(sorted(known.items(), key=lambda item: -abs(item[1]) / effect.std.get(item[0], math.inf)))
+    return dict(sorted(known.items(), key=lambda item: -abs(item[1]) / (effect.std.get(item[0]) or math.inf)))
 
 
 def _is_vague(value, std):
