@@ -1,0 +1,103 @@
+"""The publishers of docs/connect.md: the Python one as a process, over topics; the C++ one as far as its messages go."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import Imu  # noqa: E402
+from test_connect import blocks, section  # noqa: E402
+from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
+from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
+
+STAND_IN = """
+#pragma once
+#include <builtin_interfaces/msg/time.hpp>
+#include <memory>
+#include <string>
+namespace rclcpp {
+struct Time { operator builtin_interfaces::msg::Time() const { return {}; } };
+struct QoS { QoS(size_t) {} QoS & transient_local() { return *this; } };
+template<typename T> struct Publisher {
+  using SharedPtr = std::shared_ptr<Publisher>;
+  void publish(const T &) {}
+};
+struct Node {
+  explicit Node(const std::string &) {}
+  template<typename T> typename Publisher<T>::SharedPtr create_publisher(const std::string &, const QoS &) { return {}; }
+};
+}
+"""
+
+
+@pytest.fixture
+def listener():
+    rclpy.init()
+    node = rclpy.create_node("listener")
+    yield node
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def test_the_publisher_in_python(tmp_path, listener):
+    """With reliable subscriptions, as most have, that come after the anchors were sent."""
+    (tmp_path / "driver.py").write_text(*blocks(section("Message by message"), "python"))
+    process = subprocess.Popen([sys.executable, tmp_path / "driver.py"], stderr=subprocess.PIPE, text=True)
+    try:
+        imu, tdoas, surveys = [], [], []
+        once = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        reliable = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+        listener.create_subscription(Imu, "imu/data", imu.append, reliable)
+        listener.create_subscription(Tdoa, "uwb/tdoa", tdoas.append, reliable)
+        end = time.monotonic() + 60.0
+        while not (len(imu) > 20 and len(tdoas) > 8 and surveys):
+            if tdoas and not surveys and len(listener.get_subscriptions_info_by_topic("uwb/anchors")) == 0:
+                listener.create_subscription(AnchorArray, "uwb/anchors", surveys.append, once)
+            assert process.poll() is None and time.monotonic() < end, process.poll()
+            rclpy.spin_once(listener, timeout_sec=0.1)
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=30)
+    anchors = Anchors.from_message(surveys[0])
+    assert len(anchors) == 4 and anchors.frame == "map" and np.isnan(anchors.orientations).all()
+    assert all(message.linear_acceleration.z == pytest.approx(9.81) for message in imu)
+    for message in tdoas:
+        to_a, to_b = (
+            np.linalg.norm([3.0, 4.0, 1.0] - anchors.positions[anchors.row(k)])
+            for k in (message.anchor_a, message.anchor_b)
+        )
+        assert message.distance_difference == pytest.approx(to_b - to_a)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
+def test_the_publisher_in_cpp(tmp_path):
+    (code,) = blocks(section("Message by message"), "cpp")
+    (tmp_path / "rclcpp").mkdir()
+    (tmp_path / "rclcpp" / "rclcpp.hpp").write_text(STAND_IN)
+    (tmp_path / "driver.cpp").write_text(code + "\nint main() { Driver driver; }\n")
+    folders = {
+        folder
+        for prefix in os.environ["AMENT_PREFIX_PATH"].split(os.pathsep)
+        for folder in Path(prefix, "include").glob("*/")
+    }
+    paths = [word for folder in sorted(folders) for word in ("-I", folder)]
+    done = subprocess.run(
+        ["g++", "-std=c++17", "-fsyntax-only", "-Wall", "-I", tmp_path, *paths, tmp_path / "driver.cpp"],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[:2000]
+    broken = code.replace("distance_difference", "tdoa")
+    (tmp_path / "driver.cpp").write_text(broken)
+    assert subprocess.run(
+        ["g++", "-std=c++17", "-fsyntax-only", "-I", tmp_path, *paths, tmp_path / "driver.cpp"], capture_output=True
+    ).returncode  # the headers are those of the messages
