@@ -37,6 +37,35 @@ def test_streams_units_and_stamps(read):
     assert "imu_accel_interpolated" not in flight.meta
 
 
+CANDIDATES = [("group", "H"), ("idA", "B"), ("idB", "B"), ("distanceDiff", "f"), ("isSelected", "B")]
+
+
+def with_candidates(*but):
+    """A log that has the same TDOAs as candidates, of the other sign, and others that were not selected."""
+    rows = [row for row in ROWS if row[0] not in but]
+    for name, ticks, values in ROWS:
+        if name == "estTDOA":
+            a, b, d = values
+            rows += [("estTdoaCand", ticks, (7, a, b, -d, 1)), ("estTdoaCand", ticks, (7, a, b, 9.0, 0))]
+    events = {name: known for name, known in EVENTS.items() if name not in but}
+    return log_bytes(rows, events=events | {"estTdoaCand": (20, CANDIDATES)})
+
+
+def test_selected_candidates_have_the_other_sign(read):
+    flight = read(with_candidates("estTDOA"))
+    np.testing.assert_array_equal(flight.tdoa.t, [1.0005, 1.0025])
+    signs = np.where(flight.tdoa.a == [0, 1], 1.0, -1.0)  # the pair may come in either order, with its sign
+    np.testing.assert_array_equal(np.sort([flight.tdoa.a, flight.tdoa.b], axis=0), [[0, 1], [1, 5]])
+    np.testing.assert_array_equal(signs * flight.tdoa.d, [1.25, -0.5])
+    assert "estTdoaCand" not in flight.extra
+
+
+def test_what_the_filter_got_comes_before_candidates(read):
+    flight = read(with_candidates())
+    np.testing.assert_array_equal(flight.tdoa.d, [1.25, -0.5])
+    assert len(flight.extra["estTdoaCand"]["t"]) == 4
+
+
 def test_other_events_are_kept_sorted_and_empty_ones_are_not(read):
     flight = read(log_bytes())
     assert set(flight.extra) == {"estTemperature"}  # estFlow is defined but never occurs

@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from .. import cli
-from ..studies import aids
+from ..studies import aids, crazyflie
 from ..studies.checking import figures as checking
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
@@ -14,6 +14,7 @@ STUDIES = {
     "aids": aids,
     "checking": checking,
     "compare-models": compare,
+    "crazyflie": crazyflie,
     "debias-measured": measured,
     "debias-set-up": set_up,
     "default-model": default,
@@ -26,6 +27,7 @@ of measured flights: flights/, util/, surveys/.
   aids             height, pressure and velocity on measured flights, and their faults (docs/aids.md)
   checking         mistakes put into flights, and what check says of them (docs/connect.md)
   compare-models   bias models side by side on flights that took no part in training (docs/bias.md)
+  crazyflie        measured logs put through the radio link of a Crazyflie (docs/connect.md)
   debias-measured  bias maps of positions on measured flights (docs/debiasing.md)
   debias-set-up    a simulated copy of the set-up of Grasso et al. (docs/debiasing.md)
   default-model    the model that bias_node ships
@@ -48,6 +50,7 @@ def parser():
         "study checking DATA/flights DATA/util --survey DATA/surveys --only nothing",
         "study compare-models --train DATA/flights/0425 --test 0426 DATA/flights/0426 --survey DATA/surveys --out out/",
         "study compare-models --simulated 20 --out out/",
+        "study crazyflie DATA/flights/0425/TDOA2 DATA/flights/0422 --survey DATA/surveys",
         "study debias-measured --data DATA --diagnosed bench/ --out measured/",
         "study debias-set-up --out set_up/",
         "study default-model DATA/flights --survey DATA/surveys --out default.onnx",

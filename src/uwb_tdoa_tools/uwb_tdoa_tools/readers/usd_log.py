@@ -19,8 +19,10 @@ _NUMPY_OF_STRUCT = {  # codes of Python's struct module, little endian and packe
     "b": "i1", "B": "u1", "?": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "l": "<i4", "L": "<u4",
     "q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8",
 }  # fmt: skip
+_CANDIDATES, _SELECTED = "estTdoaCand", "isSelected"
 _STREAMS = {  # event name: our stream, {column in the log: column of the stream}
     "estTDOA": ("tdoa", {"idA": "a", "idB": "b", "distanceDiff": "d"}),
+    _CANDIDATES: ("tdoa", {"idA": "b", "idB": "a", "distanceDiff": "d"}),  # its sign is the other one
     "estGyroscope": ("gyro", {"gyro.x": "x", "gyro.y": "y", "gyro.z": "z"}),
     "estAcceleration": ("acc", {"acc.x": "x", "acc.y": "y", "acc.z": "z"}),
     "estPose": ("pose", {f"locSrv.{axis}": axis for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")}),
@@ -33,9 +35,11 @@ _STREAMS = {  # event name: our stream, {column in the log: column of the stream
 def read_usd_log(path, anchors, salvage=False):
     """Flight of a micro-SD event log.
 
-    TDOAs come from estTDOA, the IMU from estGyroscope (deg/s to rad/s) and estAcceleration (g to m/s^2), the ground
-    truth from estPose, the height from estTOF (mm to m), the pressure from estBarometer (altitude to Pa) and the
-    velocity from estFlow (pixel counts, with range and gyroscope). Other events that occur are in `Flight.extra` under the names and in the units of the log.
+    TDOAs come from estTDOA (d_B - d_A), or where there is none from the selected ones of estTdoaCand (d_A - d_B), the
+    IMU from estGyroscope (deg/s to rad/s) and estAcceleration (g to m/s^2), the ground truth from estPose, the height
+    from estTOF (mm to m), the pressure from estBarometer (altitude to Pa) and the velocity from estFlow (pixel counts,
+    with range and gyroscope). Other events that occur are in `Flight.extra` under the names and in the units of the
+    log.
     Raises InputError for a file that is empty, foreign, cut or damaged (the checksum is always verified), and for
     records that are not finite.
     salvage : read a cut or damaged log up to there, as the power of a vehicle that fell leaves it; `meta["remarks"]`
@@ -64,16 +68,20 @@ def read_usd_log(path, anchors, salvage=False):
         meta["remarks"].append(f"cut or damaged: {lost}; single values may be damaged too.")
 
     streams, extra, order = {}, {}, np.argsort(ids, kind="stable")
+    occurring = {events[number][0] for number in np.unique(ids).tolist()}
     numbers = np.array(list(events), dtype=np.uint16)
     ends = [np.searchsorted(ids[order], numbers, side) for side in ("left", "right")]
     for (name, fields), first, last in zip(events.values(), *ends):
         rows = _gather(raw, offsets[order[first:last]], dtypes[name])
         columns = {field: np.ascontiguousarray(rows["values"][field]) for field, _ in fields}
         columns["t"] = rows["t"] / ticks
-        if name not in _STREAMS:
+        stream, rename = _STREAMS.get(name, (None, None))
+        if stream is None or (name == _CANDIDATES and "estTDOA" in occurring):
             extra[name] = columns
             continue
-        stream, rename = _STREAMS[name]
+        if name == _CANDIDATES and _SELECTED in columns:
+            selected = columns[_SELECTED] != 0
+            columns = {field: values[selected] for field, values in columns.items()}
         missing = [field for field in rename if field not in columns]
         if missing:
             known = ", ".join(field for field, _ in fields)

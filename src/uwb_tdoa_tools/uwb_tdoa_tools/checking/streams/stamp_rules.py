@@ -14,7 +14,7 @@ STAMP_LINE = "message.header.stamp = ...  # when the sample was measured, ROS ti
 SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
 LONGEST_GAP = {"imu/data": 0.1, "uwb/tdoa": 0.5}  # s; healthy 0.012 and 0.116 at most
 SCATTER = 3.0  # standard deviation of the steps over their mean; healthy 1.4 at most
-REPEATED, LEAP = 0.3, 0.005  # share of stamps that equal the one before, healthy 0, and s between those that do not
+REPEATED, LEAP = 0.3, 0.01  # share of stamps that equal the one before, healthy 0, and s between those that do not
 PACE = 0.05  # by which the pace of the stamps may differ from that of the clock
 BLOCK = 0.1  # s between the soonest and the latest arrival of a window, beyond the lag of the first
 APART = 0.1  # s between two streams
@@ -57,7 +57,7 @@ def standing(name, windows):
         cause = f"the stamps of {name} stand still"
         return Finding("stamps_stand", ERROR, cause, f"{100.0 * share:.0f} % repeat the one before", STAMP_LINE, share)
     scatter, step = median(windows, "scatter"), median(windows, "gap")
-    packets = share > REPEATED and step > LEAP
+    packets = share > REPEATED and median(windows, "step") > LEAP * (1.0 - share)
     if not (packets or scatter > SCATTER):
         return None
     evidence = f"{100.0 * share:.0f} % repeat the one before, then they leap by {step:.3f} s"

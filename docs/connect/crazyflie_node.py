@@ -1,0 +1,71 @@
+"""Log blocks of one Crazyflie, as crazyswarm2 publishes them, to uwb/tdoa and imu/data.
+
+In crazyflies.yaml, for the robot type or the robot:
+
+    firmware_logging:
+      enabled: true
+      custom_topics:
+        tdoa_a:
+          frequency: 100
+          vars: ["tdoa2.d7-0", "tdoa2.d0-1", "tdoa2.d1-2", "tdoa2.d2-3", "tdoa2.d3-4", "tdoa2.d4-5"]
+        tdoa_b: {frequency: 100, vars: ["tdoa2.d5-6", "tdoa2.d6-7"]}
+        imu: {frequency: 100, vars: ["gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z"]}
+
+then: python3 crazyflie_node.py --ros-args -r __ns:=/cf1
+"""
+
+import sys
+
+import rclpy
+from rclpy.time import Time
+from sensor_msgs.msg import Imu
+from uwb_tdoa_msgs.msg import Tdoa
+from uwb_tdoa_tools.crazyflie.log_blocks import LogBlock, VehicleClock
+
+try:
+    from crazyflie_interfaces.msg import LogDataGeneric
+except ImportError:
+    sys.exit("crazyflie_node: error: crazyflie_interfaces is not installed; install crazyswarm2 and source it.")
+
+BLOCKS = {
+    "tdoa_a": ["tdoa2.d7-0", "tdoa2.d0-1", "tdoa2.d1-2", "tdoa2.d2-3", "tdoa2.d3-4", "tdoa2.d4-5"],
+    "tdoa_b": ["tdoa2.d5-6", "tdoa2.d6-7"],
+    "imu": ["gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z"],
+}
+
+
+def main():
+    rclpy.init()
+    node = rclpy.create_node("crazyflie_node")
+    tdoas, samples = node.create_publisher(Tdoa, "uwb/tdoa", 100), node.create_publisher(Imu, "imu/data", 100)
+    clock = VehicleClock()
+
+    def stamp(message, t, arrival):
+        message.header.stamp = Time(nanoseconds=round(1e9 * clock.stamp(t, arrival))).to_msg()
+        message.header.frame_id = "base_link"
+        return message
+
+    def on_block(message, block):
+        arrival = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        pairs, sample = block.take(message.timestamp, message.values)
+        for t, a, b, d in pairs:
+            tdoas.publish(stamp(Tdoa(anchor_a=a, anchor_b=b, distance_difference=d), t, arrival))
+        if sample is not None:
+            t, gyro, accel = sample
+            imu = stamp(Imu(), t, arrival)
+            imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z = gyro.tolist()
+            imu.linear_acceleration.x, imu.linear_acceleration.y, imu.linear_acceleration.z = accel.tolist()
+            samples.publish(imu)
+
+    for topic, variables in BLOCKS.items():
+        block = LogBlock(variables)
+        node.create_subscription(LogDataGeneric, topic, lambda message, block=block: on_block(message, block), 100)
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        pass
+    rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

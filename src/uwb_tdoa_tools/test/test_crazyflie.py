@@ -1,0 +1,106 @@
+"""Log variables of a Crazyflie, sampled and late, to streams; and the example node around that."""
+
+from dataclasses import replace
+import subprocess
+import sys
+
+from documented import ROOT
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools.crazyflie.log_blocks import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
+from uwb_tdoa_tools.crazyflie.streamed import BLOCKS, PAIRS, Link, as_received, messages, streamed
+from uwb_tdoa_tools.readers import inputs
+from uwb_tdoa_tools.scoring.evaluation import evaluate
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.studies.crazyflie import table
+
+
+@pytest.fixture(scope="module")
+def flight():
+    rates = dict(duration=12.0, imu_rate=500.0, truth_rate=50.0)
+    return simulate(SimulationConfig(seed=1, outlier_probability=0.0, start_in_air=True, **rates))
+
+
+def test_a_value_is_a_measurement_once():
+    block = LogBlock(["stateEstimate.z", "tdoa2.d7-0", "tdoa2.d0-1"])
+    first = [(pytest.approx(1.0 - PERIOD / 2), 0, 1, 0.5)]  # the other is 0: never received
+    assert block.take(1000, [1.0, 0.0, 0.5]) == (first, None)
+    assert block.take(1010, [1.0, -2.0, 0.5]) == ([(pytest.approx(1.01 - PERIOD / 2), 7, 0, -2.0)], None)
+    assert block.take(1020, [1.0, -2.0, 0.5]) == ([], None)
+    assert block.take(1030, [1.0, float("nan"), 0.25])[0][0][3] == 0.25
+
+
+def test_inertial_samples_are_in_si_units_whatever_their_order():
+    names = [*FORCES, "pm.vbat", *RATES]
+    tdoas, (t, gyro, accel) = LogBlock(names).take(2500, [0.0, 0.5, 1.0, 3.9, 180.0, 0.0, -90.0])
+    assert tdoas == [] and t == 2.5
+    np.testing.assert_allclose(gyro, [np.pi, 0.0, -np.pi / 2])
+    np.testing.assert_allclose(accel, [0.0, 0.5 * GRAVITY, GRAVITY])
+    assert LogBlock(RATES).take(0, [1.0, 2.0, 3.0]) == ([], None)  # half an IMU is none
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(0.0, 0.05), min_size=2, max_size=60), st.floats(-1e4, 1e9))
+def test_the_clock_is_off_by_the_least_delay_and_never_runs_back_far(delays, offset):
+    clock = VehicleClock()
+    for k, delay in enumerate(delays):
+        t = PERIOD * k
+        stamped = clock.stamp(t, t + offset + delay)
+        assert stamped <= t + offset + delay + 1e-6
+        assert stamped >= t + offset - 1e-6
+
+
+def test_what_is_sent_fits_the_link(flight):
+    assert sum(map(len, BLOCKS)) == 14 and all(4 * len(block) <= 26 for block in BLOCKS)
+    sent = messages(flight, Link(lost=0.1), np.random.default_rng(0))
+    assert len(sent) / 12.0 == pytest.approx(3 * 0.9 / PERIOD, rel=0.03)
+    arrivals = [message[0] for message in sent]
+    assert arrivals == sorted(arrivals)
+
+
+def test_what_comes_out_was_measured_and_in_time(flight):
+    made = streamed(flight, Link())
+    known = {pair: np.flatnonzero((flight.tdoa.a == pair[0]) & (flight.tdoa.b == pair[1])) for pair in pairs()}
+    late = []
+    for t, a, b, d in zip(made.tdoa.t, made.tdoa.a, made.tdoa.b, made.tdoa.d):
+        rows = known[a, b]
+        row = rows[np.argmin(np.abs(flight.tdoa.d[rows] - d))]
+        assert abs(flight.tdoa.d[row] - d) < 1e-6
+        late.append(t - flight.tdoa.t[row])
+    assert np.median(late) == pytest.approx(Link().latency, abs=0.003) and np.ptp(late) < 2.0 * PERIOD
+    assert 0.7 < len(made.tdoa) / len(flight.tdoa) <= 1.0
+    assert len(as_received(flight, Link()).tdoa) > 1.5 * len(flight.tdoa)
+    assert 1.0 / np.median(np.diff(made.imu.t)) == pytest.approx(1.0 / PERIOD, rel=0.1)
+
+
+def pairs():
+    return [(int(name[7]), int(name[9])) for name in PAIRS]
+
+
+def test_the_estimate_loses_little(flight):
+    direct = evaluate(flight, FilterConfig())[0].row()["rmse_3d"]
+    for link in (Link(), Link(half=True, lost=0.05)):
+        assert evaluate(streamed(flight, link), FilterConfig())[0].row()["rmse_3d"] < direct + 0.03
+
+
+@pytest.mark.slow
+def test_measured_logs_lose_little(shared_data):
+    flights = inputs.Reading(shared_data / "surveys").flights([shared_data / "flights" / "0426"])
+    tdoa2 = [f for f in flights if f.meta["protocol"] == "tdoa2"][:2]
+    lines = list(table([replace(f, extra={}) for f in tdoa2]))[2:]
+    direct, *others, naive = (float(line.split("|")[4]) for line in lines)
+    assert all(error < direct + 0.02 for error in others) and naive > min(others)
+
+
+def test_the_example_says_what_is_missing():
+    pytest.importorskip("rclpy")
+    pytest.importorskip("uwb_tdoa_msgs.msg")
+    done = subprocess.run(
+        [sys.executable, ROOT / "docs" / "connect" / "crazyflie_node.py"], capture_output=True, text=True, timeout=60
+    )
+    if "crazyflie_interfaces" not in done.stderr:
+        pytest.skip("crazyswarm2 is installed")
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "install crazyswarm2" in done.stderr

@@ -1,0 +1,1 @@
+"""What a Crazyflie sends over its radio link: log variables, sampled."""

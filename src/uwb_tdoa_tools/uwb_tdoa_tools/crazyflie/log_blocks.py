@@ -1,0 +1,62 @@
+"""Log variables of a Crazyflie, as crazyswarm2 passes them on, to TDOAs and inertial samples.
+
+    block = LogBlock(["tdoa2.d7-0", "tdoa2.d0-1", "acc.x", ...], PERIOD)
+    measured = block.take(message.timestamp, message.values)     # of a crazyflie_interfaces/LogDataGeneric
+    stamp = clock.stamp(t, arrival)                               # one VehicleClock for all blocks of a vehicle
+
+A variable holds the last value there was: it is sampled when the block is sent, repeats until there is another, and is
+on average half a period old. Nothing here knows ROS.
+"""
+
+import re
+
+import numpy as np
+
+GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer
+PERIOD = 0.01  # s, the shortest of a log block
+RATES, FORCES = [f"gyro.{axis}" for axis in "xyz"], [f"acc.{axis}" for axis in "xyz"]  # deg/s, g
+DRIFT = 1e-3  # s/s by which the clock of a vehicle may run away from ours
+_PAIR = re.compile(r"tdoa2\.d([0-7])-([0-7])")
+
+
+class LogBlock:
+    """One log block: the variables that it holds, in their order."""
+
+    def __init__(self, variables, period=PERIOD):
+        """variables : names of log variables; those that are neither TDOAs nor acc and gyro are passed over.
+        period : s."""
+        found = [(place, _PAIR.fullmatch(name)) for place, name in enumerate(variables)]
+        self._pairs = [(place, int(match[1]), int(match[2])) for place, match in found if match]
+        there, needed = list(variables), [*RATES, *FORCES]
+        self._inertial = [there.index(name) for name in needed] if set(needed) <= set(there) else None
+        self._age, self._last = 0.5 * period, {}
+
+    def take(self, timestamp, values):
+        """([(t, a, b, d)], (t, gyro (3,), accel (3,)) or None) of one message.
+
+        timestamp : ms of the vehicle's clock; values : of the variables. t in s of that clock; d in m, of the sign of
+        uwb_tdoa_msgs/Tdoa (the firmware's distanceDiff of the pair A, B is |p - B| - |p - A|); rad/s and m/s^2. A value
+        that is 0 (nothing received yet), not finite, or the same as before is no measurement."""
+        t, tdoas = 1e-3 * timestamp, []
+        for place, a, b in self._pairs:
+            d = float(values[place])
+            if d != self._last.get(place, 0.0) and np.isfinite(d):
+                tdoas.append((t - self._age, a, b, d))
+            self._last[place] = d
+        if self._inertial is None:
+            return tdoas, None
+        sample = np.array([values[place] for place in self._inertial], dtype=float)
+        return tdoas, (t, np.deg2rad(sample[:3]), GRAVITY * sample[3:])
+
+
+class VehicleClock:
+    """The vehicle's clock against ours: messages arrive late, never early, so that the least delay tells the offset."""
+
+    def __init__(self):
+        self._offset, self._at = np.inf, 0.0
+
+    def stamp(self, t, arrival):
+        """Our time, s, of t, s of the vehicle's clock, in a message that arrived at `arrival`, s of ours."""
+        self._offset = min(self._offset + DRIFT * max(arrival - self._at, 0.0), arrival - t)
+        self._at = arrival
+        return t + self._offset

@@ -1,0 +1,80 @@
+"""A recorded flight as it would have come over the radio link: sampled, rounded, repeated, lost and late."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
+
+from .log_blocks import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
+
+PAIRS = [f"tdoa2.d{k}-{(k + 1) % 8}" for k in (7, 0, 1, 2, 3, 4, 5, 6)]
+BLOCKS = PAIRS[:6], PAIRS[6:], [*RATES, *FORCES]  # 26 bytes each at most
+BOOTED = 12.3  # s on our clock at which the vehicle was switched on
+
+
+@dataclass(frozen=True)
+class Link:
+    """half : TDOAs as half floats; lost : share of messages; latency, jitter : s, of a message, the least, and the mean
+    of what comes on top."""
+
+    half: bool = False
+    lost: float = 0.0
+    latency: float = 0.004
+    jitter: float = 0.004
+
+
+def messages(flight, link, rng):
+    """[(arrival s, block, timestamp ms, values)] of a TDoA2 Flight, as they arrive. block : place in BLOCKS."""
+    tdoa, imu, sent = flight.tdoa, flight.imu, []
+    begin, end = max(tdoa.t[0], imu.t[0]), min(tdoa.t[-1], imu.t[-1])
+    for number, variables in enumerate(BLOCKS):
+        t = np.arange(begin + rng.uniform(0.0, PERIOD), end, PERIOD)
+        rows = []
+        for name in variables:
+            if name.startswith("tdoa2"):
+                a, b = int(name[7]), int(name[9])
+                mine = np.flatnonzero((tdoa.a == a) & (tdoa.b == b))
+                held = np.r_[0.0, tdoa.d[mine]][np.searchsorted(tdoa.t[mine], t, side="right")]
+                rows.append(held.astype(np.float16) if link.half else held)
+            else:
+                stream = np.rad2deg(imu.gyro) if name in RATES else imu.accel / GRAVITY
+                at = np.searchsorted(imu.t, t, side="right") - 1
+                rows.append(stream[np.maximum(at, 0), "xyz".index(name[-1])])
+        values = np.array(rows, dtype=np.float32).T
+        arrival = np.maximum.accumulate(t + link.latency + rng.exponential(link.jitter, len(t)))
+        stamps = np.floor(1e3 * (t - BOOTED + 100.0)).astype(int)
+        kept = rng.random(len(t)) >= link.lost
+        sent += [(arrival[k], number, stamps[k], values[k]) for k in np.flatnonzero(kept)]
+    return sorted(sent, key=lambda message: message[0])
+
+
+def streamed(flight, link, seed=0):
+    """The Flight that `LogBlock` and `VehicleClock` make of these messages."""
+    blocks, clock, tdoas, samples = [LogBlock(variables) for variables in BLOCKS], VehicleClock(), [], []
+    for arrival, number, timestamp, values in messages(flight, link, np.random.default_rng(seed)):
+        pairs, sample = blocks[number].take(timestamp, values)
+        tdoas += [(clock.stamp(t, arrival), a, b, d) for t, a, b, d in pairs]
+        if sample is not None:
+            samples.append((clock.stamp(sample[0], arrival), sample[1], sample[2]))
+    return _flight(flight, tdoas, samples)
+
+
+def as_received(flight, link, seed=0):
+    """The Flight of a driver that publishes every value of every message, stamped when it arrived."""
+    tdoas, samples = [], []
+    for arrival, number, _, values in messages(flight, link, np.random.default_rng(seed)):
+        for name, value in zip(BLOCKS[number], values):
+            if name.startswith("tdoa2"):
+                tdoas.append((arrival, int(name[7]), int(name[9]), float(value)))
+        if number == 2:
+            samples.append((arrival, np.deg2rad(values[:3]), GRAVITY * values[3:]))
+    return _flight(flight, tdoas, samples)
+
+
+def _flight(flight, tdoas, samples):
+    """The Flight with other streams, in order of their stamps."""
+    t, a, b, d = (np.array(column) for column in zip(*sorted(tdoas, key=lambda row: row[0])))
+    samples.sort(key=lambda row: row[0])
+    imu = Imu(*(np.array(column, dtype=float) for column in zip(*samples)))
+    return replace(flight, tdoa=Tdoas(t, a, b, d), imu=imu)
