@@ -50,6 +50,7 @@ setup(
             "replay = uwb_tdoa_tools.executables:replay",
             "simulate = uwb_tdoa_tools.executables:simulate",
             "study = uwb_tdoa_tools.executables:study",
+            "survey = uwb_tdoa_tools.executables:survey",
             "train = uwb_tdoa_tools.executables:train",
         ]
     },

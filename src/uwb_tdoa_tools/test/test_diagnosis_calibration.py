@@ -7,7 +7,6 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.diagnosis import calibration
 from uwb_tdoa_tools.diagnosis.attribution import attribute, effects_of
 from uwb_tdoa_tools.diagnosis.calibration import LEFT, calibrate
-from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
@@ -21,11 +20,7 @@ def calibrated(*effects, seed=100, seconds=40.0):
         flight = effect.inject(flight, np.random.default_rng(0))
     flight = reference.prepare(flight)
     attribution = attribute([flight], reference, undeclared=False)
-    return calibrate(residuals_of(flight, reference), attribution.candidates)
-
-
-def residuals_of(flight, reference):
-    return [residuals(flight, reference, EffectSet())]
+    return calibrate([flight], attribution, EffectSet())
 
 
 @pytest.fixture(scope="module")

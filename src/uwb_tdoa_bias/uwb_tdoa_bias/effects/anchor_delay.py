@@ -15,7 +15,6 @@ class AnchorDelay(AnchorEffect):
     bound = 5.0
     negligible = 0.01
     typical = 0.3
-    calibration_prior = 0.1
     example = "0"
     physics = "the antenna delay of an anchor is not calibrated: it always seems farther away by the same distance"
     confounded_with = ("anchor_position", "pair_offset")

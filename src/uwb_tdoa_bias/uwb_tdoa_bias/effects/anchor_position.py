@@ -29,7 +29,6 @@ class AnchorPosition(Effect):
     }
     reference = "geometry; survey repeatability of a total station is millimetres, of a tape some centimetres"
     portable = False
-    calibration_prior = 0.1
 
     @classmethod
     def check_key(cls, key):

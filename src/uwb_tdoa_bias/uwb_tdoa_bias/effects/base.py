@@ -46,7 +46,6 @@ class Effect:
     distinguished_by: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
     usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
     needs_reference: ClassVar[bool] = False  # cannot be told from the filter's innovations alone
-    calibration_prior: ClassVar[float | None] = None  # standard deviation of each parameter, if innovations alone calibrate it
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
     uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
 

@@ -69,7 +69,7 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     Raises InputError where a flight cannot be used: flights of different anchors, or without the reference.
     """
     reference = reference or GroundTruth()
-    _same_anchors([*flights, *holdout])
+    same_anchors([*flights, *holdout])
     flights, holdout = (tuple(map(reference.prepare, some)) for some in (flights, holdout))
 
     def saying(what):
@@ -124,13 +124,14 @@ def _findings(attribution, model, kept):
     return out + [replace(each, added=False) for each in attribution.findings() if each.key not in added]
 
 
-def _same_anchors(flights):
+def same_anchors(flights):
+    """Raises InputError unless all of some Flights, at least one, were flown among the same anchors."""
     if not flights:
-        raise InputError("diagnose: give at least one flight.")
+        raise InputError("give at least one flight.")
     first = flights[0]
     for flight in flights[1:]:
         same = np.array_equal(flight.anchors.ids, first.anchors.ids)
         if not (same and np.allclose(flight.anchors.positions, first.anchors.positions, atol=SAME_PLACE)):
             raise InputError(
-                f"{flight.name}: its anchors are not those of {first.name}; diagnose each installation and day alone."
+                f"{flight.name}: its anchors are not those of {first.name}; take each installation and day alone."
             )

@@ -123,8 +123,7 @@ def borne_out(attribution, flights, base, config=None, progress=lambda: None):
     selection = attribution.selection
     if not selection.chosen:
         return nothing(attribution)
-    calibration = calibrate(attribution.residuals, attribution.candidates)
-    progress()
+    calibration = calibrate(flights, attribution, base, config, progress)
     if calibration.why_not is None:
         applied = {candidate.name for candidate in calibration.selection.chosen}
         labels = [candidate.label for candidate in selection.chosen if candidate.name not in applied]

@@ -56,15 +56,14 @@ def prior_sizes(columns):
     return np.array([column.typical for column in columns])
 
 
-def fit(table, columns, inflation=None, sizes=None):
-    """Fit of some Columns of a Table. inflation : (channels,), measured on this very fit if None; sizes : (k,) standard
-    deviations of the prior, plausible ones if None."""
-    x, channel, sizes = table.matrix(columns), table.channel, prior_sizes(columns) if sizes is None else sizes
+def fit(table, columns, inflation=None):
+    """Fit of some Columns of a Table. inflation : (channels,), measured on this very fit if None."""
+    x, channel, sizes = table.matrix(columns), table.channel, prior_sizes(columns)
     size = np.maximum(np.bincount(channel, minlength=len(table.channels)), 1).astype(float)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
     residual, scale = table.y.copy(), np.ones(len(table.channels))
     for step in range(ITERATIONS):
-        scale = _scales(table, residual)
+        scale = scales(table, residual)
         weight = (NU + 1.0) / (NU + (residual / scale[channel]) ** 2)
         if not columns:
             if step:
@@ -92,7 +91,7 @@ def refit(table, columns, model, rows):
     return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=table.y - x @ beta)
 
 
-def _scales(table, residual):
+def scales(table, residual):
     """Scale of Student's t per channel, by the fixed point of its likelihood."""
     out = np.ones(len(table.channels))
     for k in np.unique(table.channel):

@@ -1,0 +1,116 @@
+"""From a tape measure and flights to anchors."""
+
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.survey import read_survey
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands.survey import main
+from uwb_tdoa_tools.diagnosis.self_survey import delay_effect
+from uwb_tdoa_tools.scoring.evaluation import evaluate
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from uwb_tdoa_tools.surveying.placing import place
+from uwb_tdoa_tools.surveying.survey import survey
+from uwb_tdoa_tools.surveying.tape import Tape
+
+TRUSTED = ("0", "6", "1.z", "2.z")
+
+
+def at(flight, positions):
+    anchors = flight.anchors
+    return replace(flight, anchors=Anchors(anchors.ids, positions, anchors.orientations, anchors.frame))
+
+
+def shaken(anchors, std, seed):
+    """Positions as a tape of this std tells them, TRUSTED coordinates as they are."""
+    off = std * np.random.default_rng(seed).standard_normal(anchors.positions.shape)
+    return anchors.positions + np.where(Tape(1.0, trusted=TRUSTED).position_std(anchors) < 0.5, 0.0, off)
+
+
+def error(flight, **options):
+    return evaluate(flight, **options)[0].row()["rmse_3d"]
+
+
+@pytest.fixture(scope="module")
+def flights():
+    delays = EFFECTS["anchor_delay"]({"3": 0.15})
+    return [delays.inject(clean_flight(seed, 40.0), np.random.default_rng(0)) for seed in (200, 201, 202)]
+
+
+@pytest.fixture(scope="module")
+def result(flights):
+    measured = shaken(flights[0].anchors, 0.2, 0)
+    return survey([at(flight, measured) for flight in flights[:2]], Tape(0.2, trusted=TRUSTED))
+
+
+def test_anchors_come_nearer_to_where_they_are_and_say_how_near(flights, result):
+    true, found = flights[0].anchors.positions, result.surveyed
+    free = result.given_std > 0.1
+    off, before = (found.anchors.positions - true)[free], (result.given.positions - true)[free]
+    assert np.sqrt(np.mean(off**2)) < 0.5 * np.sqrt(np.mean(before**2))
+    assert 0.3 < np.sqrt(np.mean((off / found.position_std[free]) ** 2)) < 1.5
+    assert result.improved[free].mean() > 0.5 and not result.improved[~free].any()
+    assert np.abs((found.anchors.positions - true)[~free]).max() < 0.02
+
+
+def test_a_flight_that_took_no_part_gains(flights, result):
+    other, found = flights[2], result.surveyed
+    before = error(at(other, result.given.positions))
+    with_effects = error(at(other, found.anchors.positions), effects=EffectSet((delay_effect(found.anchors, found.delays),)))
+    assert with_effects < 0.5 * before and with_effects < 1.2 * error(other)
+
+
+def test_ground_truth_is_not_looked_at(flights, result):
+    wrong = [replace(flight, truth=replace(flight.truth, p=flight.truth.p + 1.0)) for flight in flights[:2]]
+    again = survey([at(flight, result.given.positions) for flight in wrong], Tape(0.2, trusted=TRUSTED))
+    np.testing.assert_array_equal(again.surveyed.anchors.positions, result.surveyed.anchors.positions)
+
+
+def test_an_anchor_of_which_nothing_is_known_is_placed(flights):
+    true = flights[0].anchors.positions
+    lost = true.copy()
+    lost[5] = 0.0
+    placed = place([at(flight, lost) for flight in flights[:1]], [5]).positions
+    assert np.linalg.norm(placed[5] - true[5]) < 0.3
+    np.testing.assert_array_equal(np.delete(placed, 5, axis=0), np.delete(true, 5, axis=0))
+
+
+def test_words_name_what_is_better_and_what_is_not(result):
+    text = result.as_text()
+    assert text.count("\n") >= 9 and "coordinates are known better than before" in text
+    assert json.loads(json.dumps(result.as_dict(), allow_nan=False))["anchors"]["0"]["improved"] == [False] * 3
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"std": 0.0}, "--std: 0 must be above 0"),
+        ({"trusted": ("77",)}, "there is no anchor '77'"),
+        ({"trusted": ("1.w",)}, "has no axis 'w'"),
+        ({"unknown": tuple("01234")}, "3 of 8 anchors are left"),
+    ],
+)
+def test_a_tape_that_does_not_fit_is_refused(flights, options, words):
+    with pytest.raises(InputError, match=words.replace("(", r"\(")):
+        tape = Tape(**options)
+        tape.position_std(flights[0].anchors), tape.unknown_rows(flights[0].anchors)
+
+
+def test_the_command_writes_surveys_that_are_read(flights, tmp_path, capsys):
+    measured = shaken(flights[0].anchors, 0.1, 1)
+    write_bag(flights[0], tmp_path / "flight.bag")
+    at(flights[0], measured).anchors.to_yaml(tmp_path / "tape.yaml")
+    out = tmp_path / "out"
+    words = ["--survey", str(tmp_path / "tape.yaml"), "--height-std", "0.03", "--trusted", *TRUSTED, "--out", str(out)]
+    assert main([str(tmp_path / "flight.bag"), *words]) == 0
+    assert "next: evaluate FLIGHT --survey" in capsys.readouterr().out
+    found = [read_survey(out / name).positions for name in ("anchors.yaml", "anchors.csv")]
+    np.testing.assert_allclose(*found, atol=1e-4)
+    assert (out / "survey.png").stat().st_size > 5000 and np.abs(found[0] - measured).max() > 0.01
+    assert main([str(tmp_path / "flight.bag"), *words[:-2], "--out", str(tmp_path / "tape.yaml")]) == 2

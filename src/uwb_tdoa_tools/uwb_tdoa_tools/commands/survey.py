@@ -1,0 +1,77 @@
+"""survey: better anchors from a tape measure and flights."""
+
+import json
+from pathlib import Path
+import sys
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from .. import cli, options
+from ..diagnosis.self_survey import delay_effect
+from ..progress import Progress
+from ..surveying.survey import survey
+from ..surveying.tape import Tape
+
+DESCRIPTION = """Make a tape-measured survey better, from flights alone.
+
+Nobody needs to know where the tag flew: the flights tell which shifts of anchors, and which delays, make their TDOAs
+agree with each other and with the IMU (and with a range finder, where there is one). The frame is that of the
+coordinates that are known best: name some with --trusted, or all stays where it is on average. Ground truth is not used.
+
+Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the anchors),
+survey.json (covariance) and survey.png (before and after) to --out."""
+
+
+def main(argv=None):
+    """The executable. Returns the exit code."""
+    return cli.run(_survey, parser(), argv)
+
+
+def parser():
+    """Its options."""
+    made = cli.parser(
+        "survey",
+        DESCRIPTION,
+        "survey flight.bag --survey tape.yaml --trusted 0 4 1.z 2.z --out surveyed/",
+        "survey first.bag second.bag third.bag --survey tape.csv --std 0.3 --height-std 0.05 --out surveyed/",
+        "survey flight.bag --survey tape.yaml --unknown 5 --out surveyed/",
+    )
+    options.add_recordings(made)
+    options.add_filter(made, "effects.yaml: what is in the model already")
+    add = made.add_argument
+    add("--std", type=float, default=0.1, metavar="M", help="m, standard deviation of a coordinate as given (default 0.1)")
+    add("--height-std", type=float, metavar="M", help="m, the same of heights, which are easier to measure")
+    add("--trusted", nargs="+", default=[], metavar="A", help="anchors (3) or coordinates (3.z) that are known well")
+    add("--trusted-std", type=float, default=0.01, metavar="M", help="m, how well those are known (default 0.01)")
+    add("--unknown", nargs="+", default=[], metavar="A", help="anchors whose position is not known at all")
+    add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
+    return made
+
+
+def _survey(args):
+    out = Path(args.out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out: {out} is a file; give a directory.")
+    tape = Tape(args.std, args.height_std, tuple(args.trusted), args.trusted_std, tuple(args.unknown))
+    config, effects = options.filter_of(args)
+    base = effects or EffectSet()
+    flights = options.reading_of(args).flights(args.flights)
+    with Progress("survey") as progress:
+        result = survey(flights, tape, base, config, lambda: progress("solving"))
+    out.mkdir(parents=True, exist_ok=True)
+    anchors = result.surveyed.anchors
+    anchors.to_yaml(out / "anchors.yaml")
+    rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
+    (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
+    delays = delay_effect(anchors, result.surveyed.delays)
+    EffectSet((*base.effects, delays)).to_yaml(out / "effects.yaml")
+    (out / "survey.json").write_text(json.dumps(result.as_dict(), indent=1, allow_nan=False))
+    result.picture(out / "survey.png")
+    print(result.as_text())
+    print(f"wrote anchors.yaml, anchors.csv, effects.yaml, survey.json and survey.png to {out}")
+    print(f"next: evaluate FLIGHT --survey {out / 'anchors.yaml'} --effects {out / 'effects.yaml'}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

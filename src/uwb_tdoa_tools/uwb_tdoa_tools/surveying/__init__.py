@@ -1,0 +1,1 @@
+"""Better anchors from rough ones and flights."""

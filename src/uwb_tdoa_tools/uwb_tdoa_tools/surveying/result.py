@@ -1,0 +1,95 @@
+"""What a survey from flights says: figures, sentences, a picture."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..diagnosis.self_survey import Surveyed
+
+IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
+KNOWN_WELL = 0.02  # m, standard deviation as given that leaves nothing to wish for
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names."""
+
+    given: object
+    given_std: np.ndarray
+    surveyed: Surveyed
+    flights: tuple
+
+    @property
+    def shifts(self):
+        """(N, 3) m, from what was given."""
+        return self.surveyed.anchors.positions - self.given.positions
+
+    @property
+    def improved(self):
+        """(N, 3) bool."""
+        return self.surveyed.position_std < IMPROVED * self.given_std
+
+    def as_dict(self):
+        """For JSON."""
+        found = self.surveyed
+        return {
+            "flights": list(self.flights),
+            "frame": found.anchors.frame,
+            "anchors": {
+                str(i): {
+                    "given": self.given.positions[row].tolist(),
+                    "given_std": self.given_std[row].tolist(),
+                    "position": found.anchors.positions[row].tolist(),
+                    "std": found.position_std[row].tolist(),
+                    "improved": self.improved[row].tolist(),
+                    "delay": float(found.delays[row]),
+                }
+                for row, i in enumerate(found.anchors.ids)
+            },
+            "covariance": found.covariance.tolist(),
+            "delay_std": found.delay_std,
+            "function_std": found.function_std,
+        }
+
+    def as_text(self):
+        """A table of all coordinates, and what it means."""
+        lines = [f"{'anchor':>6}  {'given [m]':>24}  {'shift [cm]':>20}  {'std [cm]':>17}  improved"]
+        found = self.surveyed
+        for row, i in enumerate(found.anchors.ids):
+            given = "".join(f"{v:8.2f}" for v in self.given.positions[row])
+            shift = "".join(f"{100 * v:7.1f}" for v in self.shifts[row])
+            std = "".join(f"{100 * v:6.1f}" for v in found.position_std[row])
+            better = "".join(axis if good else "-" for axis, good in zip("xyz", self.improved[row]))
+            lines.append(f"{i:>6}  {given:>24}  {shift:>20}  {std:>17}  {better}")
+        count = int(self.improved.sum())
+        lines.append(f"{count} of {self.improved.size} coordinates are known better than before")
+        rough = self.given_std.max(axis=1) > KNOWN_WELL
+        unseen = [str(i) for row, i in enumerate(found.anchors.ids) if rough[row] and not self.improved[row].any()]
+        if unseen:
+            lines.append(f"nothing new is told of anchors {', '.join(unseen)}: fly closer to them, on all sides, high and low")
+        if found.function_std > 0.05:
+            lines.append(
+                f"something else is wrong too, some {100 * found.function_std:.0f} cm that change with the place (antennas, metal, "
+                "floors): shifts are kept near what was given"
+            )
+        return "\n".join(lines)
+
+    def picture(self, path):
+        """Plan and elevation, before and after, with 95 % intervals."""
+        from matplotlib.figure import Figure  # takes a second to import
+
+        figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+        found = self.surveyed.anchors.positions
+        for ax, (u, v) in zip(figure.subplots(1, 2), ((0, 1), (0, 2))):
+            ax.errorbar(
+                found[:, u], found[:, v], 1.96 * self.surveyed.position_std[:, v], 1.96 * self.surveyed.position_std[:, u],
+                fmt="o", ms=5, color="tab:blue", lw=1.2, label="surveyed, 95 %",
+            )  # fmt: skip
+            ax.plot(self.given.positions[:, u], self.given.positions[:, v], "x", ms=8, color="tab:red", label="given")
+            for row, i in enumerate(self.given.ids):
+                ax.annotate(str(i), found[row, [u, v]], textcoords="offset points", xytext=(7, 7))
+            ax.set(xlabel=f"{'xyz'[u]} [m]", ylabel=f"{'xyz'[v]} [m]", title="from above" if v == 1 else "from the side")
+            ax.set_aspect("equal", adjustable="datalim")
+            ax.grid(alpha=0.25)
+        figure.axes[0].legend()
+        figure.savefig(path, dpi=110)

@@ -1,0 +1,33 @@
+"""From a tape measure and flights to anchors."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet
+
+from ..diagnosis import self_survey
+from ..diagnosis.diagnose import same_anchors
+from ..parallel import in_one_thread
+from .placing import PLACED_STD, place
+from .result import Result
+
+NOTHING_KNOWN = 1e3  # m, standard deviation of a coordinate of which nothing is known
+
+
+@in_one_thread
+def survey(flights, tape, base=EffectSet(), config=None, progress=lambda: None):
+    """Result of Flights with the anchors that a Tape speaks of.
+
+    base : EffectSet that is in the model already; config : FilterConfig. Ground truth is not used. Raises InputError for
+    flights of different anchors or that are too short, and for a Tape that does not fit.
+    """
+    same_anchors(flights)
+    given = flights[0].anchors
+    std, rows = tape.position_std(given), tape.unknown_rows(given)
+    start, start_std = given, std.copy()
+    if rows:
+        start = place(flights, rows, config)
+        start_std[rows], std[rows] = PLACED_STD, NOTHING_KNOWN
+    found = self_survey.survey([replace(flight, anchors=start) for flight in flights], start_std, base, config, progress=progress)
+    return Result(given, std, found, tuple(flight.name for flight in flights))
