@@ -1,6 +1,9 @@
 """Faults of drivers, live, through a real ekf_node: each is named within seconds, and nothing is said of a healthy flight."""
 
+import os
 import re
+import signal
+import time
 
 import pytest
 
@@ -45,3 +48,25 @@ def test_every_fault_is_named_and_a_healthy_flight_runs(make_rig):
         both = f"2 publish on {topic} \\(.*rig"
         lane.rig.wait(lambda: re.search(both, values_of(lane.rig.fresh_status("ekf_node"))["wrong with the streams"]), name)  # noqa: B023
         lane.rig.node.destroy_publisher(publisher)
+
+    # what is sent while a node is stopped is lost, and counted to the last message
+    before, sent, epoch = values_of(lane.rig.fresh_status("ekf_node")), 5000, int(time.time())
+    os.killpg(process_of(lane).pid, signal.SIGSTOP)
+    for k in range(sent):
+        if k == sent - 10:
+            os.killpg(process_of(lane).pid, signal.SIGCONT)
+        if k >= sent - 10:  # that some are missing shows when others follow
+            time.sleep(0.05)
+        lane.rig.send_imu(time.time() - epoch, (0.0, 0.0, 1e-4 * k), epoch=epoch)
+
+    def more(key):
+        return int(values_of(lane.rig.fresh_status("ekf_node"))[key]) - int(before[key])
+
+    counted = lambda: more("IMU samples received") + more("lost on imu/data") == sent  # noqa: E731
+    lane.rig.wait(counted, "every sample to be received or counted as lost", 30.0)
+    assert more("lost on imu/data") > 0
+
+
+def process_of(lane):
+    (node,) = lane.rig._processes.values()
+    return node.process
