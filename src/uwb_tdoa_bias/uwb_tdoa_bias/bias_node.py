@@ -73,7 +73,7 @@ class BiasNode(Node):
         self._epoch, self._counts, self._rate = ros.Epoch(), Counter(), ros.Rate()
         self._early, self._hold = deque(), PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
-        self._reported_unready = 0
+        self._reported_unready = self._reported_received = self._reported_poses = 0
         self._message = TdoaCorrected()  # one for all: what is published is copied
 
         self._frame, self._frame_trouble = self._body, None  # of the TDOAs
@@ -82,8 +82,8 @@ class BiasNode(Node):
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self._inputs = {
-            "odometry": ros.subscribe_stream(self, Odometry, "odometry", self._on_odometry),
-            "uwb/tdoa": ros.subscribe_stream(self, Tdoa, "uwb/tdoa", self._on_tdoa),
+            "odometry": ros.StreamInput(self, Odometry, "odometry", self._on_odometry),
+            "uwb/tdoa": ros.StreamInput(self, Tdoa, "uwb/tdoa", self._on_tdoa),
         }
         say_unused(self, files)
         self._diagnostics = ros.Diagnostics(self, self._report)
@@ -227,6 +227,11 @@ class BiasNode(Node):
     def _report(self):
         counts = self._counts
         rate = self._rate.of(counts["received"])
+        received, self._reported_received = counts["received"] - self._reported_received, counts["received"]
+        poses, self._reported_poses = counts["poses"] - self._reported_poses, counts["poses"]
+        recent = {"uwb/tdoa": received, "odometry": poses}
+        wiring = [end.trouble(recent[name]) for name, end in self._inputs.items()]
+        wiring.append(ros.several_publishers(self, "uwb/tdoa_corrected"))
         unready, self._reported_unready = counts["unready"] - self._reported_unready, counts["unready"]
         values = {"model": self._model[NETWORK], "received": counts["received"], "published": counts["published"]}
         values |= {"waiting": len(self._hold) + len(self._tdoas) + len(self._early), "dropped": counts["dropped"]}
@@ -235,7 +240,11 @@ class BiasNode(Node):
         values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
         values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._inputs.items()}
         values |= {"subscribers of uwb/tdoa_corrected": self._publisher.get_subscription_count()}
-        return *self._health(rate, unready), values
+        values |= {f"lost on {name}": end.lost for name, end in self._inputs.items()}
+        level, text = self._health(rate, unready)
+        if level != DiagnosticStatus.ERROR and any(wiring):
+            level, text = DiagnosticStatus.WARN, next(filter(None, wiring))
+        return level, text, values
 
     def _health(self, rate, unready):
         if self._frame_trouble:

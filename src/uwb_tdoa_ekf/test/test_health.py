@@ -12,6 +12,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from uwb_tdoa_ekf.monitoring import health  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402
+from uwb_tdoa_ekf.streams import Finding  # noqa: E402
 
 STARTING, RUNNING = SimpleNamespace(running=False), SimpleNamespace(running=True)
 
@@ -79,6 +80,7 @@ def test_rates_and_age(clock):
         "odometry behind the clock": "unknown",
         "IMU rate": "500.0 Hz",
         "TDOA rate": "20.0 Hz",
+        "wrong with the streams": "nothing",
     }
 
 
@@ -127,3 +129,31 @@ def test_an_aid_that_stops_is_told_and_so_is_one_that_contradicts(clock):
         level, text, _ = second(clock, judge, RUNNING, **counts)
         assert level == expected
     assert "more than half of the messages on height" in text
+
+
+def test_what_is_wrong_with_the_streams_is_said_before_what_comes_of_it(clock):
+    judge = health.Health(FilterConfig(), lag=0.25)
+    units = Finding("imu_force_unit", "error", "the accelerometer is in g", "it is 1.0", "multiply\n  it", 9.81)
+    slow = Finding("rate", "warning", "imu/data is slow", "20 Hz", "raise it", 20.0)
+    publishers = "2 publish on imu/data (/a, /b): stop all but one"
+
+    def said(estimator, wiring=(), findings=(), **counts):
+        clock.now += 1.0
+        judge.imu, judge.tdoa = judge.imu + 1000, judge.tdoa + 400
+        return judge.report(None, estimator, Counter(counts), wiring, findings)
+
+    level, text, values = said(STARTING, [publishers], [units, slow])
+    assert (level, text) == (ERROR, "the accelerometer is in g (it is 1.0): multiply it")
+    assert publishers in values["wrong with the streams"] and "imu/data is slow" in values["wrong with the streams"]
+    assert (values["found imu_force_unit"], values["found rate"]) == ("9.81", "20")
+    assert said(RUNNING, [publishers], [slow], used=400)[:2] == (WARN, publishers)
+    assert said(RUNNING, [], [slow], used=800)[:2] == (WARN, "imu/data is slow (20 Hz): raise it")
+    level, text, values = said(RUNNING, used=1200)
+    assert (level, text, values["wrong with the streams"]) == (OK, "running", "nothing")
+
+
+def test_odometry_that_is_ahead_of_the_clock_is_a_warning(clock):
+    judge = health.Health(FilterConfig(), lag=0.25)
+    judge.behind = -9.5
+    level, text, _ = second(clock, judge, RUNNING, used=400)
+    assert level == WARN and "9.5 s ahead of the clock" in text

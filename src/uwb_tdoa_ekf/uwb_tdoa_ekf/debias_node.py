@@ -56,7 +56,7 @@ class DebiasNode(Node):
         self._newest = -math.inf
         self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
         self._publisher = ros.publish_stream(self, Odometry, "odometry/debiased")
-        self._input = ros.subscribe_stream(self, Odometry, "odometry", self._on_odometry)
+        self._input = ros.StreamInput(self, Odometry, "odometry", self._on_odometry)
         say_unused(self, files)
         self._diagnostics = ros.Diagnostics(self, self._report)
         self.get_logger().info(f"ready; {len(self._map.at)} markers, {self._map.interpolator}")

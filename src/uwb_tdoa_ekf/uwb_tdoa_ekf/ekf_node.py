@@ -41,6 +41,7 @@ from .frames import to_odometry
 from .imu_mount import ImuMount
 from .monitoring.health import OK, WARN, Health
 from .monitoring.monitor import Monitor
+from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs
 from .told_pose import told_pose
 
@@ -70,7 +71,8 @@ class EkfNode(Node):
             self._take_pressure: "pressure_invalid", self._take_velocity: "velocity_invalid",
         }  # fmt: skip
         self._estimator = None
-        self._epoch = ros.Epoch()
+        self._epoch, self._clock = ros.Epoch(), self.get_clock()
+        self._received_before = {}  # messages by topic, by the last report
         self._early = deque()
         self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
         self._imu_frame, self._imu_mount, self._frame_trouble = own["body_frame"], None, None
@@ -94,8 +96,8 @@ class EkfNode(Node):
     def _subscribe(self):
         """{topic: subscription} of all streams."""
         inputs = {
-            "imu/data": ros.subscribe_stream(self, Imu, "imu/data", self._on_imu),
-            "uwb/tdoa_corrected": ros.subscribe_stream(self, TdoaCorrected, "uwb/tdoa_corrected", self._on_tdoa),
+            "imu/data": ros.StreamInput(self, Imu, "imu/data", self._on_imu),
+            "uwb/tdoa_corrected": ros.StreamInput(self, TdoaCorrected, "uwb/tdoa_corrected", self._on_tdoa),
         }
         topics = {  # of each aid: topic, type, what takes its messages
             "height": [("height", Range, self._take_height)],
@@ -107,7 +109,7 @@ class EkfNode(Node):
         }
         for aid in aids.STREAMS:
             for topic, kind, take in topics[aid] if getattr(self._config, f"use_{aid}") else ():
-                inputs[topic] = ros.subscribe_stream(self, kind, topic, partial(self._on_aid, aid, take))
+                inputs[topic] = ros.StreamInput(self, kind, topic, partial(self._on_aid, aid, take))
         return inputs
 
     def _on_anchors(self, anchors):
@@ -116,6 +118,8 @@ class EkfNode(Node):
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
         self._estimator = Estimator(anchors, self._config, self._reorder, self._lag)
         self._imu_corrector, self._monitor = ImuCorrector(self._effects.effects), Monitor(anchors)
+        ignored = [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else []
+        self._watch, self._restarts = StreamWatch(anchors, self._lag, ignored), 0
         self._outputs.set_world(self._world or anchors.frame)
         early, self._early = self._early, deque()
         for take, message in early:
@@ -137,6 +141,7 @@ class EkfNode(Node):
     def _start_over(self):
         self._publish(*self._estimator.reset())
         self._monitor = Monitor(self._estimator.anchors)
+        self._watch.restart()
 
     def _on_pose(self, message):
         try:
@@ -211,10 +216,12 @@ class EkfNode(Node):
             gyro, accel = (x[0].tolist() for x in self._imu_corrector.correct(*map(np.array, ([t], [gyro], [accel]))))
         if self._imu_mount is not None:
             gyro, accel = self._imu_mount.in_body(t, gyro, accel)
+        self._watch.add_imu(t + self._epoch.begin, self._now(), gyro, accel)
         self._estimator.add_imu(t, gyro, accel)
 
     def _take_tdoa(self, message):
         t = self._epoch.seconds(message.header.stamp)
+        self._watch.add_tdoa(t + self._epoch.begin, self._now(), message.anchor_a, message.anchor_b, message.raw)
         self._estimator.add_tdoa(t, message.anchor_a, message.anchor_b, message.corrected, message.bias_std)
 
     def _take_height(self, message):
@@ -252,6 +259,31 @@ class EkfNode(Node):
             self._monitor.add(residuals)
             self._outputs.publish_residuals(residuals)
 
+    def _now(self):
+        """s on the clock of the node, NaN while it has none."""
+        if not self._clock.ros_time_is_active:
+            return time.time()
+        return 1e-9 * self._clock.now().nanoseconds or math.nan
+
+    def _stream_findings(self):
+        """What the rules over streams find; [] without anchors."""
+        if self._estimator is None:
+            return []
+        restarts, self._restarts = self._restarts, self._estimator.counts["restarts"]
+        if self._restarts != restarts:
+            self._watch.restart()
+        return self._watch.findings()
+
+    def _wiring(self):
+        """What is wrong with who publishes what to whom, a list of sentences."""
+        received = {"imu/data": self._health.imu, "uwb/tdoa_corrected": self._health.tdoa, **self._health.aids}
+        troubles = []
+        for topic, end in self._inputs.items():
+            total = received.get(topic, 0)
+            troubles.append(end.trouble(total - self._received_before.get(topic, 0)))
+        self._received_before = received
+        return [*filter(None, [*troubles, ros.several_publishers(self, "odometry")])]
+
     def _behind(self):
         """s from the stamp of the newest odometry to now, by the clock of the node; None without odometry."""
         if not self._outputs.published:
@@ -266,11 +298,12 @@ class EkfNode(Node):
             counts.update(estimator.counts, recoveries=estimator.recoveries)
             waiting = dict(zip(STREAMS, estimator.waiting))
         self._health.behind = self._behind()
-        level, text, values = self._health.report(self._anchors.refused, estimator, counts)
+        troubles = self._wiring(), self._stream_findings()
+        level, text, values = self._health.report(self._anchors.refused, estimator, counts, *troubles)
         alarms = self._monitor.alarms if estimator is not None else []
-        troubles = [self._frame_trouble, self._outputs.trouble, *alarms]
-        if level == OK and any(troubles):
-            level, text = WARN, next(filter(None, troubles))
+        others = [*filter(None, [self._frame_trouble, self._outputs.trouble, *alarms])]
+        if level == OK and others:
+            level, text = WARN, others[0]
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
         values |= {"TDOAs received": self._health.tdoa} | {name: counts[name] for name in VERDICTS.values()}
         values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.imu}
@@ -280,6 +313,7 @@ class EkfNode(Node):
         for aid, received in self._health.aids.items():
             values |= {f"{aid}_received": received, f"{aid}_waiting": waiting[aid]}
             values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}
+        values |= {f"lost on {name}": end.lost for name, end in self._inputs.items()}
         values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._inputs.items()}
         values |= {"subscribers of odometry": self._outputs.odometry.get_subscription_count()}
         values |= {"subscribers of uwb/residual": self._outputs.residual.get_subscription_count()}
@@ -289,7 +323,10 @@ class EkfNode(Node):
 def _warm_up(config):
     """Compile, or load from numba's cache, what the first messages would."""
     estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]), config)
-    for step in range(200):
+    watch = StreamWatch(estimator.anchors, 0.25)
+    for step in range(400):
+        watch.add_imu(0.01 * step, 0.01 * step, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+        watch.add_tdoa(0.01 * step, 0.01 * step, step % 4, (step + 1) % 4, 0.0)
         estimator.add_imu(0.01 * step, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
         estimator.add_tdoa(0.01 * step, step % 4, (step + 1) % 4, 0.0)
         estimator.add_height(0.01 * step, 1.0)
@@ -297,7 +334,8 @@ def _warm_up(config):
         estimator.add_velocity(0.01 * step, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
         odometry, _ = estimator.advance()
     to_odometry(odometry.q, odometry.v, odometry.covariance)
-    estimator.tell_pose(2.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
+    watch.findings()
+    estimator.tell_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
     estimator.finish()
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_tools.checking.streams import StreamRules
+from uwb_tdoa_ekf.streams import StreamRules
 from uwb_tdoa_tools.checking import coverage
 
 BOX = np.array([[x, y, z] for x in (0.0, 6.0) for y in (0.0, 7.0) for z in (0.2, 3.0)])

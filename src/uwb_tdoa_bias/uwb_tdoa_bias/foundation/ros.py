@@ -12,6 +12,7 @@ import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
@@ -34,6 +35,7 @@ except ImportError:
 # is used. What goes out is reliable, which every subscriber hears: RViz and most others ask for it.
 STREAM_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 OUTPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+LARGEST_LOSS = 0.01  # share of the messages of a second
 LONGEST_WAIT = 0.2  # s, until a node that receives nothing sees a signal
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])  # written into the given profile
@@ -44,9 +46,47 @@ def publish_stream(node, kind, topic):
     return node.create_publisher(kind, topic, copy(OUTPUT_QOS), qos_overriding_options=OVERRIDES)
 
 
-def subscribe_stream(node, kind, topic, callback):
-    """Subscription of a stream; QoS by parameter: qos_overrides.<topic>.subscription.reliability and .depth."""
-    return node.create_subscription(kind, topic, callback, copy(STREAM_QOS), qos_overriding_options=OVERRIDES)
+class StreamInput:
+    """Subscription of a stream. QoS by parameter: qos_overrides.<topic>.subscription.reliability and .depth.
+
+    lost : messages that were sent and that DDS did not deliver, as far as it knows.
+    """
+
+    def __init__(self, node, kind, topic, callback):
+        self.lost, self._before = 0, 0
+        self._node, self._topic = node, topic
+        events = SubscriptionEventCallbacks(message_lost=self._on_lost)
+        self._subscription = node.create_subscription(
+            kind, topic, callback, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES
+        )
+
+    def _on_lost(self, status):
+        self.lost += status.total_count_change
+
+    def get_publisher_count(self):
+        """How many publish it."""
+        return self._subscription.get_publisher_count()
+
+    def trouble(self, received):
+        """What is wrong with the stream as ROS sees it, or None. received : messages since this was asked last."""
+        lost, self._before = self.lost - self._before, self.lost
+        if self.get_publisher_count() > 1:
+            return several_publishers(self._node, self._topic)
+        if lost > LARGEST_LOSS * (received + lost):
+            return (
+                f"{lost} of {received + lost} messages on {self._topic} were lost on their way to this node: check the load "
+                f"of machine and network, or set qos_overrides.{self._subscription.topic_name}.subscription.reliability"
+            )
+        return None
+
+
+def several_publishers(node, topic):
+    """The sentence for a topic on which more than one publishes, or None."""
+    ends = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+    if len(ends) < 2:
+        return None
+    names = ", ".join(sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends))
+    return f"{len(ends)} publish on {topic} ({names}): stop all but one, or give each tag a namespace"
 
 
 class Epoch:
@@ -63,6 +103,11 @@ class Epoch:
         if self._second is None:
             self._second = stamp.sec
         return (stamp.sec - self._second) + 1e-9 * stamp.nanosec
+
+    @property
+    def begin(self):
+        """Stamp, s, of what `seconds` gives as 0."""
+        return self._second or 0
 
     def stamp(self, t):
         """builtin_interfaces/Time of float s: what `seconds` was given, to the nanosecond."""

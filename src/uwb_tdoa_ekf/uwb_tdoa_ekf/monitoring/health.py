@@ -6,6 +6,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_tdoa_bias.foundation.ros import Rate
 
 from ..core import aids
+from ..streams import ERROR as SEVERE
 from .volume import VolumeCheck
 
 START_TIMEOUT = 5.0  # s of data without a start position before it becomes a warning
@@ -46,11 +47,12 @@ class Health:
         self._starting = None
         self._counts = {}
 
-    def report(self, refused, estimator, counts):
+    def report(self, refused, estimator, counts, wiring=(), findings=()):
         """Returns (level, text, values).
 
         refused : what was wrong with the last anchors, or None; estimator : Estimator or None;
-        counts : totals by verdict.
+        counts : totals by verdict; wiring : sentences, what is wrong with who publishes what; findings : Findings of the
+        rules over streams. What is wrong with the streams is said before what comes of it.
         """
         now = time.monotonic()
         imu_rate, tdoa_rate = self._imu_rate.of(self.imu), self._tdoa_rate.of(self.tdoa)
@@ -67,6 +69,8 @@ class Health:
             judgement = ERROR, "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the tag's driver"
         elif self._use_imu and not imu_rate:
             judgement = ERROR, "no samples on imu/data: check the IMU's driver, or set use_imu to false"
+        elif wiring or findings:
+            judgement = _worst(wiring, findings)
         elif running:
             judgement = self._judge_use(counts)
         elif now - self._starting > START_TIMEOUT:
@@ -83,10 +87,15 @@ class Health:
         if running and self.behind is not None and BEHIND[0] < self.behind < BEHIND[1] and judgement[0] == OK:
             reason = "this machine is too slow for all it receives, or clocks differ"
             judgement = WARN, f"the odometry is {self.behind:.1f} s behind: {reason}"
+        if running and self.behind is not None and -BEHIND[1] < self.behind < -BEHIND[0] and judgement[0] == OK:
+            judgement = WARN, f"the odometry is {-self.behind:.1f} s ahead of the clock: correct the stamps, or the clock"
         age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
         values = {"state": "running" if running else "starting", "age of last odometry": age}
         values |= {"odometry behind the clock": _behind(self.behind)}
         values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
+        sentences = [*wiring, *(finding.sentence for finding in findings)]
+        values |= {"wrong with the streams": "; ".join(sentences) or "nothing"}
+        values |= {f"found {finding.rule}": f"{finding.value:.4g}" for finding in findings}
         return *judgement, values | at_position
 
     def _judge_aids(self, now, counts):
@@ -119,7 +128,10 @@ class Health:
     def _judge_use(self, counts):
         """What became of the TDOAs since the last time."""
         reasons = {
-            "late": f"are late: check the load of this machine, or raise lag (now {self._lag} s)",
+            "late": (
+                "are late: check the load of this machine; raise reorder if they come out of order, lag (now "
+                f"{self._lag} s) if a stream is slow"
+            ),
             "invalid": "are invalid: check that uwb/anchors lists the anchors that the tag hears, in metres",
             "rejected": "contradict the filter: check the anchors' positions, and tdoa_std",
         }
@@ -129,6 +141,13 @@ class Health:
             if recent[name] > LARGEST_UNUSED * sum(recent.values()):
                 return WARN, f"more than half of the TDOAs {reason}"
         return OK, "running"
+
+
+def _worst(wiring, findings):
+    """(level, text) of the worst; findings come most severe first."""
+    if findings and (findings[0].severity == SEVERE or not wiring):
+        return ERROR if findings[0].severity == SEVERE else WARN, findings[0].sentence
+    return WARN, wiring[0]
 
 
 def _behind(seconds):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .streams import ERROR, NOTE, WARNING, Finding, StreamRules, most_severe_first
+from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, most_severe_first
 
 from ..readers.streams import protocol
 from . import coverage, imu_rules, labels, tdoa_rules

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from .streams import NOTE, WARNING, Finding
+from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding
+
 from .survey_fit import SPREAD, spread
 
 RARE = 0.2  # of what the anchors are heard in the middle; healthy 0.54 at least

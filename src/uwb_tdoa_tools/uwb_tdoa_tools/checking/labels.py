@@ -4,7 +4,7 @@ Findings."""
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .streams import ERROR, NOTE, WARNING, Finding
+from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
 
 from .recording import IMU
 from .tdoa_rules import furthest, same_place

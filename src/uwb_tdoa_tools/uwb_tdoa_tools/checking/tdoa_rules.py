@@ -11,11 +11,11 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.config import FilterConfig
-from .streams import ERROR, Finding
-from .explain import SCALE, compare
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.streams import ERROR, Finding
 
 from .case import LONG, SHORT, Case
+from .explain import SCALE, compare
 from .survey_fit import SPREAD, SurveyFit, spread
 
 RATIO, DEVIATIONS = 0.93, 2.5  # of what stays unexplained; healthy recordings: 1.02 at least for anything that is tried

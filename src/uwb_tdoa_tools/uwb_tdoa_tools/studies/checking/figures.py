@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from uwb_tdoa_ekf.streams import ERROR
+
 from ... import parallel
 from ...checking.check import check
 from ...checking.recording import of_flight
-from ...checking.streams import ERROR
 from ...checking.tdoa_rules import furthest
 from ...readers import inputs, read_survey
 from ...readers.streams import protocol

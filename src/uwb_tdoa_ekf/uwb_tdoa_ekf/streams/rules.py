@@ -18,9 +18,10 @@ class StreamRules:
     windows.
     """
 
-    def __init__(self, anchors):
-        """anchors : Anchors."""
+    def __init__(self, anchors, kept=None):
+        """anchors : Anchors; kept : windows of each stream that are kept, the latest; None: all."""
         self.anchors, self.imu, self.tdoa = anchors, [], []  # windows
+        self._kept = kept
         self.unknown = Counter()  # ids that the survey does not have
         self._imu, self._tdoa = inertial.new_imu(), ranging.new_tdoa(anchors)
 
@@ -84,9 +85,14 @@ class StreamRules:
         )
 
     def _close_imu(self):
-        self.imu.append(inertial.imu_window(self._imu))
+        self._keep(self.imu, inertial.imu_window(self._imu))
         inertial.restart_imu(self._imu)
 
     def _close_tdoa(self):
-        self.tdoa.append(ranging.tdoa_window(self._tdoa))
+        self._keep(self.tdoa, ranging.tdoa_window(self._tdoa))
         ranging.restart_tdoa(self._tdoa)
+
+    def _keep(self, windows, window):
+        windows.append(window)
+        if self._kept is not None:
+            del windows[: -self._kept]

@@ -2,17 +2,17 @@
 
 import math
 
+from flights import corners
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_tools.checking.streams import SEVERITIES, StreamRules
-from uwb_tdoa_tools.simulation.constellations import corners
+from uwb_tdoa_ekf.streams import SEVERITIES, StreamRules
 
 GRAVITY = 9.81
-ANCHORS = Anchors.from_positions(corners().positions, ids=10 + np.arange(8)[::-1])  # no id is its row
+ANCHORS = corners()  # no id is its row
 RADIO = 0.05  # m, noise of a TDOA
 
 

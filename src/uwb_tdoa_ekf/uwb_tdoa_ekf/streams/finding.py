@@ -19,6 +19,11 @@ class Finding:
     remedy: str
     value: float
 
+    @property
+    def sentence(self):
+        """All of it in one line, for /diagnostics."""
+        return f"{self.cause} ({self.evidence}): {' '.join(self.remedy.split())}"
+
 
 def most_severe_first(findings):
     """The findings in order of severity; within one in the order in which they came."""

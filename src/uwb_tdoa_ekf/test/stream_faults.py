@@ -1,0 +1,258 @@
+"""Faults of drivers put into simulated flights that are played live, in lanes side by side, and what ekf_node says of them.
+
+As a program it prints the table of docs/reliability.md, in four minutes:  python src/uwb_tdoa_ekf/test/stream_faults.py
+"""
+
+from dataclasses import dataclass, field, replace
+import re
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from flights import fly, position_at
+from nav_msgs.msg import Odometry
+import numpy as np
+import rclpy
+from rig import STREAMS, Rig
+from std_srvs.srv import Trigger
+from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.geometry import tdoa
+
+IMU_RATE, TDOA_RATE = 100.0, 100.0  # Hz
+T, ARRIVAL, GYRO, ACCEL = range(4)
+D = 4
+LATENCY = 0.002  # s
+PAUSE = 0.3  # s between two flights
+SPIN = 0.05  # s between two looks at what a node says
+
+
+def put(columns, place, value):
+    """The columns with one replaced."""
+    return (*columns[:place], value, *columns[place + 1 :])
+
+
+def of_imu(change):
+    return lambda imu, tdoa, rng: (change(imu, rng), tdoa)
+
+
+def of_tdoa(change):
+    return lambda imu, tdoa, rng: (imu, change(tdoa, rng))
+
+
+def second_tag(columns, rng):
+    """Every TDOA is followed by one of a tag 2 m away."""
+    other = put(columns, D, columns[D] + 2.0 * np.sign(rng.normal(size=len(columns[D]))))
+    return merged(columns, put(other, T, other[T] + 0.003))
+
+
+def merged(*parts):
+    columns = [np.concatenate(column) for column in zip(*parts)]
+    order = np.argsort(columns[ARRIVAL], kind="stable")
+    return tuple(column[order] for column in columns)
+
+
+FAULTS = {  # name: (what it does to the columns of a flight, what is said)
+    "IMU in g": (of_imu(lambda c, rng: put(c, ACCEL, c[ACCEL] / 9.81)), "accelerometer is in g"),
+    "gyroscope in degrees/s": (of_imu(lambda c, rng: put(c, GYRO, np.rad2deg(c[GYRO]))), "gyroscope is in degrees/s"),
+    "IMU 0.5 s ahead": (of_imu(lambda c, rng: put(c, T, c[T] + 0.5)), "imu/data are 0.50. s ahead"),
+    "IMU 0.5 s behind": (of_imu(lambda c, rng: put(c, T, c[T] - 0.5)), "imu/data are 0.50. s behind|0.4.. s behind"),
+    "TDOAs stamped 0": (of_tdoa(lambda c, rng: put(c, T, 0.0 * c[T])), "uwb/tdoa is not stamped"),
+    "TDOAs in blocks of 1 s": (of_tdoa(lambda c, rng: put(c, ARRIVAL, np.ceil(c[ARRIVAL]))), "uwb/tdoa arrive in blocks"),
+    "TDOAs 10 s ahead": (of_tdoa(lambda c, rng: put(c, T, c[T] + 10.0)), "imu/data are .* s behind"),
+    "all 10 s ahead": (lambda imu, tdoa, rng: (put(imu, T, imu[T] + 10.0), put(tdoa, T, tdoa[T] + 10.0)), "ahead of the clock"),
+    "a second tag": (of_tdoa(second_tag), "two tags share"),
+    "every TDOA twice": (of_tdoa(lambda c, rng: merged(c, c)), "published twice"),
+    "TDOAs shuffled by 50 ms": (of_tdoa(lambda c, rng: put(c, T, c[T] - 0.05 * rng.random(len(c[T])))), "out of order.*reorder"),
+    "IMU upside down": (of_imu(lambda c, rng: put(c, ACCEL, c[ACCEL] * [1.0, -1.0, -1.0])), "-z points up"),
+}
+PUBLISHERS = {"two bias_nodes": "uwb/tdoa_corrected", "two ekf_nodes": "odometry", "two IMU drivers": "imu/data"}
+
+
+@dataclass
+class Lane:
+    """A Rig with an ekf_node, and what was played to it: [(begin, [(from, to, names of faults)])], s of the clock."""
+
+    rig: Rig
+    plan: list = field(default_factory=list)
+    heard: list = field(default_factory=list)  # (s of the clock, status)
+    poses: list = field(default_factory=list)  # (s of the clock, Odometry)
+
+
+def lanes_of(make_rig, count):
+    """`count` Lanes whose nodes are ready; their poses are only kept if there is one."""
+    lanes = []
+    for _ in range(count):
+        rig = make_rig(listen=(), reliable=False)
+        lane = Lane(rig)
+        rig.start("ekf_node", ekf_node=["-p", "odometry_rate:=20.0"])
+        name = f"/{rig.namespace}/ekf_node"
+
+        def hear(message, lane=lane, name=name):
+            lane.heard += [(time.time(), status) for status in message.status if status.name == name]
+
+        rig.node.create_subscription(DiagnosticArray, "/diagnostics", hear, ros.DIAGNOSTICS_QOS)
+        if count == 1:
+            rig.node.create_subscription(Odometry, "odometry", lambda m: lane.poses.append((time.time(), m)), ros.STREAM_QOS)
+        rig.send_anchors(FLIGHT.anchors)
+        lanes.append(lane)
+    return lanes
+
+
+def _flight():
+    """A flight that hears its anchors one after the other, as TDOA2 has them."""
+    flight = fly(seed=5, duration=30.0, imu_rate=IMU_RATE, tdoa_rate=TDOA_RATE, accel_noise=0.01, gyro_noise=0.001)
+    anchors, t = flight.anchors, flight.tdoa.t
+    a = np.arange(len(t)) % len(anchors)
+    b = (a + 1) % len(anchors)
+    p = flight.meta["wave"].motion(t)[0]
+    d = tdoa(p, anchors.positions[a], anchors.positions[b]) + 0.05 * np.random.default_rng(1).normal(size=len(t))
+    return replace(flight, tdoa=Tdoas(t, anchors.ids[a], anchors.ids[b], d))
+
+
+FLIGHT = _flight()
+
+
+def columns_of(begin, parts):
+    """imu and tdoa columns of the flight that begins at `begin` s of the clock, with [(from s, to s, names of faults)]."""
+    rng = np.random.default_rng(3)
+    end = parts[-1][1]
+    imu = _part((FLIGHT.imu.t, FLIGHT.imu.t, FLIGHT.imu.gyro, FLIGHT.imu.accel), begin, end)
+    tdoa = _part((FLIGHT.tdoa.t, FLIGHT.tdoa.t, FLIGHT.tdoa.a, FLIGHT.tdoa.b, FLIGHT.tdoa.d), begin, end)
+    out = []
+    for low, high, name in parts:
+        pieces = [tuple(c[(s[T] - begin >= low) & (s[T] - begin < high)] for c in s) for s in (imu, tdoa)]
+        for fault in name:
+            pieces = FAULTS[fault][0](*pieces, rng)
+        out.append(pieces)
+    return [merged(*stream) for stream in zip(*out)]
+
+
+def _part(columns, begin, end):
+    inside = columns[T] < end
+    t, _, *values = (column[inside] for column in columns)
+    return (t + begin, t + begin + LATENCY, *values)
+
+
+def play(lanes, plans):
+    """Play to each lane its plan, a list of flights, each [(from s, to s, names of faults)]; returns when it is over.
+
+    Before each flight the filter is reset. Fills in heard, poses and plan of the lanes.
+    """
+    epoch, events = int(time.time()), []
+    start = time.time() + 1.0
+    for lane, flights in zip(lanes, plans):
+        begin = start
+        for parts in flights:
+            lane.plan.append((begin, [(begin + low, begin + high, name) for low, high, name in parts]))
+            imu, tdoa = columns_of(begin, parts)
+            events += [(row[ARRIVAL], lane, "imu", row) for row in zip(*imu)]
+            events += [(row[ARRIVAL], lane, "tdoa", row) for row in zip(*tdoa)]
+            events += [(begin - 0.5 * PAUSE, lane, "reset", None)]
+            begin += parts[-1][1] + PAUSE
+    events.sort(key=lambda event: event[0])
+    clients = {id(lane): lane.rig.node.create_client(Trigger, "ekf_node/reset") for lane in lanes}
+    looked = 0.0
+    for arrival, lane, kind, row in events:
+        if arrival > time.time() > looked + SPIN:
+            looked = time.time()
+            _look(lanes)
+        time.sleep(max(arrival - time.time(), 0.0))
+        if kind == "reset":
+            clients[id(lane)].call_async(Trigger.Request())
+        elif kind == "imu":
+            lane.rig.send_imu(_relative(row[T], epoch), row[GYRO], row[ACCEL], epoch)
+        else:
+            lane.rig.send_corrected(_relative(row[T], epoch), int(row[2]), int(row[3]), row[D], epoch)
+    until = time.time() + PAUSE
+    while time.time() < until:
+        _look(lanes)
+
+
+def _look(lanes):
+    for lane in lanes:
+        for _ in range(2):
+            lane.rig._executor.spin_once(timeout_sec=0.0)
+
+
+def _relative(t, epoch):
+    """s after the epoch; a stamp of 0 stays one."""
+    return t - epoch if t else -float(epoch)
+
+
+def publish_twice(lane, name):
+    """Another publisher on a topic; returns it."""
+    topic = PUBLISHERS[name]
+    return lane.rig.node.create_publisher(STREAMS[topic], topic, ros.OUTPUT_QOS)
+
+
+def errors_of(lane, begin, low, high):
+    """Largest and mean error, m, and mean stated standard deviation, m, of the odometry received between two times."""
+    rows = [(at, m) for at, m in lane.poses if low <= at < high]
+    if not rows:
+        return None
+    p = np.array([(m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z) for _, m in rows])
+    t = np.array([at for at, _ in rows]) - begin  # where it is when it is told
+    error = np.linalg.norm(p - position_at(FLIGHT, t), axis=1)
+    std = [np.sqrt(sum(m.pose.covariance[k] for k in (0, 7, 14))) for _, m in rows]
+    return error.max(), float(np.sqrt(np.mean(error**2))), float(np.mean(std))
+
+
+BEFORE, DURING, AFTER = 4.0, 6.0, 6.0  # s of the table: without the fault, with it, and without it again
+COUNTERS = ("late", "rejected", "invalid", "imu_late", "imu_invalid", "recoveries")
+
+
+def table(lane):
+    """Rows of text, one for each fault that was played to the lane."""
+    for begin, ((_, _, _), (low, high, (name,)), (_, end, _)) in lane.plan:
+        during = [(at, status) for at, status in lane.heard if low < at < high]
+        named = next((at - low for at, status in during if re.search(FAULTS[name][1], _values(status)[WRONG])), None)
+        if named is None:
+            named = next((at - low for at, status in during if re.search(FAULTS[name][1], status.message)), None)
+        quiet = next((at - high for at, status in lane.heard if high < at < end and status.message == "running"), None)
+        counts = [_values(status) for _, status in during]
+        counted = {key: int(counts[-1][key]) - int(counts[0][key]) for key in COUNTERS} if counts else {}
+        errors = [errors_of(lane, begin, *span) for span in ((low, high), (high + 3.0, end))]
+        cells = [name, _number(named), *(_numbers(each) for each in errors), _number(quiet)]
+        yield " | ".join(["", *cells, ", ".join(f"{n} {key}" for key, n in counted.items() if n) or "nothing", ""]).strip()
+
+
+WRONG = "wrong with the streams"
+
+
+def _values(status):
+    return {entry.key: entry.value for entry in status.values}
+
+
+def _number(value):
+    return "no" if value is None else f"{value:.1f}"
+
+
+def _numbers(values):
+    return "no odometry" if values is None else "{:.2f}, {:.2f}, {:.2f}".format(*values)
+
+
+def main():
+    rclpy.init()
+    rigs = []
+
+    def make_rig(**options):
+        rigs.append(Rig("tag0", **options))
+        return rigs[-1]
+
+    try:
+        (lane,) = lanes_of(make_rig, 1)
+        edges = (0.0, BEFORE, BEFORE + DURING, BEFORE + DURING + AFTER)
+        parts = [[*zip(edges, edges[1:], ((), (name,), ()))] for name in FAULTS]
+        play([lane], [parts])
+        print("| fault | named after, s | largest error, RMSE, stated, m | the same 3 - 6 s later | running again, s | counted |")
+        print("|---|---|---|---|---|---|")
+        for row in table(lane):
+            print(row)
+    finally:
+        for rig in rigs:
+            rig.close()
+        rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main()

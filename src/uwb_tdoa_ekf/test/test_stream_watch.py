@@ -1,0 +1,93 @@
+"""The rules over streams as they act in flight, on measured and simulated flights."""
+
+import numpy as np
+import pytest
+from test_stream_rules import ANCHORS, streams
+from uwb_tdoa_ekf.monitoring.stream_watch import FEW_ANCHORS, StreamWatch
+
+
+def watched(imu, tdoa, seconds=8.0, **options):
+    """[{rule: Finding}], second by second, of columns as `streams` makes them."""
+    watch = StreamWatch(ANCHORS, 0.25, **options)
+    begin, said = min(imu[1][0], tdoa[1][0]), []
+    for second in range(int(seconds)):
+        for columns, add in ((imu, watch.add_imu), (tdoa, watch.add_tdoa)):
+            inside = (columns[1] >= begin + second) & (columns[1] < begin + second + 1.0)
+            for row in zip(*(column[inside].tolist() for column in columns)):
+                add(*row)
+        said.append({finding.rule: finding for finding in watch.findings()})
+    return said
+
+
+def shifted(columns, arrival):
+    return (columns[0], arrival, *columns[2:])
+
+
+def test_a_healthy_flight_has_no_findings():
+    assert not any(watched(*streams(8.0)))
+
+
+def test_a_fault_is_named_within_five_seconds_and_forgotten_when_it_ends():
+    imu, tdoa = streams(16.0)
+    force = np.where(((imu[0] > 103.0) & (imu[0] < 109.0))[:, None], imu[3] / 9.81, imu[3])
+    said = ["imu_force_unit" in found for found in watched((*imu[:3], force), tdoa, 16.0)]
+    assert not any(said[:4]) and said[8] and not any(said[14:])
+
+
+def test_a_replay_at_another_speed_is_none():
+    imu, tdoa = streams(8.0)
+    fast = [shifted(columns, columns[1][0] + (columns[1] - columns[1][0]) / 4.0) for columns in (imu, tdoa)]
+    assert not any(watched(*fast, 2.0))
+
+
+def test_blocks_of_both_streams_are_the_affair_of_who_runs_us_and_those_of_one_are_not():
+    imu, tdoa = streams(8.0)
+    imu_blocks, tdoa_blocks = (shifted(columns, np.ceil(columns[1])) for columns in (imu, tdoa))
+    assert any("blocks" in found for found in watched(imu, tdoa_blocks))
+    assert not any("blocks" in found for found in watched(imu_blocks, tdoa_blocks))
+
+
+def test_a_tag_at_a_fixed_height_may_hear_three_anchors():
+    imu, tdoa = streams(8.0)
+    three = (tdoa[2] >= 15) & (tdoa[3] >= 15)
+    tdoa = tuple(column[three] for column in tdoa)
+    assert any(FEW_ANCHORS in found for found in watched(imu, tdoa))
+    assert not any(FEW_ANCHORS in found for found in watched(imu, tdoa, ignored=[FEW_ANCHORS]))
+
+
+def test_another_time_is_judged_anew():
+    imu, tdoa = streams(8.0)
+    watch = StreamWatch(ANCHORS, 0.25)
+    for row in zip(*(column.tolist() for column in (*imu[:3], imu[3] / 9.81))):
+        watch.add_imu(*row)
+    assert watch.findings()
+    watch.restart()
+    assert not watch.findings()
+
+
+def flights(folder):
+    """(name, Flight) of the measured micro-SD logs."""
+    readers = pytest.importorskip("uwb_tdoa_tools.readers")
+    for log in sorted(path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix):
+        day = log.relative_to(folder / "flights").parts[0]
+        yield log.name, readers.read_flight(log, folder / "surveys" / f"anchor_{day}.txt")
+
+
+def test_nothing_is_said_of_measured_flights(shared_data):
+    count, rng = 0, np.random.default_rng(0)
+    for name, flight in flights(shared_data):
+        watch = StreamWatch(flight.anchors, 0.25)
+        imu, tdoa = flight.imu, flight.tdoa
+        late = [t + 0.002 + rng.exponential(0.001, len(t)) for t in (imu.t, tdoa.t)]
+        imu_rows = np.column_stack([imu.t, late[0], imu.gyro, imu.accel]).tolist()
+        tdoa_rows = list(zip(*(column.tolist() for column in (tdoa.t, late[1], tdoa.a, tdoa.b, tdoa.d))))
+        begin, end = min(imu.t[0], tdoa.t[0]), max(imu.t[-1], tdoa.t[-1])
+        for second in np.arange(begin, end):
+            cuts = [np.searchsorted(t, [second, second + 1.0]) for t in (imu.t, tdoa.t)]
+            for row in imu_rows[slice(*cuts[0])]:
+                watch.add_imu(row[0], row[1], row[2:5], row[5:])
+            for row in tdoa_rows[slice(*cuts[1])]:
+                watch.add_tdoa(*row)
+            assert watch.findings() == [], (name, second - begin)
+        count += 1
+    assert count == 22

@@ -1,0 +1,69 @@
+"""The rules over streams in flight: over the last seconds, and without those that say nothing there."""
+
+import numpy as np
+
+from ..streams import NOTE, StreamRules
+from ..streams.stamp_rules import median
+
+KEPT = 5  # windows of a second that are judged together
+FEWEST = 3  # of them, below which nothing is said
+# Said by `check`, and no warning in flight: the filter knows what a shaking accelerometer is worth.
+NOT_IN_FLIGHT = {"imu_shaking"}
+FEW_ANCHORS = "few_anchors"  # a tag with a fixed height needs three
+SMALLEST_UNIT = 100.0  # of another unit of stamps: what is less is the pace of a replay
+ALIKE = 0.5  # share of the swing of one stream's latency that the other has too, when it is we who are not scheduled
+
+
+class StreamWatch:
+    """Keeps what arrives and judges it when it is asked, once a second."""
+
+    def __init__(self, anchors, lag, ignored=()):
+        """anchors : Anchors; lag : s, what the node waits for; ignored : names of rules that do not hold for this tag."""
+        self._anchors, self._lag, self._ignored = anchors, lag, NOT_IN_FLIGHT | set(ignored)
+        self.restart()
+
+    def restart(self):
+        """Forget everything: another time has begun."""
+        self._rules = StreamRules(self._anchors, KEPT)
+        self._imu, self._tdoa = [], []
+
+    def add_imu(self, t, arrival, gyro, accel):
+        """Take a sample: stamp and arrival, s, of one clock if possible; gyro (3,) rad/s; accel (3,) m/s^2."""
+        self._imu.append((t, arrival, *gyro, *accel))
+
+    def add_tdoa(self, t, arrival, a, b, d):
+        """Take a raw TDOA: stamp and arrival, s; a, b ids; d m."""
+        self._tdoa.append((t, arrival, a, b, d))
+
+    def findings(self):
+        """What stands: a list of Finding, most severe first."""
+        imu, self._imu = self._imu, []
+        tdoa, self._tdoa = self._tdoa, []
+        rules = self._rules
+        if imu:
+            table = np.array(imu)
+            rules.feed_imu(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5:8])
+        if tdoa:
+            t, arrival, a, b, d = zip(*tdoa)
+            rules.feed_tdoa(np.array(t), np.array(arrival), np.array(a), np.array(b), np.array(d))
+        if max(len(rules.imu), len(rules.tdoa)) < FEWEST:
+            return []
+        return [finding for finding in rules.findings() if self._counts(finding)]
+
+    def _counts(self, finding):
+        if finding.severity == NOTE or finding.rule in self._ignored:
+            return False
+        if finding.rule == "stamps_unit":
+            return finding.value > SMALLEST_UNIT
+        if finding.rule == "blocks":
+            return finding.value > self._lag and not self._starved()
+        return True
+
+    def _starved(self):
+        """Whether both streams arrive in blocks: then it is this node that was not scheduled."""
+        spreads = [
+            median([window.stamps for window in windows], "spread")
+            for windows in (self._rules.imu, self._rules.tdoa)
+            if windows
+        ]
+        return len(spreads) == 2 and min(spreads) > ALIKE * max(spreads)
