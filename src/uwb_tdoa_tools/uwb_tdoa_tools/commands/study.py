@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from .. import cli
-from ..studies import aids, crazyflie
+from ..studies import aids, crazyflie, surveying
 from ..studies.checking import figures as checking
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
@@ -20,6 +20,7 @@ STUDIES = {
     "default-model": default,
     "diagnosis": figures,
     "spin": spin,
+    "surveying": surveying,
 }
 DESCRIPTION = """Make the figures of the documentation anew. Nothing here is needed to use the suite. DATA is a folder
 of measured flights: flights/, util/, surveys/.
@@ -33,6 +34,7 @@ of measured flights: flights/, util/, surveys/.
   default-model    the model that bias_node ships
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
+  surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
 """
 
 
@@ -58,6 +60,7 @@ def parser():
         "study diagnosis measured --data DATA --out bench/",
         "study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
         "study spin --out spin.png",
+        "study surveying --data DATA --draws 5 --only const1",
     )
     names = made.add_subparsers(dest="study", required=True, metavar="NAME")
     for name, study in STUDIES.items():

@@ -20,7 +20,12 @@ agree with each other and with the IMU (and with a range finder, where there is 
 coordinates that are known best: name some with --trusted, or all stays where it is on average. Ground truth is not used.
 
 Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the anchors),
-survey.json (covariance) and survey.png (before and after) to --out."""
+ekf_node.yaml (noise that the filter should assume with them), survey.json (covariance) and survey.png (before and after)
+to --out."""
+PARAMETERS = """/**:
+  ros__parameters:
+    tdoa_std: {:.3f}  # m; measured: as many TDOAs count as independent as there are
+"""
 
 
 def main(argv=None):
@@ -66,11 +71,13 @@ def _survey(args):
     (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
     delays = delay_effect(anchors, result.surveyed.delays)
     EffectSet((*base.effects, delays)).to_yaml(out / "effects.yaml")
+    (out / "ekf_node.yaml").write_text(PARAMETERS.format(result.surveyed.tdoa_std))
     (out / "survey.json").write_text(json.dumps(result.as_dict(), indent=1, allow_nan=False))
     result.picture(out / "survey.png")
     print(result.as_text())
-    print(f"wrote anchors.yaml, anchors.csv, effects.yaml, survey.json and survey.png to {out}")
-    print(f"next: evaluate FLIGHT --survey {out / 'anchors.yaml'} --effects {out / 'effects.yaml'}")
+    print(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")
+    files = (("--survey", "anchors.yaml"), ("--effects", "effects.yaml"), ("--config", "ekf_node.yaml"))
+    print("next: evaluate FLIGHT", *(f"{option} {out / file}" for option, file in files))
 
 
 if __name__ == "__main__":

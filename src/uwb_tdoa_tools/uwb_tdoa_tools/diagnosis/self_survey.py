@@ -14,6 +14,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .channels import CHANNELS, Comparison
 from .references import Nothing
@@ -33,11 +34,13 @@ FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 @dataclass(frozen=True, eq=False)
 class Surveyed:
     """anchors : Anchors; delays (N,) m; covariance (4N, 4N) m^2, of positions, anchor by anchor, and then of delays;
-    delay_std, function_std : m, what the evidence says of the size of delays, and of functions of the place."""
+    tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are; delay_std, function_std : m,
+    what the evidence says of the size of delays, and of functions of the place."""
 
     anchors: Anchors
     delays: np.ndarray
     covariance: np.ndarray
+    tdoa_std: float
     delay_std: float
     function_std: float
 
@@ -57,17 +60,20 @@ def survey(flights, position_std, base=EffectSet(), config=None, rounds=ROUNDS, 
     flights = [reference.prepare(flight) for flight in flights]
     n = len(given)
     start = np.concatenate([given.positions.ravel(), np.zeros(n)])
+    config = config or FilterConfig()
     best, found = start, None
     for _ in range(rounds):
         anchors = Anchors(given.ids, best[: 3 * n].reshape(n, 3), given.orientations, given.frame)
-        gram, vector = 0.0, 0.0
+        gram, vector, alike = 0.0, 0.0, []
         for flight in flights:
             grams, vectors = _equations(replace(flight, anchors=anchors), best[3 * n :], base, reference)
-            inflation = SYSTEMATIC * _inflation(grams[:, : 4 * n, : 4 * n], vectors[:, : 4 * n], position_std.ravel())
+            alike.append(_inflation(grams[:, : 4 * n, : 4 * n], vectors[:, : 4 * n], position_std.ravel()))
+            inflation = SYSTEMATIC * alike[-1]
             gram, vector = gram + grams.sum(axis=0) / inflation, vector + vectors.sum(axis=0) / inflation
             progress()
         step, covariance, sizes = _by_evidence(gram, vector, position_std.ravel(), best - start)
-        best, found = best + step, (covariance, *sizes)
+        tdoa_std = config.tdoa_std * float(np.sqrt(np.mean(alike) / config.tdoa_correlation_length))
+        best, found = best + step, (covariance, tdoa_std, *sizes)
     moved = Anchors(given.ids, best[: 3 * n].reshape(n, 3), given.orientations, given.frame)
     return Surveyed(moved, best[3 * n :], *found)
 

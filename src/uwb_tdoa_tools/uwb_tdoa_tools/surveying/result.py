@@ -47,6 +47,7 @@ class Result:
                 for row, i in enumerate(found.anchors.ids)
             },
             "covariance": found.covariance.tolist(),
+            "tdoa_std": found.tdoa_std,
             "delay_std": found.delay_std,
             "function_std": found.function_std,
         }

@@ -1,0 +1,118 @@
+"""Surveys of measured flights, shaken and made better from the flights alone; the tag is judged on other flights."""
+
+import argparse
+from dataclasses import replace
+import json
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flight import AIDS
+
+from ..diagnosis.self_survey import delay_effect
+from ..readers import inputs
+from ..scoring.evaluation import evaluate
+from ..surveying.survey import survey
+from ..surveying.tape import Tape
+from .diagnosis.bank import clean_flight
+
+SHAKES = 0.1, 0.3  # m
+_UTIL, _0425 = "util/const{}-trial{}.csv.gz", "flights/0425/TDOA2/0425-traj{}"
+SETS = {  # name: (paths to survey with, paths to judge on, aids that are used)
+    "const1": ([_UTIL.format(1, k) for k in ("1-tdoa2", "1-tdoa3")], [_UTIL.format(1, k) for k in ("2-tdoa2", "3-tdoa2")], ()),
+    "const3": ([_UTIL.format(3, k) for k in ("1-tdoa2", "2-tdoa2")], [_UTIL.format(3, k) for k in ("3-tdoa2", "4-tdoa2")], ()),
+    "0425": ([_0425.format(k) for k in (1, 2, 6)], [_0425.format(k) for k in (3, 7, 10)], ()),
+    "0425 with its range finder": ([_0425.format(k) for k in (1, 2, 6)], [_0425.format(k) for k in (3, 7, 10)], AIDS),
+}
+SIMULATED = 3  # flights of the simulated set, of SECONDS each
+SECONDS = 60.0
+
+
+def add_options(add):
+    """add : add_argument of a parser."""
+    add("--data", type=Path, required=True, metavar="DATA", help="folder of measured flights")
+    add("--draws", type=int, default=20, metavar="N", help="of each set and each size of the errors (default 20)")
+    add("--only", choices=(*SETS, "simulated"), help="one set")
+    add("--json", type=argparse.FileType("w"), metavar="FILE", help="write every draw")
+
+
+def run(args):
+    """Print a table, a row for each set and size."""
+    print("| set | tape off by [m] | tag, true survey | shaken | surveyed | surveyed / true, median (worst) | worse than shaken | ", end="")
+    print("anchors shaken | surveyed | normalised error |\n|---|" + 9 * "---:|")
+    every = {}
+    for name in [args.only] if args.only else [*SETS, "simulated"]:
+        flights, judged = _simulated() if name == "simulated" else _measured(args.data, *SETS[name])
+        for std in SHAKES:
+            draws = [draw(flights, judged, std, seed) for seed in tqdm(range(args.draws), desc=f"{name} {std}", disable=None)]
+            every[f"{name} {std}"] = draws
+            print(f"| {name} | {std} | {_summary(draws)} |", flush=True)
+    if args.json:
+        json.dump(every, args.json, indent=1)
+
+
+def draw(flights, judged, std, seed):
+    """dict of figures of one draw: mean 3D RMSE, m, of the judged Flights with the true, shaken and surveyed anchors; root
+    mean square errors, m, of the coordinates that are not trusted, shaken and surveyed, and of the latter over its std."""
+    true = flights[0].anchors
+    tape = Tape(std, trusted=third(true))
+    free = tape.position_std(true) > tape.trusted_std
+    noise = np.random.default_rng(seed).standard_normal(true.positions.shape)
+    rough = true.positions + np.where(free, std, tape.trusted_std) * noise
+    found = survey([at(flight, rough) for flight in flights], tape).surveyed
+    error = found.anchors.positions - true.positions
+    delays = EffectSet((delay_effect(true, found.delays),))
+    return {
+        "true": _rmse(judged),
+        "shaken": _rmse([at(flight, rough) for flight in judged]),
+        "surveyed": _rmse([at(flight, found.anchors.positions) for flight in judged], delays),
+        "anchors_shaken": _root((rough - true.positions)[free]),
+        "anchors_surveyed": _root(error[free]),
+        "normalised": _root((error / found.position_std)[free]),
+    }
+
+
+def third(anchors):
+    """Names of a third of the coordinates of eight Anchors: all of two at opposite ends, the heights of two more."""
+    far = int(np.argmax(np.linalg.norm(anchors.positions - anchors.positions[0], axis=1)))
+    others = [row for row in range(1, len(anchors)) if row != far][:2]
+    ids = [str(i) for i in anchors.ids]
+    return ids[0], ids[far], *(f"{ids[row]}.z" for row in others)
+
+
+def at(flight, positions):
+    """The Flight with its anchors at other positions, (N, 3) m."""
+    anchors = flight.anchors
+    return replace(flight, anchors=Anchors(anchors.ids, positions, anchors.orientations, anchors.frame))
+
+
+def _measured(data, fit, judge, aids):
+    surveys = inputs.Reading(str(data / "surveys"))
+    unused = [aid for aid in AIDS if aid not in aids]
+    return [[f.without(*unused) for path in some for f in surveys.flights([str(data / path)])] for some in (fit, judge)]
+
+
+def _simulated():
+    flights = [clean_flight(300 + seed, SECONDS) for seed in range(SIMULATED + 1)]
+    return flights[:-1], flights[-1:]
+
+
+def _rmse(flights, effects=None):
+    return float(np.mean([evaluate(flight, effects=effects)[0].row()["rmse_3d"] for flight in flights]))
+
+
+def _root(values):
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _summary(draws):
+    columns = {key: np.array([one[key] for one in draws]) for key in draws[0]}
+    ratio = columns["surveyed"] / columns["true"]
+    worse = int(np.sum(columns["surveyed"] > 1.03 * columns["shaken"]))
+    cells = [f"{columns[key].mean():.3f}" for key in ("true", "shaken", "surveyed")]
+    cells += [f"{np.median(ratio):.2f} ({ratio.max():.2f})", f"{worse} of {len(draws)}"]
+    cells += [f"{_root(columns[key]):.3f}" for key in ("anchors_shaken", "anchors_surveyed")]
+    return " | ".join([*cells, f"{_root(columns['normalised']):.2f}"])
