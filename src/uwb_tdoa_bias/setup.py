@@ -21,7 +21,10 @@ setup(
         "PyYAML>=6.0",
         "scipy>=1.11",
     ],
-    extras_require={"models": ["onnx>=1.14"]},  # to make known_answer.onnx anew
+    extras_require={
+        "models": ["onnx>=1.14"],  # to make known_answer.onnx anew
+        "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

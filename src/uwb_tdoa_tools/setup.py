@@ -29,7 +29,10 @@ setup(
         "uwb_tdoa_bias",
         "uwb_tdoa_ekf",
     ],
-    extras_require={"dask": ["distributed>=2024.1"]},  # for --dask
+    extras_require={
+        "dask": ["distributed>=2024.1"],  # for --dask
+        "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

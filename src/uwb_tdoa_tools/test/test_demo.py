@@ -1,7 +1,10 @@
+import shlex
+
 import pytest
 
 pytest.importorskip("rclpy")
-from uwb_tdoa_tools.commands import demo  # noqa: E402
+from uwb_tdoa_tools.commands import check, demo, diagnose  # noqa: E402
+from uwb_tdoa_tools.live.demo import next_steps  # noqa: E402
 
 
 @pytest.mark.parametrize(
@@ -15,6 +18,16 @@ from uwb_tdoa_tools.commands import demo  # noqa: E402
 def test_bad_usage_is_one_sentence(arguments, sentence, tmp_path, capsys):
     assert demo.main([*arguments, "--out", str(tmp_path / "out")]) == 2
     assert f"demo: error: {sentence}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [(), ("a flight.log", "survey.txt"), ("flight.bag",)])
+def test_the_next_commands_are_commands(given):
+    for command in next_steps(*given):
+        words = shlex.split(command)
+        name, *rest = words[words.index("uwb_tdoa_tools") + 1 :]
+        args = {"check": check, "diagnose": diagnose}[name].parser().parse_args(rest)
+        assert args.flights == ([given[0]] if given else ["RECORDING"])
+        assert args.survey == (given[1] if len(given) > 1 else None if given else "SURVEY")
 
 
 def figures(line):
@@ -32,7 +45,7 @@ def test_a_simulated_flight_through_the_real_nodes(tmp_path, capsys):
         for name in ("raw  ", "corrected  ", "corrected, without ROS")
     )
     assert corrected[3] < 0.6 * raw[3]  # 3D RMSE
-    assert "lost or late" not in printed.err
+    assert "lost or late" not in printed.err and "uwb_tdoa_tools check" in lines[-2]
     assert corrected == pytest.approx(without_ros, abs=1.01e-3)
     for name in ("flight.bag", "recorded.bag", "effects.yaml", "error.png"):
         assert (tmp_path / name).exists()

@@ -196,8 +196,10 @@ def test_setup_py_declares_what_is_imported_and_nothing_else(package):
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
     (call,) = (node for node in calls if getattr(node.func, "id", "") == "setup")
     given = {keyword.arg: keyword.value for keyword in call.keywords}
-    extras = ast.literal_eval(given["extras_require"]).values() if "extras_require" in given else []
-    required = [*ast.literal_eval(given["install_requires"]), *(text for some in extras for text in some)]
+    extras = ast.literal_eval(given["extras_require"])
+    tests = {re.match(r"[\w.-]+", text)[0] for text in extras.pop("test")}
+    assert tests == {"hypothesis", "pytest"} <= needed(package, "test")
+    required = [*ast.literal_eval(given["install_requires"]), *(text for some in extras.values() for text in some)]
     names = {re.match(r"[\w.-]+", text)[0] for text in required} - {"setuptools"}
     imported = needed(package, package)
     assert names == {KEYS[name][1] for name in imported if name in KEYS} | (imported & set(PACKAGES))

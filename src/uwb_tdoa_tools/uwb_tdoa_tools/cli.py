@@ -10,19 +10,23 @@
 """
 
 import argparse
+import json
 import os
 from pathlib import Path
 import sys
 
 from uwb_tdoa_bias.foundation.errors import Failure, InputError
+from uwb_tdoa_bias.foundation.version import written_by
 
 
 def parser(name, description, *examples):
     """An ArgumentParser that keeps line breaks, and ends its help with the given example command lines."""
     epilog = "examples:\n" + "\n".join(f"  {example}" for example in examples) if examples else None
-    return argparse.ArgumentParser(
+    made = argparse.ArgumentParser(
         prog=name, description=description, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    made.add_argument("--version", action="version", version=f"{name} of {written_by()}")
+    return made
 
 
 def run(command, parser, argv=None, ros=False):
@@ -75,6 +79,12 @@ def check_folders(*paths):
     for path in paths:
         if path is not None and not Path(path).absolute().parent.is_dir():
             raise InputError(f"{path}: its directory does not exist; make it first.")
+
+
+def write_json(path, content):
+    """Write a dict as JSON, with the version of the suite; NaN must be None by now (ValueError otherwise)."""
+    text = json.dumps({"written_by": written_by(), **content}, indent=1, allow_nan=False)
+    Path(path).write_text(text + "\n")
 
 
 def say(name, sentence):

@@ -9,6 +9,7 @@ import yaml
 from ..foundation.errors import InputError
 from ..foundation.flight import AIDS
 from ..foundation.safe_yaml import read_yaml
+from ..foundation.version import written_by
 from .aid_corrector import AidCorrector
 from .catalogue import EFFECTS
 from .imu_corrector import ImuCorrector
@@ -119,7 +120,8 @@ class EffectSet:
             number = 1 + sum(other.name == effect.name for other in self.effects[: len(entries)])
             name = effect.name if number == 1 and not effect.settings else f"{effect.name}_{number}"
             entries[name] = {key: value for key, value in entry.items() if value}
-        Path(path).write_text(yaml.safe_dump({"effects": entries}, sort_keys=False))
+        text = yaml.safe_dump({"effects": entries}, sort_keys=False)
+        Path(path).write_text(f"# {written_by()}\n{text}")
 
 
 def _plain(value):

@@ -8,6 +8,7 @@ import yaml
 
 from .errors import InputError
 from .safe_yaml import read_yaml
+from .version import written_by
 
 FARTHEST = 1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
 
@@ -130,7 +131,7 @@ class Anchors:
         for i, p, q in zip(self.ids.tolist(), self.positions.tolist(), self.orientations.tolist()):
             entries[i] = {"position": p, **({"orientation": q} if np.isfinite(q).all() else {})}
         text = yaml.safe_dump({"frame": self.frame, "anchors": entries}, sort_keys=False, default_flow_style=None)
-        Path(path).write_text(text)
+        Path(path).write_text(f"# {written_by()}\n{text}")
 
 
 def _whole(ids):

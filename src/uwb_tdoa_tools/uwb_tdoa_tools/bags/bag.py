@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
+from uwb_tdoa_bias.foundation.version import written_by
 
 from . import messages as bag_messages
 from .files import check_output, deserialize, is_bag, messages, new_bag, open_bag
@@ -126,7 +127,7 @@ def write_bag(flight, out, storage="mcap", force=False):
 
     counts = dict.fromkeys(topics, 0)
     with new_bag(out, storage, force) as writer:
-        writer.set_custom_data(_FLIGHT_KEY, json.dumps({"name": flight.name, "meta": flight.meta}, default=str))
+        writer.set_custom_data(_FLIGHT_KEY, _about_flight(flight))
         streams = []
         for topic, (msgtype, qos, outgoing) in topics.items():
             connection = writer.add_connection(topic, msgtype, typestore=store, offered_qos_profiles=[qos])
@@ -140,6 +141,10 @@ def write_bag(flight, out, storage="mcap", force=False):
 def _serialized(connection, outgoing, store):
     for stamp, message in outgoing:
         yield stamp, connection, store.serialize_cdr(message, connection.msgtype)
+
+
+def _about_flight(flight):
+    return json.dumps({"name": flight.name, "meta": flight.meta, "written_by": written_by()}, default=str)
 
 
 def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):

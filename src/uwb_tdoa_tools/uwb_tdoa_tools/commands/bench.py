@@ -1,6 +1,5 @@
 """bench: what the suite costs on this machine, in one run."""
 
-import json
 from pathlib import Path
 import sys
 
@@ -57,7 +56,7 @@ def _bench(args):
     print(f"meanwhile others used {machine['others']:.0%} of its CPU time, its host {machine['stolen']:.0%}")
     print("\n".join(table(figures)))
     if args.json is not None:
-        args.json.write_text(json.dumps({"machine": machine, "figures": as_json(figures)}, indent=1) + "\n")
+        cli.write_json(args.json, {"machine": machine, "figures": as_json(figures)})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """check: what a driver may have got wrong, found in a recording before anything else is done with it."""
 
-import json
 from pathlib import Path
 import sys
 
@@ -60,7 +59,7 @@ def _check(args):
     for finding in together:
         print("\n".join(report.lines(finding)))
     if args.json:
-        Path(args.json).write_text(json.dumps(report.as_dict(reports, together), indent=1, allow_nan=False))
+        cli.write_json(args.json, report.as_dict(reports, together))
     return int(any(one.faulty for one in reports))
 
 

@@ -1,6 +1,5 @@
 """debias: map the bias of estimated positions, take it out, and say what that is worth."""
 
-import json
 from pathlib import Path
 import sys
 
@@ -92,7 +91,7 @@ def _judged(args, estimator, recordings, made):
 
 def _write(path, figures):
     if path is not None:
-        path.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+        cli.write_json(path, figures)
 
 
 if __name__ == "__main__":

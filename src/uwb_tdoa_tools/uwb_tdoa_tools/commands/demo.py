@@ -70,6 +70,7 @@ def _demo(args):
     plot_comparison(flight, scores[:2], args.out / "error.png")
     print(f"plot       {args.out / 'error.png'}")
     print(f"took {time.monotonic() - started:.0f} s")
+    print("next       " + "\n           ".join(demo.next_steps(args.flight, args.survey)))
     return int(scores[1].row()["diverged"] or not in_time)
 
 

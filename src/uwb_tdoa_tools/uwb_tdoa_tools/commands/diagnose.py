@@ -1,6 +1,5 @@
 """diagnose: from a residual to the missing effect to a smaller error."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -64,7 +63,7 @@ def _diagnose(args):
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "diagnosis.json").write_text(json.dumps(result.as_json(), indent=1, allow_nan=False))
+    cli.write_json(out / "diagnosis.json", result.as_json())
     result.effects.to_yaml(out / "effects.yaml")
     (out / "report.html").write_text(result.as_html())
     print(result.as_text())

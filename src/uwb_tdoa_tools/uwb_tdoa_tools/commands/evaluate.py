@@ -1,6 +1,5 @@
 """How good is the estimate? Errors against ground truth, of the filter run here or of a recorded odometry."""
 
-import json
 from pathlib import Path
 import sys
 
@@ -90,7 +89,7 @@ def _evaluate(args):
               f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
     if args.json:
         report = {"runs": [as_json(row) for row in rows], "pooled": as_json(together)}
-        Path(args.json).write_text(json.dumps(report, indent=1, allow_nan=False))
+        cli.write_json(args.json, report)
     if args.markdown:
         rows += [together] * (len(scores) > 1)
         others = table.read_others(args.beside) if args.beside else {}

@@ -1,6 +1,5 @@
 """plan: where a tag can be located among given anchors, how precisely, and where the anchors had better be."""
 
-import json
 from pathlib import Path
 import sys
 
@@ -114,7 +113,7 @@ def _plan(args):
         report.say_improvement(figures["improve"])
     for path in (args.out / "plan.json", args.json):
         if path is not None:
-            path.write_text(json.dumps(figures, indent=1) + "\n")
+            cli.write_json(path, figures)
     print(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
     if args.publish:
         print(f"publishing {', '.join(outgoing)} until Ctrl-C", flush=True)

@@ -1,7 +1,6 @@
 """simulate: fly a path through a room with anchors and write what IMU, UWB tag and motion capture would record."""
 
 from dataclasses import fields
-import json
 from pathlib import Path
 import sys
 
@@ -106,7 +105,7 @@ def _simulate(args):
         write_bag(flight, args.out, args.storage, args.force)
         print(f"wrote {args.out}")
     if args.json is not None:
-        args.json.write_text(json.dumps(content, indent=2) + "\n")
+        cli.write_json(args.json, content)
         print(f"wrote {args.json}")
     if args.plot is not None:
         plot(flight, args.plot)

@@ -1,6 +1,5 @@
 """train: learn the systematic error of TDOAs from flights with ground truth."""
 
-import json
 from pathlib import Path
 import sys
 
@@ -57,7 +56,7 @@ def _train(args):
         print(f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m (root mean square)")
     curve = {label: x, "training": errors[0], "validation": errors[1]}
     content = {**result.meta, "curve": curve, "validation": result.errors}
-    (args.out / "training.json").write_text(json.dumps(content, indent=1) + "\n")
+    cli.write_json(args.out / "training.json", content)
     print(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
 
 

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+import shlex
+import shutil
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network
@@ -77,6 +79,14 @@ def fly(case, folder, rate=1.0, say=print):
         "corrected, without ROS": run_offline(flight, corrector=correction).odometry,
     }
     return accounts(live.ekf, flight), [Score(name, one, flight.truth) for name, one in estimates.items()]
+
+
+def next_steps(recording=None, survey=None):
+    """[command] to type after the demo: check a recording, then diagnose it. Default: one that the user has yet to make."""
+    run = "ros2 run uwb_tdoa_tools" if shutil.which("ros2") else "./dev run uwb_tdoa_tools"
+    words = shlex.join([str(recording), *(("--survey", str(survey)) if survey else ())]) if recording else ""
+    words = words or "RECORDING --survey SURVEY"
+    return [f"{run} check {words}", f"{run} diagnose {words} --out diagnosis/"]
 
 
 def _absolute(path):

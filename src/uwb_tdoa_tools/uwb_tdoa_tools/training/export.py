@@ -5,6 +5,8 @@ import json
 import numpy as np
 from onnx import TensorProto, checker, helper, numpy_helper
 
+from uwb_tdoa_bias.foundation.version import version
+
 OPSET, IR_VERSION = 13, 8  # old enough for every onnxruntime that the nodes accept
 
 
@@ -60,7 +62,8 @@ class Graph:
             [helper.make_tensor_value_info("bias", TensorProto.FLOAT, ["n", len(outputs)])],
             self._constants,
         )
-        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+        about = {"producer_name": "uwb_tdoa", "producer_version": version()}
+        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, **about)
         helper.set_model_props(made, {key: json.dumps(value) for key, value in meta.items()})
         checker.check_model(made)
         return made

@@ -1,0 +1,18 @@
+"""Which version of the suite this is: what is written says by which it was written."""
+
+from functools import lru_cache
+from importlib import metadata
+
+
+@lru_cache(maxsize=None)
+def version():
+    """Its version, e.g. "0.1.0"; "unknown" where the packages are not installed."""
+    try:
+        return metadata.version("uwb_tdoa_bias")
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def written_by():
+    """For the files that we write: "uwb_tdoa 0.1.0"."""
+    return f"uwb_tdoa {version()}"
