@@ -4,10 +4,10 @@ import re
 
 from documented import ROOT
 import pytest
-from spoken import sentences
+from spoken import rules, sentences
 
 PAGE = (ROOT / "docs" / "symptoms.md").read_text()
-TABLE = PAGE.partition("## What the nodes say\n")[2]
+TABLE = PAGE.partition("## What the nodes say\n")[2].partition("\n## ")[0]
 LINES = [line for line in TABLE.splitlines() if line.startswith("| ")]
 ROWS = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in LINES]
 OTHERS = ("anchors:",)  # what is wrong with a survey comes from the one who reads it
@@ -28,6 +28,13 @@ def test_the_page_says_nothing_else():
     for text, cause, remedy in ROWS[1:]:
         assert cause and remedy
         assert any(sentence in words(text) for sentence in known) or text.startswith(OTHERS), text
+
+
+def test_every_finding_of_check_is_on_the_page_and_no_other():
+    table = PAGE.partition("## What `check` finds\n")[2]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert len(named) == len(set(named)) and set(named) == rules()
 
 
 def test_the_reader_of_sentences_sees_some_of_each_node():

@@ -37,7 +37,8 @@ def load_network(name):
 
 
 class Network:
-    """An ONNX bias model, run on one thread. meta : all its metadata, dict of str."""
+    """An ONNX bias model, run on one thread. meta : all its metadata, dict of str; trained_with : names of the effects
+    that were taken out before it was trained, and have to be corrected beside it."""
 
     def __init__(self, path):
         """Load `path`; raises InputError if it is no model or its metadata do not fit."""
@@ -96,6 +97,7 @@ class Network:
         self._offset, self._scale = np.array(self._offset, dtype=float), np.array(self._scale, dtype=float)
         self.clip = float(json.loads(meta["clip"]))
         self.name = str(json.loads(meta["name"]))
+        self.trained_with = tuple(map(str, json.loads(meta.get("trained_with", "[]"))))
         limits = json.loads(meta.get("validity", "{}"))
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))

@@ -7,6 +7,8 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
+from ..checking.check import different_surveys
+from ..checking.remarks import survey_remarks
 from ..diagnosis import diagnose
 from ..diagnosis.references import REFERENCES
 from ..progress import Progress
@@ -59,6 +61,11 @@ def _diagnose(args):
     shared = {f.name for f in flights} & {f.name for f in holdout}
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
+    for flight in (*flights, *holdout):
+        for remark in survey_remarks(flight):
+            cli.say("diagnose", f"{flight.name}: {remark}")
+    for finding in different_surveys([*flights, *holdout]):
+        cli.say("diagnose", f"{finding.cause}: {finding.evidence}; {finding.remedy}.")
     reference = REFERENCES[args.reference](config)
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress)

@@ -68,6 +68,10 @@ def _evaluate(args):
     without = [f"use_{aid}:=false" for aid in args.without]
     config = options.with_parameters(config, args.parameters + without)
     network = None if args.no_bias else load_network(args.model)
+    given = {effect.name for effect in effects.effects} if effects else set()
+    if network and (lacking := sorted(set(network.trained_with) - given)):
+        cli.say("evaluate", f"{args.model} was trained with {', '.join(lacking)} taken out, which no --effects gives; "
+                "give the effects.yaml that was written beside it.")  # fmt: skip
     reading = options.reading_of(args)
     found = reading.find(args.flights, bool(args.dask))
     for option in ("odometry", "plot"):

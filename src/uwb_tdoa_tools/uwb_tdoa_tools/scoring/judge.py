@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+import sys
+
+from tqdm import tqdm
 
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
@@ -10,6 +13,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
 from ..bags.bag import late_tdoas, read_odometry
+from ..checking.remarks import survey_remarks
 from ..readers.inputs import Reading
 from .evaluation import evaluate, need_truth
 from .metrics import Score
@@ -39,6 +43,8 @@ class Judge:
     def __call__(self, recording):
         flight = self.reading.read(recording)
         need_truth(flight)
+        for remark in () if self.odometry else survey_remarks(flight):
+            tqdm.write(f"{flight.name}: {remark}", file=sys.stderr)
         if self.odometry:
             odometry = read_odometry(self.odometry, *self._where)
             score = Score(flight.name, odometry, flight.truth)

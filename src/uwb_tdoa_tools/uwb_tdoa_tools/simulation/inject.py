@@ -1,11 +1,15 @@
 """Declared effects put into flights."""
 
+import re
+
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.bag import check_output, write_bag
+
+_ANCHORS = re.compile(r"(\d+)(?:-(\d+))?(?:\..+)?")  # of which a parameter is: 3, 3-5, 3.x
 
 
 def parse_effect(name, values):
@@ -27,8 +31,21 @@ def inject(effect, recording, reading, out, seed=0, storage="mcap", force=False)
     """
     check_output(out, force)  # before the work, not after it
     flight = reading.one(recording)
+    _check_anchors(effect, flight)
     write_bag(effect.inject(flight, np.random.default_rng(seed)), out, storage, force)
     return flight.name
+
+
+def _check_anchors(effect, flight):
+    """Raise InputError if the Effect has a parameter of an anchor that the Flight does not have."""
+    for key in effect.values if "tdoa" in effect.channels else ():
+        named = _ANCHORS.fullmatch(key)
+        for anchor in filter(None, named.groups() if named else ()):
+            if flight.anchors.row(int(anchor)) < 0:
+                known = ", ".join(map(str, flight.anchors.ids))
+                raise InputError(
+                    f"--value: {effect.name}: {key}: {flight.name} has no anchor {anchor}; it has {known}."
+                )
 
 
 def catalogue():

@@ -76,6 +76,8 @@ def train(kind, training, validation, seed, name, options=structured.Options(), 
         "trained_on": sorted(one.name for one in training), "validated_on": sorted(one.name for one in validation),
         "constellations": labelling.constellations(everything),
     }  # fmt: skip
+    if model and effects:
+        meta["trained_with"] = [effect.name for effect in effects.effects]
     if model:
         learned_from = groups[0] if kind.startswith("paper") else everything
         meta |= {"validity": _validity(learned_from, model.judged), "fade_std": _rms(one.error for one in groups[1])}

@@ -1,0 +1,34 @@
+"""What every tool that estimates says of a flight before it does: a survey that cannot be right."""
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from .case import Case
+from .recording import of_flight
+from .tdoa_rules import gained, survey_fit
+
+SHORTEST = 10.0  # s; of shorter flights nothing is said
+
+
+def survey_remarks(flight):
+    """Sentences about the survey of a Flight: anchors that it lacks, and positions that cannot be right, by what moving
+    the anchors explains (see SurveyFit). Raises InputError where no TDOA is between two anchors that it has."""
+    tdoa, anchors = flight.tdoa, flight.anchors
+    known = (anchors.index(tdoa.a) >= 0) & (anchors.index(tdoa.b) >= 0)
+    heard = np.unique([tdoa.a, tdoa.b])
+    lacking = heard[anchors.index(heard) < 0].tolist()
+    if len(tdoa) and not known.any():
+        raise InputError(
+            f"{flight.name}: the tag hears anchors {_listed(heard)}, the survey has {_listed(anchors.ids)}, and no "
+            "TDOA is between two that it has; give the survey of that room."
+        )
+    if lacking:
+        share = 100.0 * np.mean(~known)
+        yield f"the survey has no anchor {_listed(lacking)}: {share:.0f} % of the TDOAs are not used; survey it, too."
+    if len(tdoa) and np.ptp(tdoa.t) > SHORTEST and gained(survey_fit(Case.of(of_flight(flight)))) is not None:
+        yield "the survey does not fit the TDOAs: of another room, or anchors have been moved; `check` says more."
+
+
+def _listed(ids):
+    return ", ".join(map(str, ids))
