@@ -42,12 +42,16 @@ class Innovations:
         regressors (n, k): derivative of the measured TDOAs by the parameters, of which the run knew nothing. A bias that
         the position can follow leaves no trace.
         """
-        regressors = np.ascontiguousarray(regressors, dtype=float)
-        out = np.zeros_like(regressors)
-        states = np.zeros((2, ERROR_STATES, regressors.shape[1]))
+        return self.and_positions(regressors, ())[0]
+
+    def and_positions(self, regressors, stamps):
+        """What `by_bias` gives, and the derivative of the estimated position at stamps (m,), s, ascending: (m, 3, k)."""
+        regressors, stamps = np.ascontiguousarray(regressors, dtype=float), np.asarray(stamps, dtype=float)
+        out, positions = np.zeros_like(regressors), np.zeros((len(stamps), 3, regressors.shape[1]))
+        states, passed = np.zeros((2, ERROR_STATES, regressors.shape[1])), 0
         for records, of in zip(self.records, self.of):
-            _through(records, of, regressors, states, out)
-        return out
+            passed = _through(records, of, regressors, states, out, stamps, passed, positions)
+        return out, positions
 
 
 def record_innovations(flight, config=None, corrector=None):
@@ -71,12 +75,16 @@ def record_innovations(flight, config=None, corrector=None):
 
 
 @compiled
-def _through(records, of, regressors, states, out):
-    """states (2, 15, k): derivative of the error state by the parameters, and room for the next one."""
+def _through(records, of, regressors, states, out, stamps, passed, positions):
+    """states (2, 15, k): derivative of the error state by the parameters, and room for the next one. `passed` of the stamps
+    (m,) lie behind; returns how many do then, and fills their positions (m, 3, k)."""
     before, after = states[0], states[1]
     n = regressors.shape[1]
     for i in range(len(records)):
         record = records[i]
+        while passed < len(stamps) and stamps[passed] < record.t:
+            positions[passed] = before[:3]
+            passed += 1
         if record.kind == RESET:
             before[:, :] = 0.0
             continue
@@ -99,3 +107,4 @@ def _through(records, of, regressors, states, out):
             for r in range(ERROR_STATES):
                 after[r, j] += record.gain[r] * change
         before[:, :] = after
+    return passed

@@ -16,6 +16,7 @@ from uwb_tdoa_tools.commands.survey import main
 from uwb_tdoa_tools.diagnosis.self_survey import delay_effect
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from uwb_tdoa_tools.surveying.marks import read_marks
 from uwb_tdoa_tools.surveying.placing import place
 from uwb_tdoa_tools.surveying.survey import survey
 from uwb_tdoa_tools.surveying.tape import Tape
@@ -82,6 +83,44 @@ def test_an_anchor_of_which_nothing_is_known_is_placed(flights):
     placed = place([at(flight, lost) for flight in flights[:1]], [5]).positions
     assert np.linalg.norm(placed[5] - true[5]) < 0.3
     np.testing.assert_array_equal(np.delete(placed, 5, axis=0), np.delete(true, 5, axis=0))
+
+
+def marks_file(path, flight, places=3, **changes):
+    """Marks of the ground truth of a Flight, 2 s each, within a millimetre."""
+    begin, truth, marks = flight.tdoa.t[0], flight.truth, []
+    for first in np.linspace(5.0, 30.0, places):
+        inside = (truth.t >= begin + first) & (truth.t <= begin + first + 2.0)
+        place = [float(round(value, 4)) for value in truth.p[inside].mean(axis=0)]
+        marks.append({"flight": flight.name, "from": float(first), "to": float(first + 2.0), "position": place, "std": 0.01})
+    marks[0].update(changes)
+    path.write_text(json.dumps({"marks": marks}))
+    return path
+
+
+def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
+    flight = flights[0]
+    away = flight.anchors.positions + [0.2, -0.15, 0.1]  # all alike: nothing in the TDOAs tells
+    moved = [at(flight, away)]
+    marks = read_marks(marks_file(tmp_path / "marks.yaml", flight, 6), moved)
+    with_marks, without = (survey(moved, Tape(0.3), marks=some).surveyed.anchors.positions for some in (marks, ()))
+    off = [np.abs((found - flight.anchors.positions).mean(axis=0)).max() for found in (with_marks, without)]
+    assert off[0] < 0.05 < 0.1 < off[1]
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"flight": "tuesday"}, "no flight 'tuesday'"),
+        ({"to": 1e4}, "must lie"),
+        ({"position": [1.0, 2.0]}, "three coordinates"),
+        ({"position": "here"}, "write it as"),
+        ({"std": 0.0}, "a std above 0"),
+        ({"height": 1.0}, "must be as"),
+    ],
+)
+def test_marks_that_cannot_be_are_refused(flights, tmp_path, changes, words):
+    with pytest.raises(InputError, match=words):
+        read_marks(marks_file(tmp_path / "marks.yaml", flights[0], **changes), flights)
 
 
 def test_words_name_what_is_better_and_what_is_not(result):

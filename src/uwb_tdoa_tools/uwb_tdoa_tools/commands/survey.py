@@ -10,6 +10,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import cli, options
 from ..diagnosis.self_survey import delay_effect
 from ..progress import Progress
+from ..surveying.marks import read_marks
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
 
@@ -41,6 +42,7 @@ def parser():
         "survey flight.bag --survey tape.yaml --trusted 0 4 1.z 2.z --out surveyed/",
         "survey first.bag second.bag third.bag --survey tape.csv --std 0.3 --height-std 0.05 --out surveyed/",
         "survey flight.bag --survey tape.yaml --unknown 5 --out surveyed/",
+        "survey flight.bag --survey tape.yaml --marks marks.yaml --out surveyed/",
     )
     options.add_recordings(made)
     options.add_filter(made, "effects.yaml: what is in the model already")
@@ -50,6 +52,7 @@ def parser():
     add("--trusted", nargs="+", default=[], metavar="A", help="anchors (3) or coordinates (3.z) that are known well")
     add("--trusted-std", type=float, default=0.01, metavar="M", help="m, how well those are known (default 0.01)")
     add("--unknown", nargs="+", default=[], metavar="A", help="anchors whose position is not known at all")
+    add("--marks", metavar="FILE", help="YAML: measured places where the tag stood or passed, and when (docs/calibration.md)")
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
 
@@ -62,8 +65,9 @@ def _survey(args):
     config, effects = options.filter_of(args)
     base = effects or EffectSet()
     flights = options.reading_of(args).flights(args.flights)
+    marks = read_marks(args.marks, flights) if args.marks else ()
     with Progress("survey") as progress:
-        result = survey(flights, tape, base, config, lambda: progress("solving"))
+        result = survey(flights, tape, base, config, marks, lambda: progress("solving"))
     out.mkdir(parents=True, exist_ok=True)
     anchors = result.surveyed.anchors
     anchors.to_yaml(out / "anchors.yaml")

@@ -28,6 +28,7 @@ PRELIMINARY_DELAY_STD = 0.05  # m
 DETERMINED = 1e-4  # share of the largest eigenvalue that a direction must have to count there
 DELAY_STDS = 0.02, 0.05, 0.1, 0.2, 0.4  # m, that the evidence chooses from
 FUNCTION_STDS = 0.003, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3  # m, the same of the functions of the place
+WITHIN_MARK = 5  # stamps at which the estimate is averaged over a mark
 FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 
 
@@ -50,10 +51,21 @@ class Surveyed:
         return np.sqrt(np.diag(self.covariance))[: 3 * len(self.anchors)].reshape(-1, 3)
 
 
-def survey(flights, position_std, base=EffectSet(), config=None, rounds=ROUNDS, progress=lambda: None):
+@dataclass(frozen=True)
+class Mark:
+    """Where the tag was on average from `first` to `last`, s since the first TDOA of a flight: position (3,) m +- std, m."""
+
+    flight: str
+    first: float
+    last: float
+    position: tuple
+    std: float
+
+
+def survey(flights, position_std, base=EffectSet(), config=None, marks=(), rounds=ROUNDS, progress=lambda: None):
     """Surveyed of Flights of the same anchors, which are where they say within position_std, (N, 3) m.
 
-    base : EffectSet that is in the model; config : FilterConfig. The frame is that of the coordinates with the smallest
+    base : EffectSet that is in the model; config : FilterConfig; marks : Marks. The frame is that of the coordinates with the smallest
     std. Raises InputError for a flight that is too short.
     """
     given, reference = flights[0].anchors, Nothing(config)
@@ -66,10 +78,12 @@ def survey(flights, position_std, base=EffectSet(), config=None, rounds=ROUNDS, 
         anchors = Anchors(given.ids, best[: 3 * n].reshape(n, 3), given.orientations, given.frame)
         gram, vector, alike = 0.0, 0.0, []
         for flight in flights:
-            grams, vectors = _equations(replace(flight, anchors=anchors), best[3 * n :], base, reference)
+            here = [mark for mark in marks if mark.flight == flight.name]
+            grams, vectors, marked = _equations(replace(flight, anchors=anchors), best[3 * n :], base, reference, here)
             alike.append(_inflation(grams[:, : 4 * n, : 4 * n], vectors[:, : 4 * n], position_std.ravel()))
             inflation = SYSTEMATIC * alike[-1]
-            gram, vector = gram + grams.sum(axis=0) / inflation, vector + vectors.sum(axis=0) / inflation
+            gram = gram + grams.sum(axis=0) / inflation + marked[0]
+            vector = vector + vectors.sum(axis=0) / inflation + marked[1]
             progress()
         step, covariance, sizes = _by_evidence(gram, vector, position_std.ravel(), best - start)
         tdoa_std = config.tdoa_std * float(np.sqrt(np.mean(alike) / config.tdoa_correlation_length))
@@ -83,9 +97,9 @@ def delay_effect(anchors, delays):
     return EFFECTS["anchor_delay"]({str(i): float(delay) for i, delay in zip(anchors.ids, delays)})
 
 
-def _equations(flight, delays, base, reference):
+def _equations(flight, delays, base, reference, marks):
     """(grams (b, k, k), vectors (b, k)) of the normal equations that the innovations of a prepared Flight give, block by
-    block."""
+    block, and (gram (k, k), vector (k,)) of those that its Marks give."""
     anchors = flight.anchors
     effects = EffectSet((*base.effects, delay_effect(anchors, delays))) if delays.any() else base
     part = CHANNELS["tdoa"].residual(Comparison.of(flight, reference, effects))
@@ -96,7 +110,10 @@ def _equations(flight, delays, base, reference):
     positions = EFFECTS["anchor_position"]().regressors(samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
     late = EFFECTS["anchor_delay"]().regressors(samples, ids)
     functions = (late[:, :, None] * _features(samples.p)[:, None, :]).reshape(len(late), -1)
-    columns = part.innovations.by_bias(np.nan_to_num(np.concatenate([positions, late, functions], axis=1)))[air]
+    stamps = [flight.tdoa.t[0] + np.linspace(mark.first, mark.last, WITHIN_MARK) for mark in marks]
+    regressors = np.nan_to_num(np.concatenate([positions, late, functions], axis=1))
+    columns, moved = part.innovations.and_positions(regressors, np.sort(np.concatenate([[], *stamps])))
+    columns = columns[air]
     innovation, variance = part.innovations.value[air], part.innovations.variance[air]
     error = innovation / np.sqrt(variance)
     scale = max(1.4826 * np.median(np.abs(error)), 1e-3)
@@ -104,7 +121,22 @@ def _equations(flight, delays, base, reference):
     block = ((samples.t[air] - samples.t[air][0]) / BLOCK).astype(int)
     parts = [(columns[block == k], weight[block == k], innovation[block == k]) for k in np.unique(block)]
     grams = np.stack([(some * w[:, None]).T @ some for some, w, _ in parts])
-    return grams, np.stack([some.T @ (w * value) for some, w, value in parts])
+    vectors = np.stack([some.T @ (w * value) for some, w, value in parts])
+    return grams, vectors, _marked(marks, stamps, moved, part.innovations.run.odometry)
+
+
+def _marked(marks, stamps, moved, odometry):
+    """(gram (k, k), vector (k,)): the estimate at a mark, averaged over it, is off by what the parameters do to it."""
+    gram, vector = np.zeros((moved.shape[2],) * 2), np.zeros(moved.shape[2])
+    order = np.argsort(np.concatenate([[], *stamps]), kind="stable")
+    moved = moved[np.argsort(order, kind="stable")].reshape(-1, WITHIN_MARK, *moved.shape[1:]).mean(axis=1)
+    for mark, t, columns in zip(marks, stamps, moved):
+        estimate = [np.interp(t, odometry.t, odometry.p[:, k]).mean() for k in range(3)]
+        place = min(int(np.searchsorted(odometry.t, t[WITHIN_MARK // 2])), len(odometry.t) - 1)
+        weight = 1.0 / (np.diag(odometry.covariance[place, :3, :3]) + mark.std**2)
+        gram += (columns * weight[:, None]).T @ columns
+        vector += columns.T @ (weight * (np.array(estimate) - mark.position))
+    return gram, vector
 
 
 def _inflation(grams, vectors, position_std):

@@ -16,10 +16,10 @@ NOTHING_KNOWN = 1e3  # m, standard deviation of a coordinate of which nothing is
 
 
 @in_one_thread
-def survey(flights, tape, base=EffectSet(), config=None, progress=lambda: None):
+def survey(flights, tape, base=EffectSet(), config=None, marks=(), progress=lambda: None):
     """Result of Flights with the anchors that a Tape speaks of.
 
-    base : EffectSet that is in the model already; config : FilterConfig. Ground truth is not used. Raises InputError for
+    base : EffectSet that is in the model already; config : FilterConfig; marks : Marks. Ground truth is not used. Raises InputError for
     flights of different anchors or that are too short, and for a Tape that does not fit.
     """
     same_anchors(flights)
@@ -29,5 +29,6 @@ def survey(flights, tape, base=EffectSet(), config=None, progress=lambda: None):
     if rows:
         start = place(flights, rows, config)
         start_std[rows], std[rows] = PLACED_STD, NOTHING_KNOWN
-    found = self_survey.survey([replace(flight, anchors=start) for flight in flights], start_std, base, config, progress=progress)
+    moved = [replace(flight, anchors=start) for flight in flights]
+    found = self_survey.survey(moved, start_std, base, config, marks, progress=progress)
     return Result(given, std, found, tuple(flight.name for flight in flights))
