@@ -17,6 +17,7 @@ then: python3 crazyflie_node.py --ros-args -r __ns:=/cf1
 import sys
 
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from uwb_tdoa_msgs.msg import Tdoa
@@ -62,7 +63,7 @@ def main():
         node.create_subscription(LogDataGeneric, topic, lambda message, block=block: on_block(message, block), 100)
     try:
         rclpy.spin(node)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ExternalShutdownException):
         pass
     rclpy.try_shutdown()
 

@@ -1,6 +1,7 @@
 """Log variables of a Crazyflie, sampled and late, to streams; and the example node around that."""
 
 from dataclasses import replace
+import json
 import subprocess
 import sys
 
@@ -104,3 +105,83 @@ def test_the_example_says_what_is_missing():
     if "crazyflie_interfaces" not in done.stderr:
         pytest.skip("crazyswarm2 is installed")
     assert done.returncode == 1 and done.stderr.count("\n") == 1 and "install crazyswarm2" in done.stderr
+
+
+PLAYER = """
+import json, sys, rclpy
+from crazyflie_interfaces.msg import LogDataGeneric
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Imu
+from uwb_tdoa_msgs.msg import Tdoa
+
+rclpy.init()
+node = rclpy.create_node("player")
+tdoas, samples, deep = [], [], QoSProfile(depth=20000)
+node.create_subscription(Tdoa, "uwb/tdoa", tdoas.append, deep)
+node.create_subscription(Imu, "imu/data", samples.append, deep)
+topics = [node.create_publisher(LogDataGeneric, name, deep) for name in ("tdoa_a", "tdoa_b", "imu")]
+while not all(topic.get_subscription_count() for topic in topics):
+    rclpy.spin_once(node, timeout_sec=0.1)
+seconds = lambda stamp: stamp.sec + 1e-9 * stamp.nanosec
+for number, (arrival, block, timestamp, values) in enumerate(json.load(open(sys.argv[1]))):
+    message = LogDataGeneric(timestamp=timestamp, values=values)
+    message.header.stamp.sec, message.header.stamp.nanosec = int(arrival), int(1e9 * (arrival % 1.0))
+    topics[block].publish(message)
+    before = len(samples)
+    while block == 2 and len(samples) == before:  # in order over all topics: the next goes when this has come back
+        rclpy.spin_once(node, timeout_sec=30.0)
+    rclpy.spin_once(node, timeout_sec=0.002)
+for _ in range(50):
+    rclpy.spin_once(node, timeout_sec=0.05)
+rows = [(seconds(m.header.stamp), m.anchor_a, m.anchor_b, m.distance_difference) for m in tdoas]
+print(json.dumps({"tdoas": rows, "samples": [(seconds(m.header.stamp), m.linear_acceleration.z) for m in samples]}))
+"""
+CMAKE = """
+cmake_minimum_required(VERSION 3.8)
+project(crazyflie_interfaces)
+find_package(ament_cmake REQUIRED)
+find_package(rosidl_default_generators REQUIRED)
+find_package(std_msgs REQUIRED)
+rosidl_generate_interfaces(${PROJECT_NAME} msg/LogDataGeneric.msg DEPENDENCIES std_msgs)
+ament_package()
+"""
+
+
+@pytest.mark.slow
+def test_the_example_over_topics_gives_what_the_converter_gives(flight, tmp_path):
+    """With a LogDataGeneric as crazyswarm2 defines it, built for the test."""
+    pytest.importorskip("rclpy")
+    pytest.importorskip("colcon_core")
+    package = tmp_path / "src" / "crazyflie_interfaces"
+    (package / "msg").mkdir(parents=True)
+    (package / "msg" / "LogDataGeneric.msg").write_text("std_msgs/Header header\nuint32 timestamp\nfloat32[] values\n")
+    (package / "CMakeLists.txt").write_text(CMAKE)
+    ours = (ROOT / "src" / "uwb_tdoa_msgs" / "package.xml").read_text()
+    without = "".join(line for line in ours.splitlines(True) if "geometry_msgs" not in line)
+    (package / "package.xml").write_text(without.replace("uwb_tdoa_msgs", "crazyflie_interfaces"))
+    build = [sys.executable, "-m", "colcon", "--log-base", "log", "build", "--merge-install"]
+    build += ["--cmake-args", f"-DPython3_EXECUTABLE={sys.executable}"]
+    subprocess.run(build, cwd=tmp_path, check=True, capture_output=True)
+    short, link = replace(flight, tdoa=_until(flight.tdoa, 4.0), imu=_until(flight.imu, 4.0)), Link()
+    sent = [
+        (arrival, number, int(timestamp), values.tolist())
+        for arrival, number, timestamp, values in messages(short, link, np.random.default_rng(0))
+    ]
+    (tmp_path / "sent.json").write_text(json.dumps(sent))
+    (tmp_path / "player.py").write_text(PLAYER)
+    script = f"source install/local_setup.bash; {sys.executable} {ROOT / 'docs/connect/crazyflie_node.py'} & node=$!; "
+    script += f"{sys.executable} player.py sent.json; kill -INT $node; wait $node"
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.stderr == ""
+    got, expected = json.loads(done.stdout), streamed(short, link)
+    t, a, b, d = (np.array(column) for column in zip(*sorted(got["tdoas"])))
+    assert len(t) == len(expected.tdoa) and len(got["samples"]) == len(expected.imu)
+    # Topics overtake each other by a few messages, over which the clock drifts by microseconds.
+    np.testing.assert_allclose(np.sort(t), np.sort(expected.tdoa.t), atol=1e-4)
+    np.testing.assert_allclose(np.sort(d), np.sort(expected.tdoa.d), atol=1e-9)
+    assert np.mean([z for _, z in got["samples"]]) == pytest.approx(expected.imu.accel[:, 2].mean(), abs=1e-6)
+
+
+def _until(stream, length):
+    rows = stream.t < stream.t[0] + length
+    return type(stream)(*(column[rows] for column in vars(stream).values()))
