@@ -85,7 +85,7 @@ def test_an_anchor_of_which_nothing_is_known_is_placed(flights):
     np.testing.assert_array_equal(np.delete(placed, 5, axis=0), np.delete(true, 5, axis=0))
 
 
-def marks_file(path, flight, places=3, **changes):
+def marks_file(path, flight, places=3, changes=()):
     """Marks of the ground truth of a Flight, 2 s each, within a millimetre."""
     begin, truth, marks = flight.tdoa.t[0], flight.truth, []
     for first in np.linspace(5.0, 30.0, places):
@@ -120,7 +120,7 @@ def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
 )
 def test_marks_that_cannot_be_are_refused(flights, tmp_path, changes, words):
     with pytest.raises(InputError, match=words):
-        read_marks(marks_file(tmp_path / "marks.yaml", flights[0], **changes), flights)
+        read_marks(marks_file(tmp_path / "marks.yaml", flights[0], changes=changes), flights)
 
 
 def test_words_name_what_is_better_and_what_is_not(result):
