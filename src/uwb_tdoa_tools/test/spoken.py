@@ -6,7 +6,7 @@ from pathlib import Path
 SRC = Path(__file__).resolve().parents[2]
 FOLDERS = ("uwb_tdoa_bias/uwb_tdoa_bias", "uwb_tdoa_ekf/uwb_tdoa_ekf")
 LEVELS = {"WARN", "ERROR"}
-SAYING = {"trouble", "unknown_frame", "_sentence", "_axis_alarms", "judge"}  # functions that give sentences
+SAYING = {"trouble", "several_publishers", "unknown_frame", "_sentence", "_axis_alarms", "judge"}  # functions that give sentences
 LEAST = 8  # characters that tell one sentence from another
 
 
