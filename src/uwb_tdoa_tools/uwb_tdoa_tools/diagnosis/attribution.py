@@ -14,7 +14,8 @@ from .findings import Finding, Refused
 from .regression.confounding import alternatives
 from .regression.fit import fit
 from .regression.held_out import held_out
-from .regression.select import Selection, select, worth
+from .regression.scan import Scan
+from .regression.select import LARGE, Selection, select, with_rivals, worth
 from .regression.table import table_of
 from .regression.terms import Candidate, Term, candidates_of, columns_of
 
@@ -80,11 +81,13 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
             break
         current = current if last else at(model)
     refused = []
-    selection = _that_hold_on_other_data(selection, refused)
+    selection, smooth, scan = _that_hold_on_other_data(selection, refused), [], None
     if undeclared:
-        smooth = _smooth(current, installation)
-        selection = _with_smooth(selection, declared, smooth, search, progress)
+        smooth, scan = _smooth(current, installation), Scan(selection.table, _views(current))
+        selection = _with_smooth(selection, declared, smooth, search, scan, progress)
         selection = _that_hold_on_other_data(selection, refused)
+    selection = with_rivals(selection, declared + smooth, scan, progress)
+    if undeclared:
         selection = _with_maps(selection, smooth, refused)
     remaining = at(effects_of(selection))
     detections = (detector.detect(remaining) for detector in detectors)
@@ -152,13 +155,22 @@ def _declared(found, reference, kinds, installation):
 
 
 def _smooth(found, installation):
-    """[Candidate] of functions of whatever each channel may depend on."""
+    """[Candidate] of functions of whatever each channel may depend on, of all anchors alike or each with its own."""
     out = []
     for name, channel in CHANNELS.items():
         parts = [flight[name] for flight in found if name in flight]
         for term in channel.smooth_terms(parts) if parts else ():
-            out += candidates_of(term, *installation)
+            out += candidates_of(term, *installation)[:1]
     return out
+
+
+def _views(found):
+    """{channel: [View]} of what a part of each channel may depend on."""
+    return {
+        name: channel.views([flight[name] for flight in found if name in flight])
+        for name, channel in CHANNELS.items()
+        if any(name in flight for flight in found)
+    }
 
 
 def _linearised(found, candidates, model):
@@ -186,16 +198,17 @@ def _inflation(table, declared, detectors):
     return model.inflation
 
 
-def _with_smooth(selection, declared, smooth, search, progress):
+def _with_smooth(selection, declared, smooth, search, scan, progress):
     """The selection carried on with functions without a name; or begun anew with them, if that explains more: the declared
-    effect was a stopgap."""
+    effect, or the large group of parameters, was a stopgap."""
+
     everything = smooth + declared
     table = selection.table.with_terms([term for candidate in smooth for term in candidate.terms])
     progress()
     inflation = selection.fit.inflation
-    after = select(table, everything, inflation, search, start=selection.chosen, progress=progress)
-    if selection.chosen and any(not candidate.declared for candidate in after.chosen):
-        anew = select(table, everything, inflation, search, progress=progress)
+    after = select(table, everything, inflation, search, scan, selection.chosen, progress)
+    if selection.chosen and any(not candidate.declared or len(candidate.columns) > LARGE for candidate in after.chosen):
+        anew = select(table, everything, inflation, search, scan, progress=progress)
         after = max(after, anew, key=lambda each: worth(each, len(everything)))
     return after
 
