@@ -6,8 +6,9 @@ from pathlib import Path
 SRC = Path(__file__).resolve().parents[2]
 FOLDERS = ("uwb_tdoa_bias/uwb_tdoa_bias", "uwb_tdoa_ekf/uwb_tdoa_ekf")
 LEVELS = {"WARN", "ERROR"}
-SAYING = {"trouble", "several_publishers", "unknown_frame", "_sentence", "_axis_alarms", "judge"}  # functions that give sentences
-LEAST = 8  # characters that tell one sentence from another
+# functions that give sentences
+SAYING = {"trouble", "unknown_frame", "several_publishers", "_sentence", "_axis_alarms", "judge"}
+LEAST = 7  # characters that tell one sentence from another
 
 
 def sentences():
@@ -19,6 +20,18 @@ def sentences():
             for text in map(_fixed, _texts(ast.parse(path.read_text()))):
                 if len(text) > LEAST:
                     found[text] = path.name
+    return found
+
+
+def rules():
+    """Names of all Findings, of the streams and of `check`."""
+    found = set()
+    for folder in ("uwb_tdoa_ekf/uwb_tdoa_ekf/streams", "uwb_tdoa_tools/uwb_tdoa_tools/checking"):
+        for path in (SRC / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Call) and _name(node.func) in ("Finding", "_says") and node.args:
+                    if isinstance(node.args[0], ast.Constant):
+                        found.add(node.args[0].value)
     return found
 
 
@@ -44,7 +57,7 @@ def _name(node):
 
 
 def _fixed(node):
-    """The beginning of a text up to its colon; of one that begins with a value the longest part that is always there."""
+    """The beginning of a text up to its colon; of one that begins with a value the longest part that stays."""
     parts = node.values if isinstance(node, ast.JoinedStr) else [node]
     texts = [part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else "" for part in parts]
     begin = texts[0].partition(":")[0]
