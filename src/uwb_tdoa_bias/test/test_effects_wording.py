@@ -4,7 +4,7 @@ from hypothesis import assume, given, strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import EFFECTS, SmoothTerm
+from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_IMU, OF_TDOA, UNITS
 from uwb_tdoa_bias.effects.wording import counted, listed, measured, significant
 from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -130,10 +130,6 @@ def test_an_effect_without_a_sentence_of_its_own_is_advised_on_by_its_physics():
 
     (sentence,) = Rust({3: 0.31, 1: 0.001}, {3: 0.01, 1: 0.002}).advice()
     assert sentence == "Look for the cause of rust: rusty connectors (found: 3 = 0.31 ± 0.01, in m)."
-
-
-def test_a_function_without_a_name_leaves_nothing_to_do():
-    assert SmoothTerm({"c0": 0.3}, {"c0": 0.01}, knots=(0.0, 1.0)).advice() == ()
 
 
 def test_every_covariate_has_a_unit():

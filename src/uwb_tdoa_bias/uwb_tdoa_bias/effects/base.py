@@ -95,6 +95,10 @@ class Effect:
     @property
     def label(self):
         """What reports call it."""
+        return self.label_of(self.values)
+
+    def label_of(self, keys):
+        """What reports call it if it has the parameters `keys` alone."""
         return self.name
 
     @property

@@ -28,6 +28,7 @@ OF_TDOA = {
     "climb_rate": lambda s: None if s.motion is None else s.motion.velocity[:, 2],
     "acceleration": lambda s: None if s.motion is None else _norm(s.motion.acceleration),
     "turning_rate": lambda s: None if s.motion is None else _norm(s.motion.rate),
+    "tilt": lambda s: np.arccos(np.clip(1.0 - 2.0 * (s.q[:, 0] ** 2 + s.q[:, 1] ** 2), -1.0, 1.0)),
     "interval": lambda s: s.interval,
     "previous_anchor": lambda s: s.previous,
     "vibration": lambda s: s.vibration,
@@ -64,7 +65,7 @@ OF_IMU = (
 
 UNITS = {
     "time": "s", "x": "m", "y": "m", "height": "m", "speed": "m/s", "climb_rate": "m/s", "acceleration": "m/s^2",
-    "turning_rate": "rad/s", "interval": "s", "previous_anchor": "id", "vibration": "m/s^2", "range": "m",
+    "turning_rate": "rad/s", "tilt": "rad", "interval": "s", "previous_anchor": "id", "vibration": "m/s^2", "range": "m",
     **dict.fromkeys((name for name in OF_ARRIVAL if name != "range"), "rad"),
     **dict.fromkeys((name for name in OF_IMU if name.startswith("rate_")), "rad/s"),
     **dict.fromkeys((name for name in OF_IMU if name.startswith("accel")), "m/s^2"),

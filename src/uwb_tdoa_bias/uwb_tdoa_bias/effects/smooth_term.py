@@ -11,33 +11,41 @@ from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
 from .base import Effect, known_anchors, once_per_anchors, tile
 from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_TDOA, sensor_covariate
+from .shapes import SHAPES, functions
+from .smooth_words import sentences
 
 DEGREE = 2
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
 AID_CHANNELS = ("height", "pressure", *(f"velocity.{axis}" for axis in "xyz"))
-FORMS = ("common", "arrival", "anchor")
+FORMS = ("common", "arrival", "anchor", "pair", "direction")
+OF_LINKS = ("pair", "direction")  # forms with a function for a pair of anchors
+TYPICAL = {"tdoa": 0.1, "gyro": 0.1, "accel": 0.5}  # m, rad/s, m/s^2
+ALONE = 0.3  # m, of what few have
 OLD_NAMES = {"force": "accel", **{f"force_{axis}": f"accel_{axis}" for axis in "xyz"}}  # of covariates, until 0.3
 
 
 @dataclass
 class SmoothTerm(Effect):
-    """A quadratic B-spline of one covariate, held constant beyond its knots; `values` are its coefficients c0, c1, ...
+    """A function of one covariate, held constant beyond its knots; `values` are its coefficients c0, c1, ...
 
     channel : "tdoa", "gyro.x" ... "accel.z", or of AID_CHANNELS
     covariate : a name of covariates.OF_TDOA, or for "tdoa" of OF_ARRIVAL, for the inertial channels of OF_IMU
     form : for "tdoa" only: "common", the same f(covariate) on every d_ab; "arrival", f of each anchor's own
-        covariate, as d_ab = f_b - f_a; "anchor", the same with a function for each anchor, coefficients "3.c0", ...
+        covariate, as d_ab = f_b - f_a; "anchor", the same with a function for each anchor, coefficients "3.c0", ...;
+        "pair": f on d_ab and -f on d_ba, coefficients "0-1.c0", ...; "direction": f on d_ab alone
     knots : where the pieces meet, ends included, rising; for a covariate of names: the names, one coefficient each
+    shape : "spline", quadratic, or one of `shapes.SHAPES`
     """
 
     channel: str = "tdoa"
     covariate: str = "time"
     form: str = "common"
     knots: tuple = field(default_factory=tuple)
+    shape: str = "spline"
 
     name: ClassVar[str] = "smooth_term"
     price: ClassVar[float] = 6.0  # of having no name: of equals, a declared effect is preferred
-    settings: ClassVar[tuple] = ("channel", "covariate", "form", "knots")
+    settings: ClassVar[tuple] = ("channel", "covariate", "form", "knots", "shape")
     unit: ClassVar[str] = "m, rad/s or m/s^2"
     bound: ClassVar[float] = 100.0
     negligible: ClassVar[float] = 0.0
@@ -63,6 +71,15 @@ class SmoothTerm(Effect):
             raise InputError(
                 f"effects: smooth_term: no {self.form!r} function of {self.covariate!r} acts on {self.channel!r}."
             )
+        if self.shape != "spline" and SHAPES.get(self.shape, (0,))[0] != len(self.knots):
+            known = ", ".join(f"{shape} ({count})" for shape, (count, _) in SHAPES.items())
+            raise InputError(
+                f"effects: smooth_term: shape: {self.shape!r} with {len(self.knots)} knots is not spline or one of {known}."
+            )
+        if self.form in OF_LINKS and self.covariate in OF_ARRIVAL:
+            raise InputError(
+                f"effects: smooth_term: form: {self.form} acts on both anchors, {self.covariate} is of one; write form: anchor."
+            )
         super().__post_init__()
 
     @classmethod
@@ -74,22 +91,24 @@ class SmoothTerm(Effect):
         if not key.rpartition(".")[2].removeprefix("c").isdigit():
             raise InputError(f"effects: smooth_term: parameter {key!r} is not a coefficient such as c0 or 3.c0.")
 
-    @classmethod
-    def typical_of(cls, key):
-        return 0.5 * cls.typical if "." in key else cls.typical  # a function for each anchor: many, hence small
+    def typical_of(self, key):
+        if self.shape != "spline" or self.form in OF_LINKS:
+            return ALONE if self.channel == "tdoa" else TYPICAL.get(self.channel.partition(".")[0], self.typical)
+        return 0.5 * self.typical if "." in key else self.typical  # a function for each anchor: many, hence small
 
     @property
     def channels(self):
         """Where it acts."""
         return (self.channel.partition(".")[0],)
 
-    @property
-    def label(self):
-        return f"{self.channel} over {self.covariate}"
+    def label_of(self, keys):
+        parts = list(dict.fromkeys(key.rpartition(".")[0] for key in keys))
+        of = f" of {self.form} {parts[0]}" if len(parts) == 1 and parts[0] else ""
+        return f"{self.channel}{of} over {self.covariate}"
 
     @property
     def uses_attitude(self):
-        return self.covariate.endswith("_in_tag")
+        return self.covariate.endswith("_in_tag") or self.covariate == "tilt"
 
     @property
     def needs_motion(self):
@@ -104,21 +123,26 @@ class SmoothTerm(Effect):
 
     def keys(self, anchors=None):
         """All coefficients: of every anchor for the form "anchor"."""
-        each = tuple(f"c{k}" for k in range(self._count))
-        return tuple(f"{i}.{c}" for i in known_anchors(anchors) for c in each) if self.form == "anchor" else each
+        return self.keys_of(known_anchors(anchors)) if self.form == "anchor" else self.keys_of(("",))
+
+    def keys_of(self, parts):
+        """All coefficients of some anchors "3" or pairs "0-1": tuple."""
+        return tuple(f"{part}.c{k}".lstrip(".") for part in parts for k in range(self.count))
 
     def basis(self, values):
         """The functions that the coefficients c0, c1, ... multiply, at covariate values (n,): (n, k), NaN stays NaN."""
         values = np.asarray(values, dtype=float)
+        if self.shape != "spline":
+            return functions(self.shape, self.knots, values)
         if self.covariate in CATEGORIES:
             return (values[:, None] == self._at).astype(float)
-        out = np.zeros((len(values), self._count))
+        out = np.zeros((len(values), self.count))
         _basis(self._at, values, out)
         return out
 
     def curve(self, values, prefix=""):
         """The function at covariate values (n,): (n,). prefix : "3." for that of anchor 3 of the form "anchor"."""
-        weights = np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self._count)]])
+        weights = np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)]])
         return self._functions(values, weights, np.zeros(len(values), dtype=np.int64))
 
     @cached_property
@@ -126,12 +150,15 @@ class SmoothTerm(Effect):
         return np.array(self.knots, dtype=float)
 
     @property
-    def _count(self):
+    def count(self):
+        """Coefficients of each function."""
+        if self.shape != "spline":
+            return SHAPES[self.shape][1]
         return len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
 
     def _functions(self, values, weights, rows):
         """Functions with weights (m, k) at values (n,), each that of its row (n,): (n,)."""
-        if self.covariate in CATEGORIES:
+        if self.shape != "spline" or self.covariate in CATEGORIES:
             return np.einsum("nk,nk->n", self.basis(values), weights[rows])
         out = np.empty(len(values))
         _curves(self._at, np.asarray(values, dtype=float), weights, rows, out)
@@ -141,7 +168,7 @@ class SmoothTerm(Effect):
     def _weights(self, anchors):
         """Coefficients of every anchor's function, (m, k); zero for an anchor without one."""
         prefixes = [f"{i}." if self.form == "anchor" else "" for i in known_anchors(anchors)]
-        return np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self._count)] for prefix in prefixes])
+        return np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)] for prefix in prefixes])
 
     def _covariate(self, samples):
         """(values per TDOA or None, values per arrival or None)"""
@@ -160,8 +187,18 @@ class SmoothTerm(Effect):
             return np.zeros(n)
         if self.form == "common":
             return self.curve(values)
+        if self.form in OF_LINKS:
+            links = dict.fromkeys(key.rpartition(".")[0] for key in self.values)
+            return sum((self._of_link(samples, link) * self.curve(values, f"{link}.") for link in links), np.zeros(n))
         late = self._functions(both, self._weights(samples.anchors), np.concatenate([samples.a, samples.b]))
         return late[n:] - late[:n]
+
+    def _of_link(self, samples, link):
+        """By how much the function of the pair "0-1" counts in each d_ab: (n,) 1, -1 or 0."""
+        ids, (first, second) = samples.anchors.ids, map(int, link.split("-"))
+        a, b = ids[samples.a], ids[samples.b]
+        forth = 1.0 * ((a == first) & (b == second))
+        return forth - ((a == second) & (b == first)) if self.form == "pair" else forth
 
     def sensor_bias(self, channel, features):
         if channel not in self.channels or not self.usable:
@@ -193,6 +230,10 @@ class SmoothTerm(Effect):
             return out
         if self.form == "common":
             return self.basis(values)[:, [int(key[1:]) for key in keys]]
+        if self.form in OF_LINKS:
+            basis = self.basis(values)
+            parts = [(basis[:, int(c[1:])], link) for link, _, c in (key.rpartition(".") for key in keys)]
+            return np.stack([part * self._of_link(samples, link) for part, link in parts], axis=1)
         basis, ids = self.basis(both), samples.anchors.ids[np.concatenate([samples.a, samples.b])]
         for column, key in enumerate(keys):
             anchor, _, c = key.rpartition(".")
@@ -207,7 +248,7 @@ class SmoothTerm(Effect):
         return [keys, *alone] if self.form == "anchor" else [keys]
 
     def advice(self):
-        return ()  # without a name there is nothing to look for
+        return sentences(self)
 
 
 @compiled
