@@ -14,6 +14,7 @@ from .findings import Finding, Refused
 from .regression.confounding import alternatives
 from .regression.fit import fit
 from .regression.held_out import held_out
+from .regression.scan import Scan
 from .regression.select import Selection, select, worth
 from .regression.table import table_of
 from .regression.terms import Candidate, Term, candidates_of, columns_of
@@ -83,7 +84,7 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
     selection = _that_hold_on_other_data(selection, refused)
     if undeclared:
         smooth = _smooth(current, installation)
-        selection = _with_smooth(selection, declared, smooth, search, progress)
+        selection = _with_smooth(selection, declared, smooth, search, Scan(selection.table, _views(current)), progress)
         selection = _that_hold_on_other_data(selection, refused)
         selection = _with_maps(selection, smooth, refused)
     remaining = at(effects_of(selection))
@@ -161,6 +162,15 @@ def _smooth(found, installation):
     return out
 
 
+def _views(found):
+    """{channel: [View]} of what a part of each channel may depend on."""
+    return {
+        name: channel.views([flight[name] for flight in found if name in flight])
+        for name, channel in CHANNELS.items()
+        if any(name in flight for flight in found)
+    }
+
+
 def _linearised(found, candidates, model):
     """Table with the columns of all candidates about `model`, whose contribution is put back: a fit gives whole values, not
     increments."""
@@ -186,16 +196,20 @@ def _inflation(table, declared, detectors):
     return model.inflation
 
 
-def _with_smooth(selection, declared, smooth, search, progress):
+def _with_smooth(selection, declared, smooth, search, scan, progress):
     """The selection carried on with functions without a name; or begun anew with them, if that explains more: the declared
     effect was a stopgap."""
+
+    def both(table, model, chosen):
+        return search(table, model, chosen) + scan(table, model, chosen)
+
     everything = smooth + declared
     table = selection.table.with_terms([term for candidate in smooth for term in candidate.terms])
     progress()
     inflation = selection.fit.inflation
-    after = select(table, everything, inflation, search, start=selection.chosen, progress=progress)
+    after = select(table, everything, inflation, both, scan.bold, selection.chosen, progress)
     if selection.chosen and any(not candidate.declared for candidate in after.chosen):
-        anew = select(table, everything, inflation, search, progress=progress)
+        anew = select(table, everything, inflation, both, scan.bold, progress=progress)
         after = max(after, anew, key=lambda each: worth(each, len(everything)))
     return after
 

@@ -98,6 +98,10 @@ class Channel:
         """SmoothTerms without values: whatever the ChannelResiduals of some flights may depend on."""
         return []
 
+    def views(self, residuals):
+        """[View] of the rows of the ChannelResiduals of some flights: whatever a part of them may depend on."""
+        return []
+
     def health(self, residuals):
         """{"pairs", "anchors", "axes" or "cross_correlation": [dict of figures]} of the ChannelResiduals of some flights."""
         return {}

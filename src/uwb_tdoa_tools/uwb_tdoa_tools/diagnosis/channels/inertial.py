@@ -13,6 +13,7 @@ from .base import Channel, ChannelResidual, Rows
 from .figures import figures
 from .knots import knots_of
 from .pairs import APART
+from .views import views_of_axes
 
 CELL = 0.25  # s over which both sides of a residual are averaged
 OF_POSE = ("x", "y", "height", "speed", "climb_rate", "acceleration")  # covariates that TDOAs have too
@@ -52,6 +53,12 @@ class Inertial(Channel):
             if knots is not None:
                 out += [SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots) for axis in self.axes]
         return out
+
+    def views(self, residuals):
+        channels, names = [f"{self.name}.{axis}" for axis in self.axes], (*OF_IMU, *OF_POSE)
+        parts = [part.samples for part in residuals]
+        values = {name: np.concatenate([np.tile(sensor_covariate(name, one), 3) for one in parts]) for name in names}
+        return views_of_axes(channels, values, np.concatenate([np.repeat(np.arange(3), len(one)) for one in parts]))
 
     def health(self, residuals):
         t = np.concatenate([part.samples.t + APART * number for number, part in enumerate(residuals)])

@@ -18,9 +18,11 @@ from uwb_tdoa_ekf.sensitivity import Innovations
 from . import pairs
 from .base import Channel, ChannelResidual, Rows
 from .knots import knots_of
+from .views import views_of_pairs
 
 CELL = 0.5  # s
 OUTLIER = 4.0  # spreads within a cell
+QUICK = ("interval", *CATEGORIES)  # covariates that change from one TDOA to the next
 WILD = 20.0  # m; a larger residual is no measurement
 
 
@@ -142,6 +144,27 @@ class Tdoa(Channel):
             if knots is not None:
                 out += [SmoothTerm(covariate=name, form=form, knots=knots) for form in ("arrival", "anchor")]
         return out
+
+    def views(self, residuals):
+        if any(part.innovations is not None for part in residuals):
+            return []  # what the path follows is not left in them
+        cells = [part.cells for part in residuals]
+        ends = [np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)]) for part in residuals]
+        of_tdoa, of_arrival, quick = {}, {}, {}
+        for name in OF_TDOA:
+            values = [OF_TDOA[name](part.samples) for part in residuals]
+            if all(v is not None for v in values) and name in QUICK:
+                quick[name] = np.concatenate([v[cell.chosen] for cell, v in zip(cells, values)])
+            elif all(v is not None for v in values):
+                of_tdoa[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, values)])
+        for name, function in OF_ARRIVAL.items():
+            both = [_of_arrivals(function, part.samples) for part in residuals]
+            means = [[cell.mean(v) for v in values] for cell, values in zip(cells, both)]
+            of_arrival[name] = np.concatenate(means, axis=1)
+        slow = views_of_pairs(*np.concatenate(ends, axis=1), of_tdoa, of_arrival)
+        first = np.cumsum([0, *(len(cell.size) for cell in cells)])
+        cell = np.concatenate([cell.group + start for cell, start in zip(cells, first)])
+        return slow + views_of_pairs(*np.concatenate(ends, axis=1)[:, cell], quick, {}, cell)
 
     def health(self, residuals):
         return pairs.health(residuals)

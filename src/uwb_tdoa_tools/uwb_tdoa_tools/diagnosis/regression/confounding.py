@@ -48,7 +48,7 @@ def alternatives(selection, candidate, candidates):
     """[Alternative] of a chosen Candidate, the nearest first: `candidates`, all declared ones, that explain at least ALIKE
     of what it contributes beyond the rest of the model, and rivals whose criterion is as good."""
     rivals = selection.rivals[selection.chosen.index(candidate)]
-    gaps = {rival.candidate.name: rival.gap for rival in rivals if rival.candidate.declared}
+    gaps = {rival.candidate.title: rival.gap for rival in rivals}
     shares = _shares(selection, candidate, candidates)
     names = sorted({*gaps, *shares}, key=lambda name: (gaps.get(name, np.inf), -shares.get(name, 0.0)))
     return [

@@ -33,6 +33,12 @@ class Fit:
         """What each row of the Table counts for, (n,), in independent rows per squared unit."""
         return self.weight / (self.scale**2 * self.inflation)[table.channel]
 
+    def likelihood(self, table):
+        """Twice the log-likelihood of Student's t, in independent rows, less what the prior says of beta."""
+        scale = self.scale[table.channel]
+        rows = 2.0 * np.log(scale) + (NU + 1.0) * np.log1p((self.residual / scale) ** 2 / NU)
+        return -float(np.sum(rows / self.inflation[table.channel]) + np.sum((self.beta / prior_sizes(self.columns)) ** 2))
+
     def values(self, columns):
         """beta of some Columns, (k,)."""
         place = {column: k for k, column in enumerate(self.columns)}

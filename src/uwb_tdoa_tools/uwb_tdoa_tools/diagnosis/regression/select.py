@@ -18,6 +18,7 @@ from .terms import columns_of
 MAX_STEPS = 14
 LEAST_DETERMINED = 0.3  # parameters that the data must tell of a candidate
 AMBIGUOUS = 10.0  # less difference in the criterion is no decision
+ALIKE = 0.1  # share of the criterion by which a function may be worse than another one that it is much like
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,12 @@ class Selection:
         return replace(self, chosen=chosen, fit=model, loss=(*self.loss, 0.0), rivals=(*self.rivals, ()))
 
 
-def select(table, candidates, inflation, search=None, start=(), progress=lambda: None):
+def select(table, candidates, inflation, search=None, bold=None, start=(), progress=lambda: None):
     """Selection among `candidates`, whose columns the Table holds.
 
-    search(table, fit, chosen) -> more Candidates, found for this residual. start : Candidates that are in the model to
-    begin with, and may fall out again. progress() is called now and then.
+    search(table, fit, chosen) -> more Candidates, found for this residual; bold : the same, of which each is fitted, because
+    the weights of the present fit, which takes what they explain for outliers, would not do it justice. start : Candidates
+    that are in the model to begin with, and may fall out again. progress() is called now and then.
     """
     chosen = list(start)
     model = fit(table, columns_of(chosen), inflation)
@@ -66,6 +68,9 @@ def select(table, candidates, inflation, search=None, start=(), progress=lambda:
         found = search(table, model, chosen) if search else []
         wider = table.with_terms([term for candidate in found for term in candidate.terms])
         ranked = rank(wider, candidates + found, chosen, model)
+        for candidate in bold(table, model, chosen) if bold else []:
+            ranked.append((_fitted(table, chosen, model, candidate, len(candidates)), candidate))
+        ranked.sort(key=lambda item: -item[0])
         progress()
         if not ranked or ranked[0][0] <= 0.0:
             break
@@ -76,7 +81,21 @@ def select(table, candidates, inflation, search=None, start=(), progress=lambda:
         chosen, model = _backward(table, chosen, model, len(candidates))
     loss = _losses(table, chosen, model, len(candidates))
     progress()
-    return Selection(table, tuple(chosen), model, tuple(loss), _rivals(table, candidates, chosen, model, progress))
+    rivals = _rivals(table, candidates, search, chosen, model, progress)
+    return Selection(table, tuple(chosen), model, tuple(loss), rivals)
+
+
+def _fitted(table, chosen, model, candidate, choices):
+    """Criterion of one Candidate more, by the likelihoods of both fits; minus infinity for what nobody would model."""
+    table = table.with_terms(candidate.terms)
+    wider = fit(table, columns_of([*chosen, candidate]), model.inflation)
+    if not acceptable(table, candidate, wider.values(candidate.columns)):
+        return -np.inf
+    scorer = Scorer(table, columns_of(chosen), wider, candidate.columns)
+    judged = scorer.judge(candidate.columns)
+    if judged is None:  # the model holds it
+        return -np.inf
+    return wider.likelihood(table) - model.likelihood(table) - scorer.price(candidate, judged.determined, choices)
 
 
 def worth(selection, choices):
@@ -93,13 +112,15 @@ def worth(selection, choices):
 
 
 def rank(table, candidates, chosen, model):
-    """[(criterion, Candidate)], best first; without those of negligible or impossible size."""
+    """[(criterion, Candidate)], best first; without those that are far from worth it, of negligible or of impossible size."""
     scorer, out = Scorer(table, columns_of(chosen), model, columns_of(candidates)), []
     for candidate in candidates:
         judged = scorer.judge(candidate.columns)
-        if judged is None or judged.determined < LEAST_DETERMINED or not acceptable(table, candidate, judged.beta):
+        if judged is None or judged.determined < LEAST_DETERMINED:
             continue
-        out.append((judged.gain - scorer.price(candidate, judged.determined, len(candidates)), candidate))
+        criterion = judged.gain - scorer.price(candidate, judged.determined, len(candidates))
+        if criterion > -AMBIGUOUS and acceptable(table, candidate, judged.beta):
+            out.append((criterion, candidate))
     return sorted(out, key=lambda item: -item[0])
 
 
@@ -144,18 +165,25 @@ def _losses(table, chosen, model, choices):
     return out
 
 
-def _rivals(table, candidates, chosen, model, progress):
-    """For each chosen Candidate, the other effects that could replace it: (Rival, ...)."""
+def _rivals(table, candidates, search, chosen, model, progress):
+    """For each chosen Candidate, the other effects that could replace it, and functions that would do nearly as much:
+    (Rival, ...)."""
     out = []
     for k, candidate in enumerate(chosen):
         others = chosen[:k] + chosen[k + 1 :]
-        rest = fit(table, columns_of(others), model.inflation)
-        ranked = rank(table, [c for c in candidates if c.name != candidate.name] + [candidate], others, rest)
+        rest, found = fit(table, columns_of(others), model.inflation), []
+        if search and not candidate.declared:
+            rest = replace(rest, weight=model.weight, scale=model.scale)  # what it explains is measured, not outliers
+            found = search(table, rest, others)
+        wider = table.with_terms([term for one in found for term in one.terms])
+        several = [c for c in candidates + found if c.title != candidate.title]
+        ranked = rank(wider, [*several, candidate], others, rest)
         own = next((score for score, ranked_one in ranked if ranked_one is candidate), None)
         near = {}
         for score, other in ranked if own is not None else []:
-            if other.name != candidate.name and score > own - AMBIGUOUS:
-                near.setdefault(other.name, Rival(float(own - score), other))
+            least = own - (AMBIGUOUS if other.declared else max(AMBIGUOUS, ALIKE * own))
+            if other is not candidate and score > least and set(other.channels) & set(candidate.channels):
+                near.setdefault(other.title, Rival(float(own - score), other))
         out.append(tuple(near.values()))
         progress()
     return tuple(out)

@@ -53,6 +53,11 @@ class Candidate:
         return self.terms[0].effect.name
 
     @property
+    def title(self):
+        """Name of its effect, or what a function without a name depends on."""
+        return self.name if self.declared else self.label
+
+    @property
     def declared(self):
         """Whether it is in the catalogue, not a function without a name."""
         return not self.terms[0].effect.settings
@@ -60,7 +65,7 @@ class Candidate:
     @property
     def label(self):
         """How it is called in reports."""
-        labels = [term.effect.label for term in self.terms]
+        labels = [term.effect.label_of(term.keys) for term in self.terms]
         return labels[0] + "".join(f" + {term.effect.covariate}" for term in self.terms[1:])
 
     def plausible(self, beta):

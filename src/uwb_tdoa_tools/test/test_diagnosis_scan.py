@@ -1,0 +1,87 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
+from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.regression.fit import fit
+from uwb_tdoa_tools.diagnosis.regression.scan import Scan
+from uwb_tdoa_tools.diagnosis.regression.table import table_of
+from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+
+TRUTH = GroundTruth()
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return clean_flight(106, 40.0)
+
+
+def scanned(flight):
+    """(Table, Fit of nothing, Scan) of a flight."""
+    found = [residuals(flight, TRUTH, EffectSet())]
+    table = table_of(found)
+    views = {name: channel.views([found[0][name]]) for name, channel in CHANNELS.items() if name in found[0]}
+    return table, fit(table, [], np.ones(len(table.channels))), Scan(table, views)
+
+
+def put_in(form, key, covariate, knots, shape, size):
+    return SmoothTerm({f"{key}.c1".lstrip("."): size}, {}, "", "tdoa", covariate, form, knots, shape)
+
+
+TERMS = [
+    put_in("anchor", "3", "x", (-3.0, 0.5, 3.0), "step", 0.3),
+    put_in("pair", "0-1", "time", (0.0, 15.0, 22.0, 40.0), "interval", 0.4),
+    put_in("anchor", "5", "range", (2.0, 8.0), "line", 0.6),
+]
+
+
+@pytest.mark.parametrize("term", TERMS, ids=lambda term: f"{term.form}-{term.covariate}")
+def test_of_thousands_the_right_function_is_proposed_first(flight, term):
+    table, model, scan = scanned(term.inject(flight))
+    first = scan(table, model, ())[0].terms[0]
+    assert (first.effect.form, first.effect.covariate, first.effect.shape) == (term.form, term.covariate, term.shape)
+    assert {key.rpartition(".")[0] for key in first.keys} == {key.rpartition(".")[0] for key in term.values}
+
+
+def test_the_gain_is_that_of_normal_equations_with_the_same_weights(flight):
+    """The closed form of thousands against one, on top of another effect."""
+    effect = effect_of("anchor_delay", True, 1)
+    table, _, scan = scanned(TERMS[2].inject(effect.inject(flight)))
+    chosen = (Candidate((Term(effect, tuple(effect.values)),)),)
+    table = table.with_terms(chosen[0].terms)
+    model = fit(table, chosen[0].columns, np.ones(len(table.channels)))
+    candidate = scan(table, model, chosen)[0]
+    table = table.with_terms(candidate.terms)
+    columns, information = [*chosen[0].columns, *candidate.columns], model.information(table)
+    x, sizes = table.matrix(columns), np.array([column.typical for column in columns])
+
+    def explained(k):
+        gram = (x[:, :k] * information[:, None]).T @ x[:, :k] + np.diag(1.0 / sizes[:k] ** 2)
+        vector = x[:, :k].T @ (information * table.y)
+        return vector @ np.linalg.solve(gram, vector)
+
+    # that of the mean of a cell is not quite the mean of the cell
+    assert scan.gains(table, model, chosen)[0][0] == pytest.approx(explained(3) - explained(1), rel=0.05)
+
+
+def test_what_acts_on_a_few_rows_alone_is_not_taken_for_outliers(flight):
+    imu = flight.imu
+    gyro = imu.gyro.copy()
+    gyro[:, 1] += 0.3 * ((imu.t > 20.0) & (imu.t < 23.0))
+    table, model, scan = scanned(replace(flight, imu=replace(imu, gyro=gyro)))
+    first = scan.bold(table, model, ())[0].terms[0].effect
+    assert (first.channel, first.covariate, first.shape) == ("gyro.y", "time", "interval")
+
+
+def test_a_function_of_one_pair_is_found_added_and_said(flight):
+    attribution = attribute([TERMS[1].inject(flight)], TRUTH)
+    (finding,) = attribution.findings()
+    assert (finding.effect.form, finding.effect.covariate, finding.effect.shape) == ("pair", "time", "interval")
+    assert finding.effect.values["0-1.c1"] == pytest.approx(0.4, abs=0.05)
+    (sentence,) = finding.effect.advice()
+    assert "the TDOA of 0-1 is 0." in sentence and "larger from" in sentence

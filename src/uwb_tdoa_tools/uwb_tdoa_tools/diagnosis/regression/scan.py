@@ -1,0 +1,236 @@
+"""A fast look at thousands of functions that nobody has declared: of one anchor, pair, direction or axis, over one covariate.
+
+Each is a level and one simple shape: a line, a rise beyond or below a point, a step, an interval, a wave. What the residual
+of a fit would gain by each is a score test: the products of a few columns with the residual and with each other, free of what the
+model holds already (Schur complement), give all shapes of a subset and a covariate in closed form. The best few become
+candidates and are judged like all others; they pay for the number that was looked at.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import SmoothTerm
+from uwb_tdoa_bias.effects.covariates import CATEGORIES
+from uwb_tdoa_bias.effects.shapes import SHAPES
+
+from ..channels.views import View
+from .fit import prior_sizes
+from .terms import Candidate, Term, columns_of
+
+BINS = 16  # between whose edges steps, intervals and rises begin and end
+PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of a wave between the ends
+WIDEST = 10  # bins of an interval; a longer one is two steps
+FINER = 9  # places between two bins where a knot is tried again
+FEWEST = 12  # values of a subset
+PROPOSED, BOLD = 24, 6  # functions that are proposed
+HUBER = 3.0  # scales; a larger residual counts as that of a heavy tail, but more than in Student's t
+LEAST_GAIN = 20.0  # twice a log-likelihood
+_ENDS = np.array([(first, last) for first in range(3) for last in (-1, -2, -3)])  # edges between which a line rises
+ANGLES = ("bearing", "bearing_in_tag", "bearing_in_anchor")
+
+
+class _Shapes:
+    """A View as columns x (k, columns) at `rows` of a Table; edges (bins + 1,)."""
+
+    def __init__(self, view, offset, edges):
+        """offset : first row of the channel."""
+        self.view, self.offset, self.edges, self.x = view, offset, edges, 0.0
+        used = np.flatnonzero(np.any([(signs != 0.0) for signs, _ in view.sides], axis=0))
+        for signs, values in view.sides:
+            known = np.where(np.isfinite(values[used]), signs[used], 0.0)
+            self.x = self.x + known[:, None] * _columns(np.nan_to_num(values[used]), edges, view.covariate)
+        if view.cell is not None:
+            used, cell = np.unique(view.cell[used], return_inverse=True)
+            self.x = np.stack([np.bincount(cell, column) for column in self.x.T], axis=1) / np.bincount(cell)[:, None]
+        self.rows = used + offset
+
+
+class Scan:
+    """All shapes of all views of a Table's channels: called as `search` of `select`."""
+
+    def __init__(self, table, views):
+        """views : {channel: [View]}, of the rows of each channel."""
+        groups = {}
+        for channel, some in views.items():
+            for view, edges in ((view, _edges(view)) for view in some):
+                if edges is not None:
+                    kind = len(edges), view.covariate in ANGLES, view.covariate in CATEGORIES
+                    groups.setdefault(kind, []).append(_Shapes(view, table.rows_of(channel).start, edges))
+        self._groups = [_Group(several, WIDEST) for several in groups.values()]
+        self._price = SmoothTerm.price + 2.0 * np.log(max(sum(map(len, groups.values())), 1))
+
+    def __call__(self, table, model, chosen):
+        """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows."""
+        return self._found(table, model, chosen, PROPOSED)
+
+    def bold(self, table, model, chosen):
+        """[Candidate], the best if what looks like outliers is taken for measured: what acts on a few rows."""
+        scale = HUBER * model.scale[table.channel]
+        weight = np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12))
+        return self._found(table, replace(model, weight=weight), chosen, BOLD)
+
+    def _found(self, table, model, chosen, number):
+        found = [self._refined(table, model, chosen, item) for item in self.gains(table, model, chosen)[:number]]
+        return [self._candidate(*item[1:]) for item in _best_first(table, found)]
+
+    def _refined(self, table, model, chosen, item):
+        """An item of `gains` with its inner knots moved by parts of a bin, if that gains more."""
+        gain, shapes, shape, knots, tried = item
+        if len(knots) < 3 or shapes.view.covariate in CATEGORIES:
+            return item
+        coarse = shapes.edges
+        near = [coarse[max(k - 1, 0) : k + 2] for k in np.searchsorted(coarse, knots[1:-1])]
+        edges = np.unique(np.concatenate([coarse[[0, -1]], *(np.linspace(some[0], some[-1], FINER) for some in near)]))
+        group = _Group([_Shapes(shapes.view, shapes.offset, edges)], len(edges))
+        moved = [each for each in group.best(*_held(table, model, chosen)) if each[2] == shape]
+        best = max(moved, key=lambda each: each[0], default=item)
+        return (*best[:4], tried * FINER) if best[0] > gain else item
+
+    def gains(self, table, model, chosen):
+        """[(gain, _Shapes, shape, knots, how many were tried)], the best first after what its coefficients and its search cost: what a
+        Fit of the chosen Candidates would gain, twice a log-likelihood, with the weights that it has."""
+        held = _held(table, model, chosen)
+        found = [item for group in self._groups for item in group.best(*held)]
+        return _best_first(table, found)
+
+    def _candidate(self, shapes, shape, knots, tried):
+        view = shapes.view
+        effect = SmoothTerm(channel=view.channel, covariate=view.covariate, form=view.form, knots=knots, shape=shape)
+        keys = effect.keys_of((view.key,))
+        return Candidate((Term(effect, keys),), self._price + 2.0 * np.log(tried))
+
+
+def _best_first(table, found):
+    costs = {shape: count * np.log(len(table.y)) for shape, (_, count) in SHAPES.items()}
+    return sorted(found, key=lambda item: costs[item[2]] + 2.0 * np.log(item[4]) - item[0])
+
+
+class _Group:
+    """Shapes with as many columns, judged together."""
+
+    def __init__(self, several, widest):
+        """several : [_Shapes]; widest : bins of an interval."""
+        view, edges = several[0].view, several[0].edges
+        self._several, n = several, len(edges) - 1
+        self._bins, self._waves, self._bends = n, len(_periods(edges, view.covariate)), n - 3
+        self._prior = np.array([_prior(shapes.view) for shapes in several])
+        i, j = np.triu_indices(n + 1, 1)
+        good = (i > 0) & ((j == n) | (j - i <= widest))
+        self._from, self._to = i[good], j[good]
+
+    def best(self, held, information, residual):
+        """[(gain, _Shapes, shape, knots, tried)]: the best of each shape of each view, with how many were tried.
+
+        held (n, k): an orthonormal base, weighted, of what the model holds.
+        """
+        products = [_products(shapes, held, information, residual) for shapes in self._several]
+        vector, own = (np.stack([product[k] for product in products]) for k in range(2))
+        n, bends, waves, prior = self._bins, self._bends, self._waves, self._prior[:, None]
+        level, cross = vector[:, :n].sum(axis=1)[:, None], own[:, :, :n].sum(axis=2)
+        power = cross[:, :n].sum(axis=1)[:, None] + prior
+
+        def of_one(first, crossed, square):
+            rest = square + prior - crossed**2 / power
+            return level**2 / power + (first - crossed * level / power) ** 2 / np.maximum(rest, 1e-9 * (square + prior))
+
+        def of_two(first, second):
+            small = np.empty((len(vector), len(first), 3, 3))
+            some = np.empty((len(vector), len(first), 3))
+            places = first, second
+            small[..., 0, 0], some[..., 0] = power, level
+            for k, place in enumerate(places, start=1):
+                small[..., 0, k] = small[..., k, 0] = cross[:, place]
+                some[..., k] = vector[:, place]
+                for other, there in enumerate(places, start=1):
+                    small[..., k, other] = own[:, place, there] + (prior if k == other else 0.0)
+            return np.einsum("svk,svk->sv", some, np.linalg.solve(small, some[..., None])[..., 0])
+
+        single = of_one(vector[:, n:], cross[:, n:], np.diagonal(own, axis1=1, axis2=2)[:, n:])
+        at = n + len(_ENDS) + 2 * bends + np.arange(waves)
+        lines = n + np.arange(len(_ENDS))
+        square = np.zeros((len(vector), n + 1, n + 1))
+        square[:, 1:, 1:] = own[:, :n, :n].cumsum(axis=1).cumsum(axis=2)
+        i, j = self._from, self._to
+        inside = square[:, j, j] - 2.0 * square[:, i, j] + square[:, i, i]
+        total, crossed = (np.pad(np.cumsum(part[:, :n], axis=1), ((0, 0), (1, 0))) for part in (vector, cross))
+        spans = of_one(total[:, j] - total[:, i], crossed[:, j] - crossed[:, i], inside)
+        last, beyond, below = j == n, *np.split(single[:, len(_ENDS) : len(_ENDS) + 2 * bends], 2, axis=1)
+        if self._several[0].view.covariate in CATEGORIES:
+            spans = np.where(j == i + 1, spans, 0.0)
+            return [*self._pick("interval", spans[:, ~last], lambda edges, k: (edges[0], edges[i[~last][k]], edges[j[~last][k]], edges[-1]))]
+        return [
+            *self._pick("line", single[:, : len(_ENDS)], lambda edges, k: edges[_ENDS[k]]),
+            *self._pick("beyond", beyond, lambda edges, k: (edges[0], edges[2 + k], edges[-1])),
+            *self._pick("below", below, lambda edges, k: (edges[0], edges[2 + k], edges[-1])),
+            *self._pick("step", spans[:, last], lambda edges, k: (edges[0], edges[i[last][k]], edges[-1])),
+            *self._pick("interval", spans[:, ~last], lambda edges, k: (edges[0], edges[i[~last][k]], edges[j[~last][k]], edges[-1])),
+            *self._pick("parabola", of_two(lines, at[-1] + waves + 1 + np.arange(len(_ENDS))), lambda edges, k: edges[_ENDS[k]]),
+            *self._pick("wave", of_two(at, at + waves), None),
+        ]
+
+    def _pick(self, shape, gains, knots):
+        """The best of the gains (views, tried) of each view."""
+        if not gains.shape[1]:
+            return
+        best = np.argmax(gains, axis=1)
+        for row in np.flatnonzero(gains[np.arange(len(gains)), best] > LEAST_GAIN):
+            shapes, edges, k = self._several[row], self._several[row].edges, best[row]
+            at = knots(edges, k) if knots else (edges[0], edges[0] + _periods(edges, shapes.view.covariate)[k])
+            yield float(gains[row, k]), shapes, shape, tuple(map(float, at)), gains.shape[1]
+
+
+def _prior(view):
+    """Information that stands for plausible sizes of its functions."""
+    line = SmoothTerm(channel=view.channel, covariate=view.covariate, form=view.form, knots=(0.0, 1.0), shape="line")
+    return line.typical_of("c0") ** -2
+
+
+def _products(shapes, held, information, residual):
+    """Of the columns with the residual (columns,), and with each other (columns, columns) free of what is held."""
+    weighted = shapes.x * information[shapes.rows, None]
+    half = held[shapes.rows].T @ weighted
+    return weighted.T @ residual[shapes.rows], weighted.T @ shapes.x - half.T @ half
+
+
+def _held(table, model, chosen):
+    """(orthonormal base, weighted, of what the chosen Candidates hold (n, k), information (n,), residual (n,))."""
+    information, base = model.information(table), columns_of(chosen)
+    b = table.matrix(base)
+    gram = (b * information[:, None]).T @ b + np.diag(1.0 / prior_sizes(base) ** 2)
+    return b @ np.linalg.cholesky(np.linalg.inv(gram)) if base else b, information, model.residual
+
+
+def _edges(view):
+    """Edges of its bins, quantiles of the covariate; None where it hardly varies."""
+    counted = np.concatenate([values[signs != 0.0] for signs, values in view.sides])
+    counted = counted[np.isfinite(counted)]
+    if len(counted) < FEWEST:
+        return None
+    if view.covariate in CATEGORIES:
+        names = np.unique(counted)
+        return np.concatenate([[names[0] - 1.5, names[0] - 0.5], names + 0.5, [names[-1] + 1.5]])
+    edges = np.unique(np.quantile(counted, np.linspace(0.005, 0.995, BINS + 1)))
+    wide = edges[-1] - edges[0] > 1e-3 * max(abs(edges[0]), abs(edges[-1]), 1e-3)
+    return edges if len(edges) > 2 * len(set(_ENDS[:, 0])) and wide else None
+
+
+def _columns(v, edges, covariate):
+    """Bins, lines, rises beyond and below the inner edges, sines, cosines, squares of the lines: (n, columns)."""
+    low, high = edges[0], edges[-1]
+    held = np.clip(v, low, high)
+    bins = np.eye(len(edges) - 1)[np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)]
+    bends = edges[2:-2]
+    first, last = edges[_ENDS[:, 0]], edges[_ENDS[:, 1]]
+    rise = np.where(last > first, last - first, np.inf)
+    lines = (np.clip(v[:, None], first, np.maximum(first, last)) - first) / rise - 0.5
+    beyond = np.maximum(held[:, None] - bends, 0.0) / (high - bends)
+    below = np.maximum(bends - held[:, None], 0.0) / (bends - low)
+    phase = 2.0 * np.pi * (v[:, None] - low) / _periods(edges, covariate)
+    return np.hstack([bins, lines, beyond, below, np.sin(phase), np.cos(phase), lines**2])
+
+
+def _periods(edges, covariate):
+    if covariate in ANGLES:
+        return 2.0 * np.pi / np.arange(1, 4)
+    return (edges[-1] - edges[0]) / np.array(PERIODS)
