@@ -15,16 +15,19 @@ from ...diagnosis import diagnose
 from ...diagnosis.attribution import attribute
 from ...diagnosis.references import GroundTruth
 from ...scoring.plots import plt
-from . import bank, measured, referenced, undeclared
+from . import bank, blind, measured, referenced, undeclared
 
-PARTS = ("bank", "aids", "no-truth", "undeclared", "injected", "measured", "measured-aids", "references", "speed")
+PARTS = (
+    "bank", "aids", "no-truth", "undeclared", "blind", "injected", "measured", "measured-aids", "references", "speed",
+)  # fmt: skip
 
 
 def add_options(add):
     """The options of the study."""
     add("part", choices=PARTS, help="what to run")
     add("--out", metavar="DIR", type=Path, required=True, help="where to write")
-    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size (default: 5)")
+    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, or cases of blind (default: 5)")
+    add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind (default: %(default)s)")
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
     add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
 
@@ -42,6 +45,7 @@ def run(args):
         "aids": _aids,
         "no-truth": _no_truth,
         "undeclared": _undeclared,
+        "blind": _blind,
         "injected": _injected,
         "measured": _measured,
         "measured-aids": _measured_aids,
@@ -103,6 +107,18 @@ def _undeclared(args):
     return {"figures": undeclared.figures(results), "cases": results}
 
 
+def _blind(args):
+    """In measured flights if there are any, else in simulated ones and in those with nothing."""
+    source = blind.Simulated() if args.data is None else blind.Measured(args.data)
+    results = _each(blind.cases(source, args.seeds, args.first), blind.run)
+    figures = blind.figures(results)
+    if args.data is None:
+        clean = list(blind.false_alarms(args.seeds, args.first))
+        figures["false alarms"] = bank.share(bool(r["said"]) for r in clean)
+    _confusions(results, args.out / "blind.png")
+    return {"figures": figures, "cases": results}
+
+
 def _injected(args):
     results = measured.injected(args.data, lambda cases, function: _each(cases, function))
     figures = {
@@ -136,6 +152,33 @@ def _speed(args):
     return {"figures": {"seconds for 120 s of flight": round(time.monotonic() - started, 1)}, "cases": result.as_text()}
 
 
+def _confusions(results, path):
+    """What was put in, and the first thing said, by channel, subset, covariate and shape."""
+    figure, axes = plt.subplots(2, 2, figsize=(14, 13), layout="constrained")
+    for k, (ax, key) in enumerate(zip(axes.ravel(), ("stream", "subset", "covariate", "shape"))):
+        pairs = [(r[key], (r["first"][k] or "none said") if r["first"] else "nothing") for r in results]
+        rows, columns = (sorted({pair[side] for pair in pairs}) for side in range(2))
+        count = np.zeros((len(rows), len(columns)))
+        for one, other in pairs:
+            count[rows.index(one), columns.index(other)] += 1
+        _matrix(ax, count, rows, columns)
+        ax.set_title(key)
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+def _matrix(ax, count, rows, columns):
+    """Counts, coloured by their share of the row."""
+    share = count / np.maximum(count.sum(axis=1, keepdims=True), 1)
+    ax.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    for row, column in zip(*np.nonzero(count)):
+        colour = "w" if share[row, column] > 0.5 else "k"
+        ax.text(column, row, int(count[row, column]), ha="center", va="center", color=colour)
+    ax.set(xticks=range(len(columns)), yticks=range(len(rows)), xlabel="found first", ylabel="put in")
+    ax.set_xticklabels(columns, rotation=90)
+    ax.set_yticklabels(rows)
+
+
 def _confusion(results, path):
     """Rows: what was put in; columns: the first thing found; small and large together."""
     names = [name for name in bank.SIZES if name not in bank.AIDED]
@@ -148,19 +191,6 @@ def _confusion(results, path):
         first = (r["found"] or ["nothing"])[0]
         count[row, columns.index(first) if first in columns else len(names)] += 1
     figure, ax = plt.subplots(figsize=(11, 10), layout="constrained")
-    share = count / np.maximum(count.sum(axis=1, keepdims=True), 1)
-    ax.imshow(share, cmap="Blues", vmin=0, vmax=1)
-    for row, column in zip(*np.nonzero(count)):
-        ax.text(
-            column,
-            row,
-            int(count[row, column]),
-            ha="center",
-            va="center",
-            color="w" if share[row, column] > 0.5 else "k",
-        )
-    ax.set(xticks=range(len(columns)), yticks=range(len(names) + 1), xlabel="found first", ylabel="put in")
-    ax.set_xticklabels(columns, rotation=90)
-    ax.set_yticklabels([*names, "nothing"])
+    _matrix(ax, count, [*names, "nothing"], columns)
     figure.savefig(path, dpi=80)
     plt.close(figure)

@@ -1,0 +1,142 @@
+"""The blind bank: effects of the grammar put into flights, measured ones on top of what others of the day have told.
+
+An effect is put into two flights. One is diagnosed, the other judges what was found: named rightly, and removed.
+"""
+
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_ekf.offline import run_offline
+
+from ...diagnosis import diagnose
+from ...diagnosis.attribution import attribute
+from ...diagnosis.references import GroundTruth
+from ...scoring.metrics import Score
+from . import grammar, measured
+from .bank import clean_flight, share
+from .claims import claims, truth_of
+
+LEAST_COST = 0.02  # m of 3D RMSE that an effect costs in both flights
+GROW, GROWTHS = 1.7, 3  # an effect that costs less is made larger, so often
+DEVELOPED_ON, DRAWN_ONCE = 0, 1_000_000  # first seeds: of cases that were looked at, and of those that are reported
+# {split of `measured`: places of its judged flights, in groups of one protocol}: each flight is judged on the next.
+GROUPS = {
+    "0425 a": ((0, 1, 2), (3, 4)),
+    "0425 b": ((0, 1, 2), (3, 4)),
+    "0426 a": ((0, 1, 2), (3, 4)),
+    "0426 b": ((0, 1), (2, 3)),
+    "const1": ((1, 2),),
+    "const3": ((0, 1),),
+    "const4 trial 1": ((0, 1),),
+    "const4 trial 3": ((0, 1),),
+}
+LOOKED_AT = ("0425 a", "0426 a", "const1", "const4 trial 1")  # while this was developed
+
+
+class Measured:
+    """Pairs of measured flights, each with what the other flights of its day and installation have told."""
+
+    def __init__(self, data, splits=tuple(GROUPS)):
+        self._data, self._splits, self._known = data, splits, {}
+
+    def pair(self, rng):
+        """((Flight, Flight), EffectSet, name of the split)."""
+        split = self._splits[rng.integers(len(self._splits))]
+        if split not in self._known:
+            fit, judge = measured.SPLITS[split]
+            base = diagnose(measured.load(self._data, fit)).effects
+            self._known[split] = base, measured.load(self._data, judge)
+        base, flights = self._known[split]
+        group = GROUPS[split][rng.integers(len(GROUPS[split]))]
+        first = int(rng.integers(len(group)))
+        return (flights[group[first]], flights[group[(first + 1) % len(group)]]), base, split
+
+
+class Simulated:
+    """Pairs of simulated flights without any other effect."""
+
+    def pair(self, rng):
+        """As that of Measured."""
+        seed = int(rng.integers(1000, 100000))
+        flights = clean_flight(seed), clean_flight(seed + 20 * int(rng.integers(1, 50)))
+        return flights, EffectSet(), "simulated"
+
+
+def rmse(flight, effects):
+    """3D RMSE of the filter, m; infinite without any estimate."""
+    run = run_offline(flight, None, Corrector(flight.anchors, effects))
+    score = Score(flight.name, run.odometry, flight.truth, run.residuals)
+    return score.row()["rmse_3d"] if len(score.t) else np.inf
+
+
+def cases(source, number, first=DEVELOPED_ON):
+    """Yields (seed, Undeclared, pair of flights with it, pair without, base, where): `number` effects that cost enough."""
+    done = 0
+    for seed in count(first):
+        if done == number:
+            return
+        pair, base, where = source.pair(np.random.default_rng([seed, 7]))
+        effect = grammar.draw(seed, pair[0])
+        before = [rmse(flight, base) for flight in pair]
+        for _ in range(1 + GROWTHS):
+            flown = [effect.inject(flight) for flight in pair]
+            if all(rmse(one, base) - none >= LEAST_COST for one, none in zip(flown, before)):
+                done += 1
+                yield seed, effect, flown, pair, base, where
+                break
+            effect = replace(effect, size=effect.size * GROW)
+
+
+def run(seed, effect, flown, pair, base, where):
+    """dict of one case."""
+    result = diagnose(flown[:1], base=base)
+    plain, before, after = rmse(pair[1], base), rmse(flown[1], base), rmse(flown[1], result.effects)
+    said, true = claims(result.findings), truth_of(effect, flown[0])
+    place = next((k for k, claim in enumerate(said) if claim.names(true)), None)
+    return {
+        "seed": seed,
+        "where": where,
+        "flight": flown[0].name,
+        "effect": effect.name,
+        "stream": effect.stream,
+        "subset": effect.subset,
+        "covariate": effect.covariate,
+        "shape": effect.shape,
+        "said": [claim.text for claim in said],
+        "first": None if not said else [said[0].stream, said[0].subset, (*said[0].covariates, "")[0], said[0].shape],
+        "place": place,
+        "covariate_right": place is not None and said[place].depends_as(true),
+        "shape_right": place is not None and said[place].shape == true.shape,
+        "rmse": [plain, before, after],
+        "removed": float(1.0 - (after - plain) / (before - plain)),
+    }
+
+
+def false_alarms(number, first=DEVELOPED_ON):
+    """Yields dict of what is found in simulated flights without any effect."""
+    for seed in range(first, first + number):
+        findings = attribute([clean_flight(1000 + seed)], GroundTruth()).findings()
+        yield {"seed": seed, "said": [claim.text for claim in claims(findings)]}
+
+
+def figures(results):
+    """Figures of the cases that cost enough."""
+    mean = {
+        "cases": len(results),
+        "channel right, of the first": share(bool(r["first"]) and r["first"][0] == r["stream"] for r in results),
+        "channel and subset right and first": share(r["place"] == 0 for r in results),
+        "named at any place": share(r["place"] is not None for r in results),
+        "covariate right": share(r["covariate_right"] for r in results),
+        "shape right": share(r["shape_right"] for r in results),
+        "half of the excess error removed": share(r["removed"] >= 0.5 for r in results),
+    }
+    for key in ("stream", "subset", "where"):
+        mean[f"first, by {key}"] = {
+            name: f"{sum(r['place'] == 0 for r in results if r[key] == name)} of {sum(r[key] == name for r in results)}"
+            for name in sorted({r[key] for r in results})
+        }
+    return mean

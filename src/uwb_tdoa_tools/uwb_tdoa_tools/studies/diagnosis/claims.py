@@ -1,0 +1,124 @@
+"""What findings say, and what an effect of the grammar is, in the same terms: stream, subset, covariate, shape.
+
+Some effects of the grammar have a name in the catalogue: an anchor that is late from one time to another is nlos.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .grammar import NAMES
+
+# {declared effect: (subset, covariates, shapes)}; "key": an anchor, a pair or an axis for each parameter.
+CATALOGUE = {
+    "anchor_delay": ("anchor", (), ()),
+    "pair_offset": ("pair", (), ()),
+    "anchor_position": ("anchor", ("bearing", "elevation"), ("periodic",)),
+    "anchor_clock_drift": ("anchor", ("time",), ("trend",)),
+    "range_scale": ("arrivals", ("range",), ("trend",)),
+    "range_bias": ("arrivals", ("range",), ("bend", "ramp")),
+    "received_power_bias": ("arrivals", ("range",), ("bend", "trend")),
+    "antenna_pattern": ("arrivals", ("elevation_in_tag",), ("bend",)),
+    "floor_multipath": ("arrivals", ("height",), ("step", "transient")),
+    "gyro_scale": ("axis", ("rate",), ("trend",)),
+    "accel_scale": ("axis", ("accel",), ("trend",)),
+    "gyro_bias": ("axis", (), ()),
+    "accel_bias": ("axis", (), ()),
+}
+# {shape of a function without a name: that of the grammar}
+SHAPES = {
+    "line": "trend", "beyond": "ramp", "below": "ramp", "step": "step", "interval": "transient", "wave": "periodic",
+    "parabola": "bend",
+}  # fmt: skip
+STREAM = {"imu_gravity": "accel", "imu_misalignment": "gyro"}
+
+
+@dataclass(frozen=True)
+class Claim:
+    """stream; subset : kind of it; who : frozenset of the anchors, or of the axis; covariates : those that it names, the first
+    and what is the same in that flight; shape; text."""
+
+    stream: str
+    subset: str
+    who: frozenset
+    covariates: tuple
+    shape: str
+    text: str
+
+    def names(self, true):
+        """Whether stream and subset are those of another Claim."""
+        return (self.stream, self.subset, self.who) == (true.stream, true.subset, true.who)
+
+    def depends_as(self, true):
+        """Whether a covariate is that of another Claim."""
+        return bool(set(self.covariates) & set(true.covariates))
+
+
+def truth_of(effect, flight):
+    """Claim of an Undeclared in a Flight. A direction is a pair where nobody hears the other one."""
+    subset = effect.subset
+    if subset == "direction":
+        a, b = effect.who
+        back = np.sum((flight.tdoa.a == b) & (flight.tdoa.b == a))
+        subset = "direction" if back > 0.1 * np.sum((flight.tdoa.a == a) & (flight.tdoa.b == b)) else "pair"
+    who = frozenset(("xyz"[effect.who[0]],) if subset == "axis" else map(str, effect.who))
+    return Claim(effect.stream, subset, who, (effect.covariate,), effect.shape, effect.name)
+
+
+def claims(findings):
+    """[Claim] of Findings, those that are worth most first."""
+    ranked = sorted(
+        findings,
+        key=lambda f: (bool(f.together_with), not f.added, -(f.worth or 0.0), -f.evidence.get("criterion", 0.0)),
+    )
+    out = []
+    for finding in ranked:
+        out += _undeclared(finding) if finding.effect.settings else _declared(finding.effect)
+    return out
+
+
+def _undeclared(finding):
+    """A Claim for every anchor or pair, or one for all anchors alike."""
+    effect = finding.effect
+    stream, _, axis = effect.channel.partition(".")
+    shape, covariates = SHAPES.get(effect.shape, ""), _covariates(finding)
+    shape = "step" if effect.covariate == NAMES else shape
+    if stream != "tdoa":
+        return [Claim(stream, "axis", frozenset((axis,)), covariates, shape, effect.label)]
+    parts = dict.fromkeys(key.rpartition(".")[0] for key in effect.values)
+    if effect.form in ("common", "arrival") or finding.together_with:
+        subset = {"common": "all", "arrival": "arrivals", "anchor": "anchors"}[effect.form]
+        return [Claim(stream, subset, frozenset(), covariates, shape, effect.label)]
+    return [
+        Claim(stream, effect.form, frozenset(part.split("-")), covariates, shape, f"{effect.label} {part} {shape}")
+        for part in parts
+    ]
+
+
+def _covariates(finding):
+    """That of the function, and those that are named as the same thing in that flight, of the same part."""
+    own, _, name = finding.effect.label.rpartition(" over ")
+    others = (other.effect.rpartition(" over ") for other in finding.alternatives)
+    return tuple(dict.fromkeys((name, *(other for part, _, other in others if part == own))))
+
+
+def _declared(effect):
+    """A Claim for every anchor, pair or axis."""
+    stream = STREAM.get(effect.name, effect.channels[0])
+    if effect.name == "nlos":
+        return [_nlos(effect, who) for who in dict.fromkeys(key.partition(".")[0] for key in effect.values)]
+    subset, covariates, shapes = CATALOGUE.get(effect.name, ("all", (), ()))
+    if subset in ("arrivals", "all"):
+        return [Claim(stream, subset, frozenset(), covariates, (*shapes, "")[0], effect.name)]
+    out = {}
+    for key in effect.values:
+        who = frozenset(key.split("-")) if subset == "pair" else frozenset((key.partition(".")[0],))
+        names = tuple(f"{name}_{key}" if subset == "axis" else name for name in covariates)
+        out.setdefault(who, Claim(stream, subset, who, names, (*shapes, "")[0], f"{effect.name} {key}"))
+    return list(out.values())
+
+
+def _nlos(effect, anchor):
+    timed = f"{anchor}.start" in effect.values
+    covariates = ("time",) if timed else ("x", "y", "height", "range")
+    return Claim("tdoa", "anchor", frozenset((anchor,)), covariates, "transient", f"nlos of {anchor}")
