@@ -175,7 +175,7 @@ def test_what_came_into_the_model_together_is_one_entry_with_one_worth(result):
     together = Candidate(tuple(Term(term, ("3.c0",)) for term in terms))
     findings = [Finding(term, "tdoa", {}, 0.2, (), (together,), True, 0.015) for term in terms]
     (entry,) = entries(replace(result, findings=findings))
-    assert entry.title == "tdoa over x and y (by anchor)" and worth_in_words(entry) == "1.5 cm"
+    assert entry.title == "tdoa of anchor 3 over x and y" and worth_in_words(entry) == "1.5 cm"
 
 
 def test_entries_are_ordered_by_worth_those_not_added_last(result):

@@ -145,6 +145,12 @@ class SmoothTerm(Effect):
         weights = np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)]])
         return self._functions(values, weights, np.zeros(len(values), dtype=np.int64))
 
+    def spread(self, values, prefix=""):
+        """Standard deviation of what `curve` gives beside a level, (n,), as if its coefficients were independent."""
+        std = np.array([self.std.get(f"{prefix}c{k}", 0.0) for k in range(self.count)])
+        std[0] *= self.shape == "spline"  # else the level
+        return np.sqrt(self.basis(values) ** 2 @ std**2)
+
     @cached_property
     def _at(self):
         return np.array(self.knots, dtype=float)

@@ -15,7 +15,7 @@ from .regression.confounding import alternatives
 from .regression.fit import fit
 from .regression.held_out import held_out
 from .regression.scan import Scan
-from .regression.select import Selection, select, worth
+from .regression.select import Selection, select, with_rivals, worth
 from .regression.table import table_of
 from .regression.terms import Candidate, Term, candidates_of, columns_of
 
@@ -81,11 +81,13 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
             break
         current = current if last else at(model)
     refused = []
-    selection = _that_hold_on_other_data(selection, refused)
+    selection, smooth, scan = _that_hold_on_other_data(selection, refused), [], None
     if undeclared:
-        smooth = _smooth(current, installation)
-        selection = _with_smooth(selection, declared, smooth, search, Scan(selection.table, _views(current)), progress)
+        smooth, scan = _smooth(current, installation), Scan(selection.table, _views(current))
+        selection = _with_smooth(selection, declared, smooth, search, scan, progress)
         selection = _that_hold_on_other_data(selection, refused)
+    selection = with_rivals(selection, declared + smooth, scan, progress)
+    if undeclared:
         selection = _with_maps(selection, smooth, refused)
     remaining = at(effects_of(selection))
     detections = (detector.detect(remaining) for detector in detectors)
@@ -153,12 +155,12 @@ def _declared(found, reference, kinds, installation):
 
 
 def _smooth(found, installation):
-    """[Candidate] of functions of whatever each channel may depend on."""
+    """[Candidate] of functions of whatever each channel may depend on, of all anchors alike or each with its own."""
     out = []
     for name, channel in CHANNELS.items():
         parts = [flight[name] for flight in found if name in flight]
         for term in channel.smooth_terms(parts) if parts else ():
-            out += candidates_of(term, *installation)
+            out += candidates_of(term, *installation)[:1]
     return out
 
 
@@ -200,16 +202,13 @@ def _with_smooth(selection, declared, smooth, search, scan, progress):
     """The selection carried on with functions without a name; or begun anew with them, if that explains more: the declared
     effect was a stopgap."""
 
-    def both(table, model, chosen):
-        return search(table, model, chosen) + scan(table, model, chosen)
-
     everything = smooth + declared
     table = selection.table.with_terms([term for candidate in smooth for term in candidate.terms])
     progress()
     inflation = selection.fit.inflation
-    after = select(table, everything, inflation, both, scan.bold, selection.chosen, progress)
+    after = select(table, everything, inflation, search, scan, selection.chosen, progress)
     if selection.chosen and any(not candidate.declared for candidate in after.chosen):
-        anew = select(table, everything, inflation, both, scan.bold, progress=progress)
+        anew = select(table, everything, inflation, search, scan, progress=progress)
         after = max(after, anew, key=lambda each: worth(each, len(everything)))
     return after
 

@@ -98,6 +98,7 @@ def _function(finding):
         "channel": effect.channel,
         "covariate": effect.covariate,
         "form": effect.form,
+        "course": effect.shape,
         "strength": finding.explained,
         "advice": effect.advice(),
         "worth": finding.worth,

@@ -6,7 +6,7 @@ model holds already (Schur complement), give all shapes of a subset and a covari
 candidates and are judged like all others; they pay for the number that was looked at.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
 from uwb_tdoa_bias.effects.shapes import SHAPES
 
-from ..channels.views import View
 from .fit import prior_sizes
 from .terms import Candidate, Term, columns_of
 
@@ -23,7 +22,7 @@ PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of a wave between 
 WIDEST = 10  # bins of an interval; a longer one is two steps
 FINER = 9  # places between two bins where a knot is tried again
 FEWEST = 12  # values of a subset
-PROPOSED, BOLD = 24, 6  # functions that are proposed
+PROPOSED = 16  # functions
 HUBER = 3.0  # scales; a larger residual counts as that of a heavy tail, but more than in Student's t
 LEAST_GAIN = 20.0  # twice a log-likelihood
 _ENDS = np.array([(first, last) for first in range(3) for last in (-1, -2, -3)])  # edges between which a line rises
@@ -61,18 +60,13 @@ class Scan:
         self._price = SmoothTerm.price + 2.0 * np.log(max(sum(map(len, groups.values())), 1))
 
     def __call__(self, table, model, chosen):
-        """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows."""
-        return self._found(table, model, chosen, PROPOSED)
-
-    def bold(self, table, model, chosen):
-        """[Candidate], the best if what looks like outliers is taken for measured: what acts on a few rows."""
+        """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows. What looks like outliers to the
+        fit counts for more: it may be what acts on a few rows alone."""
         scale = HUBER * model.scale[table.channel]
-        weight = np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12))
-        return self._found(table, replace(model, weight=weight), chosen, BOLD)
-
-    def _found(self, table, model, chosen, number):
-        found = [self._refined(table, model, chosen, item) for item in self.gains(table, model, chosen)[:number]]
-        return [self._candidate(*item[1:]) for item in _best_first(table, found)]
+        model = replace(model, weight=np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12)))
+        found = self.gains(table, model, chosen)[:PROPOSED]
+        found = _best_first(table, [self._refined(table, model, chosen, item) for item in found])
+        return [self._candidate(*item[1:]) for item in found]
 
     def _refined(self, table, model, chosen, item):
         """An item of `gains` with its inner knots moved by parts of a bin, if that gains more."""

@@ -16,6 +16,7 @@ from .table import Table
 from .terms import columns_of
 
 MAX_STEPS = 14
+FITTED = 6  # of what a scan proposes
 LEAST_DETERMINED = 0.3  # parameters that the data must tell of a candidate
 AMBIGUOUS = 10.0  # less difference in the criterion is no decision
 ALIKE = 0.1  # share of the criterion by which a function may be worse than another one that it is much like
@@ -32,7 +33,7 @@ class Rival:
 @dataclass(frozen=True, eq=False)
 class Selection:
     """table : Table with the columns of all candidates; chosen : (Candidate, ...); fit : Fit of all of them; loss :
-    criterion that each is worth beside the others; rivals : for each, (Rival, ...)."""
+    criterion that each is worth beside the others; rivals : for each, (Rival, ...), once somebody has looked for them."""
 
     table: Table
     chosen: tuple
@@ -55,21 +56,21 @@ class Selection:
         return replace(self, chosen=chosen, fit=model, loss=(*self.loss, 0.0), rivals=(*self.rivals, ()))
 
 
-def select(table, candidates, inflation, search=None, bold=None, start=(), progress=lambda: None):
+def select(table, candidates, inflation, search=None, scan=None, start=(), progress=lambda: None):
     """Selection among `candidates`, whose columns the Table holds.
 
-    search(table, fit, chosen) -> more Candidates, found for this residual; bold : the same, of which each is fitted, because
-    the weights of the present fit, which takes what they explain for outliers, would not do it justice. start : Candidates
-    that are in the model to begin with, and may fall out again. progress() is called now and then.
+    search(table, fit, chosen) -> more Candidates, found for this residual; scan : the same, of which the first few are fitted,
+    because the weights of the present fit, which takes what they explain for outliers, would not do them justice. start :
+    Candidates that are in the model to begin with, and may fall out again. progress() is called now and then.
     """
     chosen = list(start)
     model = fit(table, columns_of(chosen), inflation)
     for _ in range(MAX_STEPS):
-        found = search(table, model, chosen) if search else []
+        scanned = scan(table, model, chosen) if scan else []
+        found = (search(table, model, chosen) if search else []) + scanned[FITTED:]
         wider = table.with_terms([term for candidate in found for term in candidate.terms])
         ranked = rank(wider, candidates + found, chosen, model)
-        for candidate in bold(table, model, chosen) if bold else []:
-            ranked.append((_fitted(table, chosen, model, candidate, len(candidates)), candidate))
+        ranked += [(_fitted(table, chosen, model, candidate, len(candidates)), candidate) for candidate in scanned[:FITTED]]
         ranked.sort(key=lambda item: -item[0])
         progress()
         if not ranked or ranked[0][0] <= 0.0:
@@ -81,8 +82,7 @@ def select(table, candidates, inflation, search=None, bold=None, start=(), progr
         chosen, model = _backward(table, chosen, model, len(candidates))
     loss = _losses(table, chosen, model, len(candidates))
     progress()
-    rivals = _rivals(table, candidates, search, chosen, model, progress)
-    return Selection(table, tuple(chosen), model, tuple(loss), rivals)
+    return Selection(table, tuple(chosen), model, tuple(loss), ((),) * len(chosen))
 
 
 def _fitted(table, chosen, model, candidate, choices):
@@ -165,10 +165,10 @@ def _losses(table, chosen, model, choices):
     return out
 
 
-def _rivals(table, candidates, search, chosen, model, progress):
-    """For each chosen Candidate, the other effects that could replace it, and functions that would do nearly as much:
-    (Rival, ...)."""
-    out = []
+def with_rivals(selection, candidates, search, progress):
+    """Selection with, for each chosen Candidate, the other effects that could replace it, and functions that would do nearly
+    as much. search : of functions, or None."""
+    table, chosen, model, out = selection.table, list(selection.chosen), selection.fit, []
     for k, candidate in enumerate(chosen):
         others = chosen[:k] + chosen[k + 1 :]
         rest, found = fit(table, columns_of(others), model.inflation), []
@@ -186,4 +186,4 @@ def _rivals(table, candidates, search, chosen, model, progress):
                 near.setdefault(other.title, Rival(float(own - score), other))
         out.append(tuple(near.values()))
         progress()
-    return tuple(out)
+    return replace(selection, rivals=tuple(out))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from uwb_tdoa_bias.effects.covariates import UNITS
+from uwb_tdoa_bias.effects.smooth_words import described
 from uwb_tdoa_bias.effects.wording import listed
 
 from ..channels import CHANNELS
@@ -137,6 +138,9 @@ def _function(effect):
         ax.plot(
             at, effect.curve(at, prefix), COLOURS[k % len(COLOURS)], ls=style, lw=1.4, label=prefix.rstrip(".") or None
         )
+    if len(prefixes) == 1:
+        spread, course = effect.spread(at, prefixes[0]), effect.curve(at, prefixes[0])
+        ax.fill_between(at, course - spread, course + spread, color=COLOURS[0], alpha=0.2, lw=0)
     over, part = effect.covariate.replace("_", " "), CHANNELS[effect.channel.partition(".")[0]]
     ax.set(
         xlabel=f"{over} [{UNITS.get(effect.covariate, 'as recorded')}]",
@@ -145,7 +149,9 @@ def _function(effect):
     ax.grid(alpha=0.25, lw=0.5)
     if len(prefixes) > 1:
         ax.legend(title="anchor", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    each = ", a curve for each anchor" if len(prefixes) > 1 else ""
+    caption = f"What depends on {over} without having a name, a curve for each anchor."
+    if len(prefixes) == 1:
+        caption = f"{described(effect, prefixes[0].rstrip('.'))}. The band is twice the standard deviation wide.".capitalize()
     return embedded(
-        figure, f"Function of {over} in {effect.channel}", f"What depends on {over} without having a name{each}."
+        figure, f"Function of {over} in {effect.label.rpartition(' over ')[0]}", caption
     )

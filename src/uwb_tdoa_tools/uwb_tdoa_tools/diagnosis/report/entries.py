@@ -7,7 +7,7 @@ from uwb_tdoa_bias.effects.wording import listed, measured, significant
 CM = 100.0  # in a metre
 OR = "or"
 LEAST_WORTH = 0.0005  # m; less is no difference
-FORMS = {"common": "", "arrival": " (of each arrival)", "anchor": " (by anchor)"}
+FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}
 SHOWN = 6  # values
 
 
@@ -57,13 +57,14 @@ class Entry:
 
 
 def entries(diagnosis):
-    """[Entry] of a Diagnosis: what is added, the most worth first, then what is not."""
+    """[Entry] of a Diagnosis: what is added, the most worth first, what all anchors share over the room after what is told of
+    some; then what is not added."""
     groups = {}
     for finding in diagnosis.findings:
         key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
         groups.setdefault(key, []).append(finding)
     out = [_entry(tuple(group), diagnosis.refused) for group in groups.values()]
-    return sorted(out, key=lambda entry: (not entry.added, -(entry.worth or 0.0)))
+    return sorted(out, key=lambda entry: (not entry.added, len(entry.findings) > 1, -(entry.worth or 0.0)))
 
 
 def worth_in_words(entry):
@@ -115,14 +116,16 @@ def _title(findings):
     effect = findings[0].effect
     if findings[0].declared:
         return effect.name
-    covariates = listed(finding.effect.covariate.replace("_", " ") for finding in findings)
-    return f"{effect.channel} over {covariates}{FORMS[effect.form]}"
+    subject, _, first = effect.label.rpartition(" over ")
+    covariates = listed(name.replace("_", " ") for name in (first, *(finding.effect.covariate for finding in findings[1:])))
+    several = subject == effect.channel
+    return f"{subject} over {covariates}{FORMS.get(effect.form, '') if several else ''}"
 
 
 def _values(finding):
     effect = finding.effect
     if not finding.declared:
-        return "a smooth function without a name"
+        return f"a function without a name ({effect.shape})"
     told = significant(effect)
     shown = [f"{key} = {measured(value, effect.std.get(key))}" for key, value in effect.values.items() if key in told]
     rest, vague = shown[SHOWN:], len(effect.values) - len(shown)
