@@ -15,7 +15,7 @@ from .regression.confounding import alternatives
 from .regression.fit import fit
 from .regression.held_out import held_out
 from .regression.scan import Scan
-from .regression.select import Selection, select, with_rivals, worth
+from .regression.select import LARGE, Selection, select, with_rivals, worth
 from .regression.table import table_of
 from .regression.terms import Candidate, Term, candidates_of, columns_of
 
@@ -200,14 +200,14 @@ def _inflation(table, declared, detectors):
 
 def _with_smooth(selection, declared, smooth, search, scan, progress):
     """The selection carried on with functions without a name; or begun anew with them, if that explains more: the declared
-    effect was a stopgap."""
+    effect, or the large group of parameters, was a stopgap."""
 
     everything = smooth + declared
     table = selection.table.with_terms([term for candidate in smooth for term in candidate.terms])
     progress()
     inflation = selection.fit.inflation
     after = select(table, everything, inflation, search, scan, selection.chosen, progress)
-    if selection.chosen and any(not candidate.declared for candidate in after.chosen):
+    if selection.chosen and any(not candidate.declared or len(candidate.columns) > LARGE for candidate in after.chosen):
         anew = select(table, everything, inflation, search, scan, progress=progress)
         after = max(after, anew, key=lambda each: worth(each, len(everything)))
     return after

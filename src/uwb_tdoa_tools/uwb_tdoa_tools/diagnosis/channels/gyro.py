@@ -33,8 +33,7 @@ class Gyro(Inertial):
         measured, true = means(imu.t, imu.gyro, edges), _true_rates(poses, edges)
         before, after = (means(imu.t, imu.gyro, edges + shift) for shift in (-SHIFT, SHIFT))
         middles = 0.5 * (edges[:-1] + edges[1:])
-        features = _of_true_turns(means(imu.t, features_of(imu), edges), true)
-        change = (after - before) / (2.0 * SHIFT)
+        features, change = means(imu.t, features_of(imu), edges), (after - before) / (2.0 * SHIFT)
         return ImuResidual(self._samples(comparison, middles, measured, features, change), measured - true, self.unit)
 
     def _at_rest(self, comparison, imu):
@@ -48,17 +47,6 @@ class Gyro(Inertial):
         middles, measured = 0.5 * (edges[:-1] + edges[1:])[still], measured[still]
         samples = self._samples(comparison, middles, measured, features[still], np.zeros_like(measured))
         return ImuResidual(samples, measured, self.unit)
-
-
-def _of_true_turns(features, true):
-    """Features (n, k) with the true rates (n, 3) of a cell and its two neighbours in place of what was measured: a fault of the
-    gyroscope is in what it measures too, and would explain itself. Noise of an attitude is in the mean of three cells only if it is
-    that of their outer ends, hence not that of the residual."""
-    out, padded = features.copy(), np.pad(true, ((1, 1), (0, 0)), mode="edge")
-    rates = (padded[:-2] + padded[1:-1] + padded[2:]) / 3.0
-    out[:, [OF_IMU.index(f"rate_{axis}") for axis in "xyz"]] = rates
-    out[:, OF_IMU.index("turning_rate")] = np.linalg.norm(rates, axis=1)
-    return out
 
 
 def _true_rates(truth, edges):

@@ -20,6 +20,7 @@ from .terms import Candidate, Term, columns_of
 BINS = 16  # between whose edges steps, intervals and rises begin and end
 PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of a wave between the ends
 WIDEST = 10  # bins of an interval; a longer one is two steps
+CROWDED = 0.02  # of the range; bins that are narrower would tell noise of the covariate, which the residual may share
 FINER = 9  # places between two bins where a knot is tried again
 FEWEST = 12  # values of a subset
 PROPOSED = 16  # functions
@@ -204,9 +205,12 @@ def _edges(view):
     if view.covariate in CATEGORIES:
         names = np.unique(counted)
         return np.concatenate([[names[0] - 1.5, names[0] - 0.5], names + 0.5, [names[-1] + 1.5]])
-    edges = np.unique(np.quantile(counted, np.linspace(0.005, 0.995, BINS + 1)))
-    wide = edges[-1] - edges[0] > 1e-3 * max(abs(edges[0]), abs(edges[-1]), 1e-3)
-    return edges if len(edges) > 2 * len(set(_ENDS[:, 0])) and wide else None
+    edges = np.quantile(counted, np.linspace(0.005, 0.995, BINS + 1))
+    if edges[-1] - edges[0] < 1e-3 * max(abs(edges[0]), abs(edges[-1]), 1e-3):
+        return None
+    width = (edges - edges[0]) // (CROWDED * (edges[-1] - edges[0]))
+    edges = edges[np.unique(width, return_index=True)[1]]
+    return edges if len(edges) > 2 * len(set(_ENDS[:, 0])) else None
 
 
 def _columns(v, edges, covariate):

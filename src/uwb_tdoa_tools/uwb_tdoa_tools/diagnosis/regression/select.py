@@ -17,6 +17,7 @@ from .terms import columns_of
 
 MAX_STEPS = 14
 FITTED = 6  # of what a scan proposes
+FEW, LARGE, GOOD_PART = 3, 6, 0.5  # columns of one and of a group, and the share of its criterion that the one must reach
 LEAST_DETERMINED = 0.3  # parameters that the data must tell of a candidate
 AMBIGUOUS = 10.0  # less difference in the criterion is no decision
 ALIKE = 0.1  # share of the criterion by which a function may be worse than another one that it is much like
@@ -75,7 +76,7 @@ def select(table, candidates, inflation, search=None, scan=None, start=(), progr
         progress()
         if not ranked or ranked[0][0] <= 0.0:
             break
-        best = ranked[0][1]
+        best = _sparse_first(ranked) if scan else ranked[0][1]
         table = table.with_terms(best.terms)
         chosen.append(best)
         model = fit(table, columns_of(chosen), inflation)
@@ -83,6 +84,14 @@ def select(table, candidates, inflation, search=None, scan=None, start=(), progr
     loss = _losses(table, chosen, model, len(candidates))
     progress()
     return Selection(table, tuple(chosen), model, tuple(loss), ((),) * len(chosen))
+
+
+def _sparse_first(ranked):
+    """The best Candidate; if that is a large group, the best of few parameters that does a good part of what it does: what
+    the group is needed for besides will show."""
+    criterion, best = ranked[0]
+    few = (one for score, one in ranked if score >= GOOD_PART * criterion and len(one.columns) <= FEW)
+    return best if len(best.columns) <= LARGE else next(few, best)
 
 
 def _fitted(table, chosen, model, candidate, choices):
