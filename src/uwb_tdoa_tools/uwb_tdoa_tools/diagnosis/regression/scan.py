@@ -14,13 +14,14 @@ from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
 from uwb_tdoa_bias.effects.shapes import SHAPES
 
-from .fit import prior_sizes
+from .fit import prior_sizes, refit
 from .terms import Candidate, Term, columns_of
 
 BINS = 16  # between whose edges steps, intervals and rises begin and end
 PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of a wave between the ends
 WIDEST = 10  # bins of an interval; a longer one is two steps
 CROWDED = 0.02  # of the range; bins that are narrower would tell noise of the covariate, which the residual may share
+NOISY = 1.5  # times the noise of most series that any may have
 FINER = 9  # places between two bins where a knot is tried again
 FEWEST = 12  # values of a subset
 PROPOSED = 16  # functions
@@ -58,13 +59,16 @@ class Scan:
                     kind = len(edges), view.covariate in ANGLES, view.covariate in CATEGORIES
                     groups.setdefault(kind, []).append(_Shapes(view, table.rows_of(channel).start, edges))
         self._groups = [_Group(several, WIDEST) for several in groups.values()]
+        self.even = _noise_of_series(table) ** -2.0  # weights (n,) that are fair to noisy series, and know no outliers
         self._price = SmoothTerm.price + 2.0 * np.log(max(sum(map(len, groups.values())), 1))
 
     def __call__(self, table, model, chosen):
-        """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows. What looks like outliers to the
-        fit counts for more: it may be what acts on a few rows alone."""
-        scale = HUBER * model.scale[table.channel]
-        model = replace(model, weight=np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12)))
+        """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows. What looks like outliers to
+        the fit counts for more: it may be what acts on a few rows alone. Series that are noisier than others count for less."""
+        scale = HUBER * model.scale[table.channel] / np.sqrt(self.even)
+        weight = np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12)) * self.even
+        everywhere = np.ones(len(table.y), dtype=bool)
+        model = refit(table, columns_of(chosen), replace(model, weight=weight), everywhere)
         found = self.gains(table, model, chosen)[:PROPOSED]
         found = _best_first(table, [self._refined(table, model, chosen, item) for item in found])
         return [self._candidate(*item[1:]) for item in found]
@@ -94,6 +98,22 @@ class Scan:
         effect = SmoothTerm(channel=view.channel, covariate=view.covariate, form=view.form, knots=knots, shape=shape)
         keys = effect.keys_of((view.key,))
         return Candidate((Term(effect, keys),), self._price + 2.0 * np.log(tried))
+
+
+def _noise_of_series(table):
+    """How much noisier the series of each row is than most of its channel, (n,), at least 1: by differences of successive rows, of
+    which steps and trends are a small part."""
+    order = np.lexsort((table.t, table.series, table.flight, table.channel))
+    label = np.unique(np.stack([table.channel, table.flight, table.series]), axis=1, return_inverse=True)[1].reshape(-1)
+    step = np.abs(np.diff(table.y[order]))
+    same = label[order][1:] == label[order][:-1]
+    parts = (step[same & (label[order][1:] == k)] for k in range(label.max() + 1))
+    scatter = np.array([np.median(part) if len(part) else 0.0 for part in parts])
+    out = scatter[label]
+    for channel in np.unique(table.channel):
+        rows = table.channel == channel
+        out[rows] /= max(float(NOISY * np.median(out[rows])), 1e-12)
+    return np.maximum(out, 1.0)
 
 
 def _best_first(table, found):

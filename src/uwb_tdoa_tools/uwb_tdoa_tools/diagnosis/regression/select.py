@@ -60,7 +60,7 @@ class Selection:
 def select(table, candidates, inflation, search=None, scan=None, start=(), progress=lambda: None):
     """Selection among `candidates`, whose columns the Table holds.
 
-    search(table, fit, chosen) -> more Candidates, found for this residual; scan : the same, of which the first few are fitted,
+    search(table, fit, chosen) -> more Candidates, found for this residual; scan : a Scan, of whose Candidates the first few are fitted,
     because the weights of the present fit, which takes what they explain for outliers, would not do them justice. start :
     Candidates that are in the model to begin with, and may fall out again. progress() is called now and then.
     """
@@ -71,7 +71,7 @@ def select(table, candidates, inflation, search=None, scan=None, start=(), progr
         found = (search(table, model, chosen) if search else []) + scanned[FITTED:]
         wider = table.with_terms([term for candidate in found for term in candidate.terms])
         ranked = rank(wider, candidates + found, chosen, model)
-        ranked += [(_fitted(table, chosen, model, candidate, len(candidates)), candidate) for candidate in scanned[:FITTED]]
+        ranked += [(_fitted(table, chosen, model, one, len(candidates), scan.even), one) for one in scanned[:FITTED]]
         ranked.sort(key=lambda item: -item[0])
         progress()
         if not ranked or ranked[0][0] <= 0.0:
@@ -94,8 +94,10 @@ def _sparse_first(ranked):
     return best if len(best.columns) <= LARGE else next(few, best)
 
 
-def _fitted(table, chosen, model, candidate, choices):
-    """Criterion of one Candidate more, by the likelihoods of both fits; minus infinity for what nobody would model."""
+def _fitted(table, chosen, model, candidate, choices, even):
+    """Criterion of one Candidate more, by the likelihoods of both fits, or by least squares with the weights `even`, (n,), if that
+    says less: the one believes what noisy series show by chance, the other what outliers do. Minus infinity for what nobody would
+    model."""
     table = table.with_terms(candidate.terms)
     wider = fit(table, columns_of([*chosen, candidate]), model.inflation)
     if not acceptable(table, candidate, wider.values(candidate.columns)):
@@ -104,7 +106,9 @@ def _fitted(table, chosen, model, candidate, choices):
     judged = scorer.judge(candidate.columns)
     if judged is None:  # the model holds it
         return -np.inf
-    return wider.likelihood(table) - model.likelihood(table) - scorer.price(candidate, judged.determined, choices)
+    least_squares = Scorer(table, columns_of(chosen), replace(wider, weight=even), candidate.columns).judge(candidate.columns)
+    gain = min(wider.likelihood(table) - model.likelihood(table), least_squares.gain)
+    return gain - scorer.price(candidate, judged.determined, choices)
 
 
 def worth(selection, choices):
@@ -174,16 +178,16 @@ def _losses(table, chosen, model, choices):
     return out
 
 
-def with_rivals(selection, candidates, search, progress):
+def with_rivals(selection, candidates, scan, progress):
     """Selection with, for each chosen Candidate, the other effects that could replace it, and functions that would do nearly
-    as much. search : of functions, or None."""
+    as much. scan : Scan of functions, or None."""
     table, chosen, model, out = selection.table, list(selection.chosen), selection.fit, []
     for k, candidate in enumerate(chosen):
         others = chosen[:k] + chosen[k + 1 :]
         rest, found = fit(table, columns_of(others), model.inflation), []
-        if search and not candidate.declared:
+        if scan and not candidate.declared:
             rest = replace(rest, weight=model.weight, scale=model.scale)  # what it explains is measured, not outliers
-            found = search(table, rest, others)
+            found = scan(table, rest, others)
         wider = table.with_terms([term for one in found for term in one.terms])
         several = [c for c in candidates + found if c.title != candidate.title]
         ranked = rank(wider, [*several, candidate], others, rest)
