@@ -57,7 +57,7 @@ def pairs(flight):
     of = _Pairs(flight)
     for pair, rows in of.rows.items():
         d, true, name = of.d[rows], of.true[rows], f"({pair[0]}, {pair[1]})"
-        for rule in (_sign, _frozen, _rounded, _clipped, _between, _late):
+        for rule in (_sign, _rounded, _clipped, _frozen, _between, _late):
             found = rule(d, true, of.t[rows] - flight.tdoa.t[0])
             if found is not None:
                 yield Finding(f"pair_{rule.__name__[1:]}", ERROR, f"the TDOA of the pair {name} {found[0]}", found[1], found[2], found[3])

@@ -9,6 +9,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 
+from ..checking.numbers import numbers
 from ..parallel import in_one_thread
 from ..scoring.metrics import Score
 from . import judging, output
@@ -29,7 +30,7 @@ class Diagnosis:
     flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [Finding]; effects :
     EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
     `judging.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
-    ChannelResidual}] under `effects`.
+    ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers.
     """
 
     flights: tuple
@@ -44,6 +45,7 @@ class Diagnosis:
     health: dict
     attribution: Attribution
     remaining: list
+    numbers: dict
 
     def as_json(self):
         """What diagnosis.json holds."""
@@ -109,6 +111,7 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         health(attribution.residuals, runs, scores),
         attribution,
         remaining,
+        {flight.name: found for flight in flights if (found := numbers(flight))},
     )
 
 

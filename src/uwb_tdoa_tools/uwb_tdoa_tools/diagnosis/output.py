@@ -9,7 +9,7 @@ from uwb_tdoa_bias.effects.wording import listed
 from .report.apply import APPLY
 from .report.entries import doubt_in_words, entries, worth_in_words
 from .report.unclear import by_remedy, untold
-from .report.verdict import verdict
+from .report.verdict import faults_in_words, verdict
 
 WIDTH, LABEL = 120, 10  # columns of the screen, and of them for what a line is
 
@@ -22,6 +22,7 @@ def as_json(diagnosis):
             "flights": [flight.name for flight in diagnosis.flights],
             "rests_on": diagnosis.reference.words,
             "findings": [_finding(finding) for finding in diagnosis.findings if finding.declared],
+            "numbers": {name: [vars(item) for item in found] for name, found in diagnosis.numbers.items()},
             "unattributed": [_function(finding) for finding in diagnosis.findings if not finding.declared],
             "ambiguous": _ambiguous(diagnosis),
             "unobservable": [
@@ -45,6 +46,7 @@ def as_text(diagnosis):
     """Lines for the screen: verdict, what to do, what was found and its worth, what could not be told, what to run."""
     found = entries(diagnosis)
     lines = [("" if k else "verdict", sentence) for k, sentence in enumerate(verdict(diagnosis).sentences)]
+    lines += [("numbers", sentence) for sentence in faults_in_words(diagnosis)]
     lines += [("do", sentence) for entry in found if entry.matters for sentence in entry.advice]
     for entry in found:
         judged = f"not added: {entry.why_not}" if entry.why_not else f"worth {worth_in_words(entry)}"

@@ -6,7 +6,7 @@ from .entries import entries
 from .maps import maps
 from .markup import page, paragraphs, section
 from .sections import head, not_told, to_do, worth
-from .verdict import verdict
+from .verdict import faults_in_words, verdict
 
 
 def html(diagnosis):
@@ -16,6 +16,7 @@ def html(diagnosis):
     names = ", ".join(flight.name for flight in diagnosis.flights)
     parts = [
         head(diagnosis, verdict(diagnosis)),
+        section("What is wrong with the numbers", paragraphs(faults_in_words(diagnosis))) if diagnosis.numbers else "",
         to_do(found),
         worth(diagnosis, found),
         section("Where in the room", maps(diagnosis)),

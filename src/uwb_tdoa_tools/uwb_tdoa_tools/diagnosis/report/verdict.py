@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from uwb_tdoa_bias.effects.wording import listed
+
 from ..calibration import LEFT
 
 CM = 100.0  # in a metre
@@ -30,6 +32,18 @@ def verdict(diagnosis):
     if not any(finding.added for finding in diagnosis.findings):
         return _nothing_added(diagnosis)
     return _judged(diagnosis)
+
+
+def faults_in_words(diagnosis):
+    """What is wrong with the numbers of the flights: a sentence for each, with the flights and the evidence of the first."""
+    groups = {}
+    for name, found in diagnosis.numbers.items():
+        for item in found:
+            groups.setdefault(item.cause, []).append((name, item))
+    return [
+        f"{cause[0].upper()}{cause[1:]} ({listed(name for name, _ in several)}): {several[0][1].evidence}; {several[0][1].remedy}."
+        for cause, several in groups.items()
+    ]
 
 
 def centimetres(value):

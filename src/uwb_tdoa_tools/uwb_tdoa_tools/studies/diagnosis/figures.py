@@ -15,10 +15,10 @@ from ...diagnosis import diagnose
 from ...diagnosis.attribution import attribute
 from ...diagnosis.references import GroundTruth
 from ...scoring.plots import plt
-from . import bank, blind, measured, referenced, undeclared
+from . import bank, blind, faults, measured, referenced, undeclared
 
 PARTS = (
-    "bank", "aids", "no-truth", "undeclared", "blind", "injected", "measured", "measured-aids", "references", "speed",
+    "bank", "aids", "no-truth", "undeclared", "blind", "faults", "injected", "measured", "measured-aids", "references", "speed",
 )  # fmt: skip
 
 
@@ -26,7 +26,7 @@ def add_options(add):
     """The options of the study."""
     add("part", choices=PARTS, help="what to run")
     add("--out", metavar="DIR", type=Path, required=True, help="where to write")
-    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, or cases of blind (default: 5)")
+    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, or cases of blind and faults (default: 5)")
     add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind (default: %(default)s)")
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
     add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
@@ -35,7 +35,7 @@ def add_options(add):
 def run(args):
     """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
-    on_data = dict.fromkeys(("injected", "measured", "measured-aids", "references"), ("data",))
+    on_data = dict.fromkeys(("faults", "injected", "measured", "measured-aids", "references"), ("data",))
     for option in {"undeclared": ("cases",), **on_data}.get(args.part, ()):
         if getattr(args, option) is None:
             raise InputError(f"--{option}: {args.part} needs it.")
@@ -46,6 +46,7 @@ def run(args):
         "no-truth": _no_truth,
         "undeclared": _undeclared,
         "blind": _blind,
+        "faults": _faults,
         "injected": _injected,
         "measured": _measured,
         "measured-aids": _measured_aids,
@@ -117,6 +118,11 @@ def _blind(args):
         figures["false alarms"] = bank.share(bool(r["said"]) for r in clean)
     _confusions(results, args.out / "blind.png")
     return {"figures": figures, "cases": results}
+
+
+def _faults(args):
+    results = _each(faults.cases(args.seeds), lambda *case: faults.run(args.data, *case))
+    return {"figures": faults.figures(results), "cases": results}
 
 
 def _injected(args):
