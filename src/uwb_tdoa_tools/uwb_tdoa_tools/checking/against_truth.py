@@ -1,6 +1,6 @@
 """What is wrong with the numbers of a flight whose ground truth is known: of single pairs, of the axes of the IMU, of the truth itself.
 
-A rule takes a Flight and yields Findings. What holds for whole streams is in `streams`; here the geometry says what a pair should
+A rule takes a Flight and yields Findings. What holds for whole streams is in `uwb_tdoa_ekf.streams`; here the geometry says what a pair should
 have measured.
 """
 
@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.foundation.geometry import tdoa
-
-from .streams import ERROR, WARNING, Finding
+from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 
 FEWEST = 40  # TDOAs of a pair
 AIRBORNE = 0.3  # m

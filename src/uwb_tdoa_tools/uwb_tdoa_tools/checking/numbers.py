@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from uwb_tdoa_ekf.streams import NOTE, StreamRules, most_severe_first
+
 from .against_truth import against_truth
-from .streams import NOTE, StreamRules, most_severe_first
 
 
 def numbers(flight):
