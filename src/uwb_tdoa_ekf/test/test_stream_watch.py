@@ -31,7 +31,7 @@ def test_a_fault_is_named_within_five_seconds_and_forgotten_when_it_ends():
     imu, tdoa = streams(16.0)
     force = np.where(((imu[0] > 103.0) & (imu[0] < 109.0))[:, None], imu[3] / 9.81, imu[3])
     said = ["imu_force_unit" in found for found in watched((*imu[:3], force), tdoa, 16.0)]
-    assert not any(said[:4]) and said[8] and not any(said[14:])
+    assert not any(said[:4]) and said[8] and not any(said[13:])
 
 
 def test_a_replay_at_another_speed_is_none():

@@ -6,7 +6,7 @@ from ..streams import NOTE, StreamRules
 from ..streams.stamp_rules import median
 
 KEPT = 5  # windows of a second that are judged together
-FEWEST = 3  # of them, below which nothing is said
+FEWEST = 3  # of them, below which nothing is said; the latest so many must say it too, or it is over
 # Said by `check`, and no warning in flight: the filter knows what a shaking accelerometer is worth.
 NOT_IN_FLIGHT = {"imu_shaking"}
 FEW_ANCHORS = "few_anchors"  # a tag with a fixed height needs three
@@ -48,7 +48,8 @@ class StreamWatch:
             rules.feed_tdoa(np.array(t), np.array(arrival), np.array(a), np.array(b), np.array(d))
         if max(len(rules.imu), len(rules.tdoa)) < FEWEST:
             return []
-        return [finding for finding in rules.findings() if self._counts(finding)]
+        still = {finding.rule for finding in rules.findings(FEWEST)}
+        return [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
 
     def _counts(self, finding):
         if finding.severity == NOTE or finding.rule in self._ignored:

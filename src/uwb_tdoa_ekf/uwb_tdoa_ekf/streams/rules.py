@@ -53,21 +53,21 @@ class StreamRules:
             if counters.stamps[stamps.COUNT] >= FULL:
                 close()
 
-    def findings(self):
-        """What stands: a list of Finding, most severe first."""
-        found = []
+    def findings(self, latest=0):
+        """What stands: a list of Finding, most severe first. latest : of how many windows of each stream; 0: of all."""
+        imu, tdoa, found = self.imu[-latest:], self.tdoa[-latest:], []
         for name, windows, rules in (
-            ("imu/data", self.imu, inertial_rules.RULES),
-            ("uwb/tdoa", self.tdoa, ranging_rules.RULES),
+            ("imu/data", imu, inertial_rules.RULES),
+            ("uwb/tdoa", tdoa, ranging_rules.RULES),
         ):
             if windows:
                 stamped = [window.stamps for window in windows]
                 found += [rule(name, stamped) for rule in stamp_rules.OF_ONE]
                 found += [rule(windows) for rule in rules]
-        if self.imu and self.tdoa:
-            both = [window.stamps for window in self.imu], [window.stamps for window in self.tdoa]
+        if imu and tdoa:
+            both = [window.stamps for window in imu], [window.stamps for window in tdoa]
             found += [rule(*both) for rule in stamp_rules.OF_BOTH]
-        found.append(self._unknown(self.tdoa))
+        found.append(self._unknown(tdoa))
         return most_severe_first(finding for finding in found if finding is not None)
 
     def _unknown(self, windows):
