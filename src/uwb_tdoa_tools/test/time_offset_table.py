@@ -54,7 +54,7 @@ def run(flight, shift):
     truth = flight.truth
     t = odometry.t[(odometry.t > max(odometry.t[0] + SETTLE, truth.t[0])) & (odometry.t < truth.t[-1])]
     p = np.stack([np.interp(t, odometry.t, odometry.p[:, k]) for k in range(3)], axis=1)
-    error = np.linalg.norm(p - position_at(truth, t), axis=1)
+    error = np.linalg.norm(p - position_at(t, truth), axis=1)
     return innovation, float(np.sqrt(np.nanmean(error**2)))
 
 
