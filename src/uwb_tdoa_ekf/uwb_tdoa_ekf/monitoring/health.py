@@ -129,8 +129,8 @@ class Health:
         """What became of the TDOAs since the last time."""
         reasons = {
             "late": (
-                "are late: check the load of this machine; raise reorder if they come out of order, lag (now "
-                f"{self._lag} s) if a stream is slow"
+                "are late: check the load of this machine; raise reorder if they come out of order, or lag (now "
+                f"{self._lag} s)"
             ),
             "invalid": "are invalid: check that uwb/anchors lists the anchors that the tag hears, in metres",
             "rejected": "contradict the filter: check the anchors' positions, and tdoa_std",
