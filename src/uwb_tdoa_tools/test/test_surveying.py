@@ -97,6 +97,18 @@ def marks_file(path, flight, places=3, changes=()):
     return path
 
 
+def test_nothing_is_applied_where_something_else_is_wrong_too(flights, tmp_path, capsys):
+    region = {"2.x": 1.0, "2.y": 0.0, "2.z": 1.0, "2.radius": 1.5, "2.delay": 1.5}
+    blocked = EFFECTS["nlos"](region).inject(flights[0], np.random.default_rng(0))
+    blocked = EFFECTS["noise_correlation"]({"std": 0.2, "time": 1.0}).inject(blocked, np.random.default_rng(0))
+    write_bag(blocked, tmp_path / "flight.bag")
+    assert main([str(tmp_path / "flight.bag"), "--out", str(tmp_path / "out")]) == 1
+    assert "nothing is applied, anchors stay as given" in capsys.readouterr().out
+    kept = read_survey(tmp_path / "out" / "anchors.yaml").positions
+    np.testing.assert_allclose(kept, blocked.anchors.positions, atol=1e-9)
+    assert not len(EffectSet.from_yaml(tmp_path / "out" / "effects.yaml"))
+
+
 def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
     flight = flights[0]
     away = flight.anchors.positions + [0.2, -0.15, 0.1]  # all alike: nothing in the TDOAs tells

@@ -8,7 +8,6 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
-from ..diagnosis.self_survey import delay_effect
 from ..progress import Progress
 from ..surveying.marks import read_marks
 from ..surveying.survey import survey
@@ -22,7 +21,9 @@ coordinates that are known best: name some with --trusted, or all stays where it
 
 Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the anchors),
 ekf_node.yaml (noise that the filter should assume with them), survey.json (covariance) and survey.png (before and after)
-to --out."""
+to --out.
+
+Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
 PARAMETERS = """/**:
   ros__parameters:
     tdoa_std: {:.3f}  # m; measured: as many TDOAs count as independent as there are
@@ -69,12 +70,11 @@ def _survey(args):
     with Progress("survey") as progress:
         result = survey(flights, tape, base, config, marks, lambda: progress("solving"))
     out.mkdir(parents=True, exist_ok=True)
-    anchors = result.surveyed.anchors
+    anchors = result.anchors
     anchors.to_yaml(out / "anchors.yaml")
     rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
     (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
-    delays = delay_effect(anchors, result.surveyed.delays)
-    EffectSet((*base.effects, delays)).to_yaml(out / "effects.yaml")
+    EffectSet((*base.effects, *result.effects.effects)).to_yaml(out / "effects.yaml")
     (out / "ekf_node.yaml").write_text(PARAMETERS.format(result.surveyed.tdoa_std))
     (out / "survey.json").write_text(json.dumps(result.as_dict(), indent=1, allow_nan=False))
     result.picture(out / "survey.png")
@@ -82,6 +82,7 @@ def _survey(args):
     print(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")
     files = (("--survey", "anchors.yaml"), ("--effects", "effects.yaml"), ("--config", "ekf_node.yaml"))
     print("next: evaluate FLIGHT", *(f"{option} {out / file}" for option, file in files))
+    return 0 if result.why_not is None else 1
 
 
 if __name__ == "__main__":

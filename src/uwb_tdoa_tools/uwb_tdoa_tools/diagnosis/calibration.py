@@ -10,15 +10,14 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from .regression.fit import MIN_BLOCKS, fit, scales
+from .regression.fit import MIN_BLOCKS, fit
 from .regression.select import Selection
 from .regression.table import BLOCK, table_of
 from .regression.terms import columns_of
-from .self_survey import survey
+from .self_survey import FEWEST, survey
 
 CALIBRATED = "anchor_position", "anchor_delay"
 POSITION_STD = 0.1  # m, of the coordinates of anchors as they are given
-FEWEST = 4  # TDOAs in a cell; noise of fewer hides what is slow
 LEFT = 0.055  # m that may be left of slow innovations
 EXPLAINED = 0.1  # share of the slow innovations that must be explained
 
@@ -63,12 +62,9 @@ def calibrate(flights, attribution, base, config=None, progress=lambda: None):
     places = [keys.index(column.key) for column in columns]
     shifts = (found.anchors.positions - anchors.positions).ravel()
     beta, cov = np.concatenate([shifts, found.delays])[places], found.covariance[np.ix_(places, places)]
-    residual = table.y - table.matrix(columns) @ beta
-    fitted = replace(fit(table, columns), beta=beta, cov=cov, residual=residual, scale=scales(table, residual))
-    before, after = (np.mean(np.clip(values, -1.0, 1.0) ** 2) for values in (table.y, residual))
+    fitted = replace(fit(table, columns), beta=beta, cov=cov, residual=table.y - table.matrix(columns) @ beta)
     selection = Selection(table, chosen, fitted, (0.0,) * len(chosen), ((),) * len(chosen))
-    left = float(fitted.scale[table.channels.index("tdoa")])
-    return Calibration(selection, left, float(1.0 - after / before), len(np.unique(table.block)) >= MIN_BLOCKS)
+    return Calibration(selection, found.left, 1.0 - (found.left / found.before) ** 2, len(np.unique(table.block)) >= MIN_BLOCKS)
 
 
 def _rows(table, chosen):

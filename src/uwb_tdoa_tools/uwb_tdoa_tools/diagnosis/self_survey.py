@@ -18,8 +18,9 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .channels import CHANNELS, Comparison
 from .references import Nothing
-from .regression.fit import NU
+from .regression.fit import NU, student_scale
 
+FEWEST = 4  # TDOAs in a cell; noise of fewer hides what is slow
 ROUNDS = 2  # linear solutions, each about the last
 BLOCK = 3.0  # s over which sums of scores show how alike errors are
 SYSTEMATIC = 12.0  # by which the information is divided beside that: errors that last are no noise
@@ -35,12 +36,15 @@ FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 @dataclass(frozen=True, eq=False)
 class Surveyed:
     """anchors : Anchors; delays (N,) m; covariance (4N, 4N) m^2, of positions, anchor by anchor, and then of delays;
-    tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are; delay_std, function_std : m,
-    what the evidence says of the size of delays, and of functions of the place."""
+    before, left : m, scale of the slow innovations with the anchors as given, and with these; tdoa_std : m, for the filter: so
+    that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of the
+    size of delays, and of functions of the place."""
 
     anchors: Anchors
     delays: np.ndarray
     covariance: np.ndarray
+    before: float
+    left: float
     tdoa_std: float
     delay_std: float
     function_std: float
@@ -62,11 +66,11 @@ class Mark:
     std: float
 
 
-def survey(flights, position_std, base=EffectSet(), config=None, marks=(), rounds=ROUNDS, progress=lambda: None):
+def survey(flights, position_std, base=EffectSet(), config=None, marks=(), progress=lambda: None):
     """Surveyed of Flights of the same anchors, which are where they say within position_std, (N, 3) m.
 
-    base : EffectSet that is in the model; config : FilterConfig; marks : Marks. The frame is that of the coordinates with the smallest
-    std. Raises InputError for a flight that is too short.
+    base : EffectSet that is in the model; config : FilterConfig; marks : Marks. The frame is that of the coordinates with
+    the smallest std. Raises InputError for a flight that is too short.
     """
     given, reference = flights[0].anchors, Nothing(config)
     flights = [reference.prepare(flight) for flight in flights]
@@ -74,22 +78,29 @@ def survey(flights, position_std, base=EffectSet(), config=None, marks=(), round
     start = np.concatenate([given.positions.ravel(), np.zeros(n)])
     config = config or FilterConfig()
     best, found = start, None
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         anchors = Anchors(given.ids, best[: 3 * n].reshape(n, 3), given.orientations, given.frame)
-        gram, vector, alike = 0.0, 0.0, []
+        gram, vector, alike, slow = 0.0, 0.0, [], []
         for flight in flights:
             here = [mark for mark in marks if mark.flight == flight.name]
-            grams, vectors, marked = _equations(replace(flight, anchors=anchors), best[3 * n :], base, reference, here)
+            part = _residual(replace(flight, anchors=anchors), best[3 * n :], base, reference)
+            slow.append(_slow(part))
+            grams, vectors, marked = _equations(part, flight, here)
             alike.append(_inflation(grams[:, : 4 * n, : 4 * n], vectors[:, : 4 * n], position_std.ravel()))
             inflation = SYSTEMATIC * alike[-1]
             gram = gram + grams.sum(axis=0) / inflation + marked[0]
             vector = vector + vectors.sum(axis=0) / inflation + marked[1]
             progress()
         step, covariance, sizes = _by_evidence(gram, vector, position_std.ravel(), best - start)
+        if found is None:
+            before = student_scale(np.concatenate(slow))
         tdoa_std = config.tdoa_std * float(np.sqrt(np.mean(alike) / config.tdoa_correlation_length))
         best, found = best + step, (covariance, tdoa_std, *sizes)
     moved = Anchors(given.ids, best[: 3 * n].reshape(n, 3), given.orientations, given.frame)
-    return Surveyed(moved, best[3 * n :], *found)
+    parts = [_residual(replace(flight, anchors=moved), best[3 * n :], base, reference) for flight in flights]
+    left = student_scale(np.concatenate([_slow(part) for part in parts]))
+    covariance, *sizes = found
+    return Surveyed(moved, best[3 * n :], covariance, before, left, *sizes)
 
 
 def delay_effect(anchors, delays):
@@ -97,15 +108,25 @@ def delay_effect(anchors, delays):
     return EFFECTS["anchor_delay"]({str(i): float(delay) for i, delay in zip(anchors.ids, delays)})
 
 
-def _equations(flight, delays, base, reference, marks):
-    """(grams (b, k, k), vectors (b, k)) of the normal equations that the innovations of a prepared Flight give, block by
-    block, and (gram (k, k), vector (k,)) of those that its Marks give."""
-    anchors = flight.anchors
-    effects = EffectSet((*base.effects, delay_effect(anchors, delays))) if delays.any() else base
+def _residual(flight, delays, base, reference):
+    """TdoaResidual of a prepared Flight with late anchors: the innovations of a run."""
+    effects = EffectSet((*base.effects, delay_effect(flight.anchors, delays))) if delays.any() else base
     part = CHANNELS["tdoa"].residual(Comparison.of(flight, reference, effects))
     if part is None:
         raise InputError(f"{flight.name}: has no TDOAs in the air to survey with; fly for half a minute at least.")
-    samples, air = part.samples, part.airborne
+    return part
+
+
+def _slow(part):
+    """Innovations averaged over cells of half a second, (n,) m, those of which hold enough to hide the noise."""
+    rows = part.rows()
+    return rows.y[rows.count >= FEWEST]
+
+
+def _equations(part, flight, marks):
+    """(grams (b, k, k), vectors (b, k)) of the normal equations that a TdoaResidual gives, block by block, and (gram (k, k),
+    vector (k,)) of those that the Marks of its Flight give."""
+    samples, air, anchors = part.samples, part.airborne, part.samples.anchors
     ids = [str(i) for i in anchors.ids]
     positions = EFFECTS["anchor_position"]().regressors(samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
     late = EFFECTS["anchor_delay"]().regressors(samples, ids)

@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import AIDS
 
-from ..diagnosis.self_survey import delay_effect
 from ..readers import inputs
 from ..scoring.evaluation import evaluate
 from ..surveying.survey import survey
@@ -41,8 +39,8 @@ def add_options(add):
 
 def run(args):
     """Print a table, a row for each set and size."""
-    print("| set | tape off by [m] | tag, true survey | shaken | surveyed | surveyed / true, median (worst) | worse than shaken | ", end="")
-    print("anchors shaken | surveyed | normalised error |\n|---|" + 9 * "---:|")
+    print("| set | tape off by [m] | applied | tag, true survey | shaken | surveyed | surveyed / true, median (worst) | ", end="")
+    print("worse than shaken | anchors shaken | surveyed | normalised error |\n|---|" + 10 * "---:|")
     every = {}
     for name in [args.only] if args.only else [*SETS, "simulated"]:
         flights, judged = _simulated() if name == "simulated" else _measured(args.data, *SETS[name])
@@ -62,16 +60,16 @@ def draw(flights, judged, std, seed):
     free = tape.position_std(true) > tape.trusted_std
     noise = np.random.default_rng(seed).standard_normal(true.positions.shape)
     rough = true.positions + np.where(free, std, tape.trusted_std) * noise
-    found = survey([at(flight, rough) for flight in flights], tape).surveyed
-    error = found.anchors.positions - true.positions
-    delays = EffectSet((delay_effect(true, found.delays),))
+    result = survey([at(flight, rough) for flight in flights], tape)
+    error = result.surveyed.anchors.positions - true.positions
     return {
         "true": _rmse(judged),
         "shaken": _rmse([at(flight, rough) for flight in judged]),
-        "surveyed": _rmse([at(flight, found.anchors.positions) for flight in judged], delays),
+        "surveyed": _rmse([at(flight, result.anchors.positions) for flight in judged], result.effects),
+        "applied": result.why_not is None,
         "anchors_shaken": _root((rough - true.positions)[free]),
         "anchors_surveyed": _root(error[free]),
-        "normalised": _root((error / found.position_std)[free]),
+        "normalised": _root((error / result.surveyed.position_std)[free]),
     }
 
 
@@ -115,4 +113,5 @@ def _summary(draws):
     cells = [f"{columns[key].mean():.3f}" for key in ("true", "shaken", "surveyed")]
     cells += [f"{np.median(ratio):.2f} ({ratio.max():.2f})", f"{worse} of {len(draws)}"]
     cells += [f"{_root(columns[key]):.3f}" for key in ("anchors_shaken", "anchors_surveyed")]
-    return " | ".join([*cells, f"{_root(columns['normalised']):.2f}"])
+    applied = f"{int(columns['applied'].sum())} of {len(draws)}"
+    return " | ".join([applied, *cells, f"{_root(columns['normalised']):.2f}"])

@@ -4,20 +4,48 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..diagnosis.self_survey import Surveyed
+from uwb_tdoa_bias.effects import EffectSet
+
+from ..diagnosis.calibration import LEFT
+from ..diagnosis.self_survey import Surveyed, delay_effect
 
 IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
+CLEARLY = 1.5  # slow innovations as given over those that are left, beyond which the tape was worse than what else is wrong
 KNOWN_WELL = 0.02  # m, standard deviation as given that leaves nothing to wish for
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names."""
+    """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names; marked : whether marks
+    were given."""
 
     given: object
     given_std: np.ndarray
     surveyed: Surveyed
     flights: tuple
+    marked: bool = False
+
+    @property
+    def why_not(self):
+        """Why it must not be used instead of what was given; None if it may."""
+        before, left = self.surveyed.before, self.surveyed.left
+        if self.marked or left <= LEFT or before > CLEARLY * left:
+            return None
+        return (
+            f"{100 * before:.1f} cm of the innovations are slow with the anchors as given, and {100 * left:.1f} cm with others: more than "
+            f"{100 * LEFT:.1f} cm: something else is wrong too, and the position might suffer; give --marks, or fly where it is known"
+        )
+
+    @property
+    def anchors(self):
+        """The Anchors to use."""
+        return self.surveyed.anchors if self.why_not is None else self.given
+
+    @property
+    def effects(self):
+        """The EffectSet to use with them."""
+        delays = delay_effect(self.surveyed.anchors, self.surveyed.delays)
+        return EffectSet((delays,) if self.why_not is None else ())
 
     @property
     def shifts(self):
@@ -46,6 +74,9 @@ class Result:
                 }
                 for row, i in enumerate(found.anchors.ids)
             },
+            "applied": self.why_not is None,
+            "slow_before": found.before,
+            "slow_left": found.left,
             "covariance": found.covariance.tolist(),
             "tdoa_std": found.tdoa_std,
             "delay_std": found.delay_std,
@@ -68,11 +99,8 @@ class Result:
         unseen = [str(i) for row, i in enumerate(found.anchors.ids) if rough[row] and not self.improved[row].any()]
         if unseen:
             lines.append(f"nothing new is told of anchors {', '.join(unseen)}: fly closer to them, on all sides, high and low")
-        if found.function_std > 0.05:
-            lines.append(
-                f"something else is wrong too, some {100 * found.function_std:.0f} cm that change with the place (antennas, metal, "
-                "floors): shifts are kept near what was given"
-            )
+        if self.why_not:
+            lines.append(f"nothing is applied, anchors stay as given: {self.why_not}")
         return "\n".join(lines)
 
     def picture(self, path):

@@ -31,4 +31,4 @@ def survey(flights, tape, base=EffectSet(), config=None, marks=(), progress=lamb
         start_std[rows], std[rows] = PLACED_STD, NOTHING_KNOWN
     moved = [replace(flight, anchors=start) for flight in flights]
     found = self_survey.survey(moved, start_std, base, config, marks, progress=progress)
-    return Result(given, std, found, tuple(flight.name for flight in flights))
+    return Result(given, std, found, tuple(flight.name for flight in flights), bool(marks))

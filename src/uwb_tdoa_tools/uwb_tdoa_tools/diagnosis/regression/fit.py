@@ -69,7 +69,7 @@ def fit(table, columns, inflation=None):
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
     residual, scale = table.y.copy(), np.ones(len(table.channels))
     for step in range(ITERATIONS):
-        scale = scales(table, residual)
+        scale = _scales(table, residual)
         weight = (NU + 1.0) / (NU + (residual / scale[channel]) ** 2)
         if not columns:
             if step:
@@ -97,17 +97,21 @@ def refit(table, columns, model, rows):
     return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=table.y - x @ beta)
 
 
-def scales(table, residual):
+def _scales(table, residual):
     """Scale of Student's t per channel, by the fixed point of its likelihood."""
     out = np.ones(len(table.channels))
     for k in np.unique(table.channel):
-        r = residual[table.channel == k]
-        scale = max(1.4826 * np.median(np.abs(r)), 1e-9)
-        for _ in range(15):
-            w = (NU + 1.0) / (NU + (r / scale) ** 2)
-            scale = max(np.sqrt(np.mean(w * r**2)), 1e-9)
-        out[k] = scale
+        out[k] = student_scale(residual[table.channel == k])
     return out
+
+
+def student_scale(r):
+    """Scale of Student's t for residuals r (n,)."""
+    scale = max(1.4826 * np.median(np.abs(r)), 1e-9)
+    for _ in range(15):
+        w = (NU + 1.0) / (NU + (r / scale) ** 2)
+        scale = max(np.sqrt(np.mean(w * r**2)), 1e-9)
+    return scale
 
 
 def _covariance(table, x, residual, root, sizes):
