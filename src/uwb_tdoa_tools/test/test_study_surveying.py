@@ -1,0 +1,31 @@
+"""The figures of surveys from flights."""
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from uwb_tdoa_tools.studies.surveying import MARK_STD, draw, marks_of, third
+from uwb_tdoa_tools.surveying.tape import Tape
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return clean_flight(210, 40.0)
+
+
+def test_a_third_of_the_coordinates_are_trusted(flight):
+    std = Tape(0.3, trusted=third(flight.anchors)).position_std(flight.anchors)
+    assert (std < 0.1).sum() == 8 and std.size == 24
+
+
+def test_marks_are_where_the_tag_was(flight):
+    for mark in marks_of(flight, 6, np.random.default_rng(0)):
+        inside = (flight.truth.t - flight.tdoa.t[0] >= mark.first) & (flight.truth.t - flight.tdoa.t[0] <= mark.last)
+        assert np.linalg.norm(flight.truth.p[inside].mean(axis=0) - mark.position) < 5.0 * MARK_STD
+
+
+@pytest.mark.slow
+def test_a_draw_makes_a_shaken_survey_better_and_repeats(flight):
+    first, again = (draw([flight], [clean_flight(211, 30.0)], 0.3, 0) for _ in range(2))
+    assert first == again and first["applied"]
+    assert first["surveyed"] < 0.5 * first["shaken"] and first["anchors_surveyed"] < first["anchors_shaken"]
