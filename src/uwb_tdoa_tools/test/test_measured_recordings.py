@@ -59,6 +59,8 @@ def test_log(path):
     assert len(flight.height or ()) == counts.pop("estTOF", 0)
     readings = len(flight.pressure or ())  # the log repeats each of them, up to a thousand times a second
     assert (readings > 500) == (counts.pop("estBarometer", 0) > 0)
+    pixel_counts, velocities = counts.pop("estFlow", 0), 0 if flight.velocity is None else len(flight.velocity.t)
+    assert 0.2 * pixel_counts <= velocities <= 0.4 * pixel_counts  # some three readings for each
     assert {name: len(columns["t"]) for name, columns in flight.extra.items()} == dict(counts)
     assert "reordered" not in flight.meta and "imu_accel_interpolated" not in flight.meta
     assert set(flight.tdoa.a) == set(flight.tdoa.b) == set(range(8)) == set(flight.anchors.ids)
