@@ -10,7 +10,6 @@ import sys
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
-from uwb_tdoa_msgs.msg import AnchorArray
 from visualization_msgs.msg import Marker, MarkerArray
 
 from .foundation import ros

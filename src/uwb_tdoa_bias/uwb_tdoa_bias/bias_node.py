@@ -20,7 +20,6 @@ from .foundation.anchors import Anchors
 from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
 from .effects import EffectSet
 from .effects.tag_lever_arm import TagLeverArm
-from .foundation.errors import InputError
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from .foundation.ros_frames import FramesInput, unknown_frame
 from .foundation.ros_parameters import Parameter, declare_all, refuse_unknown, say_unused

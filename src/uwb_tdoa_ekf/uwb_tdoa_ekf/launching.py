@@ -8,7 +8,7 @@ from uwb_tdoa_bias import anchors_node, bias_node
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
-from . import debias_node, ekf_node
+from . import debias_node
 from .ekf_parameters import names_of_parameters
 
 EVERYWHERE = {"use_sim_time"}

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -25,8 +24,7 @@ TRUSTED = ("0", "6", "1.z", "2.z")
 
 
 def at(flight, positions):
-    anchors = flight.anchors
-    return replace(flight, anchors=Anchors(anchors.ids, positions, anchors.orientations, anchors.frame))
+    return replace(flight, anchors=flight.anchors.at(positions))
 
 
 def shaken(anchors, std, seed):
@@ -107,6 +105,11 @@ def test_nothing_is_applied_where_something_else_is_wrong_too(flights, tmp_path,
     kept = read_survey(tmp_path / "out" / "anchors.yaml").positions
     np.testing.assert_allclose(kept, blocked.anchors.positions, atol=1e-9)
     assert not len(EffectSet.from_yaml(tmp_path / "out" / "effects.yaml"))
+
+
+def test_flights_that_are_too_short_are_refused():
+    with pytest.raises(InputError, match="s in the air together; 30 s are needed"):
+        survey([clean_flight(203, 20.0)], Tape())
 
 
 def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):

@@ -81,6 +81,14 @@ def check_folders(*paths):
             raise InputError(f"{path}: its directory does not exist; make it first.")
 
 
+def output_folder(text):
+    """Path of --out. Raises InputError, before the work, if it is a file."""
+    out = Path(text)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out: {out} is a file; give a directory.")
+    return out
+
+
 def write_json(path, content):
     """Write a dict as JSON, with the version of the suite; NaN must be None by now (ValueError otherwise)."""
     text = json.dumps({"written_by": written_by(), **content}, indent=1, allow_nan=False)

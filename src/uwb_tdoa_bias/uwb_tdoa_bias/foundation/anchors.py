@@ -79,6 +79,14 @@ class Anchors:
         at = np.clip(np.searchsorted(self.ids[order], ids), 0, len(self.ids) - 1)
         return np.where(self.ids[order][at] == ids, order[at], -1)
 
+    def at(self, positions):
+        """The same Anchors at other positions, (N, 3) m."""
+        return Anchors(self.ids, positions, self.orientations, self.frame)
+
+    def only(self, rows):
+        """Those of some rows."""
+        return Anchors(self.ids[rows], self.positions[rows], self.orientations[rows], self.frame)
+
     @classmethod
     def from_positions(cls, positions, ids=None, frame="map"):
         """Anchors at (N, 3) positions in metres whose orientations are not known. Default ids: 0 ... N-1."""

@@ -113,3 +113,9 @@ class Flight:
     def without(self, *streams):
         """The Flight without some of the streams that may be missing, by their names, e.g. AIDS."""
         return replace(self, **dict.fromkeys(streams))
+
+    def among(self, rows):
+        """The Flight among its anchors of some rows alone, with the TDOAs that are between them."""
+        anchors, tdoa = self.anchors.only(rows), self.tdoa
+        kept = np.isin(tdoa.a, anchors.ids) & np.isin(tdoa.b, anchors.ids)
+        return replace(self, anchors=anchors, tdoa=Tdoas(tdoa.t[kept], tdoa.a[kept], tdoa.b[kept], tdoa.d[kept]))

@@ -9,7 +9,6 @@ from itertools import combinations
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, Finding
@@ -204,7 +203,7 @@ def moved(case):
     where = ", ".join(f"{s:+.1f}" for s in shift)
     cause = f"anchor {number} is not where the survey has it, but about ({where}) m from there"
     line = f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
-    anchors = Anchors(case.anchors.ids, alone[row][1], case.anchors.orientations, case.anchors.frame)
+    anchors = case.anchors.at(alone[row][1])
     yield Trial(replace(case, anchors=anchors), _says("anchor_moved", cause, line))
 
 

@@ -1,7 +1,6 @@
 """diagnose: from a residual to the missing effect to a smaller error."""
 
 import sys
-from pathlib import Path
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -52,9 +51,7 @@ def parser():
 
 
 def _diagnose(args):
-    out = Path(args.out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is a file; give a directory.")
+    out = cli.output_folder(args.out)
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
     flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)

@@ -1,11 +1,8 @@
 """survey: better anchors from a tape measure and flights."""
 
-import json
-from pathlib import Path
 import sys
 
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
 from ..progress import Progress
@@ -59,9 +56,7 @@ def parser():
 
 
 def _survey(args):
-    out = Path(args.out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is a file; give a directory.")
+    out = cli.output_folder(args.out)
     tape = Tape(args.std, args.height_std, tuple(args.trusted), args.trusted_std, tuple(args.unknown))
     config, effects = options.filter_of(args)
     base = effects or EffectSet()
@@ -76,7 +71,7 @@ def _survey(args):
     (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
     EffectSet((*base.effects, *result.effects.effects)).to_yaml(out / "effects.yaml")
     (out / "ekf_node.yaml").write_text(PARAMETERS.format(result.surveyed.tdoa_std))
-    (out / "survey.json").write_text(json.dumps(result.as_dict(), indent=1, allow_nan=False))
+    cli.write_json(out / "survey.json", result.as_dict())
     result.picture(out / "survey.png")
     print(result.as_text())
     print(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")

@@ -36,13 +36,14 @@ FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 @dataclass(frozen=True, eq=False)
 class Surveyed:
     """anchors : Anchors; delays (N,) m; covariance (4N, 4N) m^2, of positions, anchor by anchor, and then of delays;
-    before, left : m, scale of the slow innovations with the anchors as given, and with these; tdoa_std : m, for the filter: so
+    seconds : s in the air that tell; before, left : m, scale of the slow innovations with the anchors as given, and with these; tdoa_std : m, for the filter: so
     that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of the
     size of delays, and of functions of the place."""
 
     anchors: Anchors
     delays: np.ndarray
     covariance: np.ndarray
+    seconds: float
     before: float
     left: float
     tdoa_std: float
@@ -79,13 +80,14 @@ def survey(flights, position_std, base=EffectSet(), config=None, marks=(), progr
     config = config or FilterConfig()
     best, found = start, None
     for _ in range(ROUNDS):
-        anchors = Anchors(given.ids, best[: 3 * n].reshape(n, 3), given.orientations, given.frame)
-        gram, vector, alike, slow = 0.0, 0.0, [], []
+        anchors = given.at(best[: 3 * n].reshape(n, 3))
+        gram, vector, alike, slow, seconds = 0.0, 0.0, [], [], 0.0
         for flight in flights:
             here = [mark for mark in marks if mark.flight == flight.name]
             part = _residual(replace(flight, anchors=anchors), best[3 * n :], base, reference)
             slow.append(_slow(part))
             grams, vectors, marked = _equations(part, flight, here)
+            seconds += BLOCK * len(grams)
             alike.append(_inflation(grams[:, : 4 * n, : 4 * n], vectors[:, : 4 * n], position_std.ravel()))
             inflation = SYSTEMATIC * alike[-1]
             gram = gram + grams.sum(axis=0) / inflation + marked[0]
@@ -96,11 +98,11 @@ def survey(flights, position_std, base=EffectSet(), config=None, marks=(), progr
             before = student_scale(np.concatenate(slow))
         tdoa_std = config.tdoa_std * float(np.sqrt(np.mean(alike) / config.tdoa_correlation_length))
         best, found = best + step, (covariance, tdoa_std, *sizes)
-    moved = Anchors(given.ids, best[: 3 * n].reshape(n, 3), given.orientations, given.frame)
+    moved = given.at(best[: 3 * n].reshape(n, 3))
     parts = [_residual(replace(flight, anchors=moved), best[3 * n :], base, reference) for flight in flights]
     left = student_scale(np.concatenate([_slow(part) for part in parts]))
     covariance, *sizes = found
-    return Surveyed(moved, best[3 * n :], covariance, before, left, *sizes)
+    return Surveyed(moved, best[3 * n :], covariance, seconds, before, left, *sizes)
 
 
 def delay_effect(anchors, delays):

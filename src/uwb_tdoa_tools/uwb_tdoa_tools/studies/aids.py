@@ -6,8 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import AIDS, Tdoas, Velocity
+from uwb_tdoa_bias.foundation.flight import AIDS, Velocity
 from uwb_tdoa_bias.foundation.pressure import altitude_of, pressure_at
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import VERDICTS
@@ -94,10 +93,7 @@ def worth(flights, config):
 
 def of_four(flight):
     """The flight with the TDOAs among its first four anchors alone."""
-    anchors, tdoa = flight.anchors, flight.tdoa
-    few = Anchors(anchors.ids[:4], anchors.positions[:4], anchors.orientations[:4], anchors.frame)
-    kept = np.isin(tdoa.a, few.ids) & np.isin(tdoa.b, few.ids)
-    return replace(flight, anchors=few, tdoa=Tdoas(*(column[kept] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))))
+    return flight.among(np.arange(4))
 
 
 def bounds(flights, height_std):

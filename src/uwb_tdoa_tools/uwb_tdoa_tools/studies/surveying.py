@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ..diagnosis.self_survey import Mark
@@ -116,8 +115,7 @@ def third(anchors):
 
 def at(flight, positions):
     """The Flight with its anchors at other positions, (N, 3) m."""
-    anchors = flight.anchors
-    return replace(flight, anchors=Anchors(anchors.ids, positions, anchors.orientations, anchors.frame))
+    return replace(flight, anchors=flight.anchors.at(positions))
 
 
 def _measured(data, fit, judge, aids):

@@ -1,14 +1,11 @@
 """Anchors of which nothing is known: placed from where the others say that the tag flew."""
 
-from dataclasses import replace
 import itertools
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.smoother import smooth
 
 MOST = 3000  # TDOAs of a flight that are used
@@ -27,7 +24,7 @@ def place(flights, rows, config=None):
     anchors = flights[0].anchors
     known = np.setdiff1d(np.arange(len(anchors)), rows)
     positions = anchors.positions.copy()
-    paths = [smooth(_without(flight, rows), config).odometry for flight in flights]
+    paths = [smooth(flight.among(known).without("truth"), config).odometry for flight in flights]
     low, high = positions[known].min(axis=0) - BEYOND, positions[known].max(axis=0) + BEYOND
     for row in rows:
         parts = [_distances(flight, path, row, known, positions) for flight, path in zip(flights, paths)]
@@ -41,16 +38,7 @@ def place(flights, rows, config=None):
         starts = itertools.product(*zip(low, high))
         found = [least_squares(residual, start, loss="soft_l1", f_scale=SCALE, bounds=(low - 5.0, high + 5.0)) for start in starts]
         positions[row] = min(found, key=lambda one: one.cost).x
-    return Anchors(anchors.ids, positions, anchors.orientations, anchors.frame)
-
-
-def _without(flight, rows):
-    """The Flight without the anchors of some rows, and without ground truth."""
-    anchors, tdoa = flight.anchors, flight.tdoa
-    left = np.setdiff1d(np.arange(len(anchors)), rows)
-    fewer = Anchors(anchors.ids[left], anchors.positions[left], anchors.orientations[left], anchors.frame)
-    kept = np.isin(tdoa.a, fewer.ids) & np.isin(tdoa.b, fewer.ids)
-    return replace(flight, anchors=fewer, tdoa=Tdoas(*(column[kept] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))), truth=None)
+    return anchors.at(positions)
 
 
 def _distances(flight, path, row, known, positions):

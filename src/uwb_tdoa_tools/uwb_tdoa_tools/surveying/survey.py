@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..diagnosis import self_survey
 from ..diagnosis.diagnose import same_anchors
@@ -12,6 +12,7 @@ from ..parallel import in_one_thread
 from .placing import PLACED_STD, place
 from .result import Result
 
+LEAST = 30.0  # s in the air; fewer do not tell how alike errors are
 NOTHING_KNOWN = 1e3  # m, standard deviation of a coordinate of which nothing is known
 
 
@@ -31,4 +32,6 @@ def survey(flights, tape, base=EffectSet(), config=None, marks=(), progress=lamb
         start_std[rows], std[rows] = PLACED_STD, NOTHING_KNOWN
     moved = [replace(flight, anchors=start) for flight in flights]
     found = self_survey.survey(moved, start_std, base, config, marks, progress=progress)
+    if found.seconds < LEAST:
+        raise InputError(f"the flights are {found.seconds:g} s in the air together; {LEAST:g} s are needed: fly for longer.")
     return Result(given, std, found, tuple(flight.name for flight in flights), bool(marks))
