@@ -217,7 +217,7 @@ class BiasNode(Node):
         out.anchor_a, out.anchor_b = message.anchor_a, message.anchor_b
         out.raw = message.distance_difference
         out.bias, out.bias_std = bias, std
-        out.corrected = out.raw - bias
+        out.corrected, out.variance = out.raw - bias, message.variance
         out.status, out.model = status, self._model[status]
         self._publisher.publish(out)
         self._counts["published"] += 1

@@ -275,11 +275,13 @@ class Rig:
     def send_imu(self, t, gyro=(0.0, 0.0, 0.0), accel=(0.0, 0.0, 9.81), epoch=EPOCH):
         self.send("imu/data", self.imu_message(gyro, accel), t, epoch=epoch)
 
-    def send_tdoa(self, t, a, b, d, epoch=EPOCH):
-        self.send("uwb/tdoa", Tdoa(anchor_a=int(a), anchor_b=int(b), distance_difference=float(d)), t, epoch=epoch)
+    def send_tdoa(self, t, a, b, d, epoch=EPOCH, variance=0.0):
+        message = Tdoa(anchor_a=int(a), anchor_b=int(b), distance_difference=float(d), variance=float(variance))
+        self.send("uwb/tdoa", message, t, epoch=epoch)
 
-    def send_corrected(self, t, a, b, d, epoch=EPOCH):
+    def send_corrected(self, t, a, b, d, epoch=EPOCH, variance=0.0):
         message = TdoaCorrected(anchor_a=int(a), anchor_b=int(b), raw=float(d), corrected=float(d), model="none")
+        message.variance = float(variance)
         self.send("uwb/tdoa_corrected", message, t, epoch=epoch)
 
     def send_pose(self, t, p=(0.0, 0.0, 0.0), epoch=EPOCH):
@@ -317,7 +319,7 @@ class Rig:
                 i += 1
             while of_aids and of_aids[0][0] <= t:
                 self.send_aid(*of_aids[0][1:2], flight, of_aids.pop(0)[2], epoch)
-            (send_tdoa or self.send_tdoa)(t, tdoa.a[k], tdoa.b[k], tdoa.d[k], epoch)
+            (send_tdoa or self.send_tdoa)(t, tdoa.a[k], tdoa.b[k], tdoa.d[k], epoch, tdoa.variance[k])
             due = before + np.searchsorted(tdoa.t, t - ahead)
             self.wait(lambda due=due: len(self.residuals) >= due, f"{due} residuals", 60.0)
         for t, gyro, accel in zip(imu.t[i:], imu.gyro[i:], imu.accel[i:]):

@@ -193,11 +193,12 @@ def test_late_inertial_samples_are_counted():
 
 
 @pytest.mark.parametrize(
-    "t, a, b, d, bias_std",
+    "t, a, b, d, variance",
     [
         (1.0, FIRST, SECOND, np.nan, 0.0),
         (1.0, FIRST, SECOND, np.inf, 0.0),
         (1.0, FIRST, SECOND, 0.0, np.nan),
+        (1.0, FIRST, SECOND, 0.0, -1.0),
         (np.nan, FIRST, SECOND, 0.0, 0.0),
         (np.inf, FIRST, SECOND, 0.0, 0.0),
         (1.0, 999, SECOND, 0.0, 0.0),
@@ -206,9 +207,9 @@ def test_late_inertial_samples_are_counted():
         (1.0, FIRST, SECOND, 12.0, 0.0),
     ],
 )
-def test_what_cannot_be_a_measurement_is_invalid(t, a, b, d, bias_std):
+def test_what_cannot_be_a_measurement_is_invalid(t, a, b, d, variance):
     estimator = Estimator(corners())
-    estimator.add_tdoa(t, a, b, d, bias_std)
+    estimator.add_tdoa(t, a, b, d, variance)
     _, residuals = estimator.advance()
     assert residuals.verdict.tolist() == [INVALID]
     assert (residuals.a[0], residuals.b[0]) == (a, b) and residuals.weight[0] == 0.0
@@ -380,20 +381,20 @@ def test_the_order_of_the_anchors_changes_nothing():
     assert_same(one, other, 1e-9)
 
 
-def test_a_doubtful_correction_counts_less():
+def test_a_doubtful_measurement_counts_less():
     flight = fly(12, 3.0)
     spreads = []
-    for bias_std in (0.0, 1.0):
+    for variance in (0.0, 1.0):
         estimator = Estimator(flight.anchors)
         for t, stream, i in messages(flight):
             if stream == IMU:
                 estimator.add_imu(t, flight.imu.gyro[i], flight.imu.accel[i])
             else:
                 a, b, d = int(flight.tdoa.a[i]), int(flight.tdoa.b[i]), flight.tdoa.d[i]
-                estimator.add_tdoa(t, a, b, d, bias_std)
+                estimator.add_tdoa(t, a, b, d, variance)
         odometry, residuals = estimator.finish()
         used = residuals.verdict == USED
-        assert residuals.variance[used].min() > 0.25**2 + bias_std**2
+        assert residuals.variance[used].min() > 0.25**2 + variance
         spreads.append(np.trace(odometry.covariance[-1, :3, :3]))
     assert spreads[1] > 1.5 * spreads[0]
 

@@ -47,7 +47,9 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what):
     flight = recording()
     level = np.tile([0.0, 0.0, 0.0, 1.0], (len(flight.anchors), 1))  # the shipped model needs orientations
     heard = np.abs(flight.tdoa.t - 2.0) > 0.06  # nothing, for longer than a pose lag
-    tdoa = Tdoas(*(column[heard] for column in vars(flight.tdoa).values()))
+    doubt = np.where(np.arange(len(flight.tdoa)) % 5, 0.0, 0.5)  # m^2, that the tag tells
+    columns = vars(replace(flight.tdoa, variance=doubt)).values()
+    tdoa = Tdoas(*(column[heard] for column in columns))
     flight = replace(flight, anchors=replace(flight.anchors, orientations=level), tdoa=tdoa)
     effects = tmp_path / "effects.yaml"
     effects.write_text(EFFECTS)
@@ -80,6 +82,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what):
     # The corrections are the same.
     np.testing.assert_allclose([m.bias for m in rig.corrected], expected.bias, atol=1e-6)
     assert [m.raw for m in rig.corrected] == flight.tdoa.d.tolist()
+    assert [m.variance for m in rig.corrected] == flight.tdoa.variance.tolist()
     assert [m.raw - m.bias for m in rig.corrected] == [m.corrected for m in rig.corrected]
     models = {"effects": {"anchor_delay+tag_lever_arm"}, "network": {"none", "known_answer"}}
     assert {m.model for m in rig.corrected} == models.get(what, {"none", "default"})

@@ -42,7 +42,7 @@ def live(flight, corrector, config=None):
             rows = flight.anchors.index([a]), flight.anchors.index([b])
             correction = corrector.correct(np.array([t]), *rows, flight.tdoa.d[i : i + 1])
             corrected.append((correction.bias[0], correction.std[0]))
-            estimator.add_tdoa(t, a, b, correction.corrected[0], correction.std[0])
+            estimator.add_tdoa(t, a, b, correction.corrected[0], correction.std[0] ** 2)
         advance()
     odometry, residuals = estimator.finish()
     parts.append((odometry, residuals))

@@ -21,18 +21,19 @@ CASES = [
     (0, 1, -np.inf, 0.0, False),
     (0, 1, 0.0, np.nan, False),
     (0, 1, 0.0, np.inf, False),
+    (0, 1, 0.0, -0.1, False),
     (0, 1, 0.0, 0.3, True),
 ]
 
 
-@pytest.mark.parametrize("a, b, d, bias_std, expected", CASES)
-def test_one(a, b, d, bias_std, expected):
-    assert usable(a, b, d, bias_std, POSITIONS) == expected
+@pytest.mark.parametrize("a, b, d, variance, expected", CASES)
+def test_one(a, b, d, variance, expected):
+    assert usable(a, b, d, variance, POSITIONS) == expected
 
 
 def test_all_is_one_for_each():
-    a, b, d, bias_std, expected = (np.array(column) for column in zip(*CASES))
-    assert usable_all(a, b, d, bias_std, POSITIONS).tolist() == expected.tolist()
+    a, b, d, variance, expected = (np.array(column) for column in zip(*CASES))
+    assert usable_all(a, b, d, variance, POSITIONS).tolist() == expected.tolist()
 
 
 def test_none():

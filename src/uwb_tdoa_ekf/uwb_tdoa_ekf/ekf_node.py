@@ -222,7 +222,8 @@ class EkfNode(Node):
     def _take_tdoa(self, message):
         t = self._epoch.seconds(message.header.stamp)
         self._watch.add_tdoa(t + self._epoch.begin, self._now(), message.anchor_a, message.anchor_b, message.raw)
-        self._estimator.add_tdoa(t, message.anchor_a, message.anchor_b, message.corrected, message.bias_std)
+        variance = message.bias_std**2 + message.variance
+        self._estimator.add_tdoa(t, message.anchor_a, message.anchor_b, message.corrected, variance)
 
     def _take_height(self, message):
         distance = message.range

@@ -121,14 +121,14 @@ class Estimator:
             return
         self._take(IMU_STREAM, t, sample)
 
-    def add_tdoa(self, t, a, b, d, bias_std=0.0):
-        """Take one corrected TDOA: t s; a, b anchor ids; d m; bias_std m."""
+    def add_tdoa(self, t, a, b, d, variance=0.0):
+        """Take one corrected TDOA: t s; a, b anchor ids; d m; variance m^2, of what is known beyond tdoa_std."""
         i, k = self.anchors.row(a), self.anchors.row(b)
-        if not (math.isfinite(t) and usable(i, k, d, bias_std, self.anchors.positions)):
+        if not (math.isfinite(t) and usable(i, k, d, variance, self.anchors.positions)):
             self._refused.append((t, a, b, INVALID))
             self._gates[TDOA_STREAM].note(t)  # or whoever waits for our pose of this time waits for the next one
             return
-        self._take(TDOA_STREAM, t, (t, i, k, d, bias_std))
+        self._take(TDOA_STREAM, t, (t, i, k, d, variance))
 
     def add_height(self, t, distance):
         """Take one range along the body's -z: t s; distance m, inf or NaN where nothing was in range (REP 117)."""

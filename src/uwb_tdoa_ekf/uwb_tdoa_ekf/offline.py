@@ -63,8 +63,9 @@ def run_offline(flight, config=None, corrector=None, records=None):
         t, a, b, d = (column[batch] for column in raw)
         correction = corrector.correct(t, a, b, d)
         bias[batch], std[batch] = correction.bias, correction.std
-        sane = usable_all(a, b, correction.corrected, correction.std, positions)
-        corrected = structured(TDOA, t, a, b, correction.corrected, correction.std)[sane]
+        variance = correction.std**2 + tdoa.variance[batch]
+        sane = usable_all(a, b, correction.corrected, variance, positions)
+        corrected = structured(TDOA, t, a, b, correction.corrected, variance)[sane]
         last = len(imu) if until is None else int(np.searchsorted(imu_t, until))
         last_aid = len(aids) if until is None else int(np.searchsorted(aids["t"], until))
         measured = Measurements(imu[fed:last], corrected, aids[felt:last_aid])

@@ -12,11 +12,12 @@ from recordings import ANCHORS, differences, small_flight
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth, Velocity
 from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_bag
-from uwb_tdoa_tools.bags.files import new_bag
+from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.messages import tdoa_messages
 from uwb_tdoa_tools.bags.message_types import typestore
 
@@ -62,9 +63,8 @@ def flights(draw):
         ids, np.clip(values(n, 3), -1e8, 1e8), draw(st.lists(unit, min_size=n, max_size=n))
     )
     t = stamps(1)
-    tdoas = Tdoas(
-        t, draw(arrays(np.int64, len(t), elements=st.sampled_from(ids))), np.full(len(t), 65535), values(len(t))
-    )
+    a, variance = draw(arrays(np.int64, len(t), elements=st.sampled_from(ids))), np.abs(values(len(t)))
+    tdoas = Tdoas(t, a, np.full(len(t), 65535), values(len(t)), variance)
     t = stamps(1)
     imu = draw(st.sampled_from([None, Imu(t, values(len(t), 3), values(len(t), 3))]))
     t = stamps(1)
@@ -260,6 +260,29 @@ def test_odometry(tmp_path):
     np.testing.assert_array_equal(odometry.twist_covariance[1], -covariance.reshape(6, 6))
     with pytest.raises(InputError, match="no message on /tag1/odometry"):
         read_odometry(tmp_path / "bag", namespace="tag1")
+
+
+EARLIER = "std_msgs/Header header\nuint16 anchor_a\nuint16 anchor_b\nfloat64 distance_difference\n"  # before `variance`
+
+
+@BOTH
+@pytest.mark.parametrize("file_alone", [False, True])
+def test_a_bag_from_before_the_variance(tmp_path, storage, file_alone):
+    store, msgtype, header = get_typestore(Stores.ROS2_JAZZY), "uwb_tdoa_msgs/msg/Tdoa", "std_msgs/msg/Header"
+    store.register(get_types_from_msg(EARLIER, msgtype))
+    with new_bag(tmp_path / "old", storage) as writer:
+        connection = writer.add_connection("/uwb/tdoa", msgtype, typestore=store)
+        for k in range(3):
+            stamp = store.types[header](store.types["builtin_interfaces/msg/Time"](k + 1, 0), "x" * k)  # any alignment
+            message = store.types[msgtype](stamp, k, 7, 0.25 * k)
+            writer.write(connection, 10**9 * (k + 1), store.serialize_cdr(message, msgtype))
+    path = next((tmp_path / "old").glob("old.*")) if file_alone else tmp_path / "old"
+    for salvage in (False, True):
+        tdoa = read_bag(path, anchors=ANCHORS, salvage=salvage).tdoa
+        assert tdoa.a.tolist() == [0, 1, 2] and tdoa.d.tolist() == [0.0, 0.25, 0.5] and tdoa.variance.tolist() == [0.0] * 3
+    with open_bag(path) as reader:  # as `replay` publishes them
+        for _, stamp, data in messages(path, reader, reader.connections):
+            assert typestore().deserialize_cdr(data, msgtype).variance == 0.0 and stamp
 
 
 def test_fields_of_any_topic(tmp_path):

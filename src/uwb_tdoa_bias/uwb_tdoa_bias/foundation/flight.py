@@ -26,12 +26,18 @@ class Imu:
 
 @dataclass(frozen=True)
 class Tdoas:
-    """Raw measurements. t : (n,) s; a, b : (n,) anchor ids; d : (n,) metres, d_ab = |p - b| - |p - a|."""
+    """Raw measurements. t : (n,) s; a, b : (n,) anchor ids; d : (n,) metres, d_ab = |p - b| - |p - a|; variance : (n,) m^2,
+    of the noise as the tag knows it, 0 where it does not, which is everywhere unless it is given."""
 
     t: np.ndarray
     a: np.ndarray
     b: np.ndarray
     d: np.ndarray
+    variance: np.ndarray = None
+
+    def __post_init__(self):
+        if self.variance is None:
+            object.__setattr__(self, "variance", np.zeros(len(self.t)))
 
     def __len__(self):
         return len(self.t)
@@ -118,4 +124,4 @@ class Flight:
         """The Flight among its anchors of some rows alone, with the TDOAs that are between them."""
         anchors, tdoa = self.anchors.only(rows), self.tdoa
         kept = np.isin(tdoa.a, anchors.ids) & np.isin(tdoa.b, anchors.ids)
-        return replace(self, anchors=anchors, tdoa=Tdoas(tdoa.t[kept], tdoa.a[kept], tdoa.b[kept], tdoa.d[kept]))
+        return replace(self, anchors=anchors, tdoa=Tdoas(*(column[kept] for column in vars(tdoa).values())))

@@ -171,7 +171,7 @@ def _advance(ekf, tuning, t, records):
 def _update(ekf, anchors, tuning, tdoa, residual, records):
     """Every hypothesis with one TDOA; the best one's innovation becomes the residual."""
     a, b, innovation = anchors[tdoa.a], anchors[tdoa.b], ekf.innovation
-    innovation.noise_variance = tuning.tdoa_std**2 + tdoa.bias_std**2
+    innovation.noise_variance = tuning.tdoa_std**2 + tdoa.variance
     if tuning.adapt_noise:
         innovation.noise_variance += noise.excess_variance(a, b)
     for h in range(HYPOTHESES):

@@ -21,7 +21,7 @@ def _record(*columns):
 
 # What is measured. Rows of an anchor, not ids; both in the order of their stamps.
 IMU_SAMPLE = _record(("t", float), ("gyro", float, 3), ("accel", float, 3))  # s, rad/s, m/s^2 (specific force); body
-TDOA = _record(("t", float), ("a", int), ("b", int), ("d", float), ("bias_std", float))  # s, rows, m (corrected), m
+TDOA = _record(("t", float), ("a", int), ("b", int), ("d", float), ("variance", float))  # s, rows, m (corrected), m^2 (beyond tdoa_std)
 AID = _record(("t", float), ("kind", int), ("value", float, 3), ("std", float, 3))  # see aids.py
 
 # One estimate of the state, for one direction that the tag may have started in.

@@ -11,12 +11,13 @@ LARGEST_ERROR = 1.0  # m by which |d_ab| may exceed the distance between a and b
 
 
 @compiled
-def usable(a, b, d, bias_std, positions):
-    """False for an unknown anchor (row -1), a pair of one anchor, a value not finite or longer than the baseline.
+def usable(a, b, d, variance, positions):
+    """False for an unknown anchor (row -1), a pair of one anchor, a value not finite or longer than the baseline, a variance
+    that is none.
 
-    a, b : anchor rows; d, bias_std : m; positions : (N, 3) m.
+    a, b : anchor rows; d : m; variance : m^2; positions : (N, 3) m.
     """
-    if a < 0 or b < 0 or a == b or not (math.isfinite(d) and math.isfinite(bias_std)):
+    if a < 0 or b < 0 or a == b or not (math.isfinite(d) and 0.0 <= variance < math.inf):
         return False
     baseline = 0.0
     for k in range(3):
@@ -25,11 +26,11 @@ def usable(a, b, d, bias_std, positions):
 
 
 @compiled
-def usable_all(a, b, d, bias_std, positions):
+def usable_all(a, b, d, variance, positions):
     """`usable` for (n,) arrays: (n,) bool."""
     out = np.empty(len(d), np.bool_)
     for i in range(len(d)):
-        out[i] = usable(a[i], b[i], d[i], bias_std[i], positions)
+        out[i] = usable(a[i], b[i], d[i], variance[i], positions)
     return out
 
 

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..readers.streams import SALVAGE
 from .integrity import NO_SUM, SUM_KEY, check as check_whole, is_packed, metadata, seal, unpack
 from .mcap import Damaged
-from .message_types import typestore
+from .message_types import is_earlier, typestore, upgraded
 from .salvage import salvage as write_sound_part
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -114,15 +114,18 @@ def _opened(path, folder, salvage):
 
 
 def messages(path, reader, connections):
-    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order; raises InputError, also if there
-    are more or fewer than the bag says."""
+    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order, as their types are now; raises
+    InputError, also if there are more or fewer than the bag says."""
     found = reader.messages(connections=connections) if connections else iter(())
     left = {(connection.topic, connection.msgtype): 0 for connection in connections}
     for connection in connections:
         left[connection.topic, connection.msgtype] += connection.msgcount
+    earlier = {connection.id for connection in connections if is_earlier(path, connection)}
     while True:
         try:
             connection, stamp, data = next(found)
+            if connection.id in earlier:
+                data = upgraded(data, connection.msgtype)
         except StopIteration:
             break
         except Exception as error:  # as in _opened

@@ -11,6 +11,10 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 OUR_PACKAGE = "uwb_tdoa_msgs"
 OUR_TYPES = ("Tdoa", "TdoaCorrected", "TdoaResidual", "Anchor", "AnchorArray")
+OPTIONAL = {  # fields of our types that earlier recordings do not have, and what is meant there
+    f"{OUR_PACKAGE}/msg/Tdoa": {"variance": 0.0},
+    f"{OUR_PACKAGE}/msg/TdoaCorrected": {"variance": 0.0},
+}
 _SOURCE_TREE = Path(__file__).resolve().parents[3]  # where our packages lie side by side
 
 
@@ -41,6 +45,38 @@ def check_type(path, connection):
     """Raise InputError unless we know the type of a topic, in the version in which it was recorded."""
     store = typestore()
     add_type(store, connection.msgtype)
+    recorded = _recorded_hash(path, connection)
+    if recorded and recorded != store.hash_rihs01(connection.msgtype) and not is_earlier(path, connection):
+        raise InputError(
+            f"{path}: {connection.topic} was recorded with another version of {connection.msgtype}; use the version of "
+            "this software that recorded it."
+        )
+
+
+def is_earlier(path, connection):
+    """Whether a topic was recorded before its type had its OPTIONAL fields. Raises InputError."""
+    return connection.msgtype in OPTIONAL and _recorded_hash(path, connection) == _earlier().hash_rihs01(connection.msgtype)
+
+
+def upgraded(data, msgtype):
+    """Bytes of a message whose topic `is_earlier`, as of its type now."""
+    message = _earlier().deserialize_cdr(data, msgtype)
+    fields = {name: getattr(message, name) for name, _ in _earlier().fielddefs[msgtype][1]}
+    return typestore().serialize_cdr(typestore().types[msgtype](**fields, **OPTIONAL[msgtype]), msgtype)
+
+
+@lru_cache(maxsize=1)
+def _earlier():
+    """The types with OPTIONAL fields without these."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for msgtype, optional in OPTIONAL.items():
+        constants, fields = typestore().fielddefs[msgtype]
+        store.register({msgtype: (constants, [field for field in fields if field[0] not in optional])})
+    return store
+
+
+def _recorded_hash(path, connection):
+    """Hash of the type that a topic was recorded with; empty where the bag does not say. Raises InputError."""
     recorded = connection.digest
     if not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG:  # a data file without metadata.yaml
         try:
@@ -49,11 +85,7 @@ def check_type(path, connection):
             raise InputError(
                 f"{path}: the definition of {connection.msgtype} in the bag cannot be read ({error!r}); record it again."
             ) from error
-    if recorded and recorded != store.hash_rihs01(connection.msgtype):
-        raise InputError(
-            f"{path}: {connection.topic} was recorded with another version of {connection.msgtype}; use the version of "
-            "this software that recorded it."
-        )
+    return recorded
 
 
 @lru_cache(maxsize=64)

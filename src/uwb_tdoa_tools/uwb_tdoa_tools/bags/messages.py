@@ -118,17 +118,17 @@ def velocity_of(stamps, rows):
 def tdoa_messages(tdoa, store):
     """Yield (stamp ns, uwb_tdoa_msgs/Tdoa)."""
     Message = store.types["uwb_tdoa_msgs/msg/Tdoa"]
-    columns = (nanoseconds("tdoa", tdoa.t), tdoa.a, tdoa.b, tdoa.d)
-    for stamp, a, b, d in zip(*(column.tolist() for column in columns)):
-        yield stamp, Message(_header(store, stamp, BODY_FRAME), a, b, d)
+    columns = (nanoseconds("tdoa", tdoa.t), tdoa.a, tdoa.b, tdoa.d, tdoa.variance)
+    for stamp, *values in zip(*(column.tolist() for column in columns)):
+        yield stamp, Message(_header(store, stamp, BODY_FRAME), *values)
 
 
 def tdoa_row(message):
-    return stamp_of(message.header), message.anchor_a, message.anchor_b, message.distance_difference
+    return stamp_of(message.header), message.anchor_a, message.anchor_b, message.distance_difference, message.variance
 
 
 def tdoas_of(stamps, rows):
-    return Tdoas(stamps, rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2])
+    return Tdoas(stamps, rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3])
 
 
 def pose_messages(truth, frame, store):

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from . import integrity, mcap
 from .mcap import Damaged
-from .message_types import check_type, typestore
+from .message_types import check_type, is_earlier, typestore, upgraded
 
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 
@@ -49,6 +49,8 @@ def _copy(path, file, writer, connections):
             if key not in connections:
                 connections[key] = _added(path, connection, writer)
             if connections[key] is not None:
+                if is_earlier(path, connection):
+                    data = upgraded(data, connection.msgtype)
                 writer.write(connections[key], stamp, data)
                 count += 1
     except Damaged as damage:
@@ -86,8 +88,9 @@ def _from_mcap(file):
 def _from_sqlite(file):
     connection, topics = integrity.open_sqlite(file), {}
     try:
+        definitions = _definitions(connection)
         for number, topic, msgtype in connection.execute("SELECT id, name, type FROM topics"):
-            topics[number] = _channel(number, str(topic), str(msgtype), "", "")
+            topics[number] = _channel(number, str(topic), str(msgtype), *definitions.get(msgtype, ("", "")))
     except (sqlite3.Error, UnicodeDecodeError) as error:
         raise Damaged(str(error)) from error
     finally:
@@ -96,6 +99,15 @@ def _from_sqlite(file):
         if topic not in topics or type(stamp) is not int or type(data) is not bytes or not 0 <= stamp < 2**63:
             raise Damaged("a row of messages cannot be read")
         yield topics[topic], stamp, data
+
+
+def _definitions(connection):
+    """{type: (encoding, text)}; rosbag2 writes them since ROS 2 Iron."""
+    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+    try:
+        return {msgtype: (str(encoding), str(text)) for msgtype, encoding, text in connection.execute(query)}
+    except sqlite3.OperationalError:  # no such table
+        return {}
 
 
 def _texts(content, at, count):

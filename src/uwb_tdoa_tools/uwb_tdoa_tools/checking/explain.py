@@ -61,8 +61,8 @@ def compare(one, other):
 
 def unexplained(t, a, b, d, positions):
     """Unexplained of TDOAs in order of their stamps: t (n,) s; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
-    innovation, no_std = np.full(len(t), np.nan), np.zeros(len(t))
-    good = usable_all(a, b, d, no_std, positions)
-    measured = Measurements(_NO_IMU, structured(TDOA, t, a, b, d, no_std)[good])
+    innovation, no_variance = np.full(len(t), np.nan), np.zeros(len(t))
+    good = usable_all(a, b, d, no_variance, positions)
+    measured = Measurements(_NO_IMU, structured(TDOA, t, a, b, d, no_variance)[good])
     innovation[good] = feed(new_memory(positions), CONFIG.tuning(), measured)[1]["innovation"]
     return Unexplained.of(t, innovation)

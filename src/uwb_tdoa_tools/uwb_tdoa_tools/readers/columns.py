@@ -20,13 +20,14 @@ RATE = {"rad/s": 180.0 / np.pi, "deg/s": 1.0}
 FORCE = {"m/s^2": 1.0 / GRAVITY, "g": 1.0}
 NUMBER = {"": 1.0}
 STREAMS = {  # stream: {our column: (column of the stream, {unit: factor}, the first is the default)}
-    "tdoa": {"anchor_a": ("a", NUMBER), "anchor_b": ("b", NUMBER), "tdoa": ("d", LENGTH)},
+    "tdoa": {"anchor_a": ("a", NUMBER), "anchor_b": ("b", NUMBER), "tdoa": ("d", LENGTH), "tdoa_std": ("std", LENGTH)},
     "gyro": {f"gyro_{axis}": (axis, RATE) for axis in "xyz"},
     "acc": {f"accel_{axis}": (axis, FORCE) for axis in "xyz"},
     "pose": {f"pose_{axis}": (axis, LENGTH) for axis in "xyz"} | {f"pose_q{k}": (f"q{k}", NUMBER) for k in "xyzw"},
 }
 TIMES = {"tdoa": "tdoa_time", "gyro": "imu_time", "acc": "imu_time", "pose": "pose_time"}  # else "time"
-OPTIONAL = {f"pose_q{k}" for k in "xyzw"}
+ATTITUDE = {f"pose_q{k}" for k in "xyzw"}
+OPTIONAL = {*ATTITUDE, "tdoa_std"}
 UNITS = {name: units for columns in STREAMS.values() for name, (_, units) in columns.items()}
 UNITS |= {name: TIME for name in ("time", *TIMES.values())}
 HELP = (
@@ -58,8 +59,8 @@ def parse_columns(text):
             raise InputError(f"--columns: {missing[0]} is missing; {', '.join(needed)} belong together.")
         if not {TIMES[stream], "time"} & columns.keys():
             raise InputError(f"--columns: {TIMES[stream]}, or time, is missing; name the column with the time.")
-    if len(OPTIONAL & columns.keys()) not in (0, 4):
-        raise InputError(f"--columns: {', '.join(sorted(OPTIONAL))} belong together.")
+    if len(ATTITUDE & columns.keys()) not in (0, 4):
+        raise InputError(f"--columns: {', '.join(sorted(ATTITUDE))} belong together.")
     return columns
 
 

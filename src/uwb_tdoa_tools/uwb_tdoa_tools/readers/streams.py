@@ -19,7 +19,7 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
     """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams left out.
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
-        "tdoa": a, b, d (m); "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw.
+        "tdoa": a, b, d (m), and std (m) if the tag knows it; "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw.
         "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow": x, y (pixel counts), which become a velocity where "tof" and IMU are.
     extra : the same of everything else, for `Flight.extra`.
     meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps
@@ -44,7 +44,7 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
     tdoa = streams.get("tdoa")
     if tdoa is None:
         raise InputError(f"{meta['source']}: holds no TDOA measurement; record the tag's TDOAs with the flight.")
-    tdoas = Tdoas(tdoa["t"], tdoa["a"], tdoa["b"], tdoa["d"])
+    tdoas = Tdoas(tdoa["t"], tdoa["a"], tdoa["b"], tdoa["d"], tdoa["std"] ** 2 if "std" in tdoa else None)
     meta["protocol"] = protocol(tdoas)
     imu = truth = None
     if "gyro" in streams and "acc" in streams:

@@ -41,7 +41,7 @@ def mistake(text, *named, needs="", alone=False):
 def _tdoa(recording, rows=slice(None), **columns):
     """Other columns of the TDOAs, then some of their rows."""
     tdoa = replace(recording.tdoa, **columns)
-    tdoa = Tdoas(*(column[rows] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d)))
+    tdoa = Tdoas(*(column[rows] for column in vars(tdoa).values()))
     return replace(recording, tdoa=tdoa, tdoa_arrival=recording.tdoa_arrival[rows])
 
 
