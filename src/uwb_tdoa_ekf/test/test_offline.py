@@ -243,3 +243,16 @@ def test_robust_updates_are_cautious_but_not_overconfident(robust, loss):
     shares_inside(nees, nis, count, f"{robust}, {loss}")
     high = chi2.ppf(0.975, 3 * len(nees)) / len(nees)
     assert np.mean(nees.mean(axis=0) < high) >= 0.9 and nees.mean() > 1.0
+
+
+def test_a_tag_that_knows_its_noise_is_located_better():
+    told, untold = [], []
+    for seed in range(4):
+        flight, rng = fly(seed, 8.0), np.random.default_rng(seed)
+        std = rng.choice([0.0, 1.5], len(flight.tdoa))  # m, beside the 0.1 m of every one
+        noisy = replace(flight.tdoa, d=flight.tdoa.d + std * rng.standard_normal(len(std)))
+        for runs, tdoa in ((untold, noisy), (told, replace(noisy, variance=std**2))):
+            odometry = run_offline(replace(flight, tdoa=tdoa)).odometry
+            error = odometry.p - flight.meta["wave"].motion(odometry.t)[0]
+            runs.append(np.sqrt(np.mean(np.sum(error[odometry.t > 3.0] ** 2, axis=1))))
+    assert np.mean(told) < 0.5 * np.mean(untold)
