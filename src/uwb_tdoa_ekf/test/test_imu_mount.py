@@ -23,6 +23,8 @@ def test_samples_are_those_of_an_imu_in_the_origin():
     t, force, rates, gyro, accel = mounted()
     mount = ImuMount(TURN, ARM)
     found = [mount.in_body(*row) for row in zip(t, gyro, accel)]
+    for one, together in zip(zip(*found), ImuMount(TURN, ARM).all_in_body(t, gyro, accel)):
+        np.testing.assert_allclose(together, one, atol=1e-12)
     inside = slice(50, -3)
     np.testing.assert_allclose(np.array([w for w, _ in found]), rates, atol=1e-12)
     error = np.abs(np.array([f for _, f in found]) - force)[inside]

@@ -26,6 +26,16 @@ class ImuMount:
             accel -= np.cross(gyro, np.cross(gyro, self._arm))
         return gyro.tolist(), accel.tolist()
 
+    def all_in_body(self, t, gyro, accel):
+        """(gyro, accel), (n, 3) each, of samples at t (n,) s: what `in_body` gives for one after the other."""
+        rates, forces = gyro @ self._matrix.T, accel @ self._matrix.T
+        if not self._centred:
+            slopes = np.zeros_like(rates)
+            for k in np.flatnonzero(np.isfinite(rates).all(axis=1)):
+                slopes[k] = self._angular_acceleration(t[k], rates[k])
+            forces = forces - np.cross(slopes, self._arm) - np.cross(rates, np.cross(rates, self._arm))
+        return rates, forces
+
     def _angular_acceleration(self, t, gyro):
         """rad/s^2, (3,): slope of the slow part."""
         dt = np.inf if self._t is None else t - self._t

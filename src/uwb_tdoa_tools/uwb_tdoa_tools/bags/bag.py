@@ -8,11 +8,12 @@ Topic (in a bag always absolute)   type                              what
 /pressure                          sensor_msgs/msg/FluidPressure     Flight.pressure, frame base_link
 /velocity                          geometry_msgs/msg/TwistWithCovarianceStamped  Flight.velocity, frame base_link
 /ground_truth/pose                 geometry_msgs/msg/PoseStamped     Flight.truth
-/tf_static                         tf2_msgs/msg/TFMessage            frames anchor_<id>, once, transient local
+/tf_static                         tf2_msgs/msg/TFMessage            frames anchor_<id>, once, transient local; of sensors, if there are
 
 The time of a message is its header stamp. `Flight.extra` has no message type and stays behind.
 """
 
+from collections import Counter
 import heapq
 import json
 import re
@@ -28,7 +29,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_bias.foundation.version import written_by
 
-from . import messages as bag_messages
+from . import messages as bag_messages, placing
 from .files import check_output, deserialize, is_bag, messages, new_bag, open_bag
 from .integrity import metadata
 from .mcap import Damaged
@@ -154,7 +155,8 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):
     topics : {our name of a topic: its name in the bag}, e.g. {"uwb/tdoa": "/my/tdoa"}; not absolute: in the namespace.
     anchors : Anchors to use instead of the recorded uwb/anchors.
     salvage : read a cut or damaged bag up to there, and without messages that are no numbers; `meta["remarks"]` tells.
-    Stamps are header stamps; messages that were recorded out of their order are sorted (`meta["reordered"]`).
+    Stamps are header stamps; messages that were recorded out of their order are sorted (`meta["reordered"]`). An IMU in
+    a frame of its own is taken to the body as /tf_static says; `meta["antenna"]` is the place of an antenna on it, (3,) m.
     Raises InputError for a bag that is damaged, has no uwb/tdoa, or neither anchors nor uwb/anchors, and for messages
     with numbers that are not finite.
     """
@@ -162,11 +164,11 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):
         connections = _connections(reader)
         about = _about(path)
         meta = {**about["meta"], "bag": str(path)}
-        remarks, name_of = list(reader.remarks), Names(namespace, topics)
+        remarks, name_of, frames = list(reader.remarks), Names(namespace, topics), {}
 
         def stream(topic, msgtype, row, make, sound=np.isfinite):
             found = _find(path, connections, name_of(topic), msgtype)
-            stamps, rows, falls = _table(path, reader, found, row)
+            stamps, rows, falls, frames[topic] = _table(path, reader, found, row)
             if falls:
                 meta.setdefault("reordered", {})[topic] = falls
             whole = sound(rows).all(axis=1)
@@ -184,8 +186,15 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):
             anchors = _read_anchors(path, reader, connections, name_of("uwb/anchors"))
         imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
         aids = {name: stream(name, msgtype, row, make, sound) for name, (msgtype, _, row, sound, make) in _AIDS.items()}
+        tree = placing.read_frames(path, reader)
+        places = {topic: placing.placed(tree, topic, frames[topic]) for topic in ("imu/data", "uwb/tdoa")}
+        remarks += [remark for _, remark in places.values() if remark]
         pose = "geometry_msgs/msg/PoseStamped"
         truth = stream("ground_truth/pose", pose, bag_messages.pose_row, bag_messages.truth_of)
+    if imu is not None and (place := places["imu/data"][0]):
+        imu = placing.imu_in_body(imu, place)
+    if place := places["uwb/tdoa"][0]:
+        meta["antenna"] = place[1].tolist()
     if remarks:
         meta["remarks"] = remarks
     return Flight(about["name"], anchors, tdoa, imu, truth, {}, meta, **aids)
@@ -201,7 +210,7 @@ def read_odometry(path, namespace="", salvage=False, topics=None):
         topic = Names(namespace, topics)("odometry")
         names = _connections(reader)
         found = _find(path, names, topic, "nav_msgs/msg/Odometry")
-        t, rows, _ = _table(path, reader, found, bag_messages.odometry_row)
+        t, rows, *_ = _table(path, reader, found, bag_messages.odometry_row)
     if not len(t):
         others = " or ".join(f"--topic odometry={name}" for name in names if name.endswith("/odometry"))
         remedy = f"say which to take ({others})" if others else "record the output of the filter"
@@ -301,17 +310,22 @@ def _find(path, connections, topic, msgtype=None):
 
 
 def _table(path, reader, connections, row):
-    """Stamps (n,) s, the other columns (n, k) of row(message) in order of stamps, and how often the stamps fell."""
-    rows = [row(deserialize(path, c, data)) for c, _, data in messages(path, reader, connections)]
+    """Stamps (n,) s, the other columns (n, k) of row(message) in order of stamps, how often the stamps fell, and
+    {frame_id: messages}."""
+    rows, frames = [], Counter()
+    for connection, _, data in messages(path, reader, connections):
+        message = deserialize(path, connection, data)
+        rows.append(row(message))
+        frames[message.header.frame_id] += 1
     if not rows:
-        return np.empty(0), np.empty((0, 1)), 0
+        return np.empty(0), np.empty((0, 1)), 0, frames
     stamps = np.array([values[0] for values in rows], dtype=np.int64)
     table = np.array([values[1:] for values in rows], dtype=float)
     falls = int((np.diff(stamps) < 0).sum())
     if falls:
         order = np.argsort(stamps, kind="stable")
         stamps, table = stamps[order], table[order]
-    return stamps / 1e9, table, falls
+    return stamps / 1e9, table, falls, frames
 
 
 def _read_anchors(path, reader, connections, topic):

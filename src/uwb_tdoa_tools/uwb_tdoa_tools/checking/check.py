@@ -51,7 +51,7 @@ class Report:
 
 def check(recording, others=()):
     """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one."""
-    streams = _fed(recording)
+    streams = fed(recording)
     found = streams.findings()
     for rule in labels.RULES:
         found += rule(recording)
@@ -73,7 +73,7 @@ def check(recording, others=()):
     return Report(recording.name, most_severe_first(found), _facts(recording, streams))
 
 
-def _fed(recording):
+def fed(recording):
     """StreamRules that have seen all of a Recording."""
     streams, imu, tdoa = StreamRules(recording.anchors), recording.imu, recording.tdoa
     if imu is not None:

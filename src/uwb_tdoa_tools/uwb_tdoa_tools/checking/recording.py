@@ -10,7 +10,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 
-from ..bags import messages as bag_messages
+from ..bags import messages as bag_messages, placing
 from ..bags.bag import Names, is_bag
 from ..bags.files import deserialize, messages, open_bag
 from ..bags.message_types import check_type
@@ -29,7 +29,8 @@ class Recording:
 
     name : short; anchors : Anchors to check against; tdoa : Tdoas; imu : Imu or None;
     tdoa_arrival, imu_arrival : (n,) s, when the recorder received them, NaN where that is not known;
-    frames : {topic: {frame_id: messages}}; turns : {frame: (parent, quaternion x y z w, translation m)} of /tf_static;
+    frames : {topic: {frame_id: messages}}; places : {frame_id: (Rotation, arm (3,) m)} of those that /tf_static connects
+    with the body, where the samples are those of an IMU in its origin;
     topics : {topic: type} of a bag; recorded : Anchors that the bag itself holds, or None; falls : how often the stamps
     fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a damaged one.
     """
@@ -41,7 +42,7 @@ class Recording:
     tdoa_arrival: np.ndarray
     imu_arrival: np.ndarray
     frames: dict = field(default_factory=dict)
-    turns: dict = field(default_factory=dict)
+    places: dict = field(default_factory=dict)
     topics: dict = field(default_factory=dict)
     recorded: Anchors | None = None
     falls: int = 0
@@ -69,7 +70,7 @@ def _read_bag(reading, path, survey):
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
         tdoa, imu = (_stream(path, reader, name_of(topic), *_ROWS[topic]) for topic in (TDOA, IMU))
         recorded = _last(path, reader, name_of("uwb/anchors"), Anchors.from_message)
-        turns = _last(path, reader, "/tf_static", _turns) or {}
+        tree = placing.read_frames(path, reader)
         remarks = tuple(reader.remarks)
     if not len(tdoa.stamps):
         there = sorted(topic for topic, kind in topics.items() if kind == _ROWS[TDOA][0])
@@ -79,15 +80,18 @@ def _read_bag(reading, path, survey):
     anchors = read_survey(survey) if survey else recorded
     if anchors is None:
         raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
+    samples = bag_messages.imu_of(imu.stamps, imu.rows) if len(imu.stamps) else None
+    if samples is not None and (place := placing.placed(tree, IMU, imu.frames)[0]):
+        samples = placing.imu_in_body(samples, place)
     return Recording(
         name=path.stem,
         anchors=anchors,
         tdoa=bag_messages.tdoas_of(tdoa.stamps, tdoa.rows),
-        imu=bag_messages.imu_of(imu.stamps, imu.rows) if len(imu.stamps) else None,
+        imu=samples,
         tdoa_arrival=tdoa.arrival,
         imu_arrival=imu.arrival,
         frames={topic: dict(stream.frames) for topic, stream in ((TDOA, tdoa), (IMU, imu)) if len(stream.stamps)},
-        turns=turns,
+        places={frame: place for frame in {*tdoa.frames, *imu.frames} if (place := placing.place_of(tree, frame))},
         topics=topics,
         recorded=recorded,
         remarks=remarks,
@@ -131,11 +135,3 @@ def _last(path, reader, topic, make):
         except InputError as error:
             raise InputError(f"{path}: {topic}: {error}") from error
     return found
-
-
-def _turns(message):
-    turns = {}
-    for transform in message.transforms:
-        v, q = transform.transform.translation, transform.transform.rotation
-        turns[transform.child_frame_id] = transform.header.frame_id, (q.x, q.y, q.z, q.w), (v.x, v.y, v.z)
-    return turns

@@ -290,9 +290,8 @@ def unknown_frame(recording, rng, other):
 
 @mistake("IMU turned by 90 degrees about z, as /tf_static says", "frame_turned", needs="imu")
 def turned_frame(recording, rng, other):
-    quarter = tuple(Rotation.from_euler("z", 90.0, degrees=True).as_quat())
-    frames = unknown_frame(recording, rng, other)
-    return replace(frames, turns={"imu_link": ("base_link", quarter, (0.0, 0.0, 0.0))})
+    quarter = Rotation.from_euler("z", 90.0, degrees=True)
+    return replace(unknown_frame(recording, rng, other), places={"imu_link": (quarter, np.zeros(3))})
 
 
 # Stamps
