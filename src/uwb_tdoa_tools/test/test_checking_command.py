@@ -47,7 +47,7 @@ def test_without_errors_the_code_is_zero(checked):
     assert main([str(checked[0] / "good.bag")]) == 0
 
 
-@pytest.mark.parametrize("arguments, sentence", [(["nowhere.bag"], "does not exist"), ([], "usage")])
+@pytest.mark.parametrize("arguments, sentence", [(["nowhere.bag"], "does not exist"), ([], "give recordings, or --live")])
 def test_bad_input_is_two(arguments, sentence, capsys):
     assert main(arguments) == 2
     assert sentence in capsys.readouterr().err

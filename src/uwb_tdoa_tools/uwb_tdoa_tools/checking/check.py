@@ -7,7 +7,7 @@ import numpy as np
 from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, most_severe_first
 
 from ..readers.streams import protocol
-from . import coverage, imu_rules, labels, tdoa_rules
+from . import coverage, imu_rules, labels, tdoa_rules, wiring
 from .case import Case
 from .survey_fit import displacement
 from .tdoa_rules import SAME, furthest
@@ -37,11 +37,13 @@ EXPLAINS = {
 
 @dataclass(frozen=True)
 class Report:
-    """recording : its name; findings : [Finding], most severe first; facts : {what: text}, what was heard."""
+    """recording : its name; findings : [Finding], most severe first; facts : {what: text}, what was heard; ends : [End] of
+    live topics."""
 
     recording: str
     findings: list
     facts: dict
+    ends: tuple = ()
 
     @property
     def faulty(self):
@@ -53,7 +55,7 @@ def check(recording, others=()):
     """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one."""
     streams = fed(recording)
     found = streams.findings()
-    for rule in labels.RULES:
+    for rule in (*labels.RULES, *wiring.RULES):
         found += rule(recording)
     names = {finding.rule for finding in found}
     places, explained = np.empty((0, 3)), set()
@@ -70,7 +72,7 @@ def check(recording, others=()):
     view = coverage.View(recording.anchors, list(streams.tdoa), places)
     for rule in coverage.RULES:
         found += (finding for finding in rule(view) if finding.rule not in explained)
-    return Report(recording.name, most_severe_first(found), _facts(recording, streams))
+    return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)
 
 
 def fed(recording):

@@ -1,8 +1,9 @@
 """What `check` judges: the streams of a recording as they came, in the order in which they arrived."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+import tempfile
 
 import numpy as np
 
@@ -14,9 +15,11 @@ from ..bags import messages as bag_messages, placing
 from ..bags.bag import Names, is_bag
 from ..bags.files import deserialize, messages, open_bag
 from ..bags.message_types import check_type
+from ..bags.placing import TF_STATIC
 from ..readers import read_survey
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
+HEARD = (TDOA, IMU, "uwb/anchors", "height", "pressure", "velocity", "uwb/tdoa_corrected", "odometry", "uwb/residual")
 _ROWS = {
     IMU: ("sensor_msgs/msg/Imu", bag_messages.imu_row),
     TDOA: ("uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row),
@@ -31,8 +34,9 @@ class Recording:
     tdoa_arrival, imu_arrival : (n,) s, when the recorder received them, NaN where that is not known;
     frames : {topic: {frame_id: messages}}; places : {frame_id: (Rotation, arm (3,) m)} of those that /tf_static connects
     with the body, where the samples are those of an IMU in its origin;
-    topics : {topic: type} of a bag; recorded : Anchors that the bag itself holds, or None; falls : how often the stamps
-    fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a damaged one.
+    topics : {topic: type} of a bag, or of all that are live; recorded : Anchors that the bag itself holds, or None; falls :
+    how often the stamps fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a
+    damaged one; ends : [End] of live topics.
     """
 
     name: str
@@ -47,6 +51,7 @@ class Recording:
     recorded: Anchors | None = None
     falls: int = 0
     remarks: tuple = ()
+    ends: tuple = ()
 
 
 def read_recording(reading, path, survey=None):
@@ -55,6 +60,26 @@ def read_recording(reading, path, survey=None):
     if is_bag(path):
         return _read_bag(reading, Path(path), survey)
     return of_flight(reading.read((path, survey)))
+
+
+def read_live(reading, seconds, survey=None, say=print):
+    """Recording of live topics, named as a Reading says, for so many seconds. say(sentence) : told what happens. Raises
+    InputError."""
+    from ..live.listen import listen  # needs ROS
+
+    name_of = Names(reading.namespace, reading.topics)
+    with tempfile.TemporaryDirectory(prefix="uwb_tdoa_") as folder:
+        bag = Path(folder) / "live"
+        topics, ends = listen([*map(name_of, HEARD), TF_STATIC], bag, seconds, say)
+        try:
+            recording = _read_bag(reading, bag, survey)
+        except InputError as error:
+            raise InputError(str(error).replace(str(bag), "live topics")) from error
+    recording = replace(recording, topics=topics, ends=tuple(ends))
+    if "/clock" in topics:  # simulated time: the arrivals are of another
+        unknown = (np.full_like(arrival, np.nan) for arrival in (recording.tdoa_arrival, recording.imu_arrival))
+        recording = replace(recording, **dict(zip(("tdoa_arrival", "imu_arrival"), unknown)))
+    return recording
 
 
 def of_flight(flight):

@@ -11,6 +11,7 @@ def text(report):
     """Lines about one Report: the verdict first, then the findings, most severe first."""
     facts = ", ".join(f"{name} {value}" if name in ("TDOAs", "IMU") else value for name, value in report.facts.items())
     out = [f"{report.recording}: {verdict(report.findings)}  ({facts})"]
+    out += [f"  {end.topic} from {end.node}: {end.qos}" for end in report.ends if end.publishes]
     for finding in report.findings:
         out += lines(finding)
     return "\n".join(out)
@@ -35,11 +36,17 @@ def lines(finding):
 
 
 def as_dict(reports, together):
-    """For JSON: {"recordings": [{"recording", "facts", "findings"}], "together": [findings about several
-    recordings]}."""
+    """For JSON: {"recordings": [{"recording", "facts", "findings", "ends"}], "together": [findings about several
+    recordings]}; ends : who publishes and hears live topics."""
     return {
         "recordings": [
-            {"recording": r.recording, "facts": r.facts, "findings": [_finding(f) for f in r.findings]} for r in reports
+            {
+                "recording": r.recording,
+                "facts": r.facts,
+                "findings": [_finding(f) for f in r.findings],
+                "ends": [asdict(end) for end in r.ends],
+            }
+            for r in reports
         ],
         "together": [_finding(f) for f in together],
     }

@@ -1,22 +1,25 @@
 """check: what a driver may have got wrong, found in a recording before anything else is done with it."""
 
+from functools import partial
+import math
 from pathlib import Path
 import sys
 
 from tqdm import tqdm
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
 from ..checking import report
 from ..checking.check import check, different_surveys
-from ..checking.recording import read_recording
+from ..checking.recording import read_live, read_recording
 from ..readers import read_survey
 
-DESCRIPTION = """Check recordings against a survey, before anything else.
+DESCRIPTION = """Check recordings, or live topics, against a survey, before anything else.
 
 Finds what a driver, a survey or a clock may have got wrong: sign and unit of the TDOAs, ids of the anchors, the survey
 of another room, units and axes of the IMU, stamps, rates, repeats, two senders, frames. Each finding has its evidence,
 and a line to copy. Where --survey is a folder, the survey that fits is named, too. Ground truth is not needed, and not
-used.
+used. With --live it listens to the topics themselves, and also says who publishes and hears them, and with which QoS.
 
 Exit code: 0 nothing is wrong (there may be warnings), 1 there are errors, 2 bad input."""
 
@@ -35,25 +38,30 @@ def parser():
         "check 0425-traj2 --survey anchor_0425.txt",
         "check flights/ --survey surveys/",
         "check flight.bag --survey surveyed_again.yaml --json findings.json",
+        "check --live 60",
+        "check --live 60 --namespace tag1 --survey anchors.yaml",
         "check tags.bag --topic uwb/tdoa=/tag1/tdoa --topic imu/data=/tag1/imu",
     )
-    options.add_recordings(made)
+    options.add_recordings(made, nargs="*")
+    made.add_argument("--live", metavar="S", type=float, help="listen to live topics for S seconds instead")
     made.add_argument("--json", metavar="FILE", help="write all findings")
     return made
 
 
 def _check(args):
     cli.check_folders(args.json)
+    if bool(args.flights) == (args.live is not None):
+        raise InputError("FLIGHT, --live: give recordings, or --live SECONDS, and not both.")
+    if args.live is not None and not 0.0 < args.live < math.inf:
+        raise InputError(f"--live: {args.live:g} must be a number of seconds above 0, e.g. 60.")
     reading = options.reading_of(args)
     surveys = Path(args.survey) if args.survey else None
     others = _surveys(surveys) if surveys and surveys.is_dir() else []
     alone = None if others else surveys  # one survey is for bags too, which bring their own otherwise
     reports, recordings = [], []
-    for path, survey in tqdm(reading.find(args.flights), desc="checking", unit="flight", disable=None, leave=False):
-        recordings.append(read_recording(reading, path, survey or alone))
-        for remark in recordings[-1].remarks:
-            cli.say("check", f"{path}: {remark}")
-        reports.append(check(recordings[-1], others))
+    for recording in _recordings(args, reading, alone):
+        recordings.append(recording)
+        reports.append(check(recording, others))
         tqdm.write(report.text(reports[-1]))
     together = list(different_surveys(recordings))
     for finding in together:
@@ -61,6 +69,17 @@ def _check(args):
     if args.json:
         cli.write_json(args.json, report.as_dict(reports, together))
     return int(any(one.faulty for one in reports))
+
+
+def _recordings(args, reading, survey):
+    """Yield the Recording of each, or of what is live. survey : path of the one survey, or None."""
+    if args.live is not None:
+        yield read_live(reading, args.live, survey, partial(cli.say, "check"))
+    for path, its_survey in tqdm(reading.find(args.flights), desc="checking", unit="flight", disable=None, leave=False):
+        recording = read_recording(reading, path, its_survey or survey)
+        for remark in recording.remarks:
+            cli.say("check", f"{path}: {remark}")
+        yield recording
 
 
 def _surveys(folder):

@@ -1,0 +1,151 @@
+"""Who publishes and hears what: the rules, and live topics of real processes."""
+
+from dataclasses import replace
+import json
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.checking.recording import of_flight, read_live, read_recording
+from uwb_tdoa_tools.checking.wiring import RULES, End
+from uwb_tdoa_tools.commands.check import main
+from uwb_tdoa_tools.readers.inputs import Reading
+
+from recordings import small_flight
+
+IMU, TDOA = "sensor_msgs/msg/Imu", "uwb_tdoa_msgs/msg/Tdoa"
+DRIVER = End("/imu/data", "/driver", IMU, True, False, False)
+NODE = End("/imu/data", "/ekf_node", IMU, False, False, False)
+STRICT = replace(NODE, reliable=True)
+ANCHORS = End("/tag1/uwb/anchors", "/tag1/driver", "uwb_tdoa_msgs/msg/AnchorArray", True, True, False)
+
+
+@pytest.mark.parametrize(
+    "ends, expected",
+    [
+        ([DRIVER, NODE], set()),
+        ([DRIVER, STRICT], {"qos_unmatched"}),
+        ([DRIVER, STRICT, NODE], set()),  # one node that asks in both ways, as ours do for anchors
+        ([replace(DRIVER, reliable=True), STRICT], set()),
+        ([replace(DRIVER, reliable=True), replace(NODE, latched=True)], {"qos_unmatched"}),
+        ([DRIVER, replace(DRIVER, node="/other"), NODE], {"publishers_several"}),
+        ([replace(DRIVER, topic="/tf_static"), replace(DRIVER, topic="/tf_static", node="/other")], set()),
+        ([DRIVER, replace(NODE, kind=TDOA)], {"type_other"}),
+        ([ANCHORS], {"anchors_volatile"}),
+        ([replace(ANCHORS, latched=True)], set()),
+        ([], set()),
+    ],
+)
+def test_rules(ends, expected):
+    recording = replace(of_flight(small_flight()), ends=tuple(ends))
+    found = [finding for rule in RULES for finding in rule(recording)]
+    assert {finding.rule for finding in found} == expected
+    for finding in found:
+        assert all(node in finding.sentence for node in {end.node for end in ends if end.node != "/ekf_node"})
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [([], "give recordings, or --live"), (["x.bag", "--live", "3"], "not both"), (["--live", "-1"], "above 0")],
+)
+def test_recordings_or_topics(arguments, sentence, capsys):
+    assert main(arguments) == 2
+    assert sentence in capsys.readouterr().err
+
+
+FAULTY = """
+import rclpy, tf2_msgs.msg, geometry_msgs.msg, sensor_msgs.msg, std_msgs.msg, uwb_tdoa_msgs.msg
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile, DurabilityPolicy, ReliabilityPolicy
+rclpy.init()
+driver, logger = rclpy.create_node("driver", namespace="tag1"), rclpy.create_node("logger", namespace="tag1")
+poor = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+imu = driver.create_publisher(sensor_msgs.msg.Imu, "imu/data", poor)
+tdoa = driver.create_publisher(uwb_tdoa_msgs.msg.Tdoa, "ranging", 100)
+anchors = driver.create_publisher(uwb_tdoa_msgs.msg.AnchorArray, "uwb/anchors", 1)
+static = driver.create_publisher(tf2_msgs.msg.TFMessage, "/tf_static", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+place = geometry_msgs.msg.TransformStamped(child_frame_id="imu_link")
+place.header.frame_id, place.transform.rotation.x, place.transform.rotation.w = "base_link", 1.0, 0.0  # upside down
+static.publish(tf2_msgs.msg.TFMessage(transforms=[place]))
+logger.create_subscription(sensor_msgs.msg.Imu, "imu/data", print, 10)  # reliable
+survey, rows = uwb_tdoa_msgs.msg.AnchorArray(), [(0.0, 0.0, 0.0), (5.0, 0.0, 3.0), (0.0, 5.0, 3.0), (5.0, 5.0, 0.0)]
+for k, (x, y, z) in enumerate(rows):
+    anchor = uwb_tdoa_msgs.msg.Anchor(id=k)
+    anchor.pose.position.x, anchor.pose.position.y, anchor.pose.position.z = x, y, z
+    survey.anchors.append(anchor)
+step = 0
+def tick():
+    global step
+    step += 1
+    header = std_msgs.msg.Header(stamp=driver.get_clock().now().to_msg(), frame_id="imu_link")
+    force = geometry_msgs.msg.Vector3(x=0.01 * (step % 3), z=-1.0 + 0.01 * (step % 2))
+    imu.publish(sensor_msgs.msg.Imu(header=header, linear_acceleration=force))
+    header.frame_id = "base_link"
+    tdoa.publish(uwb_tdoa_msgs.msg.Tdoa(header=header, anchor_a=step % 4, anchor_b=(step + 1) % 4, distance_difference=0.001 * (step % 7)))
+    if step % 20 == 0:
+        anchors.publish(survey)
+driver.create_timer(0.01, tick)
+executor = SingleThreadedExecutor()
+executor.add_node(driver), executor.add_node(logger)
+executor.spin()
+"""
+
+
+@pytest.fixture
+def process():
+    """process(command): starts it; interrupted at the end."""
+    started = []
+
+    def start(*command):
+        started.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.send_signal(signal.SIGINT)
+        each.communicate(timeout=30)
+
+
+def test_live_topics_of_a_faulty_driver(tmp_path, process, capsys):
+    pytest.importorskip("uwb_tdoa_msgs.msg")
+    process(sys.executable, "-c", FAULTY)
+    out = tmp_path / "live.json"
+    code = main(["--live", "3", "--namespace", "tag1", "--topic", "uwb/tdoa=ranging", "--json", str(out)])
+    said = capsys.readouterr()
+    assert code == 1, said
+    (content,) = json.loads(out.read_text())["recordings"]
+    found = {finding["rule"]: finding for finding in content["findings"]}
+    assert {"imu_force_unit", "frame_turned", "qos_unmatched", "anchors_volatile"} <= found.keys(), said.out
+    assert "/tag1/logger hears nothing of what /tag1/driver publishes" in found["qos_unmatched"]["cause"]
+    assert not {"imu_turned", "stamps_apart", "other_clock", "frame_unknown"} & found.keys(), said.out
+    assert "/tag1/imu/data from /tag1/driver: best effort, volatile" in said.out
+    assert float(content["facts"]["duration"].split()[0]) == pytest.approx(3.0, abs=0.7)
+
+
+@pytest.mark.slow
+def test_what_is_live_is_judged_as_what_is_recorded(tmp_path, process):
+    """Played on simulated time, listened to for a part of it: the very samples, so that the rules say the same."""
+    pytest.importorskip("uwb_tdoa_msgs.msg")
+    flight = small_flight(4.0)
+    write_bag(flight, tmp_path / "flight.bag")
+    topics = ("--wait-matched", "60", "--wait-topics", "uwb/tdoa", "imu/data", "uwb/anchors")
+    replay = ("-m", "uwb_tdoa_tools.commands.replay", tmp_path / "flight.bag", "--rate", "2", "--clock", "100")
+    process(sys.executable, *replay, *topics)
+    live, whole = read_live(Reading(), 1.5), read_recording(Reading(), tmp_path / "flight.bag")
+    for stream, there in ((live.tdoa, whole.tdoa), (live.imu, whole.imu)):
+        assert len(there) // 2 < len(stream) < len(there) and stream.t[0] == there.t[0]  # nothing is lost, from the first on
+        for name, column in vars(stream).items():
+            np.testing.assert_array_equal(column, getattr(there, name)[: len(stream)])
+    assert np.isnan(live.tdoa_arrival).all() and np.isnan(live.imu_arrival).all()  # of another time
+    assert np.array_equal(live.anchors.positions, whole.anchors.positions) and live.frames.keys() == whole.frames.keys()
+    assert {end.topic for end in live.ends} >= {"/uwb/tdoa", "/imu/data", "/uwb/anchors"}
+
+
+def test_nobody_publishes(capsys, monkeypatch):
+    listen = pytest.importorskip("uwb_tdoa_tools.live.listen")
+    monkeypatch.setattr(listen, "FIRST_LIMIT", 0.3)
+    assert main(["--live", "3", "--namespace", "nowhere"]) == 2
+    assert "no message on /nowhere/uwb/tdoa" in capsys.readouterr().err
