@@ -52,7 +52,7 @@ def script(path, *lines):
 def test_usage_names_every_command(arguments):
     code, out, err = dev(ROOT, *arguments)
     assert (code, err) == (0, "")
-    for word in ("demo", "test", "build", "run PKG EXE", "shell", "examples:"):
+    for word in ("demo", "test", "build", "run PKG EXE", "shell", "ros2 ARGS", "examples:"):
         assert word in out
 
 

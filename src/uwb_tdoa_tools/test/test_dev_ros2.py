@@ -1,0 +1,96 @@
+"""`./dev ros2` of those without ROS, as processes against a live node; and the commands of the documentation."""
+
+import argparse
+from pathlib import Path
+import re
+import runpy
+import subprocess
+import sys
+import time
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all  # noqa: E402
+from uwb_tdoa_msgs.msg import Tdoa, TdoaResidual  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[3]
+SCRIPT = ROOT / ".dev" / "ros2.py"
+COMMANDS = {  # words: what they say, as an expression, and the exit code
+    "topic list -t": (r"/tag1/uwb/tdoa \[uwb_tdoa_msgs/msg/Tdoa\]\n", 0),
+    "topic info -v /tag1/uwb/tdoa": (
+        r"Type: uwb_tdoa_msgs/msg/Tdoa\nPublisher count: 1\n  /tag1/driver \[.*\]: best_effort, volatile\nSubscription count: ", 0,
+    ),
+    "topic echo /tag1/uwb/tdoa --once": (r"frame_id: base_link[^$]*anchor_a: 3\n[^$]*distance_difference: 0.25\n[^$]*---\n", 0),
+    "node list": (r"^/tag1/driver\n", 0),
+    "param list /tag1/driver": (r"\ngain\n", 0),
+    "param list": (r"/tag1/driver:\n(  .*\n)*  gain\n", 0),
+    "param set tag1/driver gain 0.75": (r"^Set parameter successful\n$", 0),
+    "param set tag1/driver limit 2.0": (r"error: limit: not set: ", 1),
+    "param describe /tag1/driver limit": (r"^limit: m; what is too far\n  from 0 to 9\n  read only\n$", 0),
+    "param get /tag1/driver gian": (r"error: /tag1/driver has no parameter gian", 1),
+}  # fmt: skip
+
+
+def spin_until(node, condition, patience=60.0):
+    until = time.monotonic() + patience
+    while not condition():
+        assert time.monotonic() < until
+        rclpy.spin_once(node, timeout_sec=0.02)
+
+
+@pytest.fixture
+def driver():
+    """A node that publishes TDOAs at 50 Hz, best effort, and has two parameters."""
+    rclpy.init()
+    node = rclpy.create_node("driver", namespace="tag1")
+    parameters = {
+        "gain": Parameter(0.5, "of nothing", 0.0, 1.0, settable=True),
+        "limit": Parameter(3.0, "m; what is too far", 0.0, 9.0),
+    }
+    declare_all(node, parameters)
+    poor = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher, message = node.create_publisher(Tdoa, "uwb/tdoa", poor), Tdoa(anchor_a=3, distance_difference=0.25)
+    message.header.frame_id = "base_link"
+    node.create_timer(0.02, lambda: publisher.publish(message))
+    yield node
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def start(words):
+    return subprocess.Popen(
+        [sys.executable, "-u", SCRIPT, *words.split()], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def test_commands(driver):
+    hz = start("topic hz /tag1/uwb/tdoa")
+    asked = [(words, start(words)) for words in COMMANDS]
+    spin_until(driver, lambda: all(process.poll() is not None for _, process in asked))
+    for words, process in asked:
+        expected, code = COMMANDS[words]
+        said = process.communicate()[0]
+        assert re.search(expected, said) and process.returncode == code, (words, said)
+    assert driver.get_parameter("gain").value == 0.75
+    hz.terminate()
+    rates = [float(rate) for rate in re.findall(r"average rate: ([\d.]+)", hz.communicate()[0])]
+    assert rates and rates[-1] == pytest.approx(50.0, rel=0.3)
+
+
+def test_any_message_is_yaml():
+    plain = runpy.run_path(str(SCRIPT))["_plain"]
+    residual = plain(TdoaResidual(verdict=3, weight=0.5))
+    assert residual["header"] == {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""} and residual["verdict"] == 3
+
+
+def test_its_examples_are_command_lines():
+    parser = runpy.run_path(str(SCRIPT))["parser"]()
+    examples = parser.epilog.splitlines()[1:]
+    assert len(examples) > 5
+    for example in examples:
+        dev, name, *words = example.split()
+        assert (dev, name) == ("./dev", "ros2") and isinstance(parser.parse_args(words), argparse.Namespace)
