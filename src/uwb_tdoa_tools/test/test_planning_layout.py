@@ -71,10 +71,9 @@ def test_no_layout_at_all():
 FLIGHTS = (-1.6, -1.6, 0.3), (1.6, 1.6, 2.1)  # what holds all that was flown higher than 0.3 m on 0422, 0425 and 0426
 
 
-@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("where", ["shared flights", "room"])
 @pytest.mark.slow
-def test_the_surveyed_layout_is_beaten_by_a_fifth(where, seed, shared_data):
+def test_the_surveyed_layout_is_beaten_by_a_fifth(where, shared_data):
     """8 anchors in 7 x 8 x 3 m: the worst bound over a flown volume, on a grid the search has not seen. On the walls for
     the volume of the shared flights; on stands up to 0.5 m before them, for all of the room but 0.8 m at the walls and
     0.6 m at floor and ceiling (on the bare walls hardly a fifth is possible)."""
@@ -83,7 +82,7 @@ def test_the_surveyed_layout_is_beaten_by_a_fifth(where, seed, shared_data):
     flown, depth = (FLIGHTS, 0.0) if where == "shared flights" else ((lower + MARGIN, upper - MARGIN), 0.5)
     step = 0.09 * (np.array(flown[1]) - flown[0]).max()
     aim = Goal(lattice(*flown, step), Installation(survey), criterion="round")
-    better = optimise(aim, Places.walls(lower, upper, depth=depth), 8, starts=8, seed=seed)
+    better = optimise(aim, Places.walls(lower, upper, depth=depth), 8, starts=8)
     fine = Goal(lattice(*flown, 0.6 * step), Installation(survey), criterion="round")
     before, after = fine.judge(survey), fine.judge(better)
     assert after["worst"] < 0.8 * before["worst"] and after["mean"] < before["mean"]
