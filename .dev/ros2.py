@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation.errors import Failure
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.live.session import message_class, session, subscription_qos
 
-SETTLED = 0.6  # s without news of the graph after which it is complete,
+SETTLED = 1.5  # s without news of the graph after which it is complete,
 ALONE = 3.0  # and s after which there are none
 PATIENCE = 5.0  # s for a topic, a node or an answer of it
 WINDOW = 1000  # messages that a rate is averaged over
@@ -170,10 +170,8 @@ def param_list(node, stop, args):
 
 
 def param_get(node, stop, args):
-    (value,) = _answer(node, stop, _client(node, stop, args.node).get_parameters([args.name])).values
-    if value.type == 0:
-        raise Failure(f"{args.node} has no parameter {args.name}; see ros2 param list {args.node}")
-    print(parameter_value_to_python(value))
+    values = _answer(node, stop, _client(node, stop, args.node).get_parameters([args.name])).values
+    print(parameter_value_to_python(_the_one(values, args)))
 
 
 def param_set(node, stop, args):
@@ -185,13 +183,21 @@ def param_set(node, stop, args):
 
 
 def param_describe(node, stop, args):
-    (found,) = _answer(node, stop, _client(node, stop, args.node).describe_parameters([args.name])).descriptors
+    descriptors = _answer(node, stop, _client(node, stop, args.node).describe_parameters([args.name])).descriptors
+    found = _the_one(descriptors, args)
     print(f"{found.name}: {found.description}")
     for bounds in (*found.floating_point_range, *found.integer_range):
         print(f"  from {bounds.from_value:g} to {bounds.to_value:g}")
     if found.additional_constraints:
         print(f"  {found.additional_constraints}")
     print("  read only" if found.read_only else "  can be set in flight")
+
+
+def _the_one(answers, args):
+    """The answer about a parameter; a node says nothing of those that it does not have."""
+    if not answers or answers[0].type == 0:
+        raise Failure(f"{args.node} has no parameter {args.name}; see ros2 param list {args.node}")
+    return answers[0]
 
 
 def _nodes(node, stop):
