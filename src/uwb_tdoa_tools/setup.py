@@ -1,3 +1,5 @@
+"""How colcon and pip install the package."""
+
 from setuptools import find_packages, setup
 
 NAME = "uwb_tdoa_tools"

@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
 from rig import EPOCH, make_rig, recording, seconds_of  # noqa: E402, F401
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
-from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.flight import Tdoas  # noqa: E402
 from uwb_tdoa_bias.correction.network import Network  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402

@@ -24,7 +24,7 @@ def batch(t, a, b, d, positions, p0, prior_std, q, tdoa_std):
     """Least squares over a whole recording of a tag that moves along a straight line with white acceleration noise,
     linearised about p0: positions (n, 3) and their covariances, by one large system of equations."""
     n = len(t)
-    rows, values, weights = [], [], []
+    rows, values = [], []
 
     def add(entries, value, std):
         row = np.zeros(6 * n)

@@ -70,5 +70,3 @@ def _write_data(folder):
     (folder / "util").mkdir()
     for number in (1, 3, 4):
         (folder / "util" / f"const{number}-trial1-tdoa2.csv.gz").touch()
-
-

@@ -181,9 +181,9 @@ def write_topics(path, *topics):
     """A bag of (topic, msgtype, [(stamp ns, message)])."""
     store = typestore()
     with Writer(path, version=9) as writer:
-        for topic, msgtype, messages in topics:
+        for topic, msgtype, written in topics:
             connection = writer.add_connection(topic, msgtype, typestore=store)
-            for stamp, message in messages:
+            for stamp, message in written:
                 writer.write(connection, stamp, store.serialize_cdr(message, msgtype))
 
 

@@ -51,7 +51,7 @@ KEYS = {
     "tqdm": ("python3-tqdm", "tqdm"),
     "yaml": ("python3-yaml", "PyYAML"),
 }
-RUNNERS = {"python3-pytest-xdist"}  # of the tests, which import it not
+RUNNERS = {"ament_flake8", "ament_pep257", "python3-pytest-xdist"}  # of the tests, which import them not, or where they are
 
 
 @lru_cache(maxsize=None)

@@ -44,11 +44,9 @@ def replayed(bag, folder, *options, nodes=()):
         diagnostics = Diagnostics(node)
         for package, name in (("uwb_tdoa_bias", "bias_node"), ("uwb_tdoa_ekf", "ekf_node")):
             processes.start(package, name, *nodes.get(name, ()))
-        ready = lambda: all(diagnostics.newest(name) for name in ("bias_node", "ekf_node"))
-        wait(READY_LIMIT, "the nodes", processes, node, ready)
+        wait(READY_LIMIT, "the nodes", processes, node, lambda: all(map(diagnostics.newest, ("bias_node", "ekf_node"))))
         processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
-        listening = lambda: node.count_subscribers("/odometry") == 2
-        wait(READY_LIMIT, "record", processes, node, listening)
+        wait(READY_LIMIT, "record", processes, node, lambda: node.count_subscribers("/odometry") == 2)
         command = ("uwb_tdoa_tools", "replay", bag, "--follow", "odometry", *options)
         replay = processes.start(*command, may_end_with=(0, 1, 2))
         wait(None, None, processes, node, lambda: replay.poll() is not None)

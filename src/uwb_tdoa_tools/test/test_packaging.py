@@ -45,6 +45,15 @@ def test_the_version_is_an_option(capsys):
     assert capsys.readouterr().out == f"convert of {written_by()}\n"
 
 
+def test_package_files_are_valid():
+    """By the rules of REP 149, as ament and rosdep read them."""
+    package = pytest.importorskip("catkin_pkg.package")
+    for folder in PACKAGES:
+        remarks = []
+        parsed = package.parse_package(folder / "package.xml", warnings=remarks)
+        assert remarks == [] and parsed.package_format == 3 and parsed.licenses == ["Apache-2.0"]
+
+
 def declared():
     """Names of all dependencies in all package.xml, our packages aside."""
     tags = ("depend", "exec_depend", "test_depend", "build_depend", "buildtool_depend")

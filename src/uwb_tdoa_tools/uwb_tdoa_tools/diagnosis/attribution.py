@@ -201,7 +201,6 @@ def _inflation(table, declared, detectors):
 def _with_smooth(selection, declared, smooth, search, scan, progress):
     """The selection carried on with functions without a name; or begun anew with them, if that explains more: the declared
     effect, or the large group of parameters, was a stopgap."""
-
     everything = smooth + declared
     table = selection.table.with_terms([term for candidate in smooth for term in candidate.terms])
     progress()

@@ -44,7 +44,9 @@ def oracle(flight, window):
         told = np.array([table[key] for key in keys]) if len(t) else np.zeros(0)
         return Correction(told, np.zeros(len(t)), d - told, np.full(len(t), NETWORK, dtype=np.uint8))
 
-    nothing = lambda *pose: None
+    def nothing(*pose):
+        return None
+
     return SimpleNamespace(
         idle=False, lag=np.inf, effects=EffectSet(), correct=correct, add_pose=nothing, reset=nothing
     )

@@ -67,7 +67,9 @@ def _trained(train, kinds, out, seed, validation):
     parts = [[known[name] for name in group] for group in names]
     effects_found = physics.find(sum(parts, [])) if any(kind.startswith("physics") for kind in kinds) else None
     for kind in kinds:
-        say = lambda text, kind=kind: tqdm.write(f"{kind}: {text}")
+        def say(text, kind=kind):
+            tqdm.write(f"{kind}: {text}")
+
         try:
             trained = models.train(kind, *parts, seed, kind, progress=say, found=effects_found)
         except InputError as error:

@@ -1,0 +1,29 @@
+"""The linters of ament, where they are installed: flake8 as .ci/flake8.ini says, and the form of docstrings."""
+
+import re
+
+import pytest
+
+from documented import ROOT
+
+SOURCES = [str(ROOT / "src" / name / name) for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")]
+# Module docstrings, blank lines, indentation, quotes. What a docstring says, and how it begins, is not for a linter.
+DOCSTRINGS = "D100 D104 D201 D202 D204 D207 D300 D301 D412 D414".split()
+
+
+@pytest.mark.slow
+def test_flake8(monkeypatch):
+    main = pytest.importorskip("ament_flake8.main").main_with_errors
+    monkeypatch.chdir(ROOT / "src")
+    files = [str(ROOT / name) for name in ("src", "docs", "conftest.py")]
+    code, errors = main(argv=["--config", str(ROOT / ".ci" / "flake8.ini"), *files])
+    assert code == 0, "\n".join(errors)
+
+
+@pytest.mark.slow
+def test_docstrings(monkeypatch, capsys):
+    main = pytest.importorskip("ament_pep257.main").main
+    monkeypatch.chdir(ROOT / "src")
+    code = main(argv=["--select", *DOCSTRINGS, "--", *SOURCES])
+    wrong = re.findall(r"^.*: D\d{3}: .*$", "".join(capsys.readouterr()), re.MULTILINE)
+    assert code == 0 and not wrong, "\n".join(wrong)
