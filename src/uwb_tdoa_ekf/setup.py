@@ -26,6 +26,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", glob("config/*.yaml")),
+        (f"share/{NAME}/foxglove", glob("foxglove/*.json")),
         (f"share/{NAME}/launch", glob("launch/*.py")),
         (f"share/{NAME}/rviz", glob("rviz/*.rviz")),
     ],

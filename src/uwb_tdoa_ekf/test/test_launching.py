@@ -1,6 +1,8 @@
 """What the launch files start. launch itself is not needed: it is played by stubs that take notes where it is missing."""
 
+import json
 from pathlib import Path
+import re
 import runpy
 import sys
 from types import ModuleType, SimpleNamespace
@@ -11,8 +13,10 @@ import yaml
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from nav_msgs.msg import Odometry  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.launching import NODES, start, tag, tags, typed  # noqa: E402
+from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = {name: ROOT.parent / package / "config" / f"{name}.yaml" for name, (package, _) in NODES.items()}
@@ -118,9 +122,12 @@ def test_one_tag(launched):
 
 
 def test_several_tags(launched, tmp_path):
-    (tmp_path / "tags.yaml").write_text("tags: {a: {}, b: {}}")
+    (tmp_path / "tags.yaml").write_text("tags: {a: {}, b: {}, c: {publish_tf: odom, odom_frame: c/odom}, d: {body_frame: drone}}")
     nodes = launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"))
-    assert [node.namespace for node in nodes] == ["a", "a", "b", "b"]
+    assert [node.namespace for node in nodes] == list("aabbccdd")
+    frames = [node.parameters[-1] for node in nodes if node.executable == "ekf_node"]
+    assert [frame["body_frame"] for frame in frames] == ["a/base_link", "b/base_link", "c/base_link", "drone"]  # no two alike
+    assert frames[2]["odom_frame"] == "c/odom"
 
 
 def test_a_bag_is_played_on_its_time(launched):
@@ -133,3 +140,21 @@ def test_a_bag_is_played_on_its_time(launched):
 def test_the_layout_of_rviz_is_yaml():
     content = yaml.safe_load((ROOT / "rviz" / "tdoa.rviz").read_text())
     assert {each["Name"] for each in content["Visualization Manager"]["Displays"]} >= {"Odometry", "Anchors", "TF"}
+
+
+def test_the_layout_of_foxglove_shows_what_the_nodes_publish():
+    content = json.loads((ROOT / "foxglove" / "tdoa.json").read_text())
+    kinds = {"/odometry": Odometry, "/uwb/residual": TdoaResidual, "/uwb/anchors/markers": None, "/diagnostics": None}
+    panels = content["configById"]
+    assert panels["3D!room"]["topics"].keys() | {panels["DiagnosticSummary!all"]["topicToRender"]} <= kinds.keys()
+    paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
+    for path in paths:
+        topic, filters, fields, index = re.fullmatch(r"([/\w]+)((?:\{\w+==\d+\})*)\.([.\w]+)(\[\d+\])?", path).groups()
+        message = kinds[topic]()
+        for name in [*re.findall(r"\{(\w+)==", filters), *fields.split(".")]:
+            value = getattr(message, name)
+            message = value if hasattr(value, "get_fields_and_field_types") else message
+        assert not index or len(value) > int(index[1:-1])
+    assert len(paths) == len(set(paths)) == 13
+    shown = re.findall(r'"(?:first|second)": "([^"]+)"', json.dumps(content["layout"]))
+    assert sorted(shown) == sorted(panels)

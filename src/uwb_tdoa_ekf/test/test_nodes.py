@@ -3,9 +3,11 @@
 from contextlib import contextmanager
 from dataclasses import replace
 import itertools
+import json
 from pathlib import Path
 import signal
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -14,13 +16,15 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
-from rig import EPOCH, make_rig, recording, seconds_of  # noqa: E402, F401
+from rig import OUTPUTS, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
+from rosgraph_msgs.msg import Clock  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_bias.foundation.flight import Tdoas  # noqa: E402
 from uwb_tdoa_bias.correction.network import Network  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402
+from uwb_tdoa_ekf.launching import tags  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
@@ -164,29 +168,76 @@ def test_quality_of_service(make_rig):
     rig.wait(arrived, "a measurement to pass")
 
 
+TAGS = """
+anchors_file: anchors.yaml
+world_frame: hall
+tags: {tag0: {}, tag1: {body_frame: drone, publish_tf: none}}
+"""
+
+
 @SLOW
-def test_two_tags_do_not_disturb_each_other(make_rig):
-    one, other = make_rig(listen=["odometry", "uwb/residual"]), make_rig(listen=["odometry", "uwb/residual", "/tf"])
-    flight = recording(2.0)
-    one.start("bias_node", "ekf_node")
-    other.start("bias_node", "ekf_node", ekf_node=["-p", "world_frame:=hall", "-p", "body_frame:=tag2"])
-    one.send_anchors(flight.anchors)
-    other.send_anchors(flight.anchors)
-    one.play(flight)
-    assert one.counts("ekf_node")["used"] > 0
-    idle = other.counts("ekf_node")
-    assert idle["TDOAs received"] == idle["IMU samples received"] == 0 and not other.odometry
-    other.play(flight, epoch=EPOCH - 86400)
-    for rig in (one, other):
-        rig.counts("ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu))
-    stamps = [
-        [seconds_of(message.header.stamp, epoch) for message in rig.odometry]
-        for rig, epoch in ((one, EPOCH), (other, EPOCH - 86400))
-    ]
-    assert stamps[0] == stamps[1] and len(stamps[0]) > 100
-    assert [m.pose.pose for m in one.odometry] == [m.pose.pose for m in other.odometry]
-    frames = {(t.header.frame_id, t.child_frame_id) for m in other.received["/tf"] for t in m.transforms}
-    assert frames == {("map", "base_link"), ("hall", "tag2")}
+def test_two_tags_of_a_launch_file(make_rig, tmp_path):
+    """On simulated time, which stands still in between; the second begins in the middle of its recording."""
+    flight, epoch = recording(2.0), int(time.time()) + 10**6  # what a node says is newer than anything before
+    flight.anchors.to_yaml(tmp_path / "anchors.yaml")
+    (tmp_path / "tags.yaml").write_text(TAGS)
+    one, other = make_rig(listen=["odometry", "uwb/residual", "/tf"]), make_rig(listen=["odometry", "uwb/residual"])
+    clock = one.node.create_publisher(Clock, "/clock", 10)
+    starts = [each for each in tags(tmp_path / "tags.yaml", {"use_sim_time": True}) if each.executable in OUTPUTS]
+    with ticking(clock, epoch) as running:
+        for rig in (one, other):
+            arguments = {each.executable: words_of(each) for each in starts if each.namespace == rig.namespace}
+            rig.start(*arguments, **arguments)
+        one.play(flight, epoch)
+        assert one.counts("ekf_node")["used"] > 0
+        idle = other.counts("ekf_node")
+        assert idle["TDOAs received"] == idle["IMU samples received"] == 0 and not other.odometry
+        late = np.searchsorted(flight.tdoa.t, 0.7)
+        tdoa = Tdoas(*(column[late:] for column in vars(flight.tdoa).values()))
+        other.play(replace(flight, tdoa=tdoa), epoch)
+        ekf = one.counts("ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu))
+        assert ekf["late"] == ekf["restarts"] == 0
+        assert other.counts("ekf_node", TDOAs_received=len(tdoa))["used"] > 0
+        running.clear()  # the pause
+        for rig in (one, other):
+            rig.wait(lambda rig=rig: rig.fresh_status("ekf_node").message == "paused: /clock stands still", "it to be said")
+    expected = run_offline(flight).odometry
+    np.testing.assert_allclose([vector(m.pose.pose.position) for m in one.odometry], expected.p[: len(one.odometry)], atol=1e-6)
+    assert len(one.odometry) > 100 and seconds_of(other.odometry[0].header.stamp, epoch) > 0.7
+    assert {(m.header.frame_id, m.child_frame_id) for m in one.odometry} == {("hall", "tag0/base_link")}
+    assert {(m.header.frame_id, m.child_frame_id) for m in other.odometry} == {("hall", "drone")}
+    frames = {(t.header.frame_id, t.child_frame_id) for m in one.received["/tf"] for t in m.transforms}
+    assert frames == {("hall", "tag0/base_link")}  # of both, on the one /tf that there is
+
+
+def words_of(start):
+    """The arguments that launch_ros gives a node."""
+    words = []
+    for part in start.parameters:
+        values = part.items() if isinstance(part, dict) else ()
+        words += [word for name, value in values for word in ("-p", f"{name}:={json.dumps(value)}")]
+    return words
+
+
+@contextmanager
+def ticking(publisher, epoch):
+    """Publish /clock from an epoch on; clear what it gives, and the clock stands still."""
+    over, running = threading.Event(), threading.Event()
+    running.set()
+
+    def tick():
+        t = 0.0
+        while not over.wait(0.05):
+            t += 0.05 * running.is_set()
+            publisher.publish(Clock(clock=stamp(t, epoch)))
+
+    thread = threading.Thread(target=tick)
+    thread.start()
+    try:
+        yield running
+    finally:
+        over.set()
+        thread.join()
 
 
 @SLOW
