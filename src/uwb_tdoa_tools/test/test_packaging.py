@@ -67,12 +67,38 @@ def test_rosdep_knows_what_is_declared():
     assert all(key.endswith("-pip") for key in listed["pip"])
 
 
+def container():
+    """[(instruction, rest)] of the Containerfile, continued lines joined."""
+    text = re.sub(r"\\\n\s*", " ", (ROOT / "Containerfile").read_text())
+    return [line.split(maxsplit=1) for line in text.splitlines() if line and not line.startswith("#")]
+
+
+def test_the_container_has_what_it_copies_and_calls():
+    steps = container()
+    assert steps[0] == ["FROM", "ros:jazzy"] and steps[1] == ["SHELL", '["/bin/bash", "-c"]']
+    assert {word for word, _ in steps} <= {"FROM", "SHELL", "WORKDIR", "COPY", "ENV", "RUN", "CMD"}
+    for word, rest in steps:
+        if word == "COPY":
+            assert all((ROOT / name).exists() for name in rest.split()[:-1])
+        elif word == "RUN":  # as far as a shell can tell without running it
+            assert subprocess.run(["bash", "-n", "-c", rest], capture_output=True).stderr == b""
+    ros2, launch, package, file = json.loads(dict(steps)["CMD"])
+    assert (ros2, launch) == ("ros2", "launch") and (ROOT / "src" / package / "launch" / file).is_file()
+
+
 def test_the_container_installs_what_is_declared():
-    text = (ROOT / "Containerfile").read_text()
-    for source in re.findall(r"^COPY (.+) \S+$", text, re.MULTILINE):
-        assert all((ROOT / name).exists() for name in source.split())
-    assert "FROM ros:jazzy" in text and "rosdep install --from-paths src" in text
-    assert (ROOT / "src/uwb_tdoa_ekf/launch" / re.search(r'"(\w+\.launch\.py)"', text)[1]).exists()
+    steps = container()
+    install, build = (next(rest for word, rest in steps if word == "RUN" and key in rest) for key in ("rosdep", "colcon"))
+    assert "rosdep install --from-paths src --ignore-src -y --rosdistro jazzy" in install and "colcon build" in build
+    assert install.index("rosdep update") < install.index("rosdep install") < install.index("pip install")
+    assert install.index("pip_constraint.txt") < install.index("rosdep install")  # before pip reads it
+    (variables,) = (rest for word, rest in steps if word == "ENV")
+    assert f"PIP_CONSTRAINT={dict(steps)['WORKDIR']}/pip_constraint.txt" in variables and "PIP_BREAK_SYSTEM_PACKAGES=1" in variables
+    without_key = set(re.findall(r"pip install --no-cache-dir ([\w ]+)", install)[0].split())
+    pinned = {line.partition("==")[0] for line in (ROOT / "requirements.txt").read_text().splitlines() if "==" in line}
+    assert without_key == {"onnx"} and without_key <= pinned  # the only import without a rosdep key (test_layout.py)
+    order = [word for word, _ in steps]
+    assert order.index("COPY") < order.index("RUN") and order[-1] == "CMD"
 
 
 @pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)

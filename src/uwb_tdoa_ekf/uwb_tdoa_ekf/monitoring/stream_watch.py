@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from ..streams import NOTE, StreamRules
+from ..streams import NOTE, StreamRules, most_severe_first
+from .sign_watch import SignWatch
 from ..streams.stamp_rules import median
 
 KEPT = 5  # windows of a second that are judged together
@@ -26,6 +27,7 @@ class StreamWatch:
         """Forget everything: another time has begun."""
         self._rules = StreamRules(self._anchors, KEPT)
         self._imu, self._tdoa = [], []
+        self._sign = SignWatch(self._anchors)
 
     def add_imu(self, t, arrival, gyro, accel):
         """Take a sample: stamp and arrival, s, of one clock if possible; gyro (3,) rad/s; accel (3,) m/s^2."""
@@ -46,10 +48,12 @@ class StreamWatch:
         if tdoa:
             t, arrival, a, b, d = zip(*tdoa)
             rules.feed_tdoa(np.array(t), np.array(arrival), np.array(a), np.array(b), np.array(d))
+            self._sign.feed(np.array(t), np.array(a), np.array(b), np.array(d))
         if max(len(rules.imu), len(rules.tdoa)) < FEWEST:
             return []
         still = {finding.rule for finding in rules.findings(FEWEST)}
-        return [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
+        found = [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
+        return most_severe_first([*found, *filter(None, [self._sign.finding])])
 
     def _counts(self, finding):
         if finding.severity == NOTE or finding.rule in self._ignored:

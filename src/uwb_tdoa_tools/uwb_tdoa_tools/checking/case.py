@@ -6,7 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
-from .explain import unexplained
+from uwb_tdoa_ekf.streams.explain import unexplained
 
 LONG, SHORT = 60.0, 14.0  # s of the recording that are tried: to be sure, and to choose what is worth being sure of
 PERIOD = 1.0  # s over which the motion is measured that says which part is tried

@@ -15,7 +15,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
-from .explain import Unexplained, compare
+from uwb_tdoa_ekf.streams.explain import Unexplained, compare
 
 # s that are tried, to be sure and to choose; Hz to which the samples are averaged
 PART, BRIEF, RATE = 30.0, 14.0, 200.0

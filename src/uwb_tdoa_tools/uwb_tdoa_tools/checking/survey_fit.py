@@ -10,7 +10,7 @@ from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
 from uwb_tdoa_ekf.core.startup import locate
-from .explain import SCALE
+from uwb_tdoa_ekf.streams.explain import SCALE
 
 WINDOWS, LENGTH, FEWEST = 40, 0.5, 30  # windows over the recording, s each, and TDOAs that one must have
 PRIOR = 0.5  # m, by which an anchor may be off the survey; of no anchor in particular is more believed

@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
 from .case import LONG, SHORT, Case
-from .explain import SCALE, compare
+from uwb_tdoa_ekf.streams.explain import SCALE, compare
 from .survey_fit import SPREAD, SurveyFit, spread
 
 RATIO, DEVIATIONS = 0.93, 2.5  # of what stays unexplained; healthy recordings: 1.02 at least for anything that is tried

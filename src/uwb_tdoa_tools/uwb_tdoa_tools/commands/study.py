@@ -5,7 +5,7 @@ import sys
 
 from .. import cli
 from ..studies import aids, crazyflie, surveying
-from ..studies.checking import figures as checking
+from ..studies.checking import figures as checking, in_flight
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
 from ..studies.training import compare, default, spin
@@ -19,6 +19,7 @@ STUDIES = {
     "debias-set-up": set_up,
     "default-model": default,
     "diagnosis": figures,
+    "in-flight": in_flight,
     "spin": spin,
     "surveying": surveying,
 }
@@ -33,6 +34,7 @@ of measured flights: flights/, util/, surveys/.
   debias-set-up    a simulated copy of the set-up of Grasso et al. (docs/debiasing.md)
   default-model    the model that bias_node ships
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
+  in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
   surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
 """
@@ -59,6 +61,7 @@ def parser():
         "study diagnosis bank --out bench/",
         "study diagnosis measured --data DATA --out bench/",
         "study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
+        "study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
         "study spin --out spin.png",
         "study surveying --data DATA --draws 5 --only const1",
     )

@@ -72,7 +72,7 @@ def judge_flight(task, reading, surveys, only=None):
     rows = []
     for name in ["nothing", *MISTAKES] if only is None else only:
         mistake = MISTAKES.get(name)
-        if mistake and not _possible(mistake, flight, other, rooms):
+        if mistake and not possible(mistake, flight, other, rooms):
             continue
         rng = np.random.default_rng([number, *name.encode()])
         arrives = live or (mistake is not None and "live" in mistake.needs)
@@ -87,7 +87,7 @@ def judge_flight(task, reading, surveys, only=None):
     return rows
 
 
-def _possible(mistake, flight, other, rooms):
+def possible(mistake, flight, other, rooms):
     """Whether a flight can have the mistake."""
     return not (
         ("imu" in mistake.needs and flight.imu is None)

@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_memory, structured
-from uwb_tdoa_ekf.core.validity import usable_all
+from ..core.config import FilterConfig
+from ..core.engine import feed
+from ..core.memory import IMU_SAMPLE, TDOA, Measurements, new_memory, structured
+from ..core.validity import usable_all
 
 SCALE = 0.5  # m, of the Geman-McClure loss: an innovation of that size leaves a half unexplained
 BLOCK = 2.0  # s
@@ -61,8 +61,13 @@ def compare(one, other):
 
 def unexplained(t, a, b, d, positions):
     """Unexplained of TDOAs in order of their stamps: t (n,) s; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
-    innovation, no_variance = np.full(len(t), np.nan), np.zeros(len(t))
+    return Unexplained.of(t, innovations(new_memory(positions), t, a, b, d, positions))
+
+
+def innovations(memory, t, a, b, d, positions):
+    """(n,) m of TDOAs as for `unexplained`, NaN where one is of no use, by the filter of a Memory, which goes on from there."""
+    out, no_variance = np.full(len(t), np.nan), np.zeros(len(t))
     good = usable_all(a, b, d, no_variance, positions)
     measured = Measurements(_NO_IMU, structured(TDOA, t, a, b, d, no_variance)[good])
-    innovation[good] = feed(new_memory(positions), CONFIG.tuning(), measured)[1]["innovation"]
-    return Unexplained.of(t, innovation)
+    out[good] = feed(memory, CONFIG.tuning(), measured)[1]["innovation"]
+    return out

@@ -1,0 +1,46 @@
+"""The sign of all TDOAs in flight: certain, either way, on simulated flights and on measured ones."""
+
+from flights import fly
+import numpy as np
+import pytest
+from uwb_tdoa_ekf.monitoring.sign_watch import SignWatch
+
+
+def watched(flight, sign):
+    """[(s, finding or None, certain)] of a Flight, second by second, with such a sign: callable of the stamps."""
+    watch, tdoa, said = SignWatch(flight.anchors), flight.tdoa, []
+    second = np.floor(tdoa.t - tdoa.t[0])
+    for k in range(int(second[-1])):
+        rows = second == k
+        t = tdoa.t[rows]
+        watch.feed(t, tdoa.a[rows], tdoa.b[rows], tdoa.d[rows] * sign(t))
+        said.append((k + 1.0, watch.finding, watch._certain))
+    return said
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wrong_sign_is_named_and_a_right_one_is_known(seed):
+    flight = fly(seed, 20.0)
+    right, wrong = (watched(flight, lambda t, sign=sign: sign) for sign in (1.0, -1.0))
+    assert not any(finding for _, finding, _ in right) and right[-1][2]
+    assert wrong[14][1].rule == "tdoa_sign" and not wrong[-1][2]
+    assert "the other way round" in wrong[-1][1].evidence
+
+
+def test_a_driver_that_is_put_right_is_believed():
+    said = watched(fly(1, 70.0), lambda t: np.where(t < 20.0, -1.0, 1.0))
+    assert said[18][1] is not None and said[-1][1] is None and said[-1][2]
+
+
+def test_a_tag_that_lies_still_says_nothing_of_it():
+    assert not any(finding for _, finding, _ in watched(fly(0, 30.0, hover=True), lambda t: 1.0))
+
+
+def test_disorder_and_nonsense():
+    watch, flight = SignWatch(fly(0, 1.0).anchors), fly(0, 4.0)
+    rng = np.random.default_rng(0)
+    for rows in np.array_split(rng.permutation(len(flight.tdoa)), 5):
+        t = np.where(rng.random(len(rows)) < 0.1, np.nan, flight.tdoa.t[rows])
+        watch.feed(t, np.where(rows % 7, flight.tdoa.a[rows], 999), flight.tdoa.b[rows], flight.tdoa.d[rows] * 1e9)
+    watch.feed(*(np.empty(0) for _ in range(4)))
+    assert watch.finding is None
