@@ -1,8 +1,11 @@
 import numpy as np
 import pytest
-from recordings import ANCHORS, SURVEY, log_bytes
+from recordings import ANCHORS, SURVEY, log_bytes, small_flight
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
+from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights, survey_for
 
 
@@ -114,3 +117,22 @@ def test_every_measured_recording_finds_its_survey(shared_data):
         key = survey.stem.removeprefix("anchor_")
         day = path.relative_to(shared_data / "flights").parts[0] if "flights" in path.parts else path.name.split("-")[0]
         assert key == day
+
+
+def test_a_bag_without_anchors_takes_the_survey_that_is_given(tmp_path):
+    flight = small_flight()
+    write_bag(flight, tmp_path / "whole")
+    with open_bag(tmp_path / "whole") as reader, new_bag(tmp_path / "bag") as writer:
+        there = [connection for connection in reader.connections if connection.topic != "/uwb/anchors"]
+        to = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=typestore()) for c in there}
+        for connection, stamp, data in messages(tmp_path / "whole", reader, there):
+            writer.write(to[connection.topic], stamp, data)
+    (tmp_path / "survey.csv").write_text(SURVEY)
+    reading = Reading(tmp_path / "survey.csv")
+    (recording,) = reading.find([tmp_path / "bag"])
+    assert np.array_equal(reading.read(recording).anchors.positions, flight.anchors.positions)
+    with pytest.raises(InputError, match="give a survey file"):
+        Reading().read(recording)
+    moved = SURVEY.replace("0.1,0.2,0.3", "0.5,0.2,0.3")  # counts for nothing where the bag has its own
+    (tmp_path / "survey.csv").write_text(moved)
+    assert reading.read((tmp_path / "whole", None)).anchors.positions[0, 0] == 0.1

@@ -148,12 +148,13 @@ def _about_flight(flight):
     return json.dumps({"name": flight.name, "meta": flight.meta, "written_by": written_by()}, default=str)
 
 
-def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):
+def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, spare=None):
     """Flight of a bag that was written here, by `ros2 bag record` or by our `record`; other topics are ignored.
 
     namespace : where the tag's topics are in the bag, e.g. "tag1" for /tag1/uwb/tdoa.
     topics : {our name of a topic: its name in the bag}, e.g. {"uwb/tdoa": "/my/tdoa"}; not absolute: in the namespace.
-    anchors : Anchors to use instead of the recorded uwb/anchors.
+    anchors : Anchors to use instead of the recorded uwb/anchors; spare : callable that gives those to use where none were
+        recorded, or None.
     salvage : read a cut or damaged bag up to there, and without messages that are no numbers; `meta["remarks"]` tells.
     Stamps are header stamps; messages that were recorded out of their order are sorted (`meta["reordered"]`). An IMU in
     a frame of its own is taken to the body as /tf_static says; `meta["antenna"]` is the place of an antenna on it, (3,) m.
@@ -183,7 +184,9 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None):
         if tdoa is None:
             raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {_others(connections, namespace)}.")
         if anchors is None:
-            anchors = _read_anchors(path, reader, connections, name_of("uwb/anchors"))
+            anchors = _read_anchors(path, reader, connections, name_of("uwb/anchors")) or (spare() if spare else None)
+        if anchors is None:
+            raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
         imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
         aids = {name: stream(name, msgtype, row, make, sound) for name, (msgtype, _, row, sound, make) in _AIDS.items()}
         tree = placing.read_frames(path, reader)
@@ -329,12 +332,13 @@ def _table(path, reader, connections, row):
 
 
 def _read_anchors(path, reader, connections, topic):
+    """The last Anchors of a topic, or None."""
     found = _find(path, connections, topic, "uwb_tdoa_msgs/msg/AnchorArray")
     last = None
     for connection, _, data in messages(path, reader, found):
         last = deserialize(path, connection, data)
     if last is None:
-        raise InputError(f"{path}: has no message on {topic}; give a survey file (--survey FILE).")
+        return None
     try:
         return Anchors.from_message(last)
     except InputError as error:

@@ -5,7 +5,7 @@ import sys
 
 from tqdm import tqdm
 
-from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.correction.network import SHIPPED, load_network
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.aids import STREAMS
 
@@ -82,6 +82,8 @@ def _evaluate(args):
         Path(args.tum).absolute() if args.tum else None,
     )  # fmt: skip
     scores = []
+    if not args.odometry:
+        print(_correction(judge.effects, judge.network, args.no_bias))
     print(table.head())
     for score in parallel.over(judge, found, args.jobs, args.dask):
         scores.append(score)
@@ -102,6 +104,13 @@ def _evaluate(args):
         cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
                 "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip
     return int(late > 0)
+
+
+def _correction(effects, network, nothing):
+    """What is corrected with, and what bias_node by itself would correct with."""
+    names = [part.name for part in (effects, network) if part]
+    others = "" if network or nothing else f"; bias_node by itself takes its network, too: --model {SHIPPED}"
+    return f"correcting with: {'+'.join(names) or 'nothing'}{others}"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """From the paths on a command line to flights: files or folders of recordings, one survey or a folder of them."""
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 import sys
 
@@ -13,7 +14,7 @@ from . import read_flight
 HELP = "recordings: raw logs, UTIL CSV files, bags, or folders that hold them"
 SURVEY_HELP = (
     "anchor survey (total station .txt, const .csv or anchors .yaml), or a folder of them: then anchor_KEY.* serves "
-    "the recordings whose path contains KEY; bags carry their own"
+    "the recordings whose path contains KEY; bags carry their own, and take this only where they do not"
 )
 
 
@@ -69,7 +70,8 @@ class Reading:
     def read(self, recording):
         """Flight of a pair (recording, survey or None); tells on stderr what is missing in it. Raises InputError."""
         path, survey = recording
-        flight = read_flight(path, survey, self.namespace, self.salvage, self.topics)
+        spare = None if self.survey is None else partial(survey_for, path, self.survey)
+        flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, spare)
         for remark in flight.meta.get("remarks", ()):
             tqdm.write(f"{path}: {remark}", file=sys.stderr)
         return flight
