@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, STARTUP, USED
+from uwb_tdoa_ekf.core.verdicts import COMPENSATED, INVALID, LATE, STARTUP, USED
 from uwb_tdoa_ekf.estimator import VERDICTS, Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -520,3 +520,33 @@ def test_another_tuning_counts_from_the_next_measurement_on():
     before = odometry.t < 1.95
     np.testing.assert_array_equal(odometry.p[before], undisturbed.p[before])
     assert residuals.variance[-1] > 20.0
+
+
+def with_a_late_anchor(size=0.8, since=20.0):
+    """A flight of 32 s in which one of eight anchors becomes late."""
+    flight = fly(4, 32.0, imu_rate=50.0, tdoa_rate=100.0, tdoa_std=0.05)
+    tdoa = flight.tdoa
+    sign = (tdoa.b == FIRST).astype(float) - (tdoa.a == FIRST)
+    return flight, replace(flight, tdoa=replace(tdoa, d=tdoa.d + size * sign * (tdoa.t > since)))
+
+
+def test_a_delay_that_comes_in_flight_is_taken_out_if_asked_for_whatever_the_arrival():
+    flight, harmed = with_a_late_anchor()
+    config = FilterConfig(compensate_changes=True)
+    assert_same_as_offline(harmed, config)
+    rng = np.random.default_rng(2)
+    assert_same_as_offline(harmed, config, advance=lambda: rng.random() < 0.01)
+    errors = {}
+    for name, (run_of, of) in {"sound": (flight, config), "off": (harmed, None), "on": (harmed, config)}.items():
+        run = run_offline(run_of, of)
+        late = run.odometry.t > 25.0
+        errors[name] = np.sqrt(np.mean((run.odometry.p[late] - position_at(flight, run.odometry.t[late])) ** 2))
+        of_anchor = (run.residuals.a == FIRST) | (run.residuals.b == FIRST)
+        compensated = run.residuals.verdict == COMPENSATED
+        assert compensated.any() == (name == "on") and not compensated[~of_anchor].any()
+        if name == "on":  # the innovation still has the delay
+            assert np.mean(np.abs(run.residuals.innovation[compensated])) == pytest.approx(0.8, abs=0.15)
+    assert errors["on"] < 0.5 * errors["off"]
+    estimator = Estimator(harmed.anchors)
+    feed(estimator, harmed)
+    assert estimator.alarms[0].startswith(f"anchor {FIRST}: ") and estimator.counts["compensated"] == 0

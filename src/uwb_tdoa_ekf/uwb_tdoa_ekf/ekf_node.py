@@ -40,7 +40,6 @@ from .estimator import STREAMS, VERDICTS, Estimator
 from .frames import to_odometry
 from .imu_mount import ImuMount
 from .monitoring.health import OK, WARN, Health
-from .monitoring.monitor import Monitor
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs
 from .told_pose import told_pose
@@ -117,7 +116,7 @@ class EkfNode(Node):
             self._publish(*self._estimator.finish())
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
         self._estimator = Estimator(anchors, self._config, self._reorder, self._lag)
-        self._imu_corrector, self._monitor = ImuCorrector(self._effects.effects), Monitor(anchors)
+        self._imu_corrector = ImuCorrector(self._effects.effects)
         ignored = [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else []
         self._watch, self._restarts = StreamWatch(anchors, self._lag, ignored), 0
         self._outputs.set_world(self._world or anchors.frame)
@@ -140,7 +139,6 @@ class EkfNode(Node):
 
     def _start_over(self):
         self._publish(*self._estimator.reset())
-        self._monitor = Monitor(self._estimator.anchors)
         self._watch.restart()
 
     def _on_pose(self, message):
@@ -255,9 +253,7 @@ class EkfNode(Node):
             self._outputs.publish_odometry(odometry, self._estimator.rates_at(odometry.t) - odometry.gyro_bias, variance)
             self._health.last_odometry = time.monotonic()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
-            self._monitor.add_odometry(odometry)
         if len(residuals.t):
-            self._monitor.add(residuals)
             self._outputs.publish_residuals(residuals)
 
     def _now(self):
@@ -301,7 +297,7 @@ class EkfNode(Node):
         self._health.behind = self._behind()
         troubles = self._wiring(), self._stream_findings()
         level, text, values = self._health.report(self._anchors.refused, estimator, counts, *troubles)
-        alarms = self._monitor.alarms if estimator is not None else []
+        alarms = estimator.alarms if estimator is not None else []
         others = [*filter(None, [self._frame_trouble, self._outputs.trouble, *alarms])]
         if level == OK and others:
             level, text = WARN, others[0]

@@ -16,9 +16,12 @@ from .core.config import FilterConfig
 from .core.engine import feed, tell_pose
 from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, Measurements, new_memory
 from .core.validity import MAX_ACCEL, MAX_RATE, usable
-from .core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
+from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, STARTUP, USED
+from .monitoring.monitor import Monitor
 
-VERDICTS = {USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup"}
+VERDICTS = {
+    USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup", COMPENSATED: "compensated",
+}  # fmt: skip
 STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
@@ -28,7 +31,7 @@ SILENT = 1.0  # s of stamps after which height, pressure or velocity is not wait
 @dataclass(frozen=True)
 class Residuals:
     """What became of each TDOA. t (n,) s; a, b (n,) anchor ids; innovation (n,) m and variance (n,) m^2, NaN unless
-    used or rejected by the filter; weight (n,) 0 to 1; verdict (n,) a key of VERDICTS."""
+    used, rejected or compensated by the filter; weight (n,) 0 to 1; verdict (n,) a key of VERDICTS."""
 
     t: np.ndarray
     a: np.ndarray
@@ -84,7 +87,7 @@ class Estimator:
         self._clear()
 
     def _clear(self):
-        self._memory = new_memory(self.anchors.positions)
+        self._memory, self._monitor = new_memory(self.anchors.positions), Monitor(self.anchors)
         self._waiting = [[] for _ in STREAMS]  # items of each stream in order of their stamps
         self._gates = [StampGate() for _ in STREAMS]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
@@ -105,6 +108,11 @@ class Estimator:
     def recoveries(self):
         """How often the filter found that it had lost the tag, and found it again."""
         return int(self._memory.record.recoveries)
+
+    @property
+    def alarms(self):
+        """Sentences on what has changed since the flight began."""
+        return self._monitor.alarms
 
     @property
     def waiting(self):
@@ -172,6 +180,8 @@ class Estimator:
     def retune(self, config):
         """Go on with another FilterConfig, which differs in nothing that is fixed (see FilterConfig)."""
         self.config, self._tuning = config, config.tuning()
+        if not config.compensate_changes:
+            self._memory.anchors["delay"] = self._memory.anchors["delay_variance"] = 0.0
 
     def reset(self):
         """Use everything that still waits, and forget it: what comes next starts the filter anew. Returns
@@ -248,11 +258,23 @@ class Estimator:
         while self._poses and self._poses[0]["t"][0] <= until and self._has_begun():
             pose = self._poses.pop(0)
             pose["t"] = max(pose["t"][0], self._fed_until)
-            parts.append(self._feed_measurements(pose["t"][0]))
+            parts += self._feed_and_judge(pose["t"][0])
             tell_pose(self._memory, self._tuning, pose)
             self._fed_until = pose["t"][0]
-        parts.append(self._feed_measurements(until))
+        parts += self._feed_and_judge(until)
         return parts[0] if len(parts) == 1 else tuple(_joined(column) for column in zip(*parts))
+
+    def _feed_and_judge(self, until):
+        """Use measurements; if delays are taken out, from the stamps on at which the monitor finds them."""
+        parts, monitor = [], self._monitor
+        while self.config.compensate_changes and monitor.end <= until and any(self._waiting):
+            end = monitor.end
+            parts.append(self._feed_measurements(np.nextafter(end, -math.inf)))
+            monitor.judge(end)
+            self._memory.anchors["delay"], self._memory.anchors["delay_variance"] = monitor.delays
+        parts.append(self._feed_measurements(until))
+        monitor.judge(self._fed_until)
+        return parts
 
     def _has_begun(self):
         return any(self._waiting) or self._fed_until > -math.inf
@@ -276,7 +298,9 @@ class Estimator:
                 self._fed_until = max(self._fed_until, part["t"][-1])
         self._fed_imu = [self._fed_imu[-1][-1:], imu] if len(imu) else [self._fed_imu[-1][-1:]]
         self.counts["imu_used"] += len(imu)
-        return Odometry.from_rows(odometry), self._residuals(tdoa, outcome)
+        out = Odometry.from_rows(odometry), self._residuals(tdoa, outcome)
+        self._monitor.add(*out)
+        return out
 
     def _residuals(self, tdoa, outcome):
         """Residuals of (k,) of TDOA that were fed, with their (k,) of RESIDUAL, and of those that were refused."""

@@ -1,6 +1,7 @@
 """The whole path on a recording, without ROS: what the two nodes give, in one call."""
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from .core.validity import usable_all, usable_imu
 from .core.verdicts import INVALID
 from .estimator import VERDICTS, Odometry, Residuals
 from .frames import rotation_std
+from .monitoring.monitor import Monitor
+from .monitoring.slices import LENGTH
 
 RECORDED_AT_ONCE = 256  # TDOAs that are fed together while a history is recorded: its room is for the worst case
 
@@ -59,7 +62,9 @@ def run_offline(flight, config=None, corrector=None, records=None):
     (aids, places), outcome_of_aids = rows_of(flight, config), []
     memory, tuning = new_memory(positions), config.tuning()
     bias, std, outcome, parts, fed, felt = np.zeros(len(tdoa)), np.zeros(len(tdoa)), _not_fed(len(tdoa)), [], 0, 0
-    for batch, until in _batches(*raw, corrector, RECORDED_AT_ONCE if records is not None else len(tdoa)):
+    monitor = Monitor(flight.anchors) if config.compensate_changes else None
+    at_once = RECORDED_AT_ONCE if records is not None else len(tdoa)
+    for batch, until in _batches(*raw, corrector, at_once, LENGTH if monitor else math.inf):
         t, a, b, d = (column[batch] for column in raw)
         correction = corrector.correct(t, a, b, d)
         bias[batch], std[batch] = correction.bias, correction.std
@@ -73,6 +78,11 @@ def run_offline(flight, config=None, corrector=None, records=None):
         fed, felt = last, last_aid
         outcome_of_aids.append(of_aids)
         parts.append(odometry)
+        if monitor:
+            of_batch = Residuals(t, tdoa.a[batch], tdoa.b[batch], *(outcome[batch][name] for name in RESIDUAL.names))
+            monitor.add(Odometry.from_rows(odometry), of_batch)
+            monitor.judge(math.inf if until is None else until)
+            memory.anchors["delay"], memory.anchors["delay_variance"] = monitor.delays
         if not corrector.idle and len(odometry):
             _report_poses(odometry, corrector)
     residuals = Residuals(tdoa.t, tdoa.a, tdoa.b, *(outcome[name] for name in RESIDUAL.names))
@@ -97,9 +107,9 @@ def _not_fed(n):
     return outcome
 
 
-def _batches(t, a, b, d, corrector, longest):
-    """What can be corrected and fed together, at most `longest` TDOAs: [(their places, in the order of their stamps,
-    and the stamp of the next one, or None)], at least one.
+def _batches(t, a, b, d, corrector, longest, period):
+    """What can be corrected and fed together, at most `longest` TDOAs, within one `period`, s, of stamps: [(their places,
+    in the order of their stamps, and the stamp of the next one, or None)], at least one.
 
     Corrections need poses that are `lag` old: measurements less than that apart can be corrected as one batch.
     """
@@ -108,6 +118,8 @@ def _batches(t, a, b, d, corrector, longest):
     stamps, first, batches = t[known], 0, []
     while first < len(known):
         end = len(known) if corrector.idle else int(np.searchsorted(stamps, stamps[first] + corrector.lag))
+        if period < math.inf:
+            end = min(end, int(np.searchsorted(stamps, (math.floor(stamps[first] / period) + 1.0) * period)))
         end = min(end, first + longest)
         batches.append((known[first:end], stamps[end] if end < len(known) else None))
         first = end

@@ -7,7 +7,7 @@ SRC = Path(__file__).resolve().parents[2]
 FOLDERS = ("uwb_tdoa_bias/uwb_tdoa_bias", "uwb_tdoa_ekf/uwb_tdoa_ekf")
 LEVELS = {"WARN", "ERROR"}
 # functions that give sentences
-SAYING = {"trouble", "unknown_frame", "several_publishers", "_sentence", "_axis_alarms", "judge"}
+SAYING = {"trouble", "unknown_frame", "several_publishers", "_sentence", "_silence", "_swap", "_axis_alarms", "judge"}
 LEAST = 7  # characters that tell one sentence from another
 
 
@@ -46,7 +46,7 @@ def _texts(tree):
         elif isinstance(node, ast.FunctionDef) and node.name in SAYING:
             for inner in ast.walk(node):
                 if isinstance(inner, ast.Return) and inner.value is not None:
-                    value = inner.value
+                    value = inner.value.elt if isinstance(inner.value, ast.ListComp) else inner.value
                     yield value.elts[0] if isinstance(value, ast.Tuple) and value.elts else value
                 elif isinstance(inner, ast.Call) and _name(inner.func) == "append":
                     yield inner.args[0]

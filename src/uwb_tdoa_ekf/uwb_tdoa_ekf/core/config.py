@@ -70,6 +70,7 @@ class FilterConfig:
     )
     zero_velocity: bool = _parameter(True, "a tag whose inertial sensors neither shake nor turn stands still")
     recover: bool = _parameter(True, "find the tag anew, untold where it is, when the TDOAs agree on another place")
+    compensate_changes: bool = _parameter(False, "take out the delay of an anchor that is found to have changed in flight")
 
     # The start
     initial_yaw: float = _parameter(0.0, "rad; yaw of the body at the start", high=7.0, low=-7.0)

@@ -12,7 +12,7 @@ from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, Output
 from .startup import INLIER
 from .state import coast, predict
 from .update import project, update_state
-from .verdicts import REJECTED, STARTUP, USED
+from .verdicts import COMPENSATED, REJECTED, STARTUP, USED
 
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged
 INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
@@ -93,7 +93,7 @@ def _on_imu(ekf, tuning, sample, records):
 
 @compiled
 def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
-    initialization.remember(ekf, tdoa)
+    initialization.remember(ekf, tdoa, anchors)
     t, was_running = tdoa.t, ekf.running
     if not was_running or not _advance(ekf, tuning, t, records):
         residual.innovation = residual.variance = np.nan
@@ -107,7 +107,8 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
         ekf.next_floor = t + REST_PERIOD
         _stay_on_floor(ekf, tuning, t, records)
     hypotheses.select(ekf, t)
-    agrees = 1.0 if abs(residual.innovation) < INLIER else 0.0
+    known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
+    agrees = 1.0 if abs(residual.innovation - known) < INLIER else 0.0
     ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (agrees - ekf.consistency)
     ekf.last_tdoa = t
     if tuning.recover and ekf.consistency < INCONSISTENT and t >= ekf.next_search:
@@ -171,19 +172,24 @@ def _advance(ekf, tuning, t, records):
 def _update(ekf, anchors, tuning, tdoa, residual, records):
     """Every hypothesis with one TDOA; the best one's innovation becomes the residual."""
     a, b, innovation = anchors[tdoa.a], anchors[tdoa.b], ekf.innovation
-    innovation.noise_variance = tuning.tdoa_std**2 + tdoa.variance
+    innovation.noise_variance = tuning.tdoa_std**2 + tdoa.variance + a.delay_variance + b.delay_variance
+    known = b.delay - a.delay
     if tuning.adapt_noise:
         innovation.noise_variance += noise.excess_variance(a, b)
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
             continue
-        _compare(hypothesis, a, b, tdoa.d, innovation)
+        _compare(hypothesis, a, b, tdoa.d - known, innovation)
         _assimilate(ekf, h, tuning, tdoa.t, residual, records)
         if h == ekf.best:
             height.judge(ekf.height, tuning, innovation, tdoa.t)
             if tuning.adapt_noise:
                 noise.learn(a, b, tdoa.t, innovation, tuning)
+    if a.delay != 0.0 or b.delay != 0.0:
+        residual.innovation += known
+        if residual.verdict == USED:
+            residual.verdict = COMPENSATED
 
 
 @compiled

@@ -21,13 +21,14 @@ SMALLEST_STD = 0.03  # m, of a height that is known at the start
 
 
 @compiled
-def remember(ekf, tdoa):
-    """Append a TDOA to the window."""
+def remember(ekf, tdoa, anchors):
+    """Append a TDOA to the window, without the delays of its anchors."""
     if ekf.kept == 2 * WINDOW:
         for i in range(WINDOW):
             ekf.window[i] = ekf.window[WINDOW + i]
         ekf.kept = WINDOW
     ekf.window[ekf.kept] = tdoa
+    ekf.window[ekf.kept].d -= anchors[tdoa.b].delay - anchors[tdoa.a].delay
     ekf.kept += 1
 
 

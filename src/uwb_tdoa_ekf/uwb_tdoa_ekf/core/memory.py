@@ -61,6 +61,8 @@ ANCHOR = _record(
     ("position", float, 3),  # m
     ("excess_variance", float),  # m^2, of what is received of it beyond tdoa_std, see noise.py
     ("learned", float),  # s, stamp of the last change
+    ("delay", float),  # m, that it is found to have since it changed in flight,
+    ("delay_variance", float),  # and its variance, m^2
 )
 
 HEIGHT = _record(

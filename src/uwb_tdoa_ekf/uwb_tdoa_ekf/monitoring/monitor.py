@@ -1,143 +1,175 @@
-"""Watches the residuals in flight: has an anchor, or an axis of the IMU, changed since the flight began?
+"""Watches the residuals in flight: what has changed since the flight began? An anchor that is late or early, whose clock
+drifts, that is silent or was exchanged with another; an axis of the IMU.
 
-The innovations of all pairs are explained, over the last seconds, by one delay for each anchor: d_ab is off by
-delay_b - delay_a (recursive least squares with exponential forgetting). What the delays are in the first seconds of
-motion is taken as their calibration; how much they wander then, and how wide the innovations are, says what is no
-change.
+The innovations of half a second become a Slice, and a ChangeDetector tests the slices. What it finds is named until it has
+gone.
 """
 
-from collections import deque
+from itertools import starmap
 import math
 
 import numpy as np
 
-from ..core.verdicts import REJECTED, USED
+from uwb_tdoa_bias.foundation.geometry import tdoa
 
-FORGETTING_TIME = 3.0  # s of innovations that one estimate rests on
+from .change import ChangeDetector
+from .slices import LENGTH, reduced
+from .swap import swapped
+
 MOVING = 0.3  # m/s; on the floor, residuals are not those of the air
-SETTLE, CALIBRATE = 3.0, 15.0  # s in motion: the first are ignored, those up to the second count as calibration
-ESTIMATE_PERIOD = 0.2  # s
-KEPT = 30.0  # s of estimates that are kept
-PERSISTENCE = 1.5  # s for which a change must last
-SMALLEST_CHANGE = 0.15  # m; a change of a delay is larger than this,
-DELAY_STDS = 6.0  # this many standard deviations of the delay during calibration, and
-INNOVATION_STDS = 2.0  # this many of the innovations then
-CLIP = 1.5  # m; a larger innovation counts as this
-RIDGE = 2.0  # m^-2, pulls delays that nothing tells to zero
+SETTLE = 8.0  # s in motion before an onset is looked for
+GAP = 30.0  # s without TDOAs after which a new flight begins
+LIMIT = 16.5  # ratio above which an anchor has changed: what it costs in false alarms is in docs/reliability.md
+SMALLEST_CHANGE = 0.15  # m; less does not matter, and what has come back to that has gone
+SILENT, FEWEST = 4, 40  # slices without an anchor, and the TDOAs of the others in them
+OFTEN = 0.5  # share of the slices in which it was heard before
+TOGETHER = 4  # slices in which a swap is looked for
+CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
 BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}  # rad/s and m/s^2, by which an estimated bias must have moved
-MAD_TO_STD, MEAN_MAGNITUDE_TO_STD = 1.4826, 1.25  # of normal noise
+
+NO_ODOMETRY = [np.empty(0), *[np.empty((0, 3))] * 4]  # t, p, v, gyro_bias, accel_bias
+NO_RESIDUALS = [np.empty(0), *[np.empty(0, int)] * 2, np.empty(0)]  # t, a, b, innovation
 
 
 class Monitor:
-    """Feed it residuals and odometry in stamp order; ask for `alarms`."""
+    """Feed it odometry and residuals, say until which stamp they are complete, ask for `alarms` and `delays`."""
 
     def __init__(self, anchors):
         """anchors : Anchors."""
-        self._ids = anchors.ids.tolist()
-        self._rows = {anchor: row for row, anchor in enumerate(self._ids)}
-        n = len(self._ids)
-        self._information, self._vector = np.zeros((n, n)), np.zeros(n)
-        self._t = None  # s, stamp of the last TDOA
-        self._estimates = deque(maxlen=int(KEPT / ESTIMATE_PERIOD))  # (stamp, delays (N,) m) after calibration
+        self._anchors = anchors
         self._forget()
 
     def _forget(self):
-        self._information[:], self._vector[:] = 0.0, 0.0
-        self._moving_since = self._next_estimate = None  # s, stamps
-        self._innovation_std = 0.0  # m, during calibration
-        self._calibration = []  # delays (N,) m
+        n = len(self._anchors)
+        self._odometry, self._residuals = [NO_ODOMETRY], [NO_RESIDUALS]  # of the present slice and later
+        self._end = self._last = None  # s, stamps: at which the present slice ends, and of what was added last
+        self._detector = ChangeDetector(n)
+        self._changes = {}  # row: Changes of an anchor that is not what it was
+        self._latest_change = None  # while its size is still found out
+        self._latest = []  # of the last slices: rows a, b (n,), measured d (n,) m, place (3,) m
+        self._slices, self._heard, self._missing = 0, np.zeros(n), np.zeros(n)  # slices: all, with each, lately without it
+        self._counts = []  # TDOAs of the last slices
+        self._swapped, self._silent = (), ()  # rows
+        self._moving_since = None  # s, stamp
         self._bias = self._bias_now = None  # (6,): gyroscope, accelerometer; as calibrated, and the latest
         self._bias_calibration = []
-        self._estimates.clear()
 
-    def add(self, residuals):
-        """Take Residuals; only those that reached the filter count."""
-        columns = (residuals.t, residuals.a, residuals.b, residuals.innovation, residuals.verdict)
-        for t, a, b, innovation, verdict in zip(*(column.tolist() for column in columns)):
-            if verdict in (USED, REJECTED) and math.isfinite(innovation):
-                self._add_innovation(t, self._rows[int(a)], self._rows[int(b)], min(max(innovation, -CLIP), CLIP))
+    @property
+    def end(self):
+        """Stamp, s, at which the present slice ends; inf before the first TDOA."""
+        return math.inf if self._end is None else self._end
 
-    def add_odometry(self, odometry):
-        """Take Odometry, for the biases of the IMU."""
-        if not len(odometry) or self._t is None:
+    @property
+    def delays(self):
+        """Of the anchors that are not what they were, at the present stamp: (N,) m, and their variances (N,) m^2."""
+        delays, variances = self._detector.delays_at(self._end), np.zeros(len(self._anchors))
+        changed = [*self._changes]
+        variances[changed] = [delays[row] ** 2 / found[-1].ratio for row, found in self._changes.items()]
+        return np.where(np.isin(np.arange(len(delays)), changed), delays, 0.0), variances
+
+    def add(self, odometry, residuals):
+        """Take Odometry and the Residuals that came with it."""
+        if len(odometry):
+            self._odometry.append([odometry.t, odometry.p, odometry.v, odometry.gyro_bias, odometry.accel_bias])
+        reached = np.isfinite(residuals.innovation)  # the filter
+        if reached.any():
+            columns = residuals.t, residuals.a, residuals.b, residuals.innovation
+            self._residuals.append([column[reached] for column in columns])
+            t = self._residuals[-1][0]
+            self._last = float(t[-1])
+            if self._end is None:
+                self._end = (math.floor(t[0] / LENGTH) + 1.0) * LENGTH
+
+    def judge(self, until):
+        """Everything stamped before `until`, s, was added: judge the slices that end there or earlier."""
+        if self._end is None or until < self._end:
             return
-        if self._moving_since is None:
-            if np.linalg.norm(odometry.v[-1]) > MOVING:
-                self._moving_since, self._next_estimate = self._t, self._t + SETTLE
+        residuals, odometry = (
+            [np.concatenate(columns) for columns in zip(*parts)] for parts in (self._residuals, self._odometry)
+        )
+        while self._end <= min(until, self._last + GAP):
+            now, of_now = residuals[0] < self._end, odometry[0] < self._end
+            self._judge(self._end, [column[now] for column in residuals], [column[of_now] for column in odometry])
+            residuals, odometry = [c[~now] for c in residuals], [c[~of_now] for c in odometry]
+            self._end += LENGTH
+        self._residuals, self._odometry = [residuals], [odometry]
+        if self._end <= until:  # nothing came for too long
+            self._forget()
+
+    def _judge(self, end, residuals, odometry):
+        """One slice that ends at `end`, s: its columns."""
+        _, a, b, innovation = residuals
+        a, b = self._anchors.index(a), self._anchors.index(b)
+        self._listen(a, b)
+        t, p, v, gyro_bias, accel_bias = odometry
+        if self._moving_since is None and (np.linalg.norm(v, axis=1) > MOVING).any():
+            self._moving_since = end
+        if self._moving_since is None or not (len(t) and len(a)):
             return
-        bias = np.concatenate([odometry.gyro_bias[-1], odometry.accel_bias[-1]])
-        if odometry.t[-1] < self._moving_since + CALIBRATE:
+        self._follow_biases(end, np.concatenate([gyro_bias[-1], accel_bias[-1]]))
+        place = p.mean(axis=0)
+        self._look_for_swap(a, b, innovation, place)
+        if not self._swapped:
+            self._detector.add(reduced(end - 0.5 * LENGTH, place, self._anchors.positions, a, b, innovation))
+            self._look_for_change(end)
+
+    def _look_for_change(self, end):
+        change = self._detector.find(self._moving_since + SETTLE)
+        if change is not None and change.ratio > LIMIT and abs(change.at(end)) > SMALLEST_CHANGE:
+            self._detector.take_out(change)
+            self._changes[change.row] = [*self._changes.get(change.row, ()), change]
+            self._latest_change = change
+        elif self._latest_change is not None:
+            self._latest_change = self._detector.refined(self._latest_change)
+        delays = self._detector.delays_at(end)
+        self._changes = {row: found for row, found in self._changes.items() if abs(delays[row]) > SMALLEST_CHANGE}
+
+    def _look_for_swap(self, a, b, innovation, place):
+        positions = self._anchors.positions
+        measured = innovation + tdoa(place, positions[a], positions[b])
+        self._latest = [*self._latest[1 - TOGETHER :], (a, b, measured, np.broadcast_to(place, (len(a), 3)))]
+        self._swapped = swapped(positions, *map(np.concatenate, zip(*self._latest)))
+
+    def _listen(self, a, b):
+        """Which anchors are not heard any more, while others are?"""
+        heard = np.bincount(np.concatenate([a, b]), minlength=len(self._anchors)) > 0
+        self._slices += 1
+        self._heard += heard
+        self._missing = np.where(heard, 0, self._missing + 1)
+        self._counts = [*self._counts[1 - SILENT :], len(a)]
+        often = self._heard > OFTEN * np.maximum(self._slices - self._missing, SILENT)
+        silent = (self._missing >= SILENT) & often & (sum(self._counts) >= FEWEST)
+        self._silent = tuple(np.flatnonzero(silent).tolist())
+
+    def _follow_biases(self, end, bias):
+        if end < self._moving_since + CALIBRATE:
             self._bias_calibration.append(bias)
         elif self._bias is None and self._bias_calibration:
             self._bias = np.mean(self._bias_calibration[len(self._bias_calibration) // 2 :], axis=0)
         self._bias_now = bias
 
-    def _add_innovation(self, t, a, b, innovation):
-        if self._t is None or not 0.0 <= t - self._t < 10.0 * FORGETTING_TIME:
-            self._forget()
-            dt = 0.0
-        else:
-            dt = t - self._t
-            keep = math.exp(-dt / FORGETTING_TIME)
-            self._information *= keep
-            self._vector *= keep
-        self._t = t
-        self._information[a, a] += 1.0
-        self._information[b, b] += 1.0
-        self._information[a, b] -= 1.0
-        self._information[b, a] -= 1.0
-        self._vector[a] -= innovation
-        self._vector[b] += innovation
-        if self._moving_since is None:
-            return
-        calibrating = t < self._moving_since + CALIBRATE
-        if calibrating:
-            std = MEAN_MAGNITUDE_TO_STD * abs(innovation)
-            self._innovation_std += min(1.0, dt / FORGETTING_TIME) * (std - self._innovation_std)
-        if t >= self._next_estimate:
-            self._next_estimate = t + ESTIMATE_PERIOD
-            delays = np.linalg.solve(self._information + RIDGE * np.eye(len(self._vector)), self._vector)
-            if calibrating:
-                self._calibration.append(delays)
-            elif self._calibration:
-                self._estimates.append((t, delays))
-
     @property
     def alarms(self):
         """Sentences on what has changed; empty while nothing has."""
-        return self._anchor_alarms() + self._axis_alarms()
+        swaps = [self._swap(*self._anchors.ids[[*self._swapped]])] if self._swapped else []
+        return [*swaps, *starmap(self._sentence, self._changes.items()), *self._silence(), *self._axis_alarms()]
 
-    def _anchor_alarms(self):
-        recent = [delays for t, delays in self._estimates if t > self._t - PERSISTENCE]
-        if len(recent) < PERSISTENCE / ESTIMATE_PERIOD - 1:
-            return []
-        calibrated = np.median(self._calibration, axis=0)
-        std = MAD_TO_STD * np.median(np.abs(np.array(self._calibration) - calibrated), axis=0)
-        change = np.array(recent) - calibrated
-        smallest = max(SMALLEST_CHANGE, INNOVATION_STDS * self._innovation_std)
-        limit = np.maximum(smallest, DELAY_STDS * np.maximum(std, np.median(std)))
-        certain = (change > limit).all(axis=0) | (change < -limit).all(axis=0)
-        if not certain.any():
-            return []
-        n = len(limit)  # what one anchor does, the least-norm solution spreads over all: it keeps (n - 1) / n
-        size = np.median(change, axis=0) * n / (n - 1)
-        row = int(np.argmax(np.where(certain, np.abs(size), 0.0)))  # the others only make room for it
-        return [self._sentence(row, float(size[row]), calibrated[row])]
+    def _swap(self, one, other):
+        return f"two anchors are exchanged, {one} and {other}: correct their ids, or their positions on uwb/anchors"
 
-    def _sentence(self, row, size, calibrated):
-        t = np.array([t for t, _ in self._estimates])
-        n = len(self._ids)
-        course = (np.array([delays[row] for _, delays in self._estimates]) - calibrated) * n / (n - 1)
-        since = t > t[-1] - 0.7 * KEPT
-        slope, rest = np.polyfit(t[since] - t[-1], course[since], 1)
-        ramp = np.std(course[since] - slope * (t[since] - t[-1]) - rest) < 0.5 * np.std(course[since])
-        if ramp and since.sum() > 5.0 / ESTIMATE_PERIOD:
-            what = f"its clock drifts ({slope:+.3f} m/s)"
+    def _silence(self):
+        return [f"anchor {self._anchors.ids[row]} is not heard any more: check its power and sight" for row in self._silent]
+
+    def _sentence(self, row, found):
+        size = float(self._detector.delays_at(self._end)[row])
+        again = [change for change in found if change.at(self._end) * size > 0.0]  # further in the same direction
+        if found[-1].slope or len(again) > 1:
+            what = f"its clock drifts ({size / (self._end - again[0].since):+.3f} m/s)"
         elif size > 0.0:
-            what = "it is blocked (NLOS) or was moved"
+            what = "it is late: blocked (NLOS), moved, or its delay has changed"
         else:
-            what = "it was moved"
-        return f"anchor {self._ids[row]}: {size:+.2f} m since the start of the flight: {what}"
+            what = "it is early: moved, or its delay has changed"
+        return f"anchor {self._anchors.ids[row]}: {size:+.2f} m since the start of the flight: {what}"
 
     def _axis_alarms(self):
         if self._bias is None or self._bias_now is None:

@@ -1,0 +1,152 @@
+"""Has one anchor changed? A sequential test over Slices.
+
+The delays of the anchors depend on the place: antennas, reflections, a survey that is off. A Gaussian process of the place
+(kernel below) learns them while flying; its whitened one-step errors are what is new. For every anchor and every onset within
+the last seconds a generalised likelihood ratio (Willsky and Jones, IEEE Trans. Automatic Control 21, 1976) compares a delay
+that began then, as a step or as a ramp, with none: what a delay would make of the same errors, whitened likewise, against
+them. The ratio is counted in units of the mean square of the errors before the onset, so that a flight with worse errors than
+the kernel expects needs a larger change.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from .slices import LENGTH
+
+MEAN_STD = 0.15  # m, of a delay that is the same everywhere,
+PLACE_STD, PLACE_LENGTH = 0.2, 0.9  # m, of one that depends on the place, and how far it is alike,
+LOCAL_STD, LOCAL_LENGTH, LOCAL_TIME = 0.05, 0.3, 2.0  # m, m, s, of one that lasts while the tag stays,
+NOISE_STD = 0.1  # m, and of what is new in every slice
+OUTLIER = 3.0  # normalised square of a slice's error, above which its variance is raised until it is this
+LARGEST_ERROR = 8.0  # normalised square that a slice counts as at most when the scale of the flight is learned
+SMALLEST_SCALE = 1.0  # mean normalised square below which no flight counts as better
+SCALE, SCALE_SLICES = 2.0, 20  # mean normalised square before there are any slices, and how many slices that is worth
+WINDOW, YOUNGEST = 24, 4  # slices in which an onset is looked for, and that it must have lasted
+FASTEST_DRIFT, CLEARLY = 0.1, 1.5  # m/s, of a clock; how much better than all steps a ramp must be
+CAPACITY = 240  # slices that are remembered
+
+
+@dataclass(frozen=True)
+class Change:
+    """row : of the anchor; since : s, stamp of the onset; size : m, at the onset; slope : m/s; ratio : the test."""
+
+    row: int
+    since: float
+    size: float
+    slope: float
+    ratio: float
+
+    def at(self, t):
+        """The delay, m, at stamps t, s."""
+        return np.where(t > self.since, self.size + self.slope * (t - self.since), 0.0)
+
+
+class ChangeDetector:
+    """Takes Slices in the order of their stamps; `find` tests them; what it found is taken out by `take_out`."""
+
+    def __init__(self, anchors):
+        """anchors : their number."""
+        n, room = anchors, CAPACITY
+        self._t, self._p = np.zeros(room), np.zeros((room, 3))
+        self._delays, self._response = np.zeros((room, n)), np.zeros((room, n, n))  # without what was taken out
+        self._factor, self._white = np.zeros((room, room)), np.zeros((room, n))  # Cholesky factor; whitened errors
+        self._squares = np.zeros(room)  # normalised squares
+        self._known, self._count = [], 0
+
+    def add(self, piece):
+        """Take a Slice."""
+        if self._count == CAPACITY:
+            self._forget_oldest(CAPACITY // 4)
+        k = self._count
+        self._t[k], self._p[k], self._response[k] = piece.t, piece.p, piece.response
+        self._delays[k] = piece.delays - piece.response @ self.delays_at(piece.t)
+        self._count += 1
+        self._whiten(k)
+
+    def delays_at(self, t):
+        """(N,) m: what was taken out, at stamp t, s."""
+        total = np.zeros(self._delays.shape[1])
+        for change in self._known:
+            total[change.row] += change.at(t)
+        return total
+
+    def find(self, after):
+        """The Change that explains the latest slices best, of onsets later than `after`, s; None without enough of them."""
+        first = self._first(after)
+        onsets = self._count - first - YOUNGEST
+        if onsets <= 0:
+            return None
+        value, ratio = self._compare(first)
+        ratio[onsets:][np.abs(value[onsets:]) > FASTEST_DRIFT] = 0.0
+        ratio[onsets:] /= CLEARLY
+        shape, row = np.unravel_index(np.argmax(ratio), ratio.shape)
+        since, value = self._t[first + shape % onsets] - 0.5 * LENGTH, float(value[shape, row])
+        size, slope = (value, 0.0) if shape < onsets else (0.0, value)
+        return Change(int(row), float(since), size, slope, float(ratio[shape, row]))
+
+    def refined(self, change):
+        """The step that was taken out last, with the size that it has by now, or None; takes that out instead."""
+        first = self._first(change.since)
+        if change.slope or self._t[first] - change.since > LENGTH or self._count - first <= YOUNGEST:
+            return None
+        more = float(self._compare(first)[0][0, change.row])
+        better = replace(change, size=change.size + more)
+        self._known.remove(change)
+        self._known.append(better)
+        self._subtract(replace(change, size=more))
+        return better
+
+    def take_out(self, change):
+        """Go on as if an anchor had not changed; what it does beyond that is a Change again."""
+        self._known.append(change)
+        self._subtract(change)
+
+    def _subtract(self, change):
+        for k in range(int(np.searchsorted(self._t[: self._count], change.since)), self._count):
+            self._delays[k] -= self._response[k][:, change.row] * change.at(self._t[k])
+            self._whiten(k)
+
+    def _first(self, after):
+        """Place of the first slice of the window that is later than `after`, s."""
+        return max(0, self._count - WINDOW, int(np.searchsorted(self._t[: self._count], after)))
+
+    def _compare(self, first):
+        """Steps (m), then ramps (m/s), that began with each slice from `first` on but the youngest: their most likely
+        values and their ratios, (2 k, N)."""
+        n, window = self._count - first, slice(first, self._count)
+        inverse = solve_triangular(self._factor[window, window], np.eye(n), lower=True)
+        response = self._response[window]
+        scores = np.einsum("snk,sn->sk", response, inverse.T @ self._white[window])
+        information = np.einsum("snk,tnk->stk", response, response) * (inverse.T @ inverse)[:, :, None]
+        age = np.arange(n) - np.arange(n - YOUNGEST)[:, None]  # of slices (columns) since each onset (rows)
+        shapes = np.concatenate([(age >= 0).astype(float), LENGTH * np.maximum(age + 0.5, 0.0)])
+        score = shapes @ scores
+        value = score / (np.einsum("js,stk,jt->jk", shapes, information, shapes, optimize=True) + 1e-9)
+        squares = np.minimum(self._squares[: self._count], LARGEST_ERROR)
+        before = first + np.tile(np.arange(n - YOUNGEST), 2)  # slices before each onset
+        scale = SCALE_SLICES * SCALE + np.concatenate([[0.0], np.cumsum(squares)])[before]
+        return value, score * value / np.maximum(scale / (SCALE_SLICES + before), SMALLEST_SCALE)[:, None]
+
+    def _whiten(self, k):
+        """Row k of the factor, and its whitened error."""
+        apart = ((self._p[:k] - self._p[k]) ** 2).sum(axis=1)
+        ago = np.abs(self._t[k] - self._t[:k])
+        local = np.exp(-0.5 * apart / LOCAL_LENGTH**2 - ago / LOCAL_TIME)
+        kernel = MEAN_STD**2 + PLACE_STD**2 * np.exp(-0.5 * apart / PLACE_LENGTH**2) + LOCAL_STD**2 * local
+        row = solve_triangular(self._factor[:k, :k], kernel, lower=True) if k else kernel
+        error = self._delays[k] - row @ self._white[:k]
+        variance = MEAN_STD**2 + PLACE_STD**2 + LOCAL_STD**2 + NOISE_STD**2 - row @ row
+        freedom = max(np.trace(self._response[k]), 1e-3)  # combinations of delays that are measured
+        self._squares[k] = error @ error / (variance * freedom)
+        variance *= max(1.0, self._squares[k] / OUTLIER)
+        self._factor[k, :k], self._factor[k, k] = row, np.sqrt(variance)
+        self._white[k] = error / self._factor[k, k]
+
+    def _forget_oldest(self, n):
+        for array in (self._t, self._p, self._delays, self._response):
+            array[: CAPACITY - n] = array[n:].copy()
+        self._count = CAPACITY - n
+        for k in range(self._count):
+            self._whiten(k)

@@ -1,0 +1,47 @@
+"""Residuals of half a second, reduced to one delay for each anchor.
+
+A TDOA whose anchors are late by delay_a and delay_b, predicted for a place that is off by e, has the innovation
+delay_b - delay_a + (u_b - u_a) e, with u the directions from the anchors to the tag. The place is solved for and thrown away:
+what is left are the combinations of delays that no place explains.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.geometry import ranges
+
+LENGTH = 0.5  # s of stamps
+CLIP = 1.5  # m; a larger innovation counts as this
+TDOA_VARIANCE = 0.02  # m^2, noise of one TDOA about the errors that last
+PLACE_STD = 0.5  # m, by which the filter may be off
+DELAY_STD = 0.15  # m, of a delay, before anything is measured
+
+
+@dataclass(frozen=True)
+class Slice:
+    """t : s, its middle; p : (3,) m, where the filter had the tag; delays : (N,) m, their least mean square estimate;
+    response : (N, N), what a metre of delay of each anchor (column) makes of the estimate; heard : (N,) number of TDOAs."""
+
+    t: float
+    p: np.ndarray
+    delays: np.ndarray
+    response: np.ndarray
+    heard: np.ndarray
+
+
+def reduced(t, p, positions, a, b, innovation):
+    """The Slice of TDOAs between the anchors (rows) a and b (n,), with innovations (n,) m; positions : (N, 3) m."""
+    n = len(positions)
+    value = np.clip(innovation, -CLIP, CLIP)
+    heard = np.bincount(a, minlength=n) + np.bincount(b, minlength=n)
+    both = np.bincount(a * n + b, minlength=n * n).reshape(n, n)
+    information = (np.diag(heard) - both - both.T) / TDOA_VARIANCE
+    vector = (np.bincount(b, value, n) - np.bincount(a, value, n)) / TDOA_VARIANCE
+    direction = ranges(p, positions)[1]
+    of_place = information @ direction
+    gain = np.linalg.solve(direction.T @ of_place + np.eye(3) / PLACE_STD**2, of_place.T)
+    information = information - of_place @ gain
+    vector = vector - gain.T @ (direction.T @ vector)
+    both = np.linalg.solve(information + np.eye(n) / DELAY_STD**2, np.column_stack([vector, information]))
+    return Slice(t, p, both[:, 0], both[:, 1:], heard)

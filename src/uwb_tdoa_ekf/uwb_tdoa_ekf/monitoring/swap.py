@@ -1,0 +1,37 @@
+"""Two anchors that were exchanged: each sends from where the other is said to be."""
+
+from itertools import combinations
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.geometry import tdoa
+
+LARGE = 0.75  # m, median innovation of the TDOAs with either of the two
+GAIN = 4.0  # how much less it must be with them exchanged
+SUSPECTS = 4  # anchors with the largest innovations
+FEWEST = 20  # TDOAs with either of the two
+
+
+def swapped(positions, a, b, d, p):
+    """Rows of two anchors which, exchanged, explain what is wrong, or ().
+
+    positions : (N, 3) m; a, b : (n,) rows; d : (n,) m, measured; p : (n, 3) m, where the filter had the tag. A filter that
+    has enough other anchors stays where the tag is.
+    """
+    error = np.abs(d - tdoa(p, positions[a], positions[b]))
+    n = len(positions)
+    total = np.bincount(a, error, n) + np.bincount(b, error, n)
+    mean = total / np.maximum(np.bincount(a, minlength=n) + np.bincount(b, minlength=n), 1)
+    best, pair = LARGE, ()
+    suspects = [row for row in np.argsort(-mean)[:SUSPECTS].tolist() if mean[row] > LARGE]
+    for i, k in combinations(suspects, 2):
+        concerned = np.isin(a, (i, k)) | np.isin(b, (i, k))
+        if concerned.sum() < FEWEST:
+            continue
+        now = np.median(error[concerned])
+        exchanged = positions.copy()
+        exchanged[[i, k]] = positions[[k, i]]
+        then = np.median(np.abs(d - tdoa(p, exchanged[a], exchanged[b]))[concerned])
+        if now > LARGE and GAIN * then < now and then < best:
+            best, pair = then, (i, k)
+    return pair

@@ -1,0 +1,135 @@
+"""What the monitor of ekf_node names on measured flights, and what it names on flights that nothing was put into: the
+figures of docs/reliability.md. Same code as in the node, without ROS.
+
+python src/uwb_tdoa_tools/test/monitor_table.py DATA --days 0426 0607
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from time_offset_table import measured
+
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_tools.readers import read_flight
+from uwb_tdoa_tools.scoring.metrics import position_at
+
+STEP = 0.5  # s between two looks at what the monitor says
+SIZES = {0.6: 5.0, 0.3: 10.0}  # m: s within which it is to be named
+MIDDLE = 0.4, 0.6  # of the time in the air, between which a fault begins
+JUDGED = 5.0  # s after the beginning of a fault from which errors count
+
+
+def airborne(flight):
+    """First and last instant, s, with the tag in the air."""
+    high = flight.truth.t[flight.truth.p[:, 2] > 0.3]
+    return high[0], high[-1]
+
+
+def flights_of(folder, days):
+    """Flights of these days: micro-SD logs by their folder, CSV files by their constellation."""
+    flights = [f for f in measured(folder) if any(f"/{day}/" in f.meta["source"] for day in days)]
+    for path in sorted((folder / "util").glob("*.csv.gz")):
+        constellation = path.name.split("-")[0]
+        if constellation in days:
+            flights.append(read_flight(path, folder / "surveys" / f"anchor_{constellation}.csv"))
+    return flights
+
+
+def late(flight, row, size, since):
+    """The Flight with an anchor that is late by size, m, from a stamp on."""
+    tdoa, anchor = flight.tdoa, flight.anchors.ids[row]
+    sign = (tdoa.b == anchor).astype(float) - (tdoa.a == anchor)
+    return replace(flight, tdoa=replace(tdoa, d=tdoa.d + size * sign * (tdoa.t > since)))
+
+
+def run(flight, config):
+    """Live, without ROS: [(s, sentences)] and (t (n,) s, p (n, 3) m) of a Flight."""
+    estimator, said, odometry = Estimator(flight.anchors, config), [], []
+    imu, tdoa = flight.imu, flight.tdoa
+    i = k = 0
+    for until in np.arange(tdoa.t[0] + STEP, airborne(flight)[1] + STEP, STEP):
+        last, first = np.searchsorted(tdoa.t, until), k
+        rows = zip(*(column[first:last].tolist() for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d)))
+        if imu is not None:
+            end = np.searchsorted(imu.t, until)
+            for sample in zip(*(column[i:end].tolist() for column in (imu.t, imu.gyro, imu.accel))):
+                estimator.add_imu(*sample)
+            i = end
+        for row in rows:
+            estimator.add_tdoa(*row)
+        k = last
+        out, _ = estimator.advance()
+        odometry.append(out)
+        said.append((until, estimator.alarms))
+    return said, (np.concatenate([o.t for o in odometry]), np.concatenate([o.p for o in odometry]))
+
+
+def error_of(flight, track, low, high):
+    """RMSE, m, between two stamps."""
+    t, p = track
+    inside = (t >= low) & (t < high)
+    return float(np.sqrt(np.nanmean(np.sum((p[inside] - position_at(t[inside], flight.truth)) ** 2, axis=1))))
+
+
+def clean(flights, config):
+    """Prints what is said of flights that nothing was put into."""
+    seconds = alarmed = 0
+    for flight in flights:
+        said, _ = run(flight, config)
+        seconds += airborne(flight)[1] - airborne(flight)[0]
+        first = next(((t, sentences[0]) for t, sentences in said if sentences), None)
+        alarmed += first is not None
+        if first:
+            print(f"  {flight.name}: {first[0] - airborne(flight)[0]:.1f} s in the air: {first[1]}")
+    print(f"{alarmed} of {len(flights)} unharmed flights with an alarm, {seconds:.0f} s in the air")
+
+
+def faults(flights, config, draws, seed):
+    """Prints how often a late anchor is named, and the errors with and without it compensated."""
+    rng = np.random.default_rng(seed)
+    compensating = replace(config, compensate_changes=True)
+    print("| late by, m | cases | named in time | another named first | median after, s | error, m: unharmed | harmed | compensated |")
+    print("|---|---|---|---|---|---|---|---|")
+    for size, limit in SIZES.items():
+        named, wrong, after, errors = 0, 0, [], []
+        for row in range(min(len(flight.anchors) for flight in flights)):
+            for _ in range(draws):
+                flight = flights[rng.integers(len(flights))]
+                begin, end = airborne(flight)
+                since = begin + (end - begin) * rng.uniform(*MIDDLE)
+                harmed = late(flight, row, size, since)
+                said, track = run(harmed, config)
+                name = f"anchor {flight.anchors.ids[row]}:"
+                told = next(((t, s[0]) for t, s in said if t > since and s), (np.inf, ""))
+                right = told[1].startswith(name) and told[0] - since <= limit + STEP
+                named += right
+                wrong += not told[1].startswith(name) and told[0] - since <= limit + STEP
+                after += [told[0] - since] if right else []
+                tracks = run(flight, config)[1], track, run(harmed, compensating)[1]
+                errors.append([error_of(flight, one, since + JUDGED, end) for one in tracks])
+        ratios = np.array(errors)[:, 1:] / np.array(errors)[:, :1]
+        cells = " | ".join(f"{value:.3f}" for value in np.sqrt(np.mean(np.square(errors), axis=0)))
+        n = len(errors)
+        print(f"| {size} | {n} | {100 * named / n:.0f} % | {100 * wrong / n:.0f} % | {np.median(after):.1f} | {cells} |")
+        for name, column in zip(("harmed", "compensated"), ratios.T):
+            print(f"  {name} / unharmed: median {np.median(column):.2f}, at most 1.2 in {100 * np.mean(column <= 1.2):.0f} %")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--days", nargs="+", default=["0422", "0425", "0426", "0607"])
+    parser.add_argument("--draws", type=int, default=10, help="of flight and time, for each anchor; 0: unharmed flights alone")
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    flights = flights_of(arguments.data, arguments.days)
+    clean(flights, FilterConfig())
+    if arguments.draws:
+        faults(flights, FilterConfig(), arguments.draws, arguments.seed)
+
+
+if __name__ == "__main__":
+    main()
