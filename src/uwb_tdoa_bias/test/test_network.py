@@ -109,6 +109,7 @@ def changed(tmp_path, **meta):
         ({"validity": '{"x": [0, 1, 0]}', "fade_std": "0.3"}, "margin above 0"),
         ({"validity": '{"x": [0, 1, 1]}'}, "fade_std"),
         ({"largest_yaw_std": '"wide"'}, "wide"),
+        ({"share": "1.5"}, "share must be between 0 and 1"),
     ],
 )
 def test_wrong_metadata_are_refused_by_name(tmp_path, meta, named):
@@ -126,6 +127,12 @@ def test_takes_nothing_out_before_the_yaw_is_known(tmp_path):
     np.testing.assert_array_equal(bias, [*plain[:2], 0.0])
     np.testing.assert_array_equal(std, [0.0, 0.0, abs(plain[2])])
     np.testing.assert_array_equal(known, [1.0, 1.0, 0.0])
+
+
+def test_takes_out_the_share_that_is_borne_out_and_counts_the_rest_as_uncertainty(tmp_path):
+    whole, part = Network(KNOWN).predict(batch(5)), Network(changed(tmp_path, share="0.75")).predict(batch(5))
+    np.testing.assert_allclose(part[0], 0.75 * whole[0])
+    np.testing.assert_allclose(part[1], np.hypot(whole[1], 0.25 * np.abs(whole[0])))
 
 
 def test_fades_beyond_what_it_knows(tmp_path):

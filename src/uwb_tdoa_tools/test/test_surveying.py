@@ -117,7 +117,7 @@ def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
     away = flight.anchors.positions + [0.2, -0.15, 0.1]  # all alike: nothing in the TDOAs tells
     moved = [at(flight, away)]
     marks = read_marks(marks_file(tmp_path / "marks.yaml", flight, 6), moved)
-    with_marks, without = (survey(moved, Tape(0.3), marks=some).surveyed.anchors.positions for some in (marks, ()))
+    with_marks, without = (survey(moved, Tape(0.3), constraints=some).surveyed.anchors.positions for some in (marks, ()))
     off = [np.abs((found - flight.anchors.positions).mean(axis=0)).max() for found in (with_marks, without)]
     assert off[0] < 0.05 < 0.1 < off[1]
 

@@ -2,6 +2,7 @@
 
     options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
     options.add_filter(parser)                      # --effects, --config
+    options.add_known(parser)                       # --marks, --distances, --odometry, --drift
     reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
@@ -13,6 +14,9 @@ from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
 from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
 from .readers import inputs
+from .surveying.distances import read_distances
+from .surveying.marks import read_marks
+from .surveying.paths import DRIFT, read_paths
 
 TOPICS = (  # that are read from bags
     "uwb/tdoa", "uwb/anchors", "imu/data", "height", "pressure", "velocity", "ground_truth/pose", "odometry",
@@ -58,6 +62,27 @@ def filter_of(args):
     """(FilterConfig, EffectSet or None) that --config and --effects name. Raises InputError."""
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
+
+
+def add_known(parser):
+    """--marks, --distances, --odometry and --drift: what is known beside a recording."""
+    add = parser.add_argument
+    add("--marks", metavar="FILE", help="YAML: measured places where the tag stood or passed, and when (docs/calibration.md)")
+    add("--distances", metavar="FILE", help="CSV with columns a, b, distance, std: measured distances between anchors, m")
+    add(
+        "--odometry", metavar="CSV|TOPIC",
+        help="path of another odometry or SLAM, in a frame of its own with z up: a CSV file with columns flight, t, x, y, z, or a "
+        "topic (nav_msgs/Odometry) of the bags",
+    )  # fmt: skip
+    add("--drift", type=float, default=DRIFT, metavar="M", help="of that, m per square root of a second (default %(default)s)")
+
+
+def known_of(args, flights):
+    """Constraints on Flights that those options give: tuple. Raises InputError."""
+    out = [] if args.marks is None else read_marks(args.marks, flights)
+    out += [] if args.distances is None else read_distances(args.distances, flights[0].anchors)
+    out += [] if args.odometry is None else read_paths(args.odometry, flights, args.drift, args.namespace)
+    return tuple(out)
 
 
 def with_parameters(config, texts):

@@ -10,6 +10,8 @@ Metadata of the model (all values JSON text):
     fade_std  number, metres, with validity: standard deviation of the bias where the network is not believed
     largest_yaw_std  optional: number, radians; where the yaw is less certain, the bias is not taken out, but counts as
               uncertainty
+    share     optional: number 0 ... 1: how much of the prediction is taken out, as flights left out of the training bear
+              out; the rest counts as uncertainty
 Input: one float tensor (n, number of features), of any name. Output: one float tensor (n, 1), bias in metres; (n, 2),
 bias and its standard deviation in metres; or (n, 3), with the share 0 ... 1 of what can be known that the network knows
 there: it has already faded bias and deviation itself.
@@ -38,7 +40,8 @@ def load_network(name):
 
 class Network:
     """An ONNX bias model, run on one thread. meta : all its metadata, dict of str; trained_with : names of the effects
-    that were taken out before it was trained, and have to be corrected beside it."""
+    that were taken out before it was trained, and have to be corrected beside it; share : how much of its prediction is
+    taken out, 0 ... 1."""
 
     def __init__(self, path):
         """Load `path`; raises InputError if it is no model or its metadata do not fit."""
@@ -101,6 +104,7 @@ class Network:
         limits = json.loads(meta.get("validity", "{}"))
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
+        self.share = float(json.loads(meta.get("share", "1.0")))
         self._inputs, self._judged = (np.array([_COLUMN[name] for name in some], dtype=int) for some in (names, limits))
         self._lower, self._upper, self._margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
         if not ((self._margin > 0.0) & (self._upper >= self._lower)).all():
@@ -109,6 +113,8 @@ class Network:
             raise ValueError("offset, scale and margins must be finite numbers")
         if not (self.clip > 0.0 and 0.0 <= self._fade_std < np.inf and self._largest_yaw_std >= 0.0):
             raise ValueError("clip must be above 0, fade_std and largest_yaw_std not below")
+        if not 0.0 <= self.share <= 1.0:
+            raise ValueError("share must be between 0 and 1")
 
     def predict(self, samples):
         """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
@@ -125,6 +131,8 @@ class Network:
             trust = 1.0 - np.clip(beyond.max(axis=1), 0.0, 1.0)
             bias, known = trust * bias, trust * known
             std = np.sqrt((trust * std) ** 2 + (1.0 - trust**2) * self._fade_std**2)
+        if self.share < 1.0:
+            std, bias = np.hypot(std, (1.0 - self.share) * bias), self.share * bias
         if samples.yaw_std is not None:
             undecided = samples.yaw_std > self._largest_yaw_std
             if undecided.any():

@@ -15,12 +15,18 @@ The file, written by people and by the tools, read by the nodes:
         form: arrival
         knots: [1.0, 4.0, 9.0]
         values: {c0: 0.01, c1: 0.04, c2: -0.02, c3: 0.0}
+    covariance:                         # optional, written by survey and diagnose: the prior of the next calibration
+      parameters: [anchor_delay 0, anchor_delay 3]
+      matrix:                           # lower triangle
+      - [1.6e-5]
+      - [0.4e-5, 1.6e-5]
 """
 
 from .aid_corrector import AidCorrector
 from .anchor_delay import AnchorDelay
 from .base import ArrivalEffect, Effect
 from .catalogue import EFFECTS
+from .covariance import Covariance
 from .effect_set import EffectSet
 from .imu_corrector import ImuCorrector
 from .samples import AidSamples, ImuSamples, Samples, Track, aid_samples, samples_at, true_samples
@@ -28,6 +34,6 @@ from .smooth_term import SmoothTerm
 from .tag_lever_arm import TagLeverArm
 
 __all__ = [
-    "EFFECTS", "AidCorrector", "AidSamples", "AnchorDelay", "ArrivalEffect", "Effect", "EffectSet", "ImuCorrector",
+    "EFFECTS", "AidCorrector", "AidSamples", "AnchorDelay", "ArrivalEffect", "Covariance", "Effect", "EffectSet", "ImuCorrector",
     "ImuSamples", "Samples", "SmoothTerm", "TagLeverArm", "Track", "aid_samples", "samples_at", "true_samples",
 ]  # fmt: skip

@@ -1,6 +1,6 @@
 """`effects.yaml`: which effects are in the model, with which values."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from ..foundation.safe_yaml import read_yaml
 from ..foundation.version import written_by
 from .aid_corrector import AidCorrector
 from .catalogue import EFFECTS
+from .covariance import Covariance
 from .imu_corrector import ImuCorrector
 from .smooth_term import SmoothTerm
 from .stamp_error import shifted
@@ -22,9 +23,11 @@ STREAMS = ("tdoa", "imu", "truth")  # whose stamps are moved, beside those of AI
 
 @dataclass(frozen=True)
 class EffectSet:
-    """The effects that are in the model, in the order in which they are listed."""
+    """The effects that are in the model, in the order in which they are listed. covariance : of some of their values
+    together, or None; corrections do not need it."""
 
     effects: tuple = ()
+    covariance: Covariance | None = field(default=None, compare=False)
 
     @property
     def name(self):
@@ -110,7 +113,10 @@ class EffectSet:
                 effects.append(kind(**entry))
             except (TypeError, AttributeError) as error:
                 raise InputError(f"{path}: {name}: values and std must be mappings of parameter to number.") from error
-        return cls(tuple(effects))
+        if content.get("covariance") is None:
+            return cls(tuple(effects))
+        values = {name: effect.values for name, effect in zip(map(str, entries), effects)}
+        return cls(tuple(effects), Covariance.from_dict(content["covariance"], values, path))
 
     def to_yaml(self, path):
         """Write what `from_yaml` reads."""
@@ -121,6 +127,8 @@ class EffectSet:
             name = effect.name if number == 1 and not effect.settings else f"{effect.name}_{number}"
             entries[name] = {key: value for key, value in entry.items() if value}
         text = yaml.safe_dump({"effects": entries}, sort_keys=False)
+        if self.covariance is not None:
+            text += yaml.safe_dump({"covariance": self.covariance.as_dict()}, sort_keys=False, default_flow_style=None, width=1000)
         Path(path).write_text(f"# {written_by()}\n{text}")
 
 

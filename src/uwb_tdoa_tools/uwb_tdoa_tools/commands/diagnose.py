@@ -33,19 +33,23 @@ def parser():
         "diagnose 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out diagnosis/",
         "diagnose flight.bag --effects effects.yaml --out second/",
         "diagnose flight.bag --reference heights --out by-height/",
+        "diagnose flight.bag --reference marks --marks marks.yaml --out by-marks/",
+        "diagnose flight.bag --reference odometry --odometry /vio/odometry --out by-odometry/",
         "diagnose flight.bag --no-truth --out without/",
+        "diagnose today.bag --no-truth --effects last-week/effects.yaml --out today/",
     )
     options.add_recordings(made)
-    options.add_filter(made, "effects.yaml: what is in the model already")
+    options.add_filter(made, "effects.yaml: what is in the model already; without ground truth its covariance is the prior")
     add = made.add_argument
     add("--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit")
     known = made.add_mutually_exclusive_group().add_argument
     known(
         "--reference", choices=tuple(REFERENCES), default="truth",
-        help="what flights are compared with: their ground truth (default), the heights of a range finder, or nothing; "
-        "what is not named is not read",
+        help="what flights are compared with: their ground truth (default), the heights of a range finder, --marks, "
+        "--odometry, or nothing; what is not named is not read",
     )  # fmt: skip
     known("--no-truth", dest="reference", action="store_const", const="nothing", help="short for --reference nothing")
+    options.add_known(made)
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
 
@@ -63,7 +67,10 @@ def _diagnose(args):
             cli.say("diagnose", f"{flight.name}: {remark}")
     for finding in different_surveys([*flights, *holdout]):
         cli.say("diagnose", f"{finding.cause}: {finding.evidence}; {finding.remedy}.")
-    reference = REFERENCES[args.reference](config)
+    for option in ("marks", "odometry"):
+        if args.reference == option and getattr(args, option) is None:
+            raise InputError(f"--reference {option}: --{option} says which, and is missing.")
+    reference = REFERENCES[args.reference](config, options.known_of(args, (*flights, *holdout)))
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress)
     out.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from ..studies import aids, crazyflie, surveying
 from ..studies.checking import figures as checking, in_flight
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
-from ..studies.training import compare, default, spin
+from ..studies.training import compare, default, spin, splits
 
 STUDIES = {
     "aids": aids,
@@ -20,6 +20,7 @@ STUDIES = {
     "default-model": default,
     "diagnosis": figures,
     "in-flight": in_flight,
+    "random-splits": splits,
     "spin": spin,
     "surveying": surveying,
 }
@@ -35,6 +36,7 @@ of measured flights: flights/, util/, surveys/.
   default-model    the model that bias_node ships
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
+  random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
   surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
 """
@@ -62,6 +64,7 @@ def parser():
         "study diagnosis measured --data DATA --out bench/",
         "study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
         "study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
+        "study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "study spin --out spin.png",
         "study surveying --data DATA --draws 5 --only const1",
     )

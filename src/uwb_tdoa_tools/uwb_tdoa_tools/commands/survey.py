@@ -6,7 +6,6 @@ from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, options
 from ..progress import Progress
-from ..surveying.marks import read_marks
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
 
@@ -16,8 +15,11 @@ Nobody needs to know where the tag flew: the flights tell which shifts of anchor
 agree with each other and with the IMU (and with a range finder, where there is one). The frame is that of the
 coordinates that are known best: name some with --trusted, or all stays where it is on average. Ground truth is not used.
 
-Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the anchors),
-ekf_node.yaml (noise that the filter should assume with them), survey.json (covariance) and survey.png (before and after)
+With the anchors.yaml and effects.yaml (--effects) of last week it starts from what was known then, says what has changed
+since, and makes the rest better.
+
+Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the
+anchors, and how well all is known), ekf_node.yaml (noise that the filter should assume with them), survey.json (covariance) and survey.png (before and after)
 to --out.
 
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
@@ -40,17 +42,19 @@ def parser():
         "survey flight.bag --survey tape.yaml --trusted 0 4 1.z 2.z --out surveyed/",
         "survey first.bag second.bag third.bag --survey tape.csv --std 0.3 --height-std 0.05 --out surveyed/",
         "survey flight.bag --survey tape.yaml --unknown 5 --out surveyed/",
-        "survey flight.bag --survey tape.yaml --marks marks.yaml --out surveyed/",
+        "survey flight.bag --survey tape.yaml --marks marks.yaml --distances laser.csv --out surveyed/",
+        "survey flight.bag --survey tape.yaml --odometry /vio/odometry --out surveyed/",
+        "survey today.bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml --out today/",
     )
     options.add_recordings(made)
-    options.add_filter(made, "effects.yaml: what is in the model already")
+    options.add_filter(made, "effects.yaml: what is in the model already; that of a survey is its prior, and tells what changed")
     add = made.add_argument
     add("--std", type=float, default=0.1, metavar="M", help="m, standard deviation of a coordinate as given (default 0.1)")
     add("--height-std", type=float, metavar="M", help="m, the same of heights, which are easier to measure")
     add("--trusted", nargs="+", default=[], metavar="A", help="anchors (3) or coordinates (3.z) that are known well")
     add("--trusted-std", type=float, default=0.01, metavar="M", help="m, how well those are known (default 0.01)")
     add("--unknown", nargs="+", default=[], metavar="A", help="anchors whose position is not known at all")
-    add("--marks", metavar="FILE", help="YAML: measured places where the tag stood or passed, and when (docs/calibration.md)")
+    options.add_known(made)
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
 
@@ -61,15 +65,15 @@ def _survey(args):
     config, effects = options.filter_of(args)
     base = effects or EffectSet()
     flights = options.reading_of(args).flights(args.flights)
-    marks = read_marks(args.marks, flights) if args.marks else ()
+    known = options.known_of(args, flights)
     with Progress("survey") as progress:
-        result = survey(flights, tape, base, config, marks, lambda: progress("solving"))
+        result = survey(flights, tape, base, config, known, lambda: progress("solving"))
     out.mkdir(parents=True, exist_ok=True)
     anchors = result.anchors
     anchors.to_yaml(out / "anchors.yaml")
     rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
     (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
-    EffectSet((*base.effects, *result.effects.effects)).to_yaml(out / "effects.yaml")
+    result.effects.to_yaml(out / "effects.yaml")
     (out / "ekf_node.yaml").write_text(PARAMETERS.format(result.surveyed.tdoa_std))
     cli.write_json(out / "survey.json", result.as_dict())
     result.picture(out / "survey.png")

@@ -10,13 +10,16 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import Covariance, EffectSet
+
+from .prior import DELAY, POSITION
 from .regression.fit import MIN_BLOCKS, fit
 from .regression.select import Selection
 from .regression.table import BLOCK, table_of
 from .regression.terms import columns_of
 from .self_survey import FEWEST, survey
 
-CALIBRATED = "anchor_position", "anchor_delay"
+CALIBRATED = POSITION, DELAY
 POSITION_STD = 0.1  # m, of the coordinates of anchors as they are given
 LEFT = 0.055  # m that may be left of slow innovations
 EXPLAINED = 0.1  # share of the slow innovations that must be explained
@@ -25,18 +28,23 @@ EXPLAINED = 0.1  # share of the slow innovations that must be explained
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """selection : Selection of all positions and delays of anchors; left : m, scale of the slow innovations that they leave;
-    explained : share of them that they explain; long_enough : whether the flights can tell."""
+    explained : share of them that they explain; long_enough : whether the flights can tell; placed : whether more than
+    TDOAs and IMU told where the tag was; changes : (Change, ...) since the last calibration."""
 
     selection: Selection
     left: float
     explained: float
     long_enough: bool
+    placed: bool = False
+    changes: tuple = ()
 
     @property
     def why_not(self):
         """Why it must not be applied; None if it may."""
         if not self.long_enough:
             return f"the flights are too short: {MIN_BLOCKS * BLOCK:g} s in the air are needed without ground truth"
+        if self.placed:
+            return None
         if self.left > LEFT:
             return (
                 f"positions and delays of anchors leave {100 * self.left:.1f} cm of what is slow in the innovations, more than "
@@ -47,16 +55,16 @@ class Calibration:
         return None
 
 
-def calibrate(flights, attribution, base, config=None, progress=lambda: None):
+def calibrate(flights, attribution, base, config=None, constraints=(), progress=lambda: None):
     """Calibration from the innovations of prepared Flights. attribution : Attribution of them; base : EffectSet that is in the
-    model; config : FilterConfig."""
+    model, its covariance the prior; config : FilterConfig; constraints : what else is known."""
     candidates = attribution.candidates
     whole = {candidate.name: candidate for candidate in reversed(candidates)}  # the first of an effect is all of it
     chosen = tuple(whole[name] for name in CALIBRATED)
     table = table_of(attribution.residuals).with_terms([term for candidate in candidates for term in candidate.terms])
     table = _rows(table, (table.channel == table.channels.index("tdoa")) & (table.count >= FEWEST))
     anchors = flights[0].anchors
-    found = survey(flights, np.full((len(anchors), 3), POSITION_STD), base, config, progress=progress)
+    found = survey(flights, np.full((len(anchors), 3), POSITION_STD), base, config, constraints, progress)
     columns = columns_of(chosen)
     keys = [*(f"{i}.{axis}" for i in anchors.ids for axis in "xyz"), *map(str, anchors.ids)]
     places = [keys.index(column.key) for column in columns]
@@ -64,7 +72,29 @@ def calibrate(flights, attribution, base, config=None, progress=lambda: None):
     beta, cov = np.concatenate([shifts, found.delays])[places], found.covariance[np.ix_(places, places)]
     fitted = replace(fit(table, columns), beta=beta, cov=cov, residual=table.y - table.matrix(columns) @ beta)
     selection = Selection(table, chosen, fitted, (0.0,) * len(chosen), ((),) * len(chosen))
-    return Calibration(selection, found.left, 1.0 - (found.left / found.before) ** 2, len(np.unique(table.block)) >= MIN_BLOCKS)
+    explained, long_enough = 1.0 - (found.left / found.before) ** 2, len(np.unique(table.block)) >= MIN_BLOCKS
+    placed = any(one.flight is not None for one in constraints)
+    return Calibration(selection, found.left, explained, long_enough, placed, found.changes)
+
+
+def merged(base, found, selection):
+    """The EffectSet `base` with other Effects: positions and delays of anchors are added to those it has. Their covariance is
+    that of the fit of a Selection, and is the prior of the next calibration."""
+    effects = list(base.effects)
+    for effect in found:
+        same = next((k for k, one in enumerate(effects) if one.name == effect.name and effect.name in CALIBRATED), None)
+        if same is None:
+            effects.append(effect)
+            continue
+        values = {key: effects[same].values.get(key, 0.0) + value for key, value in effect.values.items()}
+        known = effects[same]
+        effects[same] = replace(effect, values={**known.values, **values}, std={**known.std, **effect.std})
+    columns = [column for candidate in selection.chosen if candidate.name in CALIBRATED for column in candidate.columns]
+    if not columns:
+        return EffectSet(tuple(effects), base.covariance)
+    places = [selection.fit.columns.index(column) for column in columns]
+    keys = tuple((column.effect[0], column.key) for column in columns)
+    return EffectSet(tuple(effects), Covariance(keys, selection.fit.cov[np.ix_(places, places)]))
 
 
 def _rows(table, chosen):

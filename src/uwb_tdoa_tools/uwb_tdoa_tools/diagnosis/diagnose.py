@@ -14,6 +14,7 @@ from ..parallel import in_one_thread
 from ..scoring.metrics import Score
 from . import judging, output
 from .attribution import Attribution, attribute
+from .calibration import merged
 from .channels import residuals
 from .findings import Refused, usable
 from .health import health
@@ -30,7 +31,7 @@ class Diagnosis:
     flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [Finding]; effects :
     EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
     `judging.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
-    ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers.
+    ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes : sentences, what is not as in the last calibration.
     """
 
     flights: tuple
@@ -46,6 +47,7 @@ class Diagnosis:
     attribution: Attribution
     remaining: list
     numbers: dict
+    changes: tuple = ()
 
     def as_json(self):
         """What diagnosis.json holds."""
@@ -78,11 +80,14 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         return lambda: progress(what)
 
     attribution = attribute(flights, reference, base, progress=saying("tracing residuals to effects"))
-    decide = judging.useful if reference.judges else judging.borne_out
     # A finding stays one even if the filter does without it; it is only not added.
-    kept = decide(attribution, flights, base, config, saying("running the filter without each"))
+    trying = saying("running the filter without each")
+    if reference.judges:
+        kept = judging.useful(attribution, flights, base, config, trying)
+    else:
+        kept = judging.borne_out(attribution, flights, base, config, reference.constraints, trying)
     model = attribution.of(kept)
-    effects = EffectSet((*base.effects, *usable(model.effects).effects))
+    effects = merged(base, usable(model.effects).effects, kept.selection)
     judged = judging.judge(model, flights, holdout, base, effects, reference, config, saying("judging"))
     before, after, judged_on = judged
     refused = [*attribution.refused, *kept.refused]
@@ -112,6 +117,7 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         attribution,
         remaining,
         {flight.name: found for flight in flights if (found := numbers(flight))},
+        kept.changes,
     )
 
 

@@ -40,12 +40,14 @@ class Case:
 @dataclass(frozen=True, eq=False)
 class Kept:
     """What makes the filter no worse: selection : Selection; detections; refused : (Refused, ...) of the others; worth :
-    {candidate or detection: m by which the mean 3D RMSE is larger without it}."""
+    {candidate or detection: m by which the mean 3D RMSE is larger without it}; changes : sentences, what is not as in the
+    last calibration."""
 
     selection: Selection
     detections: tuple
     refused: tuple
     worth: dict
+    changes: tuple = ()
 
     @property
     def candidates(self):
@@ -114,22 +116,23 @@ def useful(attribution, flights, base, config=None, progress=lambda: None):
 _NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
 
 
-def borne_out(attribution, flights, base, config=None, progress=lambda: None):
+def borne_out(attribution, flights, base, config=None, constraints=(), progress=lambda: None):
     """Kept, where the reference tells no errors: positions and delays of anchors together, or nothing.
 
     A model that is wrong makes innovations smaller too, by pushing the path to where they are. On measured flights
     functions of the place, fitted to some, made innovations of others smaller and doubled the error of the position.
     """
     selection = attribution.selection
-    if not selection.chosen:
+    if not selection.chosen and base.covariance is None and not constraints:
         return nothing(attribution)
-    calibration = calibrate(flights, attribution, base, config, progress)
+    calibration = calibrate(flights, attribution, base, config, constraints, progress)
+    changes = tuple(change.as_text() for change in calibration.changes)
     if calibration.why_not is None:
         applied = {candidate.name for candidate in calibration.selection.chosen}
         labels = [candidate.label for candidate in selection.chosen if candidate.name not in applied]
         labels += [detection.effect.label for detection in attribution.detections]
-        return Kept(calibration.selection, (), tuple(Refused(label, _NOT_TOLD) for label in labels), {})
-    label = " + ".join(candidate.label for candidate in selection.chosen)
+        return Kept(calibration.selection, (), tuple(Refused(label, _NOT_TOLD) for label in labels), {}, changes)
+    label = " + ".join(candidate.label for candidate in selection.chosen or calibration.selection.chosen)
     return nothing(attribution, [Refused(label, calibration.why_not)])
 
 

@@ -33,6 +33,7 @@ def as_json(diagnosis):
                 }
                 for item, words in zip(diagnosis.unobservable, untold(diagnosis))
             ],
+            "changes": list(diagnosis.changes),
             "refused": [{"what": item.what, "why": item.why} for item in diagnosis.refused],
             "before": {key: diagnosis.before[key] for key in ("runs", "pooled")},
             "after": {key: diagnosis.after[key] for key in ("runs", "pooled")},
@@ -47,6 +48,7 @@ def as_text(diagnosis):
     found = entries(diagnosis)
     lines = [("" if k else "verdict", sentence) for k, sentence in enumerate(verdict(diagnosis).sentences)]
     lines += [("numbers", sentence) for sentence in faults_in_words(diagnosis)]
+    lines += [("changed", f"since the last calibration, {sentence}") for sentence in diagnosis.changes]
     lines += [("do", sentence) for entry in found if entry.matters for sentence in entry.advice]
     for entry in found:
         judged = f"not added: {entry.why_not}" if entry.why_not else f"worth {worth_in_words(entry)}"

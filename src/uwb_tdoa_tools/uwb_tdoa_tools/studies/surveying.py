@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.flight import AIDS
 
-from ..diagnosis.self_survey import Mark
+from ..diagnosis.constraints import Mark
 from ..readers import inputs
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import airborne
@@ -67,7 +67,7 @@ def marked(data):
         flights, judged = _measured(data, fit, judge, ())
         rng = np.random.default_rng(0)
         marks = [mark for flight in flights for mark in marks_of(flight, -(-MARKS // len(flights)), rng)]
-        result = survey(flights, Tape(), marks=marks)
+        result = survey(flights, Tape(), constraints=marks)
         after = _rmse([at(flight, result.anchors.positions) for flight in judged], result.effects)
         print(f"| {name} | {len(judged)} flights | {_rmse(judged):.3f} | {after:.3f} | {len(marks)} |", flush=True)
 

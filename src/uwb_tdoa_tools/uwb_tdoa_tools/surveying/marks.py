@@ -3,7 +3,7 @@
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
-from ..diagnosis.self_survey import Mark
+from ..diagnosis.constraints import Mark
 
 KEYS = ("flight", "from", "to", "position", "std")
 EXAMPLE = "{flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], std: 0.05}"

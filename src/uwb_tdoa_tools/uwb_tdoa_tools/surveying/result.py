@@ -7,7 +7,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 
 from ..diagnosis.calibration import LEFT
-from ..diagnosis.self_survey import Surveyed, delay_effect
+from ..diagnosis.self_survey import Surveyed, calibrated
 
 IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
 CLEARLY = 1.5  # slow innovations as given over those that are left, beyond which the tape was worse than what else is wrong
@@ -16,24 +16,25 @@ KNOWN_WELL = 0.02  # m, standard deviation as given that leaves nothing to wish 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names; marked : whether marks
-    were given."""
+    """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names; base : EffectSet that was in the model; placed :
+    whether more than TDOAs and IMU told where the tag was."""
 
     given: object
     given_std: np.ndarray
     surveyed: Surveyed
     flights: tuple
-    marked: bool = False
+    base: EffectSet = EffectSet()
+    placed: bool = False
 
     @property
     def why_not(self):
         """Why it must not be used instead of what was given; None if it may."""
         before, left = self.surveyed.before, self.surveyed.left
-        if self.marked or left <= LEFT or before > CLEARLY * left:
+        if self.placed or left <= LEFT or before > CLEARLY * left:
             return None
         return (
             f"{100 * before:.1f} cm of the innovations are slow with the anchors as given, and {100 * left:.1f} cm with others: more than "
-            f"{100 * LEFT:.1f} cm: something else is wrong too, and the position might suffer; give --marks, or fly where it is known"
+            f"{100 * LEFT:.1f} cm: something else is wrong too, and the position might suffer; give --marks or --odometry, or fly where it is known"
         )
 
     @property
@@ -43,9 +44,11 @@ class Result:
 
     @property
     def effects(self):
-        """The EffectSet to use with them."""
-        delays = delay_effect(self.surveyed.anchors, self.surveyed.delays)
-        return EffectSet((delays,) if self.why_not is None else ())
+        """The EffectSet to use with them, with what was in the model; its covariance is the prior of the next survey."""
+        if self.why_not is not None:
+            return self.base
+        found = self.surveyed
+        return calibrated(self.base, found.anchors, np.zeros_like(self.shifts), found.delays, found.covariance)
 
     @property
     def shifts(self):
@@ -74,6 +77,10 @@ class Result:
                 }
                 for row, i in enumerate(found.anchors.ids)
             },
+            "changes": [
+                {"effect": one.effect, "anchor": one.anchor, "values": one.values.tolist(), "std": one.std.tolist(), "or": list(one.rivals)}
+                for one in found.changes
+            ],
             "applied": self.why_not is None,
             "slow_before": found.before,
             "slow_left": found.left,
@@ -99,6 +106,9 @@ class Result:
         unseen = [str(i) for row, i in enumerate(found.anchors.ids) if rough[row] and not self.improved[row].any()]
         if unseen:
             lines.append(f"nothing new is told of anchors {', '.join(unseen)}: fly closer to them, on all sides, high and low")
+        if self.base.covariance is not None:
+            lines += [f"since the last calibration: {change.as_text()}" for change in found.changes]
+            lines += [] if found.changes else ["nothing has changed clearly since the last calibration"]
         if self.why_not:
             lines.append(f"nothing is applied, anchors stay as given: {self.why_not}")
         return "\n".join(lines)

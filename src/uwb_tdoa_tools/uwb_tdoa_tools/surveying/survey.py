@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..diagnosis import self_survey
 from ..diagnosis.diagnose import same_anchors
+from ..diagnosis.prior import Prior
 from ..parallel import in_one_thread
 from .placing import PLACED_STD, place
 from .result import Result
@@ -17,11 +19,12 @@ NOTHING_KNOWN = 1e3  # m, standard deviation of a coordinate of which nothing is
 
 
 @in_one_thread
-def survey(flights, tape, base=EffectSet(), config=None, marks=(), progress=lambda: None):
+def survey(flights, tape, base=EffectSet(), config=None, constraints=(), progress=lambda: None):
     """Result of Flights with the anchors that a Tape speaks of.
 
-    base : EffectSet that is in the model already; config : FilterConfig; marks : Marks. Ground truth is not used. Raises InputError for
-    flights of different anchors or that are too short, and for a Tape that does not fit.
+    base : EffectSet that is in the model already; its covariance, of the last calibration, counts where there is one, not the
+    Tape; config : FilterConfig; constraints : what else is known (`diagnosis/constraints`). Ground truth is not used. Raises
+    InputError for flights of different anchors or that are too short, and for a Tape that does not fit.
     """
     same_anchors(flights)
     given = flights[0].anchors
@@ -30,8 +33,13 @@ def survey(flights, tape, base=EffectSet(), config=None, marks=(), progress=lamb
     if rows:
         start = place(flights, rows, config)
         start_std[rows], std[rows] = PLACED_STD, NOTHING_KNOWN
+        if base.covariance is not None:
+            base = replace(base, covariance=base.covariance.without(tape.unknown))
     moved = [replace(flight, anchors=start) for flight in flights]
-    found = self_survey.survey(moved, start_std, base, config, marks, progress=progress)
+    found = self_survey.survey(moved, start_std, base, config, constraints, progress)
     if found.seconds < LEAST:
         raise InputError(f"the flights are {found.seconds:g} s in the air together; {LEAST:g} s are needed: fly for longer.")
-    return Result(given, std, found, tuple(flight.name for flight in flights), bool(marks))
+    prior = Prior.of(given, std, base.covariance)
+    std = np.sqrt(np.diag(prior.covariance))[: std.size].reshape(-1, 3)
+    placed = any(one.flight is not None for one in constraints)
+    return Result(given, std, found, tuple(flight.name for flight in flights), base, placed)

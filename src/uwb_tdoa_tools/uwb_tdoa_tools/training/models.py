@@ -40,36 +40,38 @@ class Trained:
 
 
 @in_one_thread
-def train(kind, training, validation, seed, name, options=structured.Options(), progress=lambda text: None, found=None):
+def train(
+    kind, training, validation, seed, name, options=structured.Options(), progress=lambda text: None, found=None, curve=True
+):  # fmt: skip
     """Train a model of `kind` (of KINDS) on lists of Flights. Returns Trained. Raises InputError.
 
     name : of the model, goes into every corrected message; progress : called with a text now and then; found : Physics
-    of the training and then the validation flights, if somebody has looked for it already. The validation
+    of the training and then the validation flights, if somebody has looked for it already; curve : whether a learning
+    curve is wanted, beyond its last point. The validation
     flights decide when the paper's network stops, and tell how far off a model is on flights that it has not seen; then
     the linear models are fitted anew to them too.
     """
     if kind not in KINDS:
         raise InputError(f"model: {kind!r} is not known; choose {', '.join(KINDS)}.")
     raw = groups = _labels(training, validation)
-    effects = model = None
+    effects, free, model = None, EffectSet(), None
     if kind.startswith("physics"):
         if found is None:
             progress("looking for effects")
             found = physics.find([*training, *validation])
-        free, effects = EffectSet(), found.effects
+        effects = found.effects
         if len(labelling.constellations([*training, *validation])) > 1:
             free, effects = physics.separate(effects)
         progress(f"effects: {found.effects.name}")
         groups = _labels(training, validation, effects)
     if kind.startswith("paper"):
-        model, curve, left = _paper(kind, *groups, seed, progress)
-    elif kind == "structured":
-        model, _, curve, left = _structured(*groups, seed, options, progress)
+        model, errors, left = _paper(kind, *groups, seed, progress)
     elif kind == "physics" and not len(free):
-        curve, left = _judge_effects(found, *raw)
+        errors, left = _judge_effects(found, *raw, _growing(len(training), seed, curve))
     else:
-        model, free, curve, left = _structured(*groups, seed, options, progress, free, kind == "physics")
-        effects = EffectSet((*free.effects, *effects.effects))
+        growing = _growing(len(training), seed, curve)
+        model, free, errors, left = _structured(*groups, seed, options, progress, growing, free, kind == "physics")
+        effects = EffectSet((*free.effects, *effects.effects)) if effects else None
     everything = [*groups[0], *groups[1]]
     meta = {
         "name": name, "kind": kind, "clip": CLIP, "seed": seed, "data": labelling.digest([*raw[0], *raw[1]]),
@@ -84,8 +86,8 @@ def train(kind, training, validation, seed, name, options=structured.Options(), 
         heads = [meta["validity"][name] for name in ("forward_x", "forward_y")]
         if model.sees_attitude and any(high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads):
             meta["largest_yaw_std"] = LARGEST_YAW_STD  # before the yaw is known, it cannot tell
-    errors = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
-    return Trained(model, effects, curve, meta, errors)
+    after = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
+    return Trained(model, effects, errors, meta, after)
 
 
 def _labels(training, validation, effects=EffectSet()):
@@ -103,11 +105,11 @@ def _paper(kind, training, validation, seed, progress):
     return model, ("epochs", list(range(1, len(errors[0]) + 1)), *errors), left
 
 
-def _structured(training, validation, seed, options, progress, free=EffectSet(), alone=False):
+def _structured(training, validation, seed, options, progress, growing, free, alone):
     """(Structured, EffectSet, learning curve over numbers of training flights, what is left of the errors of each
     validation flight by a fit to the training flights). The model itself is then fitted to all flights.
 
-    free : linear effects to fit together with the maps; alone : the maps are only there so that the effects do not take
+    growing : as `_growing` gives; free : linear effects to fit together with the maps; alone : the maps are only there so that the effects do not take
     what belongs to a place; no model is returned.
     """
     thin = [labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation)]
@@ -116,7 +118,7 @@ def _structured(training, validation, seed, options, progress, free=EffectSet(),
         return one.error - fitted.bias(one.samples) - (0.0 if alone else model.mean(one.samples))
 
     curve = []
-    for some in _growing(len(training), seed):
+    for some in growing:
         model, fitted = fit_structured([thin[0][k] for k in some], seed, options, free)
         errors = [_rms(map(remaining, group)) for group in ([thin[0][k] for k in some], thin[1])]
         curve.append((len(some), *errors))
@@ -142,11 +144,11 @@ def fit_structured(some, seed, options, free=EffectSet()):
     return model, physics.with_values(free, posterior.dense[own:], posterior.dense_covariance[own:, own:])
 
 
-def _judge_effects(found, training, validation):
+def _judge_effects(found, training, validation, growing):
     """(Learning curve over numbers of training flights, what is left of the errors of each validation flight) of the
-    effects of a Physics, which counts training flights first."""
+    effects of a Physics, which counts training flights first. growing : as `_growing` gives."""
     curve = []
-    for some in _growing(len(training), 0):
+    for some in growing:
         effects = found.fitted_to(some)
         judged = ([training[k] for k in some], validation)
         left = [[one.error - effects.bias(one.samples) for one in group] for group in judged]
@@ -154,9 +156,12 @@ def _judge_effects(found, training, validation):
     return ("training flights", *map(list, zip(*curve))), left[1]
 
 
-def _growing(count, seed):
-    """Growing subsets of `count` flights, in random order, the last one all of them: lists of numbers."""
+def _growing(count, seed, curve):
+    """Growing subsets of `count` flights, in random order, the last one all of them, which is the only one without `curve`:
+    lists of numbers."""
     order = np.random.default_rng(seed).permutation(count).tolist()
+    if not curve:
+        return [order]
     return [order[:n] for n in sorted({int(round(n)) for n in np.geomspace(1, count, min(count, POINTS))})]
 
 

@@ -26,11 +26,12 @@ class Physics:
     attribution: Attribution
 
     def fitted_to(self, flights):
-        """EffectSet of the same effects, fitted to the flights with these numbers alone."""
+        """EffectSet of the same effects, fitted to the flights with these numbers alone; what detectors found stays as it is."""
         selection = self.attribution.selection
         rows = np.isin(selection.table.flight, list(flights))
         model = refit(selection.table, columns_of(selection.chosen), selection.fit, rows)
-        return EffectSet(effects_of(replace(selection, fit=model)))
+        detected = (detection.effect for detection in self.attribution.detections)
+        return usable([*effects_of(replace(selection, fit=model)), *detected])
 
 
 def separate(effects):

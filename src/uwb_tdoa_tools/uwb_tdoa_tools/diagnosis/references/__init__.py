@@ -3,8 +3,10 @@
 from .base import Reference, View
 from .ground_truth import GroundTruth
 from .heights import Heights
+from .marks import Marks
 from .nothing import Nothing
+from .odometry import Odometry
 
-REFERENCES = {"truth": GroundTruth, "heights": Heights, "nothing": Nothing}  # made of a FilterConfig
+REFERENCES = {"truth": GroundTruth, "heights": Heights, "marks": Marks, "odometry": Odometry, "nothing": Nothing}  # made of a FilterConfig and constraints
 
-__all__ = ["REFERENCES", "GroundTruth", "Heights", "Nothing", "Reference", "View"]
+__all__ = ["REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "Odometry", "Reference", "View"]

@@ -11,8 +11,8 @@ class GroundTruth(Reference):
 
     words = "the recorded ground truth"
 
-    def __init__(self, config=None):
-        """config : FilterConfig, which no known pose needs."""
+    def __init__(self, config=None, constraints=()):
+        """config : FilterConfig and constraints, which no known pose needs."""
 
     def prepare(self, flight):
         if flight.truth is None or len(flight.truth) < 2:

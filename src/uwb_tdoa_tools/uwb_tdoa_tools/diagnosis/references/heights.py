@@ -22,8 +22,8 @@ class Heights(GroundTruth):
     attitude_known = False
     words = "heights that a range finder measured; x and y are the filter's own"
 
-    def __init__(self, config=None):
-        """config : FilterConfig."""
+    def __init__(self, config=None, constraints=()):
+        """config : FilterConfig; constraints are not needed."""
         self._config = config
 
     def prepare(self, flight):

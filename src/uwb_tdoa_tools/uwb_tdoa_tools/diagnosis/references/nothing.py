@@ -26,9 +26,9 @@ class Nothing(Reference):
     judges = False
     words = "nothing but the flights themselves"
 
-    def __init__(self, config=None):
-        """config : FilterConfig."""
-        self._config = config
+    def __init__(self, config=None, constraints=()):
+        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`)."""
+        self._config, self.constraints = config, tuple(constraints)
 
     def prepare(self, flight):
         return without_truth(flight)

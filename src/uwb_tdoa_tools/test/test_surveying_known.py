@@ -1,0 +1,167 @@
+"""What is known beside the flights: the last calibration, distances between anchors, the path of another odometry."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands.survey import main
+from uwb_tdoa_tools.diagnosis.constraints import Distance, Path
+from uwb_tdoa_tools.diagnosis.references import Odometry
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from uwb_tdoa_tools.surveying.distances import read_distances
+from uwb_tdoa_tools.surveying.paths import read_paths
+from uwb_tdoa_tools.surveying.survey import survey
+from uwb_tdoa_tools.surveying.tape import Tape
+
+LATE = EFFECTS["anchor_delay"]({"3": 0.15})
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return [LATE.inject(clean_flight(seed, 40.0), np.random.default_rng(0)) for seed in (200, 201)]
+
+
+@pytest.fixture(scope="module")
+def last_week(flights):
+    return survey(flights[:1], Tape(0.05))
+
+
+def at(flight, positions):
+    return replace(flight, anchors=flight.anchors.at(positions))
+
+
+@pytest.mark.slow
+def test_nothing_has_changed_since_last_week(flights, last_week):
+    again = survey([at(flights[1], last_week.anchors.positions)], Tape(), last_week.effects)
+    assert not again.surveyed.changes and "nothing has changed clearly" in again.as_text()
+    assert (again.surveyed.position_std <= last_week.surveyed.position_std + 0.005).all()
+    before, after = (next(e for e in one.effects.effects if e.name == "anchor_delay") for one in (last_week, again))
+    assert all(abs(after.values[key] - value) < 3.0 * before.std[key] for key, value in before.values.items())
+    assert len(again.effects) == 2 and again.effects.covariance.matrix.shape == (32, 32)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "effect, shown",
+    [
+        (EFFECTS["anchor_delay"]({"5": 0.25}), ("anchor_delay", "5")),
+        (EFFECTS["anchor_position"]({"2.x": 0.3, "2.y": -0.3, "2.z": 0.25}), ("anchor_position", "2")),
+    ],
+)
+def test_what_has_changed_is_named_with_its_size(flights, last_week, effect, shown):
+    today = at(effect.inject(flights[1], np.random.default_rng(0)), last_week.anchors.positions)
+    changes = survey([today], Tape(), last_week.effects).surveyed.changes
+    assert [(one.effect, one.anchor) for one in changes] == [shown]
+    away = changes[0].values - list(effect.values.values())
+    assert (np.abs(away) < 4.0 * changes[0].std + 0.05).all() and (changes[0].std < 0.15).all()
+
+
+@pytest.mark.slow
+def test_an_anchor_that_is_said_to_be_unknown_is_not_held_by_last_week(last_week):
+    kept = last_week.effects.covariance.without(("5",))
+    assert len(kept.keys) == 28 and not [key for key in kept.keys if key[1][0] == "5"]
+
+
+def test_a_distance_holds_the_length_of_the_line_alone(flights):
+    anchors = flights[0].anchors
+    first, second = anchors.positions[:2]
+    away = Distance(int(anchors.ids[0]), int(anchors.ids[1]), float(np.linalg.norm(first - second)) + 0.1, 0.01)
+    gram, vector = away.equations(anchors, 40)
+    step = np.linalg.solve(gram + np.eye(40), vector)
+    line = (first - second) / np.linalg.norm(first - second)
+    np.testing.assert_allclose(step[:6], [*(0.05 * line), *(-0.05 * line)], atol=1e-4)
+    assert not step[6:].any()
+
+
+@pytest.mark.slow
+def test_distances_tell_of_anchors_what_flights_do_not(flights):
+    true = flights[0].anchors
+    rough = true.positions + 0.1 * np.random.default_rng(5).standard_normal((8, 3))
+    ids, k = true.ids, [(a, b) for a in range(8) for b in range(a)]
+    laser = [Distance(int(ids[a]), int(ids[b]), float(np.linalg.norm(true.positions[a] - true.positions[b])), 0.005) for a, b in k]
+    results = [survey([at(flights[0], rough)], Tape(0.1), constraints=some).surveyed for some in ((), laser)]
+    lengths = [np.array([np.linalg.norm(one.anchors.positions[a] - one.anchors.positions[b]) for a, b in k]) for one in results]
+    off = [np.sqrt(np.mean((some - [one.distance for one in laser]) ** 2)) for some in lengths]
+    assert off[1] < 0.01 < off[0] and results[1].position_std.mean() < 0.8 * results[0].position_std.mean()
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("a,b,distance\n0,1,3\n", "no column std"),
+        ("a,b,distance,std\n0,99,3,0.01\n", "must be two of the anchors"),
+        ("a,b,distance,std\n0,0,3,0.01\n", "must be two of the anchors"),
+        ("a,b,distance,std\n0,1,-3,0.01\n", "is no distance"),
+        ("a,b,distance,std\n0,1,three,0.01\n", "must be a finite number"),
+        ("a,b,distance,std\n", "holds no distance"),
+    ],
+)
+def test_distances_that_cannot_be_are_refused(flights, tmp_path, text, words):
+    (tmp_path / "laser.csv").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_distances(tmp_path / "laser.csv", flights[0].anchors)
+
+
+def odometry_of(flight, drift=0.02, yaw=1.0, seed=0):
+    """Path of the ground truth of a Flight in a frame of its own, that drifts."""
+    truth, rng = flight.truth, np.random.default_rng(seed)
+    t = np.arange(truth.t[0], truth.t[-1], 0.05)
+    p = np.stack([np.interp(t, truth.t, column) for column in truth.p.T], axis=1)
+    walk = np.cumsum(drift * np.sqrt(0.05) * rng.standard_normal(p.shape), axis=0)
+    return Path(flight.name, t, Rotation.from_euler("z", yaw).apply(p) + [5.0, -3.0, 1.0] + walk, max(drift, 1e-3))
+
+
+@pytest.mark.slow
+def test_the_frame_of_an_odometry_makes_no_difference(flights):
+    flight, (one, other) = flights[0], (odometry_of(flights[0], yaw=yaw) for yaw in (0.3, -2.0))
+    results = [survey([replace(flight, truth=None)], Tape(0.1), constraints=[path]).surveyed for path in (one, other)]
+    away = results[0].anchors.positions - results[1].anchors.positions
+    assert np.abs(away).max() < 0.02
+
+
+def test_a_path_laid_beside_the_filters_is_where_the_tag_was_but_for_a_shift(flights):
+    flight = EFFECTS["anchor_position"]({"1.z": 0.4, "6.x": -0.3}).inject(flights[0], np.random.default_rng(0))
+    reference = Odometry(None, [odometry_of(flight, drift=0.005)])
+    wrong = replace(flight, truth=replace(flight.truth, p=flight.truth.p[::-1] + 30.0))
+    paths = [reference.prepare(each).truth for each in (replace(flight, truth=None), wrong)]
+    np.testing.assert_array_equal(paths[0].p, paths[1].p)  # no truth is read
+    path = paths[0]
+    aloft = (path.t > flight.truth.t[0] + 5.0) & (path.t < flight.truth.t[-1] - 5.0)
+    off = path.p[aloft] - np.stack([np.interp(path.t[aloft], flight.truth.t, c) for c in flight.truth.p.T], axis=1)
+    assert np.sqrt(np.mean((off - off.mean(axis=0)) ** 2)) < 0.03
+    with pytest.raises(InputError, match="holds no path"):
+        reference.prepare(flights[1])
+
+
+def test_paths_are_read_from_tables_and_refused_where_they_cannot_be(flights, tmp_path):
+    flight, path = flights[0], odometry_of(flights[0])
+    rows = [f"{flight.name},{t:.3f},{x:.4f},{y:.4f},{z:.4f}" for t, (x, y, z) in zip(path.t, path.p)]
+    (tmp_path / "vio.csv").write_text("\n".join(["flight,t,x,y,z", *rows, ""]))
+    (read,) = read_paths(tmp_path / "vio.csv", [flight])
+    np.testing.assert_allclose(read.p, path.p, atol=1e-4)
+    (tmp_path / "back.csv").write_text("\n".join(["flight,t,x,y,z", *rows[::-1], ""]))
+    for source, one, words in (
+        ("vio.csv", flights[1], "holds no row of flight"), ("back.csv", flight, "do not rise"), ("topic", flight, "is no bag"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            read_paths(tmp_path / source, [one])
+    with pytest.raises(InputError, match="--drift: -1"):
+        read_paths(tmp_path / "vio.csv", [flight], -1.0)
+
+
+@pytest.mark.slow
+def test_the_command_goes_on_from_what_it_wrote(flights, tmp_path, capsys):
+    write_bag(flights[0], tmp_path / "first.bag")
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main([str(tmp_path / "first.bag"), "--std", "0.05", "--out", str(first)]) == 0
+    capsys.readouterr()
+    again = ["--survey", str(first / "anchors.yaml"), "--effects", str(first / "effects.yaml"), "--out", str(second)]
+    assert main([str(tmp_path / "first.bag"), *again]) == 0
+    assert "since the last calibration" in capsys.readouterr().out
+    known = [EffectSet.from_yaml(folder / "effects.yaml") for folder in (first, second)]
+    assert [len(one) for one in known] == [2, 2] and known[1].covariance.keys == known[0].covariance.keys

@@ -1,0 +1,52 @@
+"""As much of a model as flights left out bear out."""
+
+import json
+
+import pytest
+from training_flights import flight
+
+from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_tools.studies.training import splits
+from uwb_tdoa_tools.training import shrinking, structured
+from uwb_tdoa_tools.training.shrinking import SHARES, BorneOut, choose
+
+OPTIONS = structured.Options(centres=10, link_centres=10)
+
+
+def errors(*ratios):
+    """As of BorneOut: of flights with an error of 0.5 m, ratios at all SHARES."""
+    return {str(k): {None: 0.5} | dict(zip(SHARES, (0.5 * ratio for ratio in some))) for k, some in enumerate(ratios)}
+
+
+@pytest.mark.parametrize(
+    "ratios, share",
+    [
+        ([(1.0, 0.8, 0.7, 0.6), (1.0, 0.8, 0.7, 0.6)], 1.0),  # all gain
+        ([(1.0, 1.0, 1.1, 1.2), (1.0, 1.1, 1.1, 1.1)], 0.0),  # none gains
+        ([(1.0, 0.8, 0.7, 0.6), (1.0, 0.96, 1.0, 1.15)], 0.5),  # the mean alone would take all but the last bit
+    ],
+)
+def test_takes_what_gains_without_harm(ratios, share):
+    assert choose(errors(*ratios)) == share
+
+
+def test_effects_alone_are_taken_as_they_are():
+    told = BorneOut(choose({"a": {None: 0.4, 1.0: 0.3}}), {"a": {None: 0.4, 1.0: 0.3}})
+    assert told.share == 1.0 and "falls by 25% +- 0% (of 1 flights, each left out; the worst +25%)" in told.as_text()
+
+
+def test_a_flight_is_judged_by_what_it_took_no_part_in():
+    late = EFFECTS["anchor_delay"]({"3": 0.4, "5": -0.4})
+    flights = [late.inject(flight(seed)) for seed in range(2)] + [flight(2)]
+    told = shrinking.bear_out("structured", flights, 0, OPTIONS)
+    assert set(told.errors) == {one.name for one in flights}
+    alike, other = (told.errors[flights[k].name] for k in (0, 2))
+    assert alike[1.0] < 0.9 * alike[None] and other[1.0] > 1.1 * other[None]
+    assert told.share < 1.0 and told.as_dict()["worst"] == told.gains.min()
+
+
+def test_splits_are_done_once_and_summed_up(tmp_path, monkeypatch):
+    rows = [{"seed": seed, "kind": "structured", "left_out": splits._text(errors((1, 0.9, 0.8, 0.7))), "judged": splits._text(errors((1, 0.9, 0.9, 1.2)))} for seed in (0, 1)]  # fmt: skip
+    (tmp_path / "rows").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    text = splits.table(splits._read(tmp_path / "rows"), shrunk=False)
+    assert "| structured | 2 | -20.0% | 0.0% | -20.0% | 1.20 | 2 of 2 | 30.0% | 1.00 |" in text

@@ -1,0 +1,134 @@
+"""What is known of positions and delays of anchors before some flights: what a tape says, or the last calibration.
+
+The last calibration holds where nothing has changed since. What has, an anchor that was moved, a module that was replaced, is
+found by evidence (MacKay, Bayesian interpolation, Neural Computation 1992), one change after the other, as long as each makes
+the flights ODDS times as probable.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+DELAY_STDS = 0.02, 0.05, 0.1, 0.2, 0.4  # m, that the evidence chooses from where nothing is known of delays
+DELAY_STD = 0.1  # m, of the delay of an anchor that the last calibration did not have
+FUNCTION_STDS = 0.003, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3  # m, the same of functions of the place
+DRIFT = 0.005  # m, by which anything may be off since the last calibration without having changed
+MOVED, LATER = 0.3, 0.2  # m, standard deviations of changes: of each coordinate, of a delay
+ODDS = 100.0
+LOOSE = 0.05  # m, standard deviation of delays in a preliminary solution
+POSITION, DELAY = "anchor_position", "anchor_delay"
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """covariance (4N, 4N) m^2: of coordinates, anchor by anchor, and delays; told (4N,) bool: what the last calibration knows; ids
+    (N,)."""
+
+    covariance: np.ndarray
+    told: np.ndarray
+    ids: tuple
+
+    @classmethod
+    def of(cls, anchors, position_std, last=None):
+        """position_std (N, 3) m : of Anchors; last : Covariance of the last calibration, or None."""
+        keys, n = keys_of(anchors.ids), len(anchors)
+        covariance = np.diag(np.concatenate([position_std.ravel(), np.full(n, DELAY_STD)]) ** 2.0)
+        told = np.zeros(4 * n, dtype=bool)
+        if last is not None:
+            places, known = last.of(keys)
+            covariance[np.ix_(places, places)] = known + DRIFT**2 * np.eye(len(places))
+            told[places] = True
+        return cls(covariance, told, tuple(map(str, anchors.ids)))
+
+    @property
+    def loose(self):
+        """(4N,) m: standard deviations that forbid nothing which may have happened."""
+        n = len(self.ids)
+        std = np.hypot(np.sqrt(np.diag(self.covariance)), np.where(self.told, MOVED, 0.0))
+        return np.concatenate([std[: 3 * n], np.full(n, LOOSE)])
+
+    def changes(self):
+        """{(what, number of an anchor): (places, m, standard deviation)} of what may have changed."""
+        n, out = len(self.ids), {}
+        for k in range(n):
+            for what, places, std in ((POSITION, np.arange(3 * k, 3 * k + 3), MOVED), (DELAY, np.array([3 * n + k]), LATER)):
+                if self.told[places].all():
+                    out[what, k] = places, std
+        return out
+
+    def with_changes(self, changes):
+        """(4N, 4N) m^2, the covariance after some of `changes`."""
+        out = self.covariance.copy()
+        for places, std in changes:
+            out[places, places] += std**2
+        return out
+
+    def with_delays(self, std):
+        """(4N, 4N) m^2, the covariance with another standard deviation of all delays."""
+        out = self.covariance.copy()
+        rows = np.arange(3 * len(self.ids), len(out))
+        out[rows, rows] = std**2
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """step (4N,), covariance (4N, 4N); changed : {key of `Prior.changes`: keys of others of its anchor that
+    the flights cannot tell from it}; delay_std, function_std : m."""
+
+    evidence: float
+    step: np.ndarray
+    covariance: np.ndarray
+    function_std: float
+    delay_std: float = DELAY_STD
+    changed: dict = field(default_factory=dict)
+
+
+def keys_of(ids):
+    """((effect, parameter), ...) of all coordinates and delays of anchors."""
+    return (*((POSITION, f"{i}.{axis}") for i in ids for axis in "xyz"), *((DELAY, str(i)) for i in ids))
+
+
+def solve(gram, vector, prior, offset):
+    """Solution of normal equations with the largest evidence.
+
+    gram (k, k), vector (k,) : the first 4N columns those of a Prior, the others functions; offset (4N,) m: where the equations
+    were made, from the mean of the prior.
+    """
+    parts = [(std, *_without_functions(gram, vector, len(offset), std)) for std in FUNCTION_STDS]
+
+    def best(covariance):
+        return max((_solution(part, covariance, offset) for part in parts), key=lambda one: one.evidence)
+
+    if not prior.told.any():
+        trials = ((best(prior.with_delays(std)), std) for std in DELAY_STDS)
+        found, std = max(trials, key=lambda trial: trial[0].evidence)
+        return Solution(found.evidence, found.step, found.covariance, found.function_std, std)
+    found, possible, changed = best(prior.covariance), prior.changes(), {}
+    while len(changed) < len(possible):
+        known = [possible[key] for key in changed]
+        trials = {key: best(prior.with_changes([*known, change])) for key, change in possible.items() if key not in changed}
+        key = max(trials, key=lambda key: trials[key].evidence)
+        if trials[key].evidence < found.evidence + np.log(ODDS):
+            break
+        found, doubt = trials[key], trials[key].evidence - np.log(ODDS)
+        changed[key] = [other for other in trials if other[1] == key[1] and other != key and trials[other].evidence > doubt]
+    return Solution(found.evidence, found.step, found.covariance, found.function_std, changed=changed)
+
+
+def _without_functions(gram, vector, n, std):
+    """(gram (n, n), vector (n,), logarithm of the evidence of the rest) with functions of a size integrated out."""
+    cross = gram[:n, n:]
+    functions = gram[n:, n:] + np.eye(len(gram) - n) / std**2
+    solved = np.linalg.solve(functions, np.column_stack([cross.T, vector[n:]]))
+    evidence = vector[n:] @ solved[:, -1] - np.linalg.slogdet(functions)[1] - 2.0 * len(functions) * np.log(std)
+    return gram[:n, :n] - cross @ solved[:, :-1], vector[:n] - cross @ solved[:, -1], 0.5 * evidence
+
+
+def _solution(part, covariance, offset):
+    std, gram, vector, evidence = part
+    prior = np.linalg.inv(covariance)
+    right, information = vector - prior @ offset, gram + prior
+    step = np.linalg.solve(information, right)
+    evidence += 0.5 * (right @ step - np.linalg.slogdet(information)[1] - np.linalg.slogdet(covariance)[1] - offset @ prior @ offset)
+    return Solution(evidence, step, np.linalg.inv(information), std)
