@@ -7,8 +7,10 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.truth_time_offset import TruthTimeOffset
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.diagnosis import diagnose
-from uwb_tdoa_tools.diagnosis.references import REFERENCES, GroundTruth, Heights, Nothing
+from uwb_tdoa_tools.diagnosis.references import REFERENCES, GroundTruth, Heights, Marks, Nothing
+from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+from uwb_tdoa_tools.studies.surveying import marks_of
 
 NONSENSE = np.array([100.0, -50.0, 7.0])
 
@@ -66,6 +68,21 @@ def test_a_path_by_heights_is_at_the_right_height(aided):
 def test_a_flight_without_a_range_finder_cannot_be_compared_with_heights(flight):
     with pytest.raises(InputError, match="holds no height.*--no-truth"):
         diagnose([flight], reference=Heights())
+
+
+@pytest.mark.slow
+def test_marks_tell_which_anchor_is_late_without_the_truth():
+    flight = effect_of("anchor_delay", True, 4).inject(clean_flight(100, 40.0))
+    marks = marks_of(flight, 6, np.random.default_rng(0))
+    found = [diagnose([each], reference=Marks(None, marks)) for each in (replace(flight, truth=None), with_wrong_truth(flight))]
+    assert found[0].as_json() == found[1].as_json() and found[0].as_json()["rests_on"].startswith("places measured")
+    assert {"anchor_position", "anchor_delay"} == {effect.name for effect in found[0].effects.effects}
+    assert found[0].effects.covariance.matrix.shape == (32, 32)
+    after, before = (evaluate(flight, effects=effects)[0].row()["rmse_3d"] for effects in (found[0].effects, EffectSet()))
+    assert after < 0.5 * before
+    again = diagnose([flight], base=found[0].effects, reference=Marks(None, marks))  # last week's as the prior
+    assert [effect.name for effect in again.effects.effects] == [effect.name for effect in found[0].effects.effects]
+    assert not again.changes
 
 
 def test_every_reference_is_made_of_a_filter_configuration():

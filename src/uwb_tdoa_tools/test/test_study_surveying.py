@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
-from uwb_tdoa_tools.studies.surveying import MARK_STD, draw, marks_of, third
+from uwb_tdoa_tools.studies.surveying import END_STD, MARK_STD, draw, ends_of, marks_of, odometry_of, third
 from uwb_tdoa_tools.surveying.tape import Tape
 
 
@@ -22,6 +22,19 @@ def test_marks_are_where_the_tag_was(flight):
     for mark in marks_of(flight, 6, np.random.default_rng(0)):
         inside = (flight.truth.t - flight.tdoa.t[0] >= mark.first) & (flight.truth.t - flight.tdoa.t[0] <= mark.last)
         assert np.linalg.norm(flight.truth.p[inside].mean(axis=0) - mark.position) < 5.0 * MARK_STD
+
+
+def test_marks_of_the_ends_are_on_the_floor(flight):
+    first, last = ends_of(flight, 1, np.random.default_rng(0))
+    assert first.last < last.first and max(abs(first.position[2]), abs(last.position[2])) < 5.0 * END_STD
+
+
+def test_an_odometry_is_the_path_in_another_frame_that_drifts(flight):
+    (path,) = odometry_of(flight, 1, np.random.default_rng(0))
+    true = np.stack([np.interp(path.t, flight.truth.t, column) for column in flight.truth.p.T], axis=1)
+    assert np.abs(path.p - true).max() > 0.5
+    laid, _ = path.aligned(path.t, true)
+    assert np.sqrt(np.mean((laid - true) ** 2)) < 0.1
 
 
 @pytest.mark.slow

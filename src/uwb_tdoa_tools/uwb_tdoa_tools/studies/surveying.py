@@ -6,14 +6,16 @@ import json
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.flight import AIDS
 
-from ..diagnosis.constraints import Mark
+from ..diagnosis.constraints import Mark, Path
 from ..readers import inputs
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import airborne
+from ..surveying.paths import DRIFT
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
 from .diagnosis.bank import clean_flight
@@ -28,6 +30,8 @@ SETS = {  # name: (paths to survey with, paths to judge on, aids that are used)
     "0425 with its range finder": ([_0425.format(k) for k in (1, 2, 6)], [_0425.format(k) for k in (3, 7, 10)], AIDS),
 }
 MARKS, MARK_TIME, MARK_STD = 6, 2.0, 0.05  # of each split at least; s, m
+END_TIME, END_STD = 2.0, 0.1  # s, m
+ODOMETRY_STEP = 0.05  # s
 SIMULATED = 3  # flights of the simulated set, of SECONDS each
 SECONDS = 60.0
 
@@ -37,14 +41,14 @@ def add_options(add):
     add("--data", type=Path, required=True, metavar="DATA", help="folder of measured flights")
     add("--draws", type=int, default=20, metavar="N", help="of each set and each size of the errors (default 20)")
     add("--only", choices=(*SETS, "simulated"), help="one set")
-    add("--marks", action="store_true", help="instead: six marks on flights of every day and constellation, judged on others")
+    add("--known", choices=tuple(KNOWN), help="instead: flights of every day and constellation with this known beside, judged on others")
     add("--json", type=argparse.FileType("w"), metavar="FILE", help="write every draw")
 
 
 def run(args):
     """Print a table, a row for each set and size."""
-    if args.marks:
-        return marked(args.data)
+    if args.known:
+        return with_known(args.data, args.known)
     print("| set | tape off by [m] | applied | tag, true survey | shaken | surveyed | surveyed / true, median (worst) | ", end="")
     print("worse than shaken | anchors shaken | surveyed | normalised error |\n|---|" + 10 * "---:|")
     every = {}
@@ -58,18 +62,22 @@ def run(args):
         json.dump(every, args.json, indent=1)
 
 
-def marked(data):
-    """Print a table: surveys as they came, within 0.1 m, made better with MARKS marks of 5 cm."""
-    print("| surveyed with | judged on | mean 3D RMSE before | after | marks |\n|---|---|---:|---:|---:|")
+def with_known(data, kind):
+    """Print a table: surveys as they came, within 0.1 m, made better with what KNOWN of a kind says."""
+    print("| surveyed with | judged on | mean 3D RMSE before | after | worst ratio | known |\n|---|---|---:|---:|---:|---:|")
     for name, (fit, judge) in SPLITS.items():
         if not judge:
             continue
         flights, judged = _measured(data, fit, judge, ())
         rng = np.random.default_rng(0)
-        marks = [mark for flight in flights for mark in marks_of(flight, -(-MARKS // len(flights)), rng)]
-        result = survey(flights, Tape(), constraints=marks)
-        after = _rmse([at(flight, result.anchors.positions) for flight in judged], result.effects)
-        print(f"| {name} | {len(judged)} flights | {_rmse(judged):.3f} | {after:.3f} | {len(marks)} |", flush=True)
+        known = [one for flight in flights for one in KNOWN[kind](flight, len(flights), rng)]
+        result = survey([replace(flight, truth=None) for flight in flights], Tape(), constraints=known)
+        before, after = (
+            np.array([_rmse([at(flight, anchors.positions)], effects) for flight in judged])
+            for anchors, effects in ((result.given, None), (result.anchors, result.effects))
+        )
+        cells = f"{before.mean():.3f} | {after.mean():.3f} | {(after / before).max():.2f} | {len(known)}"
+        print(f"| {name} | {len(judged)} flights | {cells} |", flush=True)
 
 
 def marks_of(flight, count, rng):
@@ -82,6 +90,36 @@ def marks_of(flight, count, rng):
         since = first - flight.tdoa.t[0]
         out.append(Mark(flight.name, since, since + MARK_TIME, tuple(place), MARK_STD))
     return out
+
+
+def ends_of(flight, several, rng):
+    """[Mark]: where the tag stood before it took off and after it landed, END_TIME each, END_STD off."""
+    truth, out = flight.truth, []
+    last = flight.tdoa.t[-1] - flight.tdoa.t[0]
+    for since in (0.0, last - END_TIME):
+        first = flight.tdoa.t[0] + since
+        inside = (truth.t >= first) & (truth.t <= first + END_TIME)
+        if inside.any():
+            place = truth.p[inside].mean(axis=0) + END_STD * rng.standard_normal(3)
+            out.append(Mark(flight.name, since, since + END_TIME, tuple(place), END_STD))
+    return out
+
+
+def odometry_of(flight, several, rng):
+    """[Path]: the ground truth in a frame of its own, that drifts by DRIFT."""
+    truth = flight.truth
+    t = np.arange(truth.t[0], truth.t[-1], ODOMETRY_STEP)
+    p = np.stack([np.interp(t, truth.t, column) for column in truth.p.T], axis=1)
+    walk = np.cumsum(DRIFT * np.sqrt(ODOMETRY_STEP) * rng.standard_normal(p.shape), axis=0)
+    turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
+    return [Path(flight.name, t, turn.apply(p) + rng.uniform(-5.0, 5.0, 3) + walk, DRIFT)]
+
+
+KNOWN = {  # kind: function of (Flight, how many there are, Generator) that gives constraints
+    "marks": lambda flight, several, rng: marks_of(flight, -(-MARKS // several), rng),
+    "ends": ends_of,
+    "odometry": odometry_of,
+}
 
 
 def draw(flights, judged, std, seed):
