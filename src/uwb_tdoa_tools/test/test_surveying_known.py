@@ -10,8 +10,8 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
-from uwb_tdoa_tools.diagnosis.constraints import Distance, Path
-from uwb_tdoa_tools.diagnosis.references import Odometry
+from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark
+from uwb_tdoa_tools.diagnosis.references import Odometry, Path
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
 from uwb_tdoa_tools.surveying.distances import read_distances
 from uwb_tdoa_tools.surveying.paths import read_paths
@@ -116,26 +116,34 @@ def odometry_of(flight, drift=0.02, yaw=1.0, seed=0):
     return Path(flight.name, t, Rotation.from_euler("z", yaw).apply(p) + [5.0, -3.0, 1.0] + walk, max(drift, 1e-3))
 
 
-@pytest.mark.slow
-def test_the_frame_of_an_odometry_makes_no_difference(flights):
-    flight, (one, other) = flights[0], (odometry_of(flights[0], yaw=yaw) for yaw in (0.3, -2.0))
-    results = [survey([replace(flight, truth=None)], Tape(0.1), constraints=[path]).surveyed for path in (one, other)]
-    away = results[0].anchors.positions - results[1].anchors.positions
-    assert np.abs(away).max() < 0.02
+def ends(flight, std=0.05):
+    """[Mark] of where a Flight was before it took off and after it landed."""
+    truth, last = flight.truth, flight.tdoa.t[-1] - flight.tdoa.t[0]
+    return [Mark(flight.name, since, since + 2.0, tuple(truth.p[row]), std) for since, row in ((0.0, 0), (last - 2.0, -1))]
 
 
-def test_a_path_laid_beside_the_filters_is_where_the_tag_was_but_for_a_shift(flights):
+def test_a_path_laid_beside_the_filters_is_where_the_tag_was_and_takes_its_shift_from_marks(flights):
     flight = EFFECTS["anchor_position"]({"1.z": 0.4, "6.x": -0.3}).inject(flights[0], np.random.default_rng(0))
-    reference = Odometry(None, [odometry_of(flight, drift=0.005)])
     wrong = replace(flight, truth=replace(flight.truth, p=flight.truth.p[::-1] + 30.0))
-    paths = [reference.prepare(each).truth for each in (replace(flight, truth=None), wrong)]
-    np.testing.assert_array_equal(paths[0].p, paths[1].p)  # no truth is read
-    path = paths[0]
-    aloft = (path.t > flight.truth.t[0] + 5.0) & (path.t < flight.truth.t[-1] - 5.0)
-    off = path.p[aloft] - np.stack([np.interp(path.t[aloft], flight.truth.t, c) for c in flight.truth.p.T], axis=1)
-    assert np.sqrt(np.mean((off - off.mean(axis=0)) ** 2)) < 0.03
+    shifts = []
+    for marks in ([], ends(flight)):
+        reference = Odometry(None, [odometry_of(flight, drift=0.005), *marks])
+        paths = [reference.prepare(each).truth for each in (replace(flight, truth=None), wrong)]
+        np.testing.assert_array_equal(paths[0].p, paths[1].p)  # no truth is read
+        path = paths[0]
+        aloft = (path.t > flight.truth.t[0] + 5.0) & (path.t < flight.truth.t[-1] - 5.0)
+        off = path.p[aloft] - np.stack([np.interp(path.t[aloft], flight.truth.t, c) for c in flight.truth.p.T], axis=1)
+        assert np.sqrt(np.mean((off - off.mean(axis=0)) ** 2)) < 0.04
+        shifts.append(np.abs(off.mean(axis=0)).max())
+    assert shifts[1] < 0.03 < shifts[0]
     with pytest.raises(InputError, match="holds no path"):
         reference.prepare(flights[1])
+
+
+def test_the_frame_of_an_odometry_makes_no_difference(flights):
+    flight = replace(flights[0], truth=None)
+    one, other = (Odometry(None, [odometry_of(flights[0], 0.0, yaw)]).prepare(flight).truth for yaw in (0.3, -2.0))
+    assert np.abs(one.p - other.p).max() < 1e-6
 
 
 def test_paths_are_read_from_tables_and_refused_where_they_cannot_be(flights, tmp_path):

@@ -2,7 +2,7 @@
 
     options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
     options.add_filter(parser)                      # --effects, --config
-    options.add_known(parser)                       # --marks, --distances, --odometry, --drift
+    options.add_known(parser)                       # --marks, --distances
     reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
@@ -16,7 +16,6 @@ from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 from .readers import inputs
 from .surveying.distances import read_distances
 from .surveying.marks import read_marks
-from .surveying.paths import DRIFT, read_paths
 
 TOPICS = (  # that are read from bags
     "uwb/tdoa", "uwb/anchors", "imu/data", "height", "pressure", "velocity", "ground_truth/pose", "odometry",
@@ -65,23 +64,16 @@ def filter_of(args):
 
 
 def add_known(parser):
-    """--marks, --distances, --odometry and --drift: what is known beside a recording."""
+    """--marks and --distances: what is known beside a recording."""
     add = parser.add_argument
     add("--marks", metavar="FILE", help="YAML: measured places where the tag stood or passed, and when (docs/calibration.md)")
     add("--distances", metavar="FILE", help="CSV with columns a, b, distance, std: measured distances between anchors, m")
-    add(
-        "--odometry", metavar="CSV|TOPIC",
-        help="path of another odometry or SLAM, in a frame of its own with z up: a CSV file with columns flight, t, x, y, z, or a "
-        "topic (nav_msgs/Odometry) of the bags",
-    )  # fmt: skip
-    add("--drift", type=float, default=DRIFT, metavar="M", help="of that, m per square root of a second (default %(default)s)")
 
 
 def known_of(args, flights):
     """Constraints on Flights that those options give: tuple. Raises InputError."""
     out = [] if args.marks is None else read_marks(args.marks, flights)
     out += [] if args.distances is None else read_distances(args.distances, flights[0].anchors)
-    out += [] if args.odometry is None else read_paths(args.odometry, flights, args.drift, args.namespace)
     return tuple(out)
 
 

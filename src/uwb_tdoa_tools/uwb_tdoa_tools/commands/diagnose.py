@@ -11,6 +11,7 @@ from ..checking.remarks import survey_remarks
 from ..diagnosis import diagnose
 from ..diagnosis.references import REFERENCES
 from ..progress import Progress
+from ..surveying.paths import DRIFT, read_paths
 
 DESCRIPTION = """Find out what is wrong with the measurements of some flights, and put it right.
 
@@ -34,7 +35,7 @@ def parser():
         "diagnose flight.bag --effects effects.yaml --out second/",
         "diagnose flight.bag --reference heights --out by-height/",
         "diagnose flight.bag --reference marks --marks marks.yaml --out by-marks/",
-        "diagnose flight.bag --reference odometry --odometry /vio/odometry --out by-odometry/",
+        "diagnose flight.bag --reference odometry --odometry /vio/odometry --marks marks.yaml --out by-odometry/",
         "diagnose flight.bag --no-truth --out without/",
         "diagnose today.bag --no-truth --effects last-week/effects.yaml --out today/",
     )
@@ -50,6 +51,12 @@ def parser():
     )  # fmt: skip
     known("--no-truth", dest="reference", action="store_const", const="nothing", help="short for --reference nothing")
     options.add_known(made)
+    add(
+        "--odometry", metavar="CSV|TOPIC",
+        help="path of another odometry or SLAM, in a frame of its own with z up: a CSV file with columns flight, t, x, y, z, or a "
+        "topic (nav_msgs/Odometry) of the bags; with --marks, e.g. where it took off and landed, it goes through them",
+    )  # fmt: skip
+    add("--drift", type=float, default=DRIFT, metavar="M", help="of that, m per square root of a second (default %(default)s)")
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
 
@@ -70,7 +77,10 @@ def _diagnose(args):
     for option in ("marks", "odometry"):
         if args.reference == option and getattr(args, option) is None:
             raise InputError(f"--reference {option}: --{option} says which, and is missing.")
-    reference = REFERENCES[args.reference](config, options.known_of(args, (*flights, *holdout)))
+    known = options.known_of(args, (*flights, *holdout))
+    if args.odometry is not None:
+        known = (*known, *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace))
+    reference = REFERENCES[args.reference](config, known)
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress)
     out.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,6 @@ def parser():
         "survey first.bag second.bag third.bag --survey tape.csv --std 0.3 --height-std 0.05 --out surveyed/",
         "survey flight.bag --survey tape.yaml --unknown 5 --out surveyed/",
         "survey flight.bag --survey tape.yaml --marks marks.yaml --distances laser.csv --out surveyed/",
-        "survey flight.bag --survey tape.yaml --odometry /vio/odometry --out surveyed/",
         "survey today.bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml --out today/",
     )
     options.add_recordings(made)

@@ -11,7 +11,8 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.flight import AIDS
 
-from ..diagnosis.constraints import Mark, Path
+from ..diagnosis.constraints import Mark
+from ..diagnosis.references import Path
 from ..readers import inputs
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import airborne
@@ -118,7 +119,6 @@ def odometry_of(flight, several, rng):
 KNOWN = {  # kind: function of (Flight, how many there are, Generator) that gives constraints
     "marks": lambda flight, several, rng: marks_of(flight, -(-MARKS // several), rng),
     "ends": ends_of,
-    "odometry": odometry_of,
 }
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.bag import read_odometry
-from ..diagnosis.constraints import Path
+from ..diagnosis.references.path import Path
 from ..readers.tables import number, read_table
 
 COLUMNS = "t", "x", "y", "z"

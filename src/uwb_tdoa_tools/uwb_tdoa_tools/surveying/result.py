@@ -34,7 +34,7 @@ class Result:
             return None
         return (
             f"{100 * before:.1f} cm of the innovations are slow with the anchors as given, and {100 * left:.1f} cm with others: more than "
-            f"{100 * LEFT:.1f} cm: something else is wrong too, and the position might suffer; give --marks or --odometry, or fly where it is known"
+            f"{100 * LEFT:.1f} cm: something else is wrong too, and the position might suffer; give --marks, or fly where it is known"
         )
 
     @property

@@ -8,6 +8,5 @@ further parameters are off by.
 
 from .distance import Distance
 from .mark import Mark
-from .path import Path
 
-__all__ = ["Distance", "Mark", "Path"]
+__all__ = ["Distance", "Mark"]

@@ -6,7 +6,8 @@ from .heights import Heights
 from .marks import Marks
 from .nothing import Nothing
 from .odometry import Odometry
+from .path import Path
 
 REFERENCES = {"truth": GroundTruth, "heights": Heights, "marks": Marks, "odometry": Odometry, "nothing": Nothing}  # made of a FilterConfig and constraints
 
-__all__ = ["REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "Odometry", "Reference", "View"]
+__all__ = ["REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "Odometry", "Path", "Reference", "View"]

@@ -1,0 +1,60 @@
+"""The path of another odometry or SLAM, in a frame of its own."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+SPACING = 2.0  # s between the stamps at which it is compared
+ALOFT = 0.3  # m above where it was lowest from which on it counts: on the floor TDOAs are metres off
+FRAME_STD = 10.0  # m: where its frame began, after it was laid beside another path
+LASTING_STD = 0.3  # m, of an estimate from TDOAs, each axis: what lasts for seconds
+COMMON_STD = 0.3  # m, the same of what all of a flight has in common
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Where the tag was in a frame with z up, of unknown origin and yaw, that drifts as a random walk.
+
+    flight : name; t (n,) s, clock of the flight; p (n, 3) m; drift : m per square root of a second.
+    """
+
+    flight: str
+    t: np.ndarray
+    p: np.ndarray
+    drift: float
+
+    def at(self, t):
+        """(m, 3) m in its own frame."""
+        return np.stack([np.interp(t, self.t, column) for column in self.p.T], axis=1)
+
+    def stamps(self, first, last):
+        """(m,) s, SPACING apart, while it was aloft, from `first` to `last`, s."""
+        aloft = self.t[(self.p[:, 2] > self.p[:, 2].min() + ALOFT) & (self.t > first) & (self.t < last)]
+        return np.arange(aloft[0], aloft[-1], SPACING) if len(aloft) else np.zeros(0)
+
+    def laid(self, t, estimate, marks, begin, wanted):
+        """(k, 3) m: where the tag was at stamps `wanted` (k,), in the frame of an estimate (m, 3) m at stamps t (m,) and of Marks.
+
+        Turned about the vertical and moved as fits the estimate best; then by as much as the frame began elsewhere and has
+        drifted, the mean of a random walk given the estimate, whose errors last, and the marks. begin : stamp of the first TDOA.
+        """
+        there = self.at(t)
+        one, other = ((p - p.mean(axis=0))[:, :2] for p in (there, estimate))
+        yaw = np.arctan2(np.sum(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]), np.sum(one * other))
+        turn = Rotation.from_euler("z", yaw)
+        shift = estimate.mean(axis=0) - turn.apply(there).mean(axis=0)
+        stamps = [mark.stamps(begin) for mark in marks]
+        away = [mark.position - (turn.apply(self.at(s)) + shift).mean(axis=0) for mark, s in zip(marks, stamps)]
+        away = np.concatenate([estimate - turn.apply(there) - shift, np.reshape(away, (-1, 3))])
+        known = np.concatenate([t, [s.mean() for s in stamps]])
+        n, m = len(known), len(t)
+        noise = np.diag(np.concatenate([np.full(m, LASTING_STD), [mark.std for mark in marks]]) ** 2.0)
+        noise[:m, :m] += COMMON_STD**2
+        weights = np.linalg.solve(self._walk(known, known) + noise, away)
+        return turn.apply(self.at(wanted)) + shift + self._walk(wanted, known) @ weights.reshape(n, 3)
+
+    def _walk(self, one, other):
+        """(k, n) m^2: covariance of one axis of where the frame is, at stamps one (k,) and other (n,)."""
+        since = np.minimum(one[:, None], other) - self.t[0]
+        return FRAME_STD**2 + self.drift**2 * np.maximum(since, 0.0)
