@@ -129,7 +129,7 @@ def _changes(prior, found, offset):
 
 def calibrated(base, anchors, shifts, delays, covariance):
     """The EffectSet `base` with shifts (N, 3) m and delays (N,) m of Anchors on top, and their covariance (4N, 4N) m^2."""
-    n, std = len(anchors), np.sqrt(np.diag(covariance))
+    std = np.sqrt(np.diag(covariance))
     keys = keys_of(anchors.ids)
     found = dict(zip(keys, np.concatenate([shifts.ravel(), delays])))
     effects = [effect for effect in base.effects if effect.name not in (POSITION, DELAY)]
