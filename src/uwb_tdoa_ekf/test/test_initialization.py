@@ -75,8 +75,9 @@ def test_a_good_flight_needs_no_recovery():
 
 
 def test_the_window_keeps_the_latest_tdoas_in_order():
-    ekf, fed = new_memory(np.zeros((4, 3))).record, 5 * WINDOW + 7
+    memory, fed = new_memory(np.zeros((4, 3))), 5 * WINDOW + 7
+    ekf = memory.record
     for k in range(fed):
-        remember(ekf, np.array([(0.01 * k, k % 4, 0, 1.0 * k, 0.0)], TDOA)[0])
+        remember(ekf, np.array([(0.01 * k, k % 4, 0, 1.0 * k, 0.0)], TDOA)[0], memory.anchors)
     assert WINDOW <= ekf.kept <= 2 * WINDOW
     np.testing.assert_array_equal(ekf.window["d"][: ekf.kept], np.arange(fed - ekf.kept, fed))
