@@ -1,10 +1,13 @@
 """The figures of surveys from flights."""
 
+import argparse
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
-from uwb_tdoa_tools.studies.surveying import END_STD, MARK_STD, draw, ends_of, marks_of, odometry_of, third
+from uwb_tdoa_tools.studies.surveying import END_STD, MARK_STD, add_options, draw, ends_of, marks_of, odometry_of, third
 from uwb_tdoa_tools.surveying.tape import Tape
 
 
@@ -42,3 +45,10 @@ def test_a_draw_makes_a_shaken_survey_better_and_repeats(flight):
     first, again = (draw([flight], [clean_flight(211, 30.0)], 0.3, 0) for _ in range(2))
     assert first == again and first["applied"]
     assert first["surveyed"] < 0.5 * first["shaken"] and first["anchors_surveyed"] < first["anchors_shaken"]
+
+
+def test_its_options_are_read():
+    parser = argparse.ArgumentParser()
+    add_options(parser.add_argument)
+    args = parser.parse_args(["--data", "here", "--known", "odometry", "--split", "const1"])
+    assert (args.data, args.known, args.split) == (Path("here"), "odometry", "const1")

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
 from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark
-from uwb_tdoa_tools.diagnosis.references import Odometry, Path
+from uwb_tdoa_tools.diagnosis.references import Odometry, OdometryPath
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
 from uwb_tdoa_tools.surveying.distances import read_distances
 from uwb_tdoa_tools.surveying.paths import read_paths
@@ -108,12 +108,12 @@ def test_distances_that_cannot_be_are_refused(flights, tmp_path, text, words):
 
 
 def odometry_of(flight, drift=0.02, yaw=1.0, seed=0):
-    """Path of the ground truth of a Flight in a frame of its own, that drifts."""
+    """OdometryPath of the ground truth of a Flight in a frame of its own, that drifts."""
     truth, rng = flight.truth, np.random.default_rng(seed)
     t = np.arange(truth.t[0], truth.t[-1], 0.05)
     p = np.stack([np.interp(t, truth.t, column) for column in truth.p.T], axis=1)
     walk = np.cumsum(drift * np.sqrt(0.05) * rng.standard_normal(p.shape), axis=0)
-    return Path(flight.name, t, Rotation.from_euler("z", yaw).apply(p) + [5.0, -3.0, 1.0] + walk, max(drift, 1e-3))
+    return OdometryPath(flight.name, t, Rotation.from_euler("z", yaw).apply(p) + [5.0, -3.0, 1.0] + walk, max(drift, 1e-3))
 
 
 def ends(flight, std=0.05):

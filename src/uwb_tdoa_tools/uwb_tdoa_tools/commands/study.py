@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from .. import cli
-from ..studies import aids, crazyflie, surveying
+from ..studies import aids, crazyflie, recalibrating, surveying
 from ..studies.checking import figures as checking, in_flight
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
@@ -21,6 +21,7 @@ STUDIES = {
     "diagnosis": figures,
     "in-flight": in_flight,
     "random-splits": splits,
+    "recalibrating": recalibrating,
     "spin": spin,
     "surveying": surveying,
 }
@@ -37,6 +38,7 @@ of measured flights: flights/, util/, surveys/.
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
+  recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
   surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
 """
@@ -65,6 +67,7 @@ def parser():
         "study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
         "study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
         "study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
+        "study recalibrating --data DATA --only const1",
         "study spin --out spin.png",
         "study surveying --data DATA --draws 5 --only const1",
     )

@@ -11,8 +11,9 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.flight import AIDS
 
+from ..diagnosis import diagnose
 from ..diagnosis.constraints import Mark
-from ..diagnosis.references import Path
+from ..diagnosis.references import Odometry, OdometryPath
 from ..readers import inputs
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import airborne
@@ -42,14 +43,15 @@ def add_options(add):
     add("--data", type=Path, required=True, metavar="DATA", help="folder of measured flights")
     add("--draws", type=int, default=20, metavar="N", help="of each set and each size of the errors (default 20)")
     add("--only", choices=(*SETS, "simulated"), help="one set")
-    add("--known", choices=tuple(KNOWN), help="instead: flights of every day and constellation with this known beside, judged on others")
+    add("--known", choices=(*KNOWN, "odometry"), help="instead: flights of every day and constellation with this known beside, judged on others")
+    add("--split", choices=tuple(SPLITS), help="with --known: one of these alone")
     add("--json", type=argparse.FileType("w"), metavar="FILE", help="write every draw")
 
 
 def run(args):
     """Print a table, a row for each set and size."""
     if args.known:
-        return with_known(args.data, args.known)
+        return with_known(args.data, args.known, [args.split] if args.split else SPLITS)
     print("| set | tape off by [m] | applied | tag, true survey | shaken | surveyed | surveyed / true, median (worst) | ", end="")
     print("worse than shaken | anchors shaken | surveyed | normalised error |\n|---|" + 10 * "---:|")
     every = {}
@@ -63,20 +65,22 @@ def run(args):
         json.dump(every, args.json, indent=1)
 
 
-def with_known(data, kind):
-    """Print a table: surveys as they came, within 0.1 m, made better with what KNOWN of a kind says."""
-    print("| surveyed with | judged on | mean 3D RMSE before | after | worst ratio | known |\n|---|---|---:|---:|---:|---:|")
-    for name, (fit, judge) in SPLITS.items():
-        if not judge:
-            continue
-        flights, judged = _measured(data, fit, judge, ())
-        rng = np.random.default_rng(0)
-        known = [one for flight in flights for one in KNOWN[kind](flight, len(flights), rng)]
-        result = survey([replace(flight, truth=None) for flight in flights], Tape(), constraints=known)
-        before, after = (
-            np.array([_rmse([at(flight, anchors.positions)], effects) for flight in judged])
-            for anchors, effects in ((result.given, None), (result.anchors, result.effects))
-        )
+def with_known(data, kind, splits):
+    """Print a table: surveys as they came, within 0.1 m, made better with what KNOWN of a kind says; or diagnosed beside an odometry
+    that took off and landed at known places."""
+    print("| fitted to | judged on | mean 3D RMSE before | after | worst ratio | known |\n|---|---|---:|---:|---:|---:|")
+    for name in (name for name in splits if SPLITS[name][1]):
+        flights, judged = _measured(data, *SPLITS[name], ())
+        rng, bare = np.random.default_rng(0), [replace(flight, truth=None) for flight in flights]
+        if kind == "odometry":
+            known = [one for flight in flights for make in (odometry_of, ends_of) for one in make(flight, 1, rng)]
+            effects, positions = diagnose(bare, reference=Odometry(None, known)).effects, flights[0].anchors.positions
+        else:
+            known = [one for flight in flights for one in KNOWN[kind](flight, len(flights), rng)]
+            result = survey(bare, Tape(), constraints=known)
+            effects, positions = result.effects, result.anchors.positions
+        before = np.array([rmse([flight]) for flight in judged])
+        after = np.array([rmse([at(flight, positions)], effects) for flight in judged])
         cells = f"{before.mean():.3f} | {after.mean():.3f} | {(after / before).max():.2f} | {len(known)}"
         print(f"| {name} | {len(judged)} flights | {cells} |", flush=True)
 
@@ -107,13 +111,13 @@ def ends_of(flight, several, rng):
 
 
 def odometry_of(flight, several, rng):
-    """[Path]: the ground truth in a frame of its own, that drifts by DRIFT."""
+    """[OdometryPath]: the ground truth in a frame of its own, that drifts by DRIFT."""
     truth = flight.truth
     t = np.arange(truth.t[0], truth.t[-1], ODOMETRY_STEP)
     p = np.stack([np.interp(t, truth.t, column) for column in truth.p.T], axis=1)
     walk = np.cumsum(DRIFT * np.sqrt(ODOMETRY_STEP) * rng.standard_normal(p.shape), axis=0)
     turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
-    return [Path(flight.name, t, turn.apply(p) + rng.uniform(-5.0, 5.0, 3) + walk, DRIFT)]
+    return [OdometryPath(flight.name, t, turn.apply(p) + rng.uniform(-5.0, 5.0, 3) + walk, DRIFT)]
 
 
 KNOWN = {  # kind: function of (Flight, how many there are, Generator) that gives constraints
@@ -133,9 +137,9 @@ def draw(flights, judged, std, seed):
     result = survey([at(flight, rough) for flight in flights], tape)
     error = result.surveyed.anchors.positions - true.positions
     return {
-        "true": _rmse(judged),
-        "shaken": _rmse([at(flight, rough) for flight in judged]),
-        "surveyed": _rmse([at(flight, result.anchors.positions) for flight in judged], result.effects),
+        "true": rmse(judged),
+        "shaken": rmse([at(flight, rough) for flight in judged]),
+        "surveyed": rmse([at(flight, result.anchors.positions) for flight in judged], result.effects),
         "applied": result.why_not is None,
         "anchors_shaken": _root((rough - true.positions)[free]),
         "anchors_surveyed": _root(error[free]),
@@ -157,9 +161,14 @@ def at(flight, positions):
 
 
 def _measured(data, fit, judge, aids):
-    surveys = inputs.Reading(str(data / "surveys"))
+    return [measured_flights(data, some, aids) for some in (fit, judge)]
+
+
+def measured_flights(data, paths, aids=()):
+    """Flights below a folder, with these of AIDS alone."""
     unused = [aid for aid in AIDS if aid not in aids]
-    return [[f.without(*unused) for path in some for f in surveys.flights([str(data / path)])] for some in (fit, judge)]
+    reading = inputs.Reading(str(data / "surveys"))
+    return [flight.without(*unused) for path in paths for flight in reading.flights([str(data / path)])]
 
 
 def _simulated():
@@ -167,7 +176,8 @@ def _simulated():
     return flights[:-1], flights[-1:]
 
 
-def _rmse(flights, effects=None):
+def rmse(flights, effects=None):
+    """Mean 3D RMSE of the filter on Flights, m."""
     return float(np.mean([evaluate(flight, effects=effects)[0].row()["rmse_3d"] for flight in flights]))
 
 

@@ -1,13 +1,13 @@
 """Paths of another odometry or SLAM: a CSV file, or a topic of the bags that the flights are in."""
 
-from pathlib import Path as File
+from pathlib import Path
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.bag import read_odometry
-from ..diagnosis.references.path import Path
+from ..diagnosis.references.path import OdometryPath
 from ..readers.tables import number, read_table
 
 COLUMNS = "t", "x", "y", "z"
@@ -15,11 +15,11 @@ DRIFT = 0.02  # m per square root of a second: visual-inertial odometry that is 
 
 
 def read_paths(source, flights, drift=DRIFT, namespace=""):
-    """[Path], one for each of some Flights that it has. source : a CSV file with the columns flight, t (s, clock of the recording), x, y, z (m), or
+    """[OdometryPath], one for each of some Flights that it has. source : a CSV file with the columns flight, t (s, clock of the recording), x, y, z (m), or
     the name of a nav_msgs/Odometry topic of the bags; drift : m per square root of a second. Raises InputError."""
     if not 0.0 <= drift <= 10.0:
         raise InputError(f"--drift: {drift:g} must be from 0 to 10 m per square root of a second.")
-    if File(source).is_file():
+    if Path(source).is_file():
         return _of_table(source, flights, drift)
     out = []
     for flight in flights:
@@ -27,7 +27,7 @@ def read_paths(source, flights, drift=DRIFT, namespace=""):
             raise InputError(f"--odometry {source}: is no CSV file, and {flight.name} is no bag that could have such a topic.")
         found = read_odometry(flight.meta["bag"], namespace, topics={"odometry": source})
         sound = np.isfinite(found.p).all(axis=1)
-        out.append(Path(flight.name, found.t[sound], found.p[sound], drift))
+        out.append(OdometryPath(flight.name, found.t[sound], found.p[sound], drift))
     return out
 
 
@@ -43,5 +43,5 @@ def _of_table(path, flights, drift):
         table = np.array(some)
         if (np.diff(table[:, 0]) <= 0.0).any():
             raise InputError(f"{path}: the stamps of flight {name} do not rise; sort its rows by t.")
-        out.append(Path(name, table[:, 0], table[:, 1:], drift))
+        out.append(OdometryPath(name, table[:, 0], table[:, 1:], drift))
     return out

@@ -6,8 +6,8 @@ from .heights import Heights
 from .marks import Marks
 from .nothing import Nothing
 from .odometry import Odometry
-from .path import Path
+from .path import OdometryPath
 
 REFERENCES = {"truth": GroundTruth, "heights": Heights, "marks": Marks, "odometry": Odometry, "nothing": Nothing}  # made of a FilterConfig and constraints
 
-__all__ = ["REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "Odometry", "Path", "Reference", "View"]
+__all__ = ["REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "Odometry", "OdometryPath", "Reference", "View"]

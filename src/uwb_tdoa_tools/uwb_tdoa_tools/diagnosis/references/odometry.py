@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.smoother import smooth
 
 from .ground_truth import GroundTruth
 from .nothing import without_truth
-from .path import Path
+from .path import OdometryPath
 
 FEWEST = 5  # stamps to lay it beside the filter's path
 
@@ -26,9 +26,9 @@ class Odometry(GroundTruth):
     attitude_known = False
 
     def __init__(self, config=None, constraints=()):
-        """config : FilterConfig; constraints : Paths, and Marks that lie on them."""
-        self._config, self._paths = config, {one.flight: one for one in constraints if isinstance(one, Path)}
-        self._marks = [one for one in constraints if one.flight is not None and not isinstance(one, Path)]
+        """config : FilterConfig; constraints : OdometryPaths, and Marks that lie on them."""
+        self._config, self._paths = config, {one.flight: one for one in constraints if isinstance(one, OdometryPath)}
+        self._marks = [one for one in constraints if one.flight is not None and not isinstance(one, OdometryPath)]
         through = "laid through marks" if self._marks else "laid beside the filter's path: a shift of all of a flight is not seen"
         self.words = f"another odometry in a frame of its own, {through}"
 

@@ -13,7 +13,7 @@ COMMON_STD = 0.3  # m, the same of what all of a flight has in common
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class OdometryPath:
     """Where the tag was in a frame with z up, of unknown origin and yaw, that drifts as a random walk.
 
     flight : name; t (n,) s, clock of the flight; p (n, 3) m; drift : m per square root of a second.
