@@ -6,9 +6,11 @@ Every parameter is documented in config/bias_node.yaml.
 """
 
 from collections import Counter, deque
+from itertools import groupby
 import math
 import sys
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -23,6 +25,8 @@ from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from .foundation.ros_frames import FramesInput, unknown_frame
 from .foundation.ros_parameters import Parameter, declare_all, refuse_unknown, say_unused
+from .foundation.ros_streams import Streams
+from .foundation.ros_wire import Wire
 from .correction.pose_queue import PoseQueue
 from .correction.network import SHIPPED, load_network
 from .correction.poses import known_yaw_std
@@ -47,6 +51,11 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
     ),
 }
 ROTATIONS = [21, 28, 35]  # places of the variances about the axes in the covariance of a pose
+POSE = "pose.pose.position", "pose.pose.orientation", "pose.covariance"  # what is read of an Odometry,
+MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a Tdoa
+CORRECTED = (  # what is written of a TdoaCorrected
+    "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status",
+)  # fmt: skip
 EARLY = 2000  # TDOAs kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
@@ -73,17 +82,15 @@ class BiasNode(Node):
         self._early, self._hold = deque(), PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
-        self._message = TdoaCorrected()  # one for all: what is published is copied
-
+        self._wire, self._templates = Wire(TdoaCorrected, *CORRECTED), {}  # by frame and model
         self._frame, self._frame_trouble = self._body, None  # of the TDOAs
         self._declared = self._effects  # without the arm of the antenna
         self._publisher = ros.publish_stream(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
-        self._inputs = {
-            "odometry": ros.StreamInput(self, Odometry, "odometry", self._on_odometry),
-            "uwb/tdoa": ros.StreamInput(self, Tdoa, "uwb/tdoa", self._on_tdoa),
-        }
+        self._streams = Streams(self, self._epoch, self._release)
+        self._streams.add(Wire(Odometry, *POSE), "odometry", self._on_odometry)
+        self._streams.add(Wire(Tdoa, *MEASURED), "uwb/tdoa", self._on_tdoa)
         say_unused(self, files)
         self._diagnostics = ros.Diagnostics(self, self._report)
         self._anchors.start()
@@ -105,8 +112,8 @@ class BiasNode(Node):
     def _on_anchors(self, _):
         self._start_over()
         early, self._early = self._early, deque()
-        for message in early:
-            self._take(message)
+        self._take([self._seconds(item) for item in early], early)
+        self._release()
 
     def _on_frames(self):
         """A constant transform is new, or another."""
@@ -135,93 +142,120 @@ class BiasNode(Node):
         if self._anchors.anchors is not None:
             self._start_over()
 
-    def _on_odometry(self, message):
-        self._counts["poses"] += 1
+    def _on_odometry(self, frame, t, rows, arrival):
+        self._counts["poses"] += len(t)
         if self._corrector is None or self._idle:
             return
-        if message.header.frame_id != self._corrector.anchors.frame:
+        if frame != self._corrector.anchors.frame:
             self.get_logger().warning(
-                f"odometry is in frame '{message.header.frame_id}', the anchors in '{self._corrector.anchors.frame}': "
+                f"odometry is in frame '{frame}', the anchors in '{self._corrector.anchors.frame}': "
                 "taken as the same frame",
                 once=True,
             )
-        self._take_pose(self._epoch.seconds(message.header.stamp), message.pose)
-        self._release()
+        if self._poses.take_all(t.tolist()):
+            self._add_poses(t, rows)
+        else:
+            for k, stamp in enumerate(t.tolist()):
+                self._take_pose(stamp, rows[k : k + 1])
 
-    def _take_pose(self, t, pose):
-        accepted, _, jumped_back = self._poses.take(t, pose)
+    def _take_pose(self, t, row):
+        """One pose, after the gate has judged its stamp."""
+        accepted, _, jumped_back = self._poses.take(t, row)
         if jumped_back:
             self._start_over()
             held, self._tdoas = self._tdoas.finish(), StampGate()
-            for _, message in held:
-                self._take(message)
-        for t, pose in accepted:
-            position, turns = pose.pose.position, np.sqrt(np.maximum(pose.covariance[ROTATIONS], 0.0))
-            at, orientation = (position.x, position.y, position.z), ros.orientation_of(pose.pose.orientation)
-            self._corrector.add_pose(t, at, orientation, known_yaw_std(turns[None])[0])
+            for stamp, item in held:
+                self._take([stamp], [item])
+        for stamp, row in accepted:
+            self._add_poses(np.array([stamp]), row)
 
-    def _on_tdoa(self, message):
-        self._counts["received"] += 1
-        if message.header.frame_id != self._frame:
-            self._place_antenna(message.header.frame_id)
+    def _add_poses(self, t, rows):
+        turns = np.sqrt(np.maximum(rows["pose.covariance"][:, ROTATIONS], 0.0))
+        q = rows["pose.pose.orientation"]
+        q = np.where(q.any(axis=1)[:, None], q, math.nan)  # (0, 0, 0, 0) says: not known
+        self._corrector.add_pose(t, rows["pose.pose.position"], q, known_yaw_std(turns))
+
+    def _on_tdoa(self, frame, t, rows, arrival):
+        self._counts["received"] += len(t)
+        if frame != self._frame:
+            self._place_antenna(frame)
+        items = [(frame, *row) for row in rows.tolist()]
         if self._idle:
-            self._publish(message, 0.0, 0.0, PASSED)
+            self._publish(items, np.zeros(len(t)), np.zeros(len(t)), np.full(len(t), PASSED))
         elif self._corrector is None:
-            if len(self._early) == EARLY:
+            self._early.extend(items)
+            while len(self._early) > EARLY:
                 self._early.popleft()
                 self._counts["dropped"] += 1
-            self._early.append(message)
         else:
-            self._take(message)
+            self._take(t.tolist(), items)
 
-    def _take(self, message):
-        t = self._epoch.seconds(message.header.stamp) - self._late
-        accepted, outliers, jumped_back = self._tdoas.take(t, message)
-        for _, outlier in outliers:  # ekf_node says of it that its stamp is wrong
-            self._publish(outlier, 0.0, 0.0, PASSED)
-        if jumped_back:
-            self.get_logger().info("time has gone back: starting over")
-            self._start_over()
-            held, self._poses = self._poses.finish(), StampGate()
-            for t_held, pose in held:
-                self._take_pose(t_held, pose)
-        for t, message in accepted:
-            self._hold.add(t, message)
-        self._release()
+    def _seconds(self, item):
+        _, sec, nanosec, *_ = item
+        return self._epoch.seconds(Time(sec=sec, nanosec=nanosec))
+
+    def _take(self, stamps, items):
+        """Have TDOAs wait for their poses: stamps, s, as received; items : (frame, sec, nanosec, a, b, d, variance)."""
+        stamps = [t - self._late for t in stamps]
+        if stamps and self._tdoas.take_all(stamps):
+            for t, item in zip(stamps, items):
+                self._hold.add(t, item)
+            return
+        for t, item in zip(stamps, items):
+            accepted, outliers, jumped_back = self._tdoas.take(t, item)
+            for _, outlier in outliers:  # ekf_node says of it that its stamp is wrong
+                self._publish([outlier], np.zeros(1), np.zeros(1), np.array([PASSED]))
+            if jumped_back:
+                self.get_logger().info("time has gone back: starting over")
+                self._start_over()
+                held, self._poses = self._poses.finish(), StampGate()
+                for stamp, row in held:
+                    self._take_pose(stamp, row)
+            for stamp, kept in accepted:
+                self._hold.add(stamp, kept)
 
     def _release(self):
-        released = self._hold.take(self._is_ready)
+        """Publish what need not wait any longer."""
+        released = self._hold.take(self._is_ready) if self._corrector is not None else []
         if not released:
             return
-        t = np.array([t for t, _, _ in released])
-        row = self._corrector.anchors.row
-        a, b = np.array([(row(message.anchor_a), row(message.anchor_b)) for _, message, _ in released]).T
-        d = np.array([message.distance_difference for _, message, _ in released])
+        stamps, items, ready = zip(*released)
+        t, d = np.array(stamps), np.array([item[5] for item in items])
+        a, b = (self._corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
         correction = self._corrector.correct(t[valid], a[valid], b[valid], d[valid])
         bias, std, status = np.zeros(len(t)), np.zeros(len(t)), np.full(len(t), PASSED)
         bias[valid], std[valid], status[valid] = correction.bias, correction.std, correction.status
         self._counts["invalid"] += len(t) - int(valid.sum())
-        for (at, message, ready), *values in zip(released, bias.tolist(), std.tolist(), status.tolist()):
-            self._counts["unready"] += not ready
-            if self._late:
-                message.header.stamp = self._epoch.stamp(at)
-            self._publish(message, *values)
+        self._counts["unready"] += len(t) - sum(ready)
+        self._publish(items, bias, std, status, self._epoch.parts(t) if self._late else None)
 
     def _is_ready(self, before):
         return self._poses.newest == -math.inf or self._corrector.ready(before)
 
-    def _publish(self, message, bias, std, status):
-        out = self._message
-        out.header = message.header
-        out.anchor_a, out.anchor_b = message.anchor_a, message.anchor_b
-        out.raw = message.distance_difference
-        out.bias, out.bias_std = bias, std
-        out.corrected, out.variance = out.raw - bias, message.variance
-        out.status, out.model = status, self._model[status]
-        self._publisher.publish(out)
-        self._counts["published"] += 1
-        self._counts[STATUS[status]] += 1
+    def _publish(self, items, bias, std, status, stamps=None):
+        """Publish corrected TDOAs: items as in `_take`; bias, std (n,) m; status (n,); stamps : seconds and nanoseconds, (n,)
+        each, instead of their own."""
+        columns = [np.array(column) for column in list(zip(*items))[1:]]
+        measured = columns if stamps is None else (*stamps, *columns[2:])  # up to the variance
+        values = *measured, bias, std, measured[4] - bias, status
+        kinds, first = [(item[0], self._model[one]) for item, one in zip(items, status.tolist())], 0
+        for kind, same in groupby(kinds):
+            some = slice(first, first := first + len(list(same)))
+            rows = self._template(*kind).rows(some.stop - some.start)
+            for name, column in zip(("sec", "nanosec", *CORRECTED), values):
+                rows[name] = column[some]
+            for message in self._template(*kind).messages(rows):
+                self._publisher.publish(message)
+        self._counts["published"] += len(items)
+        self._counts.update(STATUS[one] for one in status.tolist())
+
+    def _template(self, frame, model):
+        if (frame, model) not in self._templates:
+            message = TdoaCorrected(model=model)
+            message.header.frame_id = frame
+            self._templates[frame, model] = self._wire.template(message)
+        return self._templates[frame, model]
 
     def _report(self):
         counts = self._counts
@@ -229,7 +263,7 @@ class BiasNode(Node):
         received, self._reported_received = counts["received"] - self._reported_received, counts["received"]
         poses, self._reported_poses = counts["poses"] - self._reported_poses, counts["poses"]
         recent = {"uwb/tdoa": received, "odometry": poses}
-        wiring = [end.trouble(recent[name]) for name, end in self._inputs.items()]
+        wiring = [end.trouble(recent[name]) for name, end in self._streams.inputs.items()]
         wiring.append(ros.several_publishers(self, "uwb/tdoa_corrected"))
         unready, self._reported_unready = counts["unready"] - self._reported_unready, counts["unready"]
         values = {"model": self._model[NETWORK], "received": counts["received"], "published": counts["published"]}
@@ -237,9 +271,9 @@ class BiasNode(Node):
         values |= {name: counts[name] for name in STATUS.values()}
         values |= {"released before their pose": counts["unready"], "invalid": counts["invalid"]}
         values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
-        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._inputs.items()}
+        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._streams.inputs.items()}
         values |= {"subscribers of uwb/tdoa_corrected": self._publisher.get_subscription_count()}
-        values |= {f"lost on {name}": end.lost for name, end in self._inputs.items()}
+        values |= {f"lost on {name}": end.lost for name, end in self._streams.inputs.items()}
         level, text = self._health(rate, unready)
         if level != DiagnosticStatus.ERROR and any(wiring):
             level, text = DiagnosticStatus.WARN, next(filter(None, wiring))

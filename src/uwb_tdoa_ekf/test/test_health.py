@@ -33,8 +33,8 @@ def clock(monkeypatch):
 def second(clock, judge, estimator, imu=1000, tdoa=400, refused=None, **counts):
     """Let one second pass with so many messages; returns (level, text, values)."""
     clock.now += 1.0
-    judge.imu += imu
-    judge.tdoa += tdoa
+    judge.received["imu"] += imu
+    judge.received["tdoa"] += tdoa
     return judge.report(refused, estimator, Counter(counts))
 
 
@@ -118,13 +118,13 @@ def test_a_tag_outside_of_the_flyable_volume_is_a_warning(clock):
 def test_an_aid_that_stops_is_told_and_so_is_one_that_contradicts(clock):
     judge, counts = health.Health(FilterConfig(), 0.25), Counter(used=1)
     for _ in range(3):
-        judge.aids["height"] += 25
+        judge.received["height"] += 25
         counts.update(used=400, height_used=25)
         assert second(clock, judge, RUNNING, **counts)[:2] == (OK, "running")
     said = [second(clock, judge, RUNNING, **counts) for _ in range(3)]
     assert said[-1][0] == WARN and "no messages on height any more" in said[-1][1]
     for expected in (OK, WARN):  # for a second even a sound one may contradict
-        judge.aids["height"] += 25
+        judge.received["height"] += 25
         counts.update(used=400, height_rejected=25)
         level, text, _ = second(clock, judge, RUNNING, **counts)
         assert level == expected
@@ -139,7 +139,7 @@ def test_what_is_wrong_with_the_streams_is_said_before_what_comes_of_it(clock):
 
     def said(estimator, wiring=(), findings=(), **counts):
         clock.now += 1.0
-        judge.imu, judge.tdoa = judge.imu + 1000, judge.tdoa + 400
+        judge.received.update(imu=1000, tdoa=400)
         return judge.report(None, estimator, Counter(counts), wiring, findings)
 
     level, text, values = said(STARTING, [publishers], [units, slow])

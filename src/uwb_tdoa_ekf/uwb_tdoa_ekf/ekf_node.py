@@ -30,13 +30,14 @@ from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
 from uwb_tdoa_bias.foundation.ros_frames import FramesInput, unknown_frame
 from uwb_tdoa_bias.foundation.ros_parameters import refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_streams import Streams
+from uwb_tdoa_bias.foundation.ros_wire import Wire
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
 from .core import aids
 from .core.config import RENAMED
-from .core.verdicts import INVALID
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
-from .estimator import STREAMS, VERDICTS, Estimator
+from .estimator import STREAMS, VERDICTS, Estimator, invalid
 from .frames import to_odometry
 from .imu_mount import ImuMount
 from .monitoring.health import OK, WARN, Health
@@ -44,6 +45,22 @@ from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs
 from .told_pose import told_pose
 
+# Of each stream: topic, type and the fields of its messages that are read.
+TOPICS = {
+    "imu": [
+        (
+            "imu/data", Imu, "angular_velocity", "linear_acceleration", "angular_velocity_covariance",
+            "linear_acceleration_covariance",
+        )
+    ],
+    "tdoa": [("uwb/tdoa_corrected", TdoaCorrected, "anchor_a", "anchor_b", "raw", "corrected", "bias_std", "variance")],
+    "height": [("height", Range, "range", "min_range", "max_range")],
+    "pressure": [("pressure", FluidPressure, "fluid_pressure")],
+    "velocity": [
+        ("velocity", TwistWithCovarianceStamped, "twist.twist.linear", "twist.covariance"),
+        ("velocity/odometry", Odometry, "twist.twist.linear", "twist.covariance"),
+    ],
+}  # fmt: skip
 EARLY = 5000  # messages kept while there are no anchors
 UNKNOWN_VARIANCE = 1e6  # (m/s)^2, at which and above a velocity is not measured
 
@@ -65,14 +82,10 @@ class EkfNode(Node):
         volume, effects_file = own["flyable_volume"], own["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._aid_corrector = AidCorrector(self._effects.effects)
-        self._invalid = {  # how a message counts that none has received
-            self._take_imu: "imu_invalid", self._take_tdoa: "invalid", self._take_height: "height_invalid",
-            self._take_pressure: "pressure_invalid", self._take_velocity: "velocity_invalid",
-        }  # fmt: skip
         self._estimator = None
         self._epoch, self._clock = ros.Epoch(), self.get_clock()
         self._received_before = {}  # messages by topic, by the last report
-        self._early = deque()
+        self._early = deque()  # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one message each
         self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
         self._imu_frame, self._imu_mount, self._frame_trouble = own["body_frame"], None, None
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
@@ -83,7 +96,7 @@ class EkfNode(Node):
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames, moving)
         self._outputs = Outputs(self, self._epoch, self._frames.frames, self._body, own["publish_tf"], own["odom_frame"])
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
-        self._inputs = self._subscribe()
+        self._streams = self._subscribe()
         self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
         self._reset = self.create_service(Trigger, "~/reset", self._on_reset)
         follow_changes(self, lambda: self._config, self._on_config)
@@ -93,23 +106,18 @@ class EkfNode(Node):
         self.get_logger().info("ready")
 
     def _subscribe(self):
-        """{topic: subscription} of all streams."""
-        inputs = {
-            "imu/data": ros.StreamInput(self, Imu, "imu/data", self._on_imu),
-            "uwb/tdoa_corrected": ros.StreamInput(self, TdoaCorrected, "uwb/tdoa_corrected", self._on_tdoa),
-        }
-        topics = {  # of each aid: topic, type, what takes its messages
-            "height": [("height", Range, self._take_height)],
-            "pressure": [("pressure", FluidPressure, self._take_pressure)],
-            "velocity": [
-                ("velocity", TwistWithCovarianceStamped, self._take_velocity),
-                ("velocity/odometry", Odometry, self._take_velocity),
-            ],
-        }
-        for aid in aids.STREAMS:
-            for topic, kind, take in topics[aid] if getattr(self._config, f"use_{aid}") else ():
-                inputs[topic] = ros.StreamInput(self, kind, topic, partial(self._on_aid, aid, take))
-        return inputs
+        """Streams of everything that the filter takes."""
+        streams = Streams(self, self._epoch, self._advance, self._frames.catch_up)
+        self._takers = {
+            "imu": self._take_imu, "tdoa": self._take_tdoa, "height": self._take_height,
+            "pressure": self._take_pressure, "velocity": self._take_velocity,
+        }  # fmt: skip
+        for stream, topics in TOPICS.items():
+            if stream in aids.STREAMS and not getattr(self._config, f"use_{stream}"):
+                continue
+            for topic, kind, *fields in topics:
+                streams.add(Wire(kind, *fields), topic, partial(self._receive, stream))
+        return streams
 
     def _on_anchors(self, anchors):
         if self._estimator is not None:
@@ -121,9 +129,9 @@ class EkfNode(Node):
         self._watch, self._restarts = StreamWatch(anchors, self._lag, ignored), 0
         self._outputs.set_world(self._world or anchors.frame)
         early, self._early = self._early, deque()
-        for take, message in early:
-            take(message)
-        self._publish(*self._estimator.advance())
+        for stream, part in early:
+            self._takers[stream](*part)
+        self._advance()
 
     def _on_config(self, config):
         self._config = config
@@ -171,80 +179,66 @@ class EkfNode(Node):
         else:
             self._imu_mount = ImuMount(*between)
 
-    def _on_imu(self, message):
-        self._health.imu += 1
-        self._receive(self._take_imu, message)
-
-    def _on_tdoa(self, message):
-        self._health.tdoa += 1
-        self._receive(self._take_tdoa, message)
-
-    def _on_aid(self, aid, take, message):
-        self._health.aids[aid] += 1
-        self._receive(take, message)
-
-    def _receive(self, take, message):
+    def _receive(self, stream, *part):
+        """Messages of a stream, see Streams."""
+        n = len(part[1])
+        self._health.received[stream] += n
         if self._estimator is not None:
-            take(message)
-            self._publish(*self._estimator.advance())
+            self._takers[stream](*part)
             return
-        self._early.append((take, message))
-        if len(self._early) > EARLY:
-            take, message = self._early.popleft()
-            self._past[self._invalid[take]] += 1
-            if take == self._take_tdoa:
-                t = self._epoch.seconds(message.header.stamp)
-                a, b = message.anchor_a, message.anchor_b
-                self._outputs.publish_residual(t, a, b, math.nan, math.nan, 0.0, INVALID)
+        frame, *columns = part
+        self._early.extend((stream, (frame, *(column[k : k + 1] for column in columns))) for k in range(n))
+        while len(self._early) > EARLY:
+            stream, (_, t, rows, _) = self._early.popleft()
+            self._past["invalid" if stream == "tdoa" else f"{stream}_invalid"] += 1
+            if stream == "tdoa":
+                self._outputs.publish_residuals(invalid(t, rows["anchor_a"], rows["anchor_b"]))
 
-    def _take_imu(self, message):
-        t = self._epoch.seconds(message.header.stamp)
-        if message.header.frame_id != self._imu_frame:
-            self._place_imu(message.header.frame_id)
-        rate, force = message.angular_velocity, message.linear_acceleration  # the specific force, says REP 145
-        gyro, accel = (rate.x, rate.y, rate.z), (force.x, force.y, force.z)
-        if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
+    def _advance(self):
+        if self._estimator is not None:
+            self._publish(*self._estimator.advance())
+
+    def _take_imu(self, frame, t, rows, arrival):
+        if frame != self._imu_frame:
+            self._place_imu(frame)
+        gyro, accel = rows["angular_velocity"].copy(), rows["linear_acceleration"].copy()  # the specific force, says REP 145
+        unmeasured = (rows["angular_velocity_covariance"][:, 0] == -1.0) | (rows["linear_acceleration_covariance"][:, 0] == -1.0)
+        if unmeasured.any():
             self.get_logger().warning(
                 "imu/data says with a covariance of -1 that it has no angular velocity or no acceleration: such "
                 "samples are not used; without a whole IMU set use_imu to false",
                 once=True,
             )
-            gyro = (math.nan,) * 3
+            gyro[unmeasured] = math.nan
         if not self._imu_corrector.idle:
-            gyro, accel = (x[0].tolist() for x in self._imu_corrector.correct(*map(np.array, ([t], [gyro], [accel]))))
+            gyro, accel = self._imu_corrector.correct(t, gyro, accel)
         if self._imu_mount is not None:
             gyro, accel = self._imu_mount.in_body(t, gyro, accel)
-        self._watch.add_imu(t + self._epoch.begin, self._now(), gyro, accel)
+        self._watch.add_imu(t + self._epoch.begin, self._arrived(arrival), gyro, accel)
         self._estimator.add_imu(t, gyro, accel)
 
-    def _take_tdoa(self, message):
-        t = self._epoch.seconds(message.header.stamp)
-        self._watch.add_tdoa(t + self._epoch.begin, self._now(), message.anchor_a, message.anchor_b, message.raw)
-        variance = message.bias_std**2 + message.variance
-        self._estimator.add_tdoa(t, message.anchor_a, message.anchor_b, message.corrected, variance)
+    def _take_tdoa(self, frame, t, rows, arrival):
+        a, b = rows["anchor_a"], rows["anchor_b"]
+        self._watch.add_tdoa(t + self._epoch.begin, self._arrived(arrival), a, b, rows["raw"])
+        self._estimator.add_tdoa(t, a, b, rows["corrected"], rows["bias_std"] ** 2 + rows["variance"])
 
-    def _take_height(self, message):
-        distance = message.range
-        if not message.min_range <= distance <= message.max_range:  # out of range, says REP 117
-            distance = math.inf
-        self._estimator.add_height(*self._corrected("height", message.header.stamp, distance))
+    def _take_height(self, frame, t, rows, arrival):
+        distance = rows["range"].astype(float)
+        inside = (rows["min_range"] <= distance) & (distance <= rows["max_range"])  # or it is out of range, says REP 117
+        self._estimator.add_height(*self._corrected("height", t, np.where(inside, distance, math.inf)))
 
-    def _take_pressure(self, message):
-        self._estimator.add_pressure(*self._corrected("pressure", message.header.stamp, message.fluid_pressure))
+    def _take_pressure(self, frame, t, rows, arrival):
+        self._estimator.add_pressure(*self._corrected("pressure", t, rows["fluid_pressure"]))
 
-    def _take_velocity(self, message):
-        v, covariance = message.twist.twist.linear, message.twist.covariance
-        variance = [float(covariance[place]) for place in (0, 7, 14)]
-        std = [math.sqrt(x) if 0.0 <= x < UNKNOWN_VARIANCE else math.inf for x in variance]
-        self._estimator.add_velocity(*self._corrected("velocity", message.header.stamp, (v.x, v.y, v.z), std))
+    def _take_velocity(self, frame, t, rows, arrival):
+        variance = rows["twist.covariance"][:, [0, 7, 14]]
+        known = (variance >= 0.0) & (variance < UNKNOWN_VARIANCE)
+        std = np.sqrt(np.where(known, variance, math.inf))
+        self._estimator.add_velocity(*self._corrected("velocity", t, rows["twist.twist.linear"], std))
 
-    def _corrected(self, stream, stamp, *values):
-        """Stamp, s, and values of a height, pressure or velocity without the effects."""
-        columns = (self._epoch.seconds(stamp), *values)
-        if self._aid_corrector.idle:
-            return columns
-        corrected = self._aid_corrector.correct(stream, *(np.array([column]) for column in columns))
-        return [column[0].tolist() for column in corrected]
+    def _corrected(self, stream, *columns):
+        """Stamps and values of heights, pressures or velocities without the effects."""
+        return columns if self._aid_corrector.idle else self._aid_corrector.correct(stream, *columns)
 
     def _publish(self, odometry, residuals):
         if len(odometry.t):
@@ -256,11 +250,11 @@ class EkfNode(Node):
         if len(residuals.t):
             self._outputs.publish_residuals(residuals)
 
-    def _now(self):
-        """s on the clock of the node, NaN while it has none."""
+    def _arrived(self, arrival):
+        """When messages arrived on the clock of the node, (n,) s; NaN while it has none."""
         if not self._clock.ros_time_is_active:
-            return time.time()
-        return 1e-9 * self._clock.now().nanoseconds or math.nan
+            return arrival
+        return np.full(len(arrival), 1e-9 * self._clock.now().nanoseconds or math.nan)
 
     def _stream_findings(self):
         """What the rules over streams find; [] without anchors."""
@@ -273,9 +267,9 @@ class EkfNode(Node):
 
     def _wiring(self):
         """What is wrong with who publishes what to whom, a list of sentences."""
-        received = {"imu/data": self._health.imu, "uwb/tdoa_corrected": self._health.tdoa, **self._health.aids}
+        received = {topics[0][0]: self._health.received[stream] for stream, topics in TOPICS.items()}
         troubles = []
-        for topic, end in self._inputs.items():
+        for topic, end in self._streams.inputs.items():
             total = received.get(topic, 0)
             troubles.append(end.trouble(total - self._received_before.get(topic, 0)))
         self._received_before = received
@@ -289,8 +283,7 @@ class EkfNode(Node):
 
     def _report(self):
         counts, estimator = Counter(self._past), self._estimator
-        early = Counter(self._invalid[take].rpartition("_")[0] for take, _ in self._early)
-        waiting = {stream: early["" if stream == "tdoa" else stream] for stream in STREAMS}
+        waiting = Counter(stream for stream, _ in self._early)
         if estimator is not None:
             counts.update(estimator.counts, recoveries=estimator.recoveries)
             waiting = dict(zip(STREAMS, estimator.waiting))
@@ -302,16 +295,16 @@ class EkfNode(Node):
         if level == OK and others:
             level, text = WARN, others[0]
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
-        values |= {"TDOAs received": self._health.tdoa} | {name: counts[name] for name in VERDICTS.values()}
-        values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.imu}
+        values |= {"TDOAs received": self._health.received["tdoa"]} | {name: counts[name] for name in VERDICTS.values()}
+        values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.received["imu"]}
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
         values |= {"imu_waiting": waiting["imu"], "odometry published": self._outputs.published}
         values |= {name: counts[name] for name in ("recoveries", "restarts")}
-        for aid, received in self._health.aids.items():
-            values |= {f"{aid}_received": received, f"{aid}_waiting": waiting[aid]}
+        for aid in aids.STREAMS:
+            values |= {f"{aid}_received": self._health.received[aid], f"{aid}_waiting": waiting[aid]}
             values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}
-        values |= {f"lost on {name}": end.lost for name, end in self._inputs.items()}
-        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._inputs.items()}
+        values |= {f"lost on {name}": end.lost for name, end in self._streams.inputs.items()}
+        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._streams.inputs.items()}
         values |= {"subscribers of odometry": self._outputs.odometry.get_subscription_count()}
         values |= {"subscribers of uwb/residual": self._outputs.residual.get_subscription_count()}
         return level, text, values
@@ -320,10 +313,10 @@ class EkfNode(Node):
 def _warm_up(config):
     """Compile, or load from numba's cache, what the first messages would."""
     estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]), config)
-    watch = StreamWatch(estimator.anchors, 0.25)
+    watch, steps = StreamWatch(estimator.anchors, 0.25), np.arange(400)
+    watch.add_imu(0.01 * steps, 0.01 * steps, np.zeros((400, 3)), np.tile((0.0, 0.0, 9.81), (400, 1)))
+    watch.add_tdoa(0.01 * steps, 0.01 * steps, steps % 4, (steps + 1) % 4, np.zeros(400))
     for step in range(400):
-        watch.add_imu(0.01 * step, 0.01 * step, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
-        watch.add_tdoa(0.01 * step, 0.01 * step, step % 4, (step + 1) % 4, 0.0)
         estimator.add_imu(0.01 * step, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
         estimator.add_tdoa(0.01 * step, step % 4, (step + 1) % 4, 0.0)
         estimator.add_height(0.01 * step, 1.0)

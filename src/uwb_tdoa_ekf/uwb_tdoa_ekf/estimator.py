@@ -1,9 +1,7 @@
 """The filter for live streams: messages in any order in, odometry that depends on their stamps alone out."""
 
-from bisect import bisect_right, insort
 from dataclasses import dataclass, fields
 import math
-from operator import itemgetter
 
 import numpy as np
 
@@ -14,10 +12,11 @@ from .aid_rows import ROWS
 from .core import aids
 from .core.config import FilterConfig
 from .core.engine import feed, tell_pose
-from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, Measurements, new_memory
-from .core.validity import MAX_ACCEL, MAX_RATE, usable
+from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, Measurements, new_memory, structured
+from .core.validity import usable_all, usable_imu
 from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, STARTUP, USED
 from .monitoring.monitor import Monitor
+from .waiting import Waiting
 
 VERDICTS = {
     USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup", COMPENSATED: "compensated",
@@ -88,7 +87,7 @@ class Estimator:
 
     def _clear(self):
         self._memory, self._monitor = new_memory(self.anchors.positions), Monitor(self.anchors)
-        self._waiting = [[] for _ in STREAMS]  # items of each stream in order of their stamps
+        self._waiting = [Waiting(kind) for kind in KINDS]
         self._gates = [StampGate() for _ in STREAMS]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
         self._poses = []  # (1,) of POSE, told and not reached yet
@@ -120,47 +119,40 @@ class Estimator:
         return tuple(len(stream) + len(gate) for stream, gate in zip(self._waiting, self._gates))
 
     def add_imu(self, t, gyro, accel):
-        """Take one inertial sample: t s; gyro (3,) rad/s; accel (3,) m/s^2, specific force; body frame."""
-        sample = (t, tuple(gyro), tuple(accel))
-        rates, accels = (all(abs(x) < limit for x in part) for part, limit in zip(sample[1:], (MAX_RATE, MAX_ACCEL)))
-        if not (math.isfinite(t) and rates and accels):  # NaN is not below anything
-            self.counts["imu_invalid"] += 1
-            self._gates[IMU_STREAM].note(t)
-            return
-        self._take(IMU_STREAM, t, sample)
+        """Take inertial samples in the order of their arrival: t (n,) s; gyro (n, 3) rad/s; accel (n, 3) m/s^2, specific
+        force; body frame. Or one: a number, (3,), (3,)."""
+        rows = structured(IMU_SAMPLE, np.atleast_1d(t), np.atleast_2d(gyro), np.atleast_2d(accel))
+        self._add(IMU_STREAM, rows, usable_imu(rows["t"], rows["gyro"], rows["accel"]))
 
     def add_tdoa(self, t, a, b, d, variance=0.0):
-        """Take one corrected TDOA: t s; a, b anchor ids; d m; variance m^2, of what is known beyond tdoa_std."""
-        i, k = self.anchors.row(a), self.anchors.row(b)
-        if not (math.isfinite(t) and usable(i, k, d, variance, self.anchors.positions)):
-            self._refused.append((t, a, b, INVALID))
-            self._gates[TDOA_STREAM].note(t)  # or whoever waits for our pose of this time waits for the next one
-            return
-        self._take(TDOA_STREAM, t, (t, i, k, d, variance))
+        """Take corrected TDOAs in the order of their arrival: t (n,) s; a, b (n,) anchor ids; d (n,) m; variance (n,) m^2, of
+        what is known beyond tdoa_std. Or one: numbers."""
+        t, a, b, d = map(np.atleast_1d, (t, a, b, d))
+        rows = structured(TDOA, t, self.anchors.index(a), self.anchors.index(b), d, np.broadcast_to(variance, d.shape))
+        usable = usable_all(rows["a"], rows["b"], rows["d"], rows["variance"], self.anchors.positions) & np.isfinite(t)
+        refused = zip(*(column[~usable].tolist() for column in (t, a, b))) if not usable.all() else ()
+        self._refused += [(*one, INVALID) for one in refused]
+        self._add(TDOA_STREAM, rows, usable)
 
     def add_height(self, t, distance):
-        """Take one range along the body's -z: t s; distance m, inf or NaN where nothing was in range (REP 117)."""
-        self._add_aid(aids.HEIGHT, t, [distance])
+        """Take ranges along the body's -z in the order of their arrival: t (n,) s; distance (n,) m, inf or NaN where nothing
+        was in range (REP 117). Or one: numbers."""
+        self._add_aid(aids.HEIGHT, t, np.atleast_1d(distance))
 
     def add_pressure(self, t, pressure):
-        """Take one static air pressure: t s; pressure Pa."""
-        self._add_aid(aids.PRESSURE, t, [pressure])
+        """Take static air pressures in the order of their arrival: t (n,) s; pressure (n,) Pa. Or one: numbers."""
+        self._add_aid(aids.PRESSURE, t, np.atleast_1d(pressure))
 
     def add_velocity(self, t, v, std):
-        """Take one velocity in the body frame: t s; v (3,) m/s; std (3,) m/s, inf for a component that is not measured."""
-        self._add_aid(aids.VELOCITY, t, [v], [std])
+        """Take velocities in the body frame in the order of their arrival: t (n,) s; v (n, 3) m/s; std (n, 3) m/s, inf for a
+        component that is not measured. Or one: a number, (3,), (3,)."""
+        self._add_aid(aids.VELOCITY, t, np.atleast_2d(v), np.atleast_2d(std))
 
     def _add_aid(self, kind, t, *columns):
         name = aids.STREAMS[kind]
-        if not getattr(self.config, f"use_{name}"):
-            return
-        rows, usable = ROWS[name](self.config, np.array([t]), *columns)
-        if usable[0]:
-            t, kind, value, std = rows[0].tolist()
-            self._take(FIRST_AID + kind, t, (t, kind, tuple(value), tuple(std)))
-        else:
-            self.counts[f"{name}_invalid"] += 1
-            self._gates[FIRST_AID + kind].note(t)
+        if getattr(self.config, f"use_{name}"):
+            rows, usable = ROWS[name](self.config, np.atleast_1d(t), *columns)
+            self._add(FIRST_AID + kind, rows, usable)
 
     def tell_pose(self, t, p, covariance, yaw=math.nan, yaw_std=math.nan):
         """Take a pose that somebody tells: t s; p (3,) m, NaN where it is not known; covariance (3, 3) m^2; yaw and yaw_std rad,
@@ -215,42 +207,63 @@ class Estimator:
         near = (place >= 0) & (np.abs(t - sample["t"]) <= self.config.imu_timeout)
         return np.where(near[:, None], sample["gyro"], math.nan)
 
-    def _take(self, stream, t, item):
-        """Keep an item of a stream, and one that was held because of its stamp, if their stamps are accepted."""
-        accepted, outliers, jumped_back = self._gates[stream].take(t, item)
+    def _add(self, stream, rows, usable):
+        """Take rows of a stream, of which some may not be usable: those count as invalid (TDOAs are refused already)."""
+        gate = self._gates[stream]
+        if len(rows) and not gate and usable.all():
+            newest = self._waiting[stream].append(rows, gate.newest, self._fed_until)
+            if newest == newest:
+                gate.newest = newest
+                return
+        for k, (t, good) in enumerate(zip(rows["t"].tolist(), usable.tolist())):
+            if good:
+                self._take(stream, t, rows[k : k + 1])
+                continue
+            if stream != TDOA_STREAM:
+                self.counts[f"{STREAMS[stream]}_invalid"] += 1
+            self._gates[stream].note(t)  # or whoever waits for our pose of this time waits for the next one
+
+    def _take(self, stream, t, row):
+        """Keep a row of a stream, and one that was held because of its stamp, if their stamps are accepted."""
+        accepted, outliers, jumped_back = self._gates[stream].take(t, row)
         if jumped_back:
             self._start_anew(stream)
         self._refuse_outliers(stream, outliers)
-        for t, item in accepted:
-            if t < self._fed_until:
-                self._refuse(stream, item, LATE)
-            else:
-                _insert(item, self._waiting[stream])
+        for _, row in accepted:
+            self._keep(stream, row)
+
+    def _keep(self, stream, rows):
+        """Have rows wait in the order of their stamps, but those that come after what was used."""
+        late = rows["t"] < self._fed_until
+        if late.any():
+            self._refuse(stream, rows[late], LATE)
+            rows = rows[~late]
+        if len(rows):
+            self._waiting[stream].merge(rows)
 
     def _refuse_outliers(self, stream, outliers):
         """Account for items whose stamps are far from those of their neighbours."""
-        for t, item in outliers:
-            self._refuse(stream, item, INVALID if t > self._gates[stream].newest else LATE)
+        for t, row in outliers:
+            self._refuse(stream, row, INVALID if t > self._gates[stream].newest else LATE)
 
-    def _refuse(self, stream, item, verdict):
+    def _refuse(self, stream, rows, verdict):
         if stream != TDOA_STREAM:
-            self.counts[f"{STREAMS[stream]}_{VERDICTS[verdict]}"] += 1
+            self.counts[f"{STREAMS[stream]}_{VERDICTS[verdict]}"] += len(rows)
         else:
-            t, i, k, _, _ = item
-            self._refused.append((t, *self.anchors.ids[[i, k]].tolist(), verdict))
+            ids = (self.anchors.ids[rows[side]].tolist() for side in "ab")
+            self._refused += [(*one, verdict) for one in zip(rows["t"].tolist(), *ids)]
 
     def _start_anew(self, stream):
         """Forget everything but the time that the stream has fallen back to."""
         for k, waiting in enumerate(self._waiting):
-            for item in waiting:
-                self._refuse(k, item, LATE)
+            self._refuse(k, waiting.rows, LATE)
         self.counts["restarts"] += 1
-        held = [(k, *one) for k, gate in enumerate(self._gates) if k != stream for one in gate.finish()]
+        held = [(k, *outlier) for k, gate in enumerate(self._gates) if k != stream for outlier in gate.finish()]
         gate = self._gates[stream]
         self._clear()
         self._gates[stream] = gate
-        for other, t, item in held:  # was not plausible in the time that is over
-            self._take(other, t, item)
+        for other, t, row in held:  # was not plausible in the time that is over
+            self._take(other, t, row)
 
     def _feed(self, until):
         """Use what is stamped up to `until`, s, and between it what poses were told."""
@@ -277,16 +290,13 @@ class Estimator:
         return parts
 
     def _has_begun(self):
-        return any(self._waiting) or self._fed_until > -math.inf
+        return any(map(len, self._waiting)) or self._fed_until > -math.inf
 
     def _feed_measurements(self, until):
-        counts = [bisect_right(waiting, until, key=itemgetter(0)) for waiting in self._waiting]
-        if not (any(counts) or self._refused):
+        imu, tdoa, *felt = (waiting.take(until) if len(waiting) else NONE[k] for k, waiting in enumerate(self._waiting))
+        felt = np.concatenate(felt) if any(map(len, felt)) else NO_AIDS
+        if not (len(imu) or len(tdoa) or len(felt) or self._refused):
             return NOTHING
-        imu, tdoa, *felt = (np.array(waiting[:n], kind) for waiting, n, kind in zip(self._waiting, counts, KINDS))
-        for waiting, n in zip(self._waiting, counts):
-            del waiting[:n]
-        felt = np.concatenate(felt) if any(counts[FIRST_AID:]) else NO_AIDS
         felt = felt[np.lexsort((felt["kind"], felt["t"]))] if len(felt) > 1 else felt
         odometry, outcome, of_aids = feed(
             self._memory, self._tuning, Measurements(imu if self.config.use_imu else imu[:0], tdoa, felt)
@@ -317,8 +327,15 @@ class Estimator:
         return Residuals(*columns)
 
 
-NO_AIDS = np.empty(0, AID)
+NONE = [np.empty(0, kind) for kind in KINDS]
+NO_AIDS = NONE[FIRST_AID]
 NOTHING = Odometry.from_rows(np.empty(0, ODOMETRY)), Residuals(*(np.empty(0) for _ in range(7)))
+
+
+def invalid(t, a, b):
+    """Residuals of TDOAs that no Estimator took: t (n,) s; a, b (n,) ids."""
+    unknown, none = np.full((2, len(t)), math.nan), np.zeros(len(t))
+    return Residuals(t, a, b, *unknown, none, np.full(len(t), INVALID, np.uint8))
 
 
 def _joined(parts):
@@ -326,10 +343,3 @@ def _joined(parts):
     parts = [part for part in parts if len(part.t)] or parts[:1]
     kind = type(parts[0])
     return kind(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind)))
-
-
-def _insert(item, waiting):
-    if waiting and item < waiting[-1]:
-        insort(waiting, item)
-    else:
-        waiting.append(item)

@@ -7,7 +7,6 @@ frame with rotations about its fixed axes, twist in the child (body) frame.
 import math
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
@@ -21,15 +20,37 @@ def to_odometry(q, v, covariance):
     in the body frame. Returns u = R(q)' v, (n, 3) m/s, and (n, 9, 9) of [position, rotation about the world's axes,
     u]. An attitude error dtheta is R dtheta in the world; with an error dv, u changes by R' dv + u x dtheta.
     """
-    to_world = Rotation.from_quat(q).as_matrix()
-    to_body = to_world.transpose(0, 2, 1)
-    u = (to_body @ v[:, :, None])[:, :, 0]
-    jacobian = np.zeros((len(q), 9, 9))
-    jacobian[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    jacobian[:, 3:6, 6:] = to_world
-    jacobian[:, 6:, 3:6] = to_body
-    jacobian[:, [6, 6, 7, 7, 8, 8], [7, 8, 6, 8, 6, 7]] = u[:, [2, 1, 2, 0, 1, 0]] * (-1, 1, 1, -1, -1, 1)  # [u]x
-    return u, jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+    u, out = np.empty((len(q), 3)), np.empty((len(q), 9, 9))
+    _to_odometry(np.ascontiguousarray(q), np.ascontiguousarray(v), np.ascontiguousarray(covariance), u, out)
+    return u, out
+
+
+@compiled
+def _to_odometry(q, v, covariance, u, out):
+    R, jacobian, half = np.empty((3, 3)), np.zeros((9, 9)), np.empty((9, 9))
+    for n in range(len(q)):
+        rotation(q[n, 0], q[n, 1], q[n, 2], q[n, 3], R)
+        for i in range(3):
+            u[n, i] = R[0, i] * v[n, 0] + R[1, i] * v[n, 1] + R[2, i] * v[n, 2]
+            jacobian[i, i] = 1.0
+            for j in range(3):
+                jacobian[3 + i, 6 + j] = R[i, j]
+                jacobian[6 + i, 3 + j] = R[j, i]
+        jacobian[6, 7], jacobian[6, 8] = -u[n, 2], u[n, 1]  # [u]x
+        jacobian[7, 6], jacobian[7, 8] = u[n, 2], -u[n, 0]
+        jacobian[8, 6], jacobian[8, 7] = -u[n, 1], u[n, 0]
+        _multiply(jacobian, covariance[n], half)
+        _multiply(half, jacobian.T, out[n])
+
+
+@compiled
+def _multiply(a, b, out):
+    for i in range(9):
+        for j in range(9):
+            total = 0.0
+            for k in range(9):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
 
 
 def rotation_std(q, covariance):

@@ -19,22 +19,14 @@ class ImuMount:
         self._t, self._slow = None, np.zeros(3)  # s, stamp of the last sample, and slow part of its rate, rad/s
 
     def in_body(self, t, gyro, accel):
-        """gyro (3,) rad/s and accel (3,) m/s^2 in the body frame, of one sample at t s. Stamps rise, but for outliers."""
-        gyro, accel = self._matrix @ gyro, self._matrix @ accel
-        if not self._centred and np.isfinite(gyro).all():
-            accel = accel - np.cross(self._angular_acceleration(t, gyro), self._arm)
-            accel -= np.cross(gyro, np.cross(gyro, self._arm))
-        return gyro.tolist(), accel.tolist()
-
-    def all_in_body(self, t, gyro, accel):
-        """(gyro, accel), (n, 3) each, of samples at t (n,) s: what `in_body` gives for one after the other."""
-        rates, forces = gyro @ self._matrix.T, accel @ self._matrix.T
+        """gyro (n, 3) rad/s and accel (n, 3) m/s^2 in the body frame, of samples at t (n,) s. Stamps rise, but for outliers."""
+        gyro, accel = gyro @ self._matrix.T, accel @ self._matrix.T
         if not self._centred:
-            slopes = np.zeros_like(rates)
-            for k in np.flatnonzero(np.isfinite(rates).all(axis=1)):
-                slopes[k] = self._angular_acceleration(t[k], rates[k])
-            forces = forces - np.cross(slopes, self._arm) - np.cross(rates, np.cross(rates, self._arm))
-        return rates, forces
+            slopes = np.zeros_like(gyro)
+            for k in np.flatnonzero(np.isfinite(gyro).all(axis=1)):
+                slopes[k] = self._angular_acceleration(t[k], gyro[k])
+            accel = accel - np.cross(slopes, self._arm) - np.cross(gyro, np.cross(gyro, self._arm))
+        return gyro, accel
 
     def _angular_acceleration(self, t, gyro):
         """rad/s^2, (3,): slope of the slow part."""

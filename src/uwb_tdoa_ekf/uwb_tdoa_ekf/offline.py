@@ -96,7 +96,7 @@ def _imu_samples(imu):
     """(n,) of IMU_SAMPLE, those that can be measurements; of an Imu, or None."""
     if imu is None:
         return np.empty(0, IMU_SAMPLE)
-    sane = usable_imu(imu.gyro, imu.accel) & np.isfinite(imu.t)
+    sane = usable_imu(imu.t, imu.gyro, imu.accel)
     return structured(IMU_SAMPLE, imu.t[sane], imu.gyro[sane], imu.accel[sane])
 
 

@@ -67,10 +67,10 @@ def test_sensors_are_taken_to_the_body(flight, tmp_path, robot):
     other = [(plate, f"{robot}imu_link", [0.1, 0.0, 0.0], TURN.as_quat())]  # from another broadcaster
     path = mounted(flight, tmp_path / "m.bag", half, other, robot=robot)
     read = bag.read_bag(path)
-    mount = ImuMount(TURN, ARM)
-    rows = [mount.in_body(*row) for row in zip(flight.imu.t, TURN.inv().apply(flight.imu.gyro), TURN.inv().apply(flight.imu.accel))]
+    of_sensor = (TURN.inv().apply(samples) for samples in (flight.imu.gyro, flight.imu.accel))
+    _, accel = ImuMount(TURN, ARM).in_body(flight.imu.t, *of_sensor)
     np.testing.assert_allclose(read.imu.gyro, flight.imu.gyro, atol=1e-9)
-    np.testing.assert_allclose(read.imu.accel, [accel for _, accel in rows], atol=1e-9)
+    np.testing.assert_allclose(read.imu.accel, accel, atol=1e-9)
     assert read.meta["antenna"] == pytest.approx(ANTENNA) and "remarks" not in read.meta
     checked = read_recording(Reading(), path)
     np.testing.assert_allclose(checked.imu.accel, read.imu.accel, atol=1e-9)

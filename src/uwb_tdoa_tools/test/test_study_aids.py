@@ -33,11 +33,11 @@ def said(flight, monkeypatch):
     begin, end = flight.imu.t[[0, -1]]
     for now in np.arange(begin + 1.0, end):
         monkeypatch.setattr("time.monotonic", lambda: now)
-        judge.imu, judge.tdoa = (int(np.sum(stream.t < now)) for stream in (flight.imu, flight.tdoa))
+        judge.received["imu"], judge.received["tdoa"] = (int(np.sum(stream.t < now)) for stream in (flight.imu, flight.tdoa))
         counts = Counter()
         for name, outcome in run.aids.items():
             heard = getattr(flight, name).t < now
-            judge.aids[name] = int(np.sum(heard))
+            judge.received[name] = int(np.sum(heard))
             counts.update({f"{name}_{word}": int(np.sum(outcome["verdict"][heard] == v)) for v, word in VERDICTS.items()})
         out.append(judge.report(None, RUNNING, counts)[:2])
     return out

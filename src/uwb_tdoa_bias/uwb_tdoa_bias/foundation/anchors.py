@@ -75,6 +75,8 @@ class Anchors:
     def index(self, ids):
         """Rows of the given ids: int array of the shape of `ids`, -1 where an id is unknown."""
         ids = np.asarray(ids)
+        if ids.size < 100:  # few are looked up faster than sorted
+            return np.array([self.row(i) for i in ids.ravel().tolist()], dtype=np.intp).reshape(ids.shape)
         order = np.argsort(self.ids)
         at = np.clip(np.searchsorted(self.ids[order], ids), 0, len(self.ids) - 1)
         return np.where(self.ids[order][at] == ids, order[at], -1)

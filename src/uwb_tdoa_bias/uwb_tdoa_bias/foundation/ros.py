@@ -52,13 +52,22 @@ class StreamInput:
     lost : messages that were sent and that DDS did not deliver, as far as it knows.
     """
 
-    def __init__(self, node, kind, topic, callback):
+    def __init__(self, node, kind, topic, callback, raw=False):
+        """raw : messages as bytes, which `drain` needs."""
         self.lost, self._before = 0, 0
         self._node, self._topic = node, topic
         events = SubscriptionEventCallbacks(message_lost=self._on_lost)
         self._subscription = node.create_subscription(
-            kind, topic, callback, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES
+            kind, topic, callback, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES, raw=raw
         )
+
+    def drain(self, keep):
+        """Take what has arrived: keep(data, arrival) is called for each message, which arrived then, ns since 1970."""
+        kind, handle = self._subscription.msg_type, self._subscription.handle
+        with handle:
+            while (taken := handle.take_message(kind, True)) is not None:
+                data, about = taken
+                keep(data, about["received_timestamp"] or time.time_ns())
 
     def _on_lost(self, status):
         self.lost += status.total_count_change
@@ -103,6 +112,17 @@ class Epoch:
         if self._second is None:
             self._second = stamp.sec
         return (stamp.sec - self._second) + 1e-9 * stamp.nanosec
+
+    def seconds_of(self, sec, nanosec):
+        """Float s, (n,), of the two parts of stamps, (n,) each."""
+        if self._second is None:
+            self._second = int(sec[0])
+        return (sec.astype(np.int64) - self._second) + 1e-9 * nanosec
+
+    def parts(self, t):
+        """What `seconds_of` was given, to the nanosecond, of t (n,) s."""
+        second, nanosecond = np.divmod(np.round(t * 1e9).astype(np.int64), 10**9)
+        return self._second + second, nanosecond
 
     @property
     def begin(self):

@@ -19,8 +19,14 @@ class FramesInput:
         self.frames = Frames()
         self._seconds, self._on_new = seconds, on_new
         node.create_subscription(TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS)
-        if moving:
-            node.create_subscription(TFMessage, "/tf", self._on_moving, TF_QOS)
+        self._moving = node.create_subscription(TFMessage, "/tf", self._on_moving, TF_QOS) if moving else None
+
+    def catch_up(self):
+        """Take what has arrived of frames that move, before what was measured among them."""
+        if self._moving is not None:
+            with self._moving.handle:
+                while (taken := self._moving.handle.take_message(TFMessage, False)) is not None:
+                    self._on_moving(taken[0])
 
     def _on_static(self, message):
         new = [self.frames.set(*_of(transform)) for transform in message.transforms]

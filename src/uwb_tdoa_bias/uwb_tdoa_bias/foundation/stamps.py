@@ -34,6 +34,17 @@ class StampGate:
         self._held = [(t, item)]
         return [], held, False
 
+    def take_all(self, stamps):
+        """Whether items stamped so, a list of s in the order of their arrival, are all plausible; then they are accepted."""
+        newest = self.newest if self.newest > -math.inf else stamps[0]
+        for t in stamps:
+            if not newest - LARGEST_STEP_BACK <= t <= newest + LARGEST_STEP_AHEAD:
+                return False
+            newest = max(newest, t)
+        if not self._held:
+            self.newest = newest
+        return not self._held
+
     def note(self, t):
         """Note the time t, s, of an item that is good for nothing else."""
         if self._is_plausible(t):

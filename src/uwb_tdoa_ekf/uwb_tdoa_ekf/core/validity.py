@@ -34,6 +34,12 @@ def usable_all(a, b, d, variance, positions):
     return out
 
 
-def usable_imu(gyro, accel):
-    """(n,) bool: finite and within the range of any sensor. gyro (n, 3) rad/s, accel (n, 3) m/s^2."""
-    return (np.abs(gyro) < MAX_RATE).all(axis=-1) & (np.abs(accel) < MAX_ACCEL).all(axis=-1)
+@compiled
+def usable_imu(t, gyro, accel):
+    """(n,) bool: finite and within the range of any sensor. t (n,) s; gyro (n, 3) rad/s, accel (n, 3) m/s^2."""
+    out = np.empty(len(t), np.bool_)
+    for i in range(len(t)):
+        out[i] = math.isfinite(t[i])
+        for k in range(3):  # NaN is not below anything
+            out[i] = out[i] and abs(gyro[i, k]) < MAX_RATE and abs(accel[i, k]) < MAX_ACCEL
+    return out

@@ -1,5 +1,6 @@
 """What ekf_node says about itself on /diagnostics, and what to do about it."""
 
+from collections import Counter
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -33,8 +34,7 @@ class Health:
 
     def __init__(self, config, lag, volume=None):
         """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
-        self.imu = self.tdoa = 0  # messages received
-        self.aids = dict.fromkeys(aids.STREAMS, 0)  # messages received of each
+        self.received = Counter()  # messages of each stream: imu, tdoa, and those of aids
         self.last_odometry = None  # time.monotonic(), s
         self.last_position = None  # (3,) m and its covariance (3, 3) m^2
         self.behind = None  # s from the stamp of the newest odometry to the present time of ROS
@@ -55,7 +55,7 @@ class Health:
         rules over streams. What is wrong with the streams is said before what comes of it.
         """
         now = time.monotonic()
-        imu_rate, tdoa_rate = self._imu_rate.of(self.imu), self._tdoa_rate.of(self.tdoa)
+        imu_rate, tdoa_rate = self._imu_rate.of(self.received["imu"]), self._tdoa_rate.of(self.received["tdoa"])
         running = estimator is not None and estimator.running
         if running or not tdoa_rate:
             self._starting = None
@@ -101,7 +101,8 @@ class Health:
     def _judge_aids(self, now, counts):
         """Whether height, pressure and velocity that were there still are, and are used."""
         judgement = OK, "running"
-        for aid, received in self.aids.items():
+        for aid in aids.STREAMS:
+            received = self.received[aid]
             before, since = self._aids_heard.get(aid, (0, now))
             if received != before:
                 since = now

@@ -30,11 +30,11 @@ class StreamWatch:
         self._sign = SignWatch(self._anchors)
 
     def add_imu(self, t, arrival, gyro, accel):
-        """Take a sample: stamp and arrival, s, of one clock if possible; gyro (3,) rad/s; accel (3,) m/s^2."""
-        self._imu.append((t, arrival, *gyro, *accel))
+        """Take samples: stamps and arrivals, (n,) s, of one clock if possible; gyro (n, 3) rad/s; accel (n, 3) m/s^2."""
+        self._imu.append((t, arrival, gyro, accel))
 
     def add_tdoa(self, t, arrival, a, b, d):
-        """Take a raw TDOA: stamp and arrival, s; a, b ids; d m."""
+        """Take raw TDOAs: stamps and arrivals, (n,) s; a, b (n,) ids; d (n,) m."""
         self._tdoa.append((t, arrival, a, b, d))
 
     def findings(self):
@@ -43,12 +43,11 @@ class StreamWatch:
         tdoa, self._tdoa = self._tdoa, []
         rules = self._rules
         if imu:
-            table = np.array(imu)
-            rules.feed_imu(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5:8])
+            rules.feed_imu(*map(np.concatenate, zip(*imu)))
         if tdoa:
-            t, arrival, a, b, d = zip(*tdoa)
-            rules.feed_tdoa(np.array(t), np.array(arrival), np.array(a), np.array(b), np.array(d))
-            self._sign.feed(np.array(t), np.array(a), np.array(b), np.array(d))
+            t, arrival, a, b, d = map(np.concatenate, zip(*tdoa))
+            rules.feed_tdoa(t, arrival, a, b, d)
+            self._sign.feed(t, a, b, d)
         if max(len(rules.imu), len(rules.tdoa)) < FEWEST:
             return []
         still = {finding.rule for finding in rules.findings(FEWEST)}

@@ -44,7 +44,7 @@ def place_of(frames, frame):
 
 def imu_in_body(imu, place):
     """The Imu with the samples of one that is at a place (see `place_of`), in the origin of the body."""
-    return Imu(imu.t, *ImuMount(*place).all_in_body(imu.t, imu.gyro, imu.accel))
+    return Imu(imu.t, *ImuMount(*place).in_body(imu.t, imu.gyro, imu.accel))
 
 
 def placed(frames, topic, counts):
