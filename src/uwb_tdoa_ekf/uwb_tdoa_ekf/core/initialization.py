@@ -15,6 +15,7 @@ from .state import GRAVITY
 MINIMUM = 12  # TDOAs a search needs
 AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
 CLEARLY_MORE = 0.2  # share by which a recovery must explain more than the filter does
+RECOVERY_WINDOW = 0.3  # s of TDOAs that a recovery rests on: a tag that leaves a floor must not wait for those of the floor
 SEARCH_PERIOD = 0.1  # s between two searches
 TILT_STD = 0.1  # rad, at the start
 SMALLEST_STD = 0.03  # m, of a height that is known at the start
@@ -131,7 +132,7 @@ def _turn(hypothesis, yaw, std):
 @compiled
 def recover(ekf, anchors, tuning, t, history):
     """If the window agrees on a position and the filter on another one, go there; attitude and biases stay."""
-    window = _recent(ekf, tuning.start_window)
+    window = _recent(ekf, min(tuning.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
