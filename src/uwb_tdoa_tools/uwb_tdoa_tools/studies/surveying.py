@@ -42,8 +42,9 @@ def add_options(add):
     """add : add_argument of a parser."""
     add("--data", type=Path, required=True, metavar="DATA", help="folder of measured flights")
     add("--draws", type=int, default=20, metavar="N", help="of each set and each size of the errors (default 20)")
+    add("--first", type=int, default=0, metavar="SEED", help="of the first draw (default 0)")
     add("--only", choices=(*SETS, "simulated"), help="one set")
-    add("--known", choices=(*KNOWN, "odometry"), help="instead: flights of every day and constellation with this known beside, judged on others")
+    add("--known", choices=(*KNOWN, "odometry"), help="instead: flights of every split with this known beside, judged on others")
     add("--split", choices=tuple(SPLITS), help="with --known: one of these alone")
     add("--json", type=argparse.FileType("w"), metavar="FILE", help="write every draw")
 
@@ -58,7 +59,8 @@ def run(args):
     for name in [args.only] if args.only else [*SETS, "simulated"]:
         flights, judged = _simulated() if name == "simulated" else _measured(args.data, *SETS[name])
         for std in SHAKES:
-            draws = [draw(flights, judged, std, seed) for seed in tqdm(range(args.draws), desc=f"{name} {std}", disable=None)]
+            seeds = tqdm(range(args.first, args.first + args.draws), desc=f"{name} {std}", disable=None)
+            draws = [draw(flights, judged, std, seed) for seed in seeds]
             every[f"{name} {std}"] = draws
             print(f"| {name} | {std} | {_summary(draws)} |", flush=True)
     if args.json:
@@ -141,6 +143,9 @@ def draw(flights, judged, std, seed):
         "shaken": rmse([at(flight, rough) for flight in judged]),
         "surveyed": rmse([at(flight, result.anchors.positions) for flight in judged], result.effects),
         "applied": result.why_not is None,
+        "slow_before": result.surveyed.before,
+        "slow_left": result.surveyed.left,
+        "delay_std": result.surveyed.delay_std,
         "anchors_shaken": _root((rough - true.positions)[free]),
         "anchors_surveyed": _root(error[free]),
         "normalised": _root((error / result.surveyed.position_std)[free]),
