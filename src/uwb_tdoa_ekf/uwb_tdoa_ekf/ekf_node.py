@@ -43,6 +43,7 @@ from .imu_mount import ImuMount
 from .monitoring.health import OK, WARN, Health
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs
+from .streams import ERROR as SEVERE
 from .told_pose import told_pose
 
 # Of each stream: topic, type and the fields of its messages that are read.
@@ -263,7 +264,10 @@ class EkfNode(Node):
         restarts, self._restarts = self._restarts, self._estimator.counts["restarts"]
         if self._restarts != restarts:
             self._watch.restart()
-        return self._watch.findings()
+        findings = self._watch.findings()
+        wrong_imu = any(finding.severity == SEVERE and finding.rule.startswith("imu_") for finding in findings)
+        self._estimator.distrust_imu(wrong_imu)
+        return findings
 
     def _wiring(self):
         """What is wrong with who publishes what to whom, a list of sentences."""

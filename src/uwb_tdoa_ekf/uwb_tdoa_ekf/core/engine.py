@@ -71,6 +71,22 @@ def tell_pose(memory, tuning, pose):
     _tell(memory, tuning, pose, history.NOTHING)
 
 
+@compiled
+def _distrust(memory, tuning, distrusted, records):
+    ekf = memory.ekf[0]
+    if ekf.running and distrusted != ekf.distrusted:
+        if distrusted:
+            initialization.widen(ekf)
+        else:
+            initialization.level_anew(ekf, tuning[0], records)
+    ekf.distrusted = distrusted
+
+
+def distrust_imu(memory, tuning, distrusted):
+    """Go without inertial samples from here on, or with them again: from the attitude that they then have."""
+    _distrust(memory, tuning, distrusted, history.NOTHING)
+
+
 def most_records(measurements):
     """Room that a history needs for Measurements that are fed at once."""
     imu, tdoa, aid = measurements
@@ -84,7 +100,7 @@ def most_records(measurements):
 def _on_imu(ekf, tuning, sample, records):
     fresh = inertial.observe(ekf.imu, sample, tuning.imu_timeout)
     if ekf.running and _advance(ekf, tuning, sample.t, records):
-        ekf.quiet = tuning.zero_velocity and fresh and inertial.is_quiet(ekf.imu)
+        ekf.quiet = tuning.zero_velocity and fresh and not ekf.distrusted and inertial.is_quiet(ekf.imu)
         if ekf.quiet and sample.t >= ekf.next_rest:
             ekf.next_rest = sample.t + REST_PERIOD
             _rest(ekf, sample.t, records)
@@ -143,7 +159,7 @@ def _advance(ekf, tuning, t, records):
     if t - ekf.t > LOST_TIME:
         ekf.running, ekf.first_tdoa, ekf.next_search = False, t, -np.inf
         return False
-    sensed = tuning.use_imu and t - ekf.imu.t < tuning.imu_timeout
+    sensed = tuning.use_imu and t - ekf.imu.t < tuning.imu_timeout and not ekf.distrusted
     if sensed and ekf.t < t:
         inertial.weigh(ekf.imu, ekf.quiet, tuning)
     while ekf.t < t:

@@ -18,6 +18,7 @@ CLEARLY_MORE = 0.2  # share by which a recovery must explain more than the filte
 RECOVERY_WINDOW = 0.3  # s of TDOAs that a recovery rests on: a tag that leaves a floor must not wait for those of the floor
 SEARCH_PERIOD = 0.1  # s between two searches
 TILT_STD = 0.1  # rad, at the start
+WRONG_POSITION = 1.0  # m, that inertial samples which are wrong have made
 SMALLEST_STD = 0.03  # m, of a height that is known at the start
 
 
@@ -151,6 +152,25 @@ def recover(ekf, anchors, tuning, t, history):
     ekf.consistency = 1.0
     ekf.recoveries += 1
     add_reset(ekf, t, history)
+
+
+@compiled
+def widen(ekf):
+    """What was integrated lately was wrong: nobody knows by how much, but the TDOAs."""
+    for h in range(HYPOTHESES):
+        for k in range(3):
+            ekf.hypotheses[h].P[k, k] += WRONG_POSITION**2
+            ekf.hypotheses[h].P[3 + k, 3 + k] += SPEED**2
+
+
+@compiled
+def level_anew(ekf, tuning, history):
+    """Stay at position and velocity; attitude as at a start: level, the yaw unknown; biases as at a start too."""
+    best = ekf.hypotheses[ekf.best]
+    x, y, z, w = best.x[6], best.x[7], best.x[8], best.x[9]
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    _begin(ekf, tuning, ekf.t, best.x[:6].copy(), best.P[:6, :6].copy(), yaw, 2.0 * math.pi)
+    add_reset(ekf, ekf.t, history)
 
 
 @compiled

@@ -105,6 +105,7 @@ EKF = _record(
     ("barometer", BAROMETER),
     ("velocity", VELOCITY),
     ("next_floor", float),  # s, stamp before which not to say again that the tag is at its fixed height
+    ("distrusted", bool),  # the inertial samples are wrong, somebody says: not used
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
     ("workspace", float, (2, 3)),  # m, lower and upper bounds, see workspace.py
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
