@@ -329,6 +329,8 @@ def _warm_up(config):
         odometry, _ = estimator.advance()
     to_odometry(odometry.q, odometry.v, odometry.covariance)
     watch.findings()
+    estimator.distrust_imu(True)
+    estimator.distrust_imu(False)
     estimator.tell_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
     estimator.finish()
 
