@@ -83,6 +83,24 @@ def test_with_aids_too_skew_changes_nothing(seed, delay):
     assert_aids_as_offline(flight, order=order, advance=lambda: rng.random() < 0.3)
 
 
+@settings(max_examples=5)
+@given(seeds)
+def test_batches_are_what_their_messages_are_one_by_one(seed):
+    flight, rng, parts = spoiled(with_aids(fly(2, 2.0))), np.random.default_rng(seed), []
+    estimator, cut = Estimator(flight.anchors), flight.imu.t[0]
+    while cut <= flight.imu.t[-1]:
+        before, cut = cut, cut + rng.choice([0.001, 0.01, 0.1])
+        for name in ("imu", "tdoa", *AIDS):
+            columns = [column for key, column in vars(getattr(flight, name)).items() if key != "variance"]
+            some = (columns[0] >= before) & (columns[0] < cut)
+            if some.any():
+                getattr(estimator, f"add_{name}")(*(column[some] for column in columns))
+        parts.append(estimator.advance()[0])
+    expected = run_offline(flight)
+    assert_same(joined([*parts, estimator.finish()[0]]), expected.odometry)
+    assert {name: estimator.counts[name] for name in VERDICTS.values()} == expected.counts
+
+
 def test_an_aid_that_stops_is_waited_for_for_a_second_and_then_done_without():
     flight = with_aids(fly(3, 6.0))
     estimator, behind = Estimator(flight.anchors), {}
