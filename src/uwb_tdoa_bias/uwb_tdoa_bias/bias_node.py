@@ -28,7 +28,7 @@ from .foundation.ros_parameters import Parameter, declare_all, refuse_unknown, s
 from .foundation.ros_streams import Streams
 from .foundation.ros_wire import Wire
 from .correction.pose_queue import PoseQueue
-from .correction.network import SHIPPED, load_network
+from .correction.network import UNASKED, load_network, unasked
 from .correction.poses import known_yaw_std
 from .foundation.stamps import StampGate
 
@@ -38,7 +38,9 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
         "", 'path of an effects.yaml: which systematic effects to remove, with which values; "" for none'
     ),
     "model_file": Parameter(
-        SHIPPED, 'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 modules'
+        UNASKED,
+        'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 modules; auto: default, or none '
+        "beside effects_file, whose effects were found without it",
     ),
     "pose_lag": Parameter(
         0.05, "s; a TDOA is corrected at the newest pose at least this much older than the TDOA before it", 0.001, 10.0
@@ -74,7 +76,7 @@ class BiasNode(Node):
         self._lag, self._limit, self._body = own["pose_lag"], own["hold"], own["body_frame"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._late = self._effects.stamp_offset("tdoa")  # s
-        self._network = load_network(model_file)
+        self._network = load_network(unasked(effects_file) if model_file == UNASKED else model_file)
         self._model = self._warm_up()
         self._idle = self._model[NETWORK] == "none"
         self._corrector = None

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from uwb_tdoa_bias.correction.network import SHIPPED, load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -102,22 +103,34 @@ def test_no_truth_is_bad_input(flight):
 
 
 def test_report_of_one_flight(flight, bag, tmp_path, capsys):
-    told = report([bag], tmp_path)
+    told = report([bag, "--no-bias"], tmp_path)
     (row,) = told["runs"]
     assert NEEDED <= set(row) and NEEDED <= set(told["pooled"])
     assert row["flight"] == flight.name
     assert row["rmse_3d"] == pytest.approx(evaluate(flight)[0].row()["rmse_3d"], abs=1e-4)  # stamps are rounded to ns
     assert told["pooled"]["rmse_3d"] == row["rmse_3d"] and told["pooled"]["diverged"] == 0
     first, *table = capsys.readouterr().out.splitlines()
-    assert first == "correcting with: nothing; bias_node by itself takes its network, too: --model default"
+    assert first == "correcting with: nothing"
     assert table[0].split()[:5] == ["flight", "x", "y", "z", "3D"]
     assert table[1].startswith(flight.name) and f"{row['rmse_3d']:.3f}" in table[1]
+
+
+def test_corrects_with_what_bias_node_takes_unasked(flight, bag, tmp_path, capsys):
+    effects = tmp_path / "effects.yaml"
+    EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.1}),)).to_yaml(effects)
+    (row,) = report([bag], tmp_path)["runs"]
+    assert row["rmse_3d"] == pytest.approx(evaluate(flight, network=load_network(SHIPPED))[0].row()["rmse_3d"], abs=1e-4)
+    assert main([str(bag), "--effects", str(effects)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("correcting")] == [
+        "correcting with: default", "correcting with: anchor_delay",
+    ]  # fmt: skip
 
 
 def test_no_bias_runs_without_effects(flight, bag, tmp_path):
     effects = tmp_path / "effects.yaml"
     EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.8}),)).to_yaml(effects)
-    plain = report([bag], tmp_path)["runs"]
+    plain = report([bag, "--no-bias"], tmp_path)["runs"]
     spoiled = report([bag, "--effects", effects], tmp_path)["runs"]
     assert report([bag, "--effects", effects, "--no-bias"], tmp_path)["runs"] == plain
     assert spoiled[0]["rmse_3d"] > plain[0]["rmse_3d"] + 0.05
@@ -142,7 +155,7 @@ def test_recorded_odometry_is_judged(flight, bag, tmp_path):
     odometry = run_offline(flight).odometry
     off = replace(odometry, p=odometry.p + [0.3, 0.0, 0.0])
     recorded = write_odometry(tmp_path / "recorded", off)
-    own, judged = report([bag], tmp_path)["runs"][0], report([bag, "--odometry", recorded], tmp_path)["runs"][0]
+    own, judged = report([bag, "--no-bias"], tmp_path)["runs"][0], report([bag, "--odometry", recorded], tmp_path)["runs"][0]
     assert judged["rmse_x"] == pytest.approx(0.3, abs=0.05)
     assert judged["rmse_y"] == pytest.approx(own["rmse_y"], abs=1e-3)
     assert judged["nees_mean"] > own["nees_mean"]

@@ -28,6 +28,7 @@ from .features import NAMES, everything
 
 MODELS = Path(__file__).parent / "models"
 SHIPPED = "default"  # instead of a path: the model that comes with the package
+UNASKED = "auto"  # where nobody named a model: see `unasked`
 _COLUMN = {name: column for column, name in enumerate(NAMES)}
 
 
@@ -36,6 +37,12 @@ def load_network(name):
     if not name:
         return None
     return Network(MODELS / "default.onnx" if str(name) == SHIPPED else name)
+
+
+def unasked(effects):
+    """What `load_network` loads where nobody named a model: the one shipped, but nothing beside effects, which were found, and
+    judged, without it. effects : path of an effects.yaml, or None."""
+    return "" if effects else SHIPPED
 
 
 class Network:

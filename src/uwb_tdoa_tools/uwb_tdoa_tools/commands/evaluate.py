@@ -5,7 +5,7 @@ import sys
 
 from tqdm import tqdm
 
-from uwb_tdoa_bias.correction.network import SHIPPED, load_network
+from uwb_tdoa_bias.correction.network import load_network, unasked
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.aids import STREAMS
 
@@ -39,7 +39,11 @@ def parser():
     add = made.add_argument
     options.add_recordings(made)
     options.add_filter(made, "effects.yaml: systematic effects to correct for")
-    add("--model", metavar="FILE", help='ONNX bias network to correct with; "default" is the one shipped')
+    add(
+        "--model", metavar="FILE",
+        help='ONNX bias network to correct with; "default" is the one shipped, which is taken, as bias_node takes it, where '
+        "neither this nor --effects is given",
+    )  # fmt: skip
     add("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
     add(
         "-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[],
@@ -67,7 +71,7 @@ def _evaluate(args):
     config, effects = options.filter_of(args)
     without = [f"use_{aid}:=false" for aid in args.without]
     config = options.with_parameters(config, args.parameters + without)
-    network = None if args.no_bias else load_network(args.model)
+    network = None if args.no_bias else load_network(unasked(args.effects) if args.model is None else args.model)
     given = {effect.name for effect in effects.effects} if effects else set()
     if network and (lacking := sorted(set(network.trained_with) - given)):
         cli.say("evaluate", f"{args.model} was trained with {', '.join(lacking)} taken out, which no --effects gives; "
@@ -83,7 +87,7 @@ def _evaluate(args):
     )  # fmt: skip
     scores = []
     if not args.odometry:
-        print(_correction(judge.effects, judge.network, args.no_bias))
+        print(f"correcting with: {'+'.join(part.name for part in (judge.effects, judge.network) if part) or 'nothing'}")
     print(table.head())
     for score in parallel.over(judge, found, args.jobs, args.dask):
         scores.append(score)
@@ -104,13 +108,6 @@ def _evaluate(args):
         cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
                 "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip
     return int(late > 0)
-
-
-def _correction(effects, network, nothing):
-    """What is corrected with, and what bias_node by itself would correct with."""
-    names = [part.name for part in (effects, network) if part]
-    others = "" if network or nothing else f"; bias_node by itself takes its network, too: --model {SHIPPED}"
-    return f"correcting with: {'+'.join(names) or 'nothing'}{others}"
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import shlex
 import shutil
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import SHIPPED, load_network
+from uwb_tdoa_bias.correction.network import SHIPPED, load_network, unasked
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
@@ -58,7 +58,7 @@ def measured(path, reading, effects_file=None, model=None):
     if flight.truth is None:
         raise InputError(f"{path}: holds no ground truth to compare with; take a flight that has it.")
     airborne(flight.truth)
-    return Case(flight, effects_file, model or (None if effects_file else SHIPPED))
+    return Case(flight, effects_file, model or unasked(effects_file))
 
 
 def fly(case, folder, rate=1.0, say=print):
