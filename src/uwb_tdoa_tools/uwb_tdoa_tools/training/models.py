@@ -71,7 +71,7 @@ def train(
     else:
         growing = _growing(len(training), seed, curve)
         model, free, errors, left = _structured(*groups, seed, options, progress, growing, free, kind == "physics")
-        effects = EffectSet((*free.effects, *effects.effects)) if effects else None
+        effects = None if effects is None else EffectSet((*free.effects, *effects.effects))
     everything = [*groups[0], *groups[1]]
     meta = {
         "name": name, "kind": kind, "clip": CLIP, "seed": seed, "data": labelling.digest([*raw[0], *raw[1]]),
