@@ -15,7 +15,7 @@ from rig import make_rig  # noqa: E402, F401
 from stream_faults import FAULTS, PUBLISHERS, lanes_of, play, publish_twice  # noqa: E402
 
 SECONDS = 6.0  # s of each fault, and within which it is named
-LANES = 4
+LANES = 3  # more of them make this player late on two cores that do other things too: blocks then count as its own
 FLIGHTS = [  # faults that do not hide each other come together
     (), ("IMU in g", "every TDOA twice"), ("gyroscope in degrees/s", "TDOAs shuffled by 50 ms"),
     ("IMU upside down", "a second tag"), ("IMU 0.5 s ahead",), ("IMU 0.5 s behind",), ("TDOAs stamped 0",),
@@ -39,7 +39,7 @@ def test_every_fault_is_named_and_a_healthy_flight_runs(make_rig):
                 assert statuses[-1].message == "running" and statuses[-1].level == DiagnosticStatus.OK, said
                 assert {values_of(status)["wrong with the streams"] for status in statuses} == {"nothing"}
             for name in names:
-                assert any(re.search(FAULTS[name][1], text) for text in said), (name, said)
+                assert any(re.search(FAULTS[name][1], text) for text in said), (name, said, [values_of(each) for each in statuses])
                 assert statuses[-1].level != DiagnosticStatus.OK and statuses[-1].message != "running", (name, said)
 
     lane = lanes[0]
