@@ -1,10 +1,12 @@
 """Feed a flight to an Estimator message by message."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 
 from uwb_tdoa_ekf.core.aids import STREAMS
+from uwb_tdoa_ekf.estimator import VERDICTS, Estimator
+from uwb_tdoa_ekf.offline import run_offline
 
 IMU, TDOA, HEIGHT, PRESSURE, VELOCITY = range(5)
 
@@ -61,3 +63,17 @@ def assert_same(left, right, tolerance=0.0):
         a, b = getattr(left, field.name), getattr(right, field.name)
         assert len(a) == len(b), field.name
         np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance, err_msg=field.name)
+
+
+def assert_same_as_offline(flight, config=None, **feeding):
+    estimator = Estimator(flight.anchors, config)
+    odometry, residuals = feed(estimator, flight, **feeding)
+    expected = run_offline(flight, config)
+    assert_same(odometry, expected.odometry)
+    assert_same(by_stamp(residuals), by_stamp(expected.residuals))  # what is refused is told at once
+    assert {name: estimator.counts[name] for name in VERDICTS.values()} == expected.counts
+
+
+def by_stamp(residuals):
+    order = np.argsort(residuals.t, kind="stable")
+    return replace(residuals, **{field.name: getattr(residuals, field.name)[order] for field in fields(residuals)})
