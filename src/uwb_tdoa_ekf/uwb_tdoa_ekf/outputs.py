@@ -88,11 +88,14 @@ class Outputs:
         )  # fmt: skip
         for name, column in zip(ODOMETRY, columns):
             rows[name] = column
+        transformed = self._tf_publisher is not None and (self._odom or self._tf_publisher.get_subscription_count())
         for k, message in enumerate(self._odometry.messages(rows)):
             self.odometry.publish(message)
-            self.stamp = self._epoch.stamp(odometry.t[k].item())
-            if self._tf_publisher is not None and (self._odom or self._tf_publisher.get_subscription_count()):
+            if transformed:
+                self.stamp = self._epoch.stamp(odometry.t[k].item())
                 self._publish_transform(odometry.t[k], odometry.p[k].tolist(), odometry.q[k].tolist())
+        if n:
+            self.stamp = self._epoch.stamp(odometry.t[-1].item())
         self.published += n
 
     def _publish_transform(self, t, p, q):
