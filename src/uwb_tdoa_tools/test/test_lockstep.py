@@ -12,6 +12,7 @@ from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
+from uwb_tdoa_tools.benchmark.flights import first  # noqa: E402
 from uwb_tdoa_tools.live.processes import Diagnostics, Processes, own_domain, wait  # noqa: E402
 from uwb_tdoa_tools.live.session import session  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
@@ -69,7 +70,7 @@ def assert_equal_to_offline(flight, told, recorded):
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate", "busy"), [(1, 0), (4, 3), (8, 1)])
 def test_at_any_rate_and_load_the_result_is_that_of_the_bag(tmp_path, load, rate, busy):
-    write_bag(simulate(SimulationConfig(seed=3, duration=20.0)), tmp_path / "flight.bag")
+    write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
     load(busy)
     code, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path, "--rate", rate)
     assert code == 0, said
@@ -79,7 +80,7 @@ def test_at_any_rate_and_load_the_result_is_that_of_the_bag(tmp_path, load, rate
 @pytest.mark.slow
 def test_a_measured_flight_beside_two_busy_processes(shared_data, tmp_path, load):
     log, survey = shared_data / "flights/0426/0426-traj3", shared_data / "surveys/anchor_0426.txt"
-    write_bag(read_flight(log, survey), tmp_path / "flight.bag")
+    write_bag(first(read_flight(log, survey), 24.0), tmp_path / "flight.bag")
     load(2)
     code, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path, "--rate", 4)
     assert code == 0, said
@@ -116,6 +117,6 @@ def delayed(bag, out, count=10, delay=1_000_000_000):
 def test_what_was_late_is_told_with_code_1(tmp_path):
     write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
     delayed(tmp_path / "flight.bag", tmp_path / "delayed.bag")
-    code, said, told, _ = replayed(tmp_path / "delayed.bag", tmp_path)
+    code, said, told, _ = replayed(tmp_path / "delayed.bag", tmp_path, "--rate", 2)
     assert told["ekf_node"]["late"] == "10"
     assert code == 1 and "10 TDOAs late" in said

@@ -110,11 +110,11 @@ def test_brute_force_agrees_in_space():
 @pytest.mark.slow
 def test_brute_force_agrees_on_a_whole_grid():
     for anchors, dimensions, grid in (
-        (SQUARE, 2, Grid.slice((-1, 5), (-1, 5), 0.2, 0.1)),  # with the diagonals, on which two solutions meet in one
-        (corners(), 3, Grid.box((-4, -4.5, -0.5), (4, 4.5, 3.5), 0.8)),
+        (SQUARE, 2, Grid.slice((-1, 5), (-1, 5), 0.2, 0.2)),  # with the diagonals, on which two solutions meet in one
+        (corners(), 3, Grid.box((-4, -4.5, -0.5), (4, 4.5, 3.5), 1.5)),
     ):
         unique, agrees, points, _ = brute_force(Installation(anchors, dimensions=dimensions), grid)
-        assert len(points) > 200 and 0.1 < unique.mean() < 0.9
+        assert len(points) > 100 and 0.1 < unique.mean() < 0.9
         assert agrees.mean() >= 0.99
 
 
