@@ -47,16 +47,16 @@ MESSAGES = {
     "/pressure": "sensor_msgs/msg/FluidPressure",
     "/velocity": "geometry_msgs/msg/TwistWithCovarianceStamped",
 }
-_FOLDER = Path(tempfile.mkdtemp(prefix="fuzz_", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))
+FOLDER = Path(tempfile.mkdtemp(prefix="fuzz_", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))
 
 
 def clean_up():
     """Remove the scratch files of this process."""
-    shutil.rmtree(_FOLDER, ignore_errors=True)
+    shutil.rmtree(FOLDER, ignore_errors=True)
 
 
 def _file(data, name="input"):
-    path = _FOLDER / name
+    path = FOLDER / name
     path.write_bytes(data)
     return path
 
@@ -125,7 +125,7 @@ def bag_mcap_sealed(data):
         mcap.set_sums(path)
     except mcap.Damaged:
         return
-    _finite(read_bag(path))
+    _finite(read_bag(path, anchors=ANCHORS))
 
 
 def bag_mcap_salvaged(data):
@@ -141,7 +141,7 @@ def bag_sqlite_salvaged(data):
 
 
 def bag_metadata(data):
-    folder = _FOLDER / "bag"
+    folder = FOLDER / "bag"
     folder.mkdir(exist_ok=True)
     if not (folder / "small.mcap").exists():
         shutil.copy(CORPUS / "bag_mcap" / "small", folder / "small.mcap")
@@ -152,7 +152,7 @@ def bag_metadata(data):
 def bag_message(data):
     """The first byte says of which topic, the rest is its message."""
     topic, msgtype = list(MESSAGES.items())[data[0] % len(MESSAGES) if data else 0]
-    path = _file(_bag_of(topic, msgtype, data[1:]), "message.mcap")
+    path = _file(bag_of(topic, msgtype, data[1:]), "message.mcap")
     if topic == "/odometry":
         read_odometry(path)
     else:
@@ -221,7 +221,7 @@ def _tdoa():
     return bytes(typestore().serialize_cdr(message, TDOA))
 
 
-def _bag_of(topic, msgtype, data):
+def bag_of(topic, msgtype, data):
     """An MCAP file, without chunks and index, of one TDOA and one message with the data."""
 
     def text(content):
