@@ -43,7 +43,7 @@ from .imu_mount import ImuMount
 from .monitoring.health import OK, WARN, Health
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs
-from .streams import ERROR as SEVERE
+from .streams import most_severe_first
 from .told_pose import told_pose
 
 # Of each stream: topic, type and the fields of its messages that are read.
@@ -264,10 +264,7 @@ class EkfNode(Node):
         restarts, self._restarts = self._restarts, self._estimator.counts["restarts"]
         if self._restarts != restarts:
             self._watch.restart()
-        findings = self._watch.findings()
-        wrong_imu = any(finding.severity == SEVERE and finding.rule.startswith("imu_") for finding in findings)
-        self._estimator.distrust_imu(wrong_imu)
-        return findings
+        return most_severe_first([*self._watch.findings(), *filter(None, [self._estimator.without_imu])])
 
     def _wiring(self):
         """What is wrong with who publishes what to whom, a list of sentences."""
@@ -329,8 +326,6 @@ def _warm_up(config):
         odometry, _ = estimator.advance()
     to_odometry(odometry.q, odometry.v, odometry.covariance)
     watch.findings()
-    estimator.distrust_imu(True)
-    estimator.distrust_imu(False)
     estimator.tell_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
     estimator.finish()
 

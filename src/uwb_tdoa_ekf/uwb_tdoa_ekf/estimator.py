@@ -11,15 +11,17 @@ from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BAC
 from .aid_rows import ROWS
 from .core import aids
 from .core.config import FilterConfig
-from .core.engine import distrust_imu, feed, tell_pose
+from .core.engine import feed, tell_pose
 from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, Measurements, new_memory, structured
 from .core.validity import usable_all, usable_imu
-from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, STARTUP, USED
+from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, REPEATED, STARTUP, USED
+from .monitoring.implausible import implausible
 from .monitoring.monitor import Monitor
 from .waiting import Waiting
 
 VERDICTS = {
     USED: "used", REJECTED: "rejected", LATE: "late", INVALID: "invalid", STARTUP: "startup", COMPENSATED: "compensated",
+    REPEATED: "repeated",
 }  # fmt: skip
 STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
@@ -114,6 +116,12 @@ class Estimator:
         return self._monitor.alarms
 
     @property
+    def without_imu(self):
+        """Finding by which the filter goes without inertial samples, because they cannot be right; None while it uses them."""
+        ekf = self._memory.record
+        return implausible(ekf.plausibility) if ekf.distrusted else None
+
+    @property
     def waiting(self):
         """Messages received and neither used nor refused yet, for each of STREAMS."""
         return tuple(len(stream) + len(gate) for stream, gate in zip(self._waiting, self._gates))
@@ -174,11 +182,6 @@ class Estimator:
         self.config, self._tuning = config, config.tuning()
         if not config.compensate_changes:
             self._memory.anchors["delay"] = self._memory.anchors["delay_variance"] = 0.0
-
-    def distrust_imu(self, distrusted):
-        """Go on without inertial samples, because they are known to be wrong, or with them again. Until it is said anew."""
-        if distrusted != bool(self._memory.record.distrusted):
-            distrust_imu(self._memory, self._tuning, distrusted)
 
     def reset(self):
         """Use everything that still waits, and forget it: what comes next starts the filter anew. Returns

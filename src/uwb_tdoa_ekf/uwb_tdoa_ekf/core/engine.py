@@ -7,12 +7,12 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
-from . import aids, barometer, height, history, hypotheses, inertial, initialization, noise, robust, workspace
+from . import aids, barometer, height, history, hypotheses, inertial, initialization, noise, plausibility, robust, workspace
 from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, Output
 from .startup import INLIER
 from .state import coast, predict
 from .update import project, update_state
-from .verdicts import COMPENSATED, REJECTED, STARTUP, USED
+from .verdicts import COMPENSATED, REJECTED, REPEATED, STARTUP, USED
 
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged
 INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
@@ -71,34 +71,21 @@ def tell_pose(memory, tuning, pose):
     _tell(memory, tuning, pose, history.NOTHING)
 
 
-@compiled
-def _distrust(memory, tuning, distrusted, records):
-    ekf = memory.ekf[0]
-    if ekf.running and distrusted != ekf.distrusted:
-        if distrusted:
-            initialization.widen(ekf)
-        else:
-            initialization.level_anew(ekf, tuning[0], records)
-    ekf.distrusted = distrusted
-
-
-def distrust_imu(memory, tuning, distrusted):
-    """Go without inertial samples from here on, or with them again: from the attitude that they then have."""
-    _distrust(memory, tuning, distrusted, history.NOTHING)
-
-
 def most_records(measurements):
     """Room that a history needs for Measurements that are fed at once."""
     imu, tdoa, aid = measurements
-    rests = len(imu)
-    if rests:
-        rests = min(rests, 2 + (imu["t"][-1] - imu["t"][0]) / REST_PERIOD)
-    return RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_REST * int(rests) + RECORDS_OF_AID * len(aid)
+    seconds = imu["t"][-1] - imu["t"][0] if len(imu) else 0.0
+    rests, switches = (min(len(imu), 2 + int(seconds / period)) for period in (REST_PERIOD, 0.5 * plausibility.CLEARED))
+    return RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_REST * rests + switches + RECORDS_OF_AID * len(aid)
 
 
 @compiled
 def _on_imu(ekf, tuning, sample, records):
     fresh = inertial.observe(ekf.imu, sample, tuning.imu_timeout)
+    distrusted = plausibility.judge(ekf.plausibility, ekf.imu, sample, fresh, ekf.distrusted)
+    if distrusted != ekf.distrusted:
+        ekf.distrusted = distrusted
+        _switch(ekf, tuning, records)
     if ekf.running and _advance(ekf, tuning, sample.t, records):
         ekf.quiet = tuning.zero_velocity and fresh and not ekf.distrusted and inertial.is_quiet(ekf.imu)
         if ekf.quiet and sample.t >= ekf.next_rest:
@@ -108,12 +95,24 @@ def _on_imu(ekf, tuning, sample, records):
 
 
 @compiled
+def _switch(ekf, tuning, records):
+    """Go without inertial samples from here on, or with them again: from the attitude that they then have."""
+    if ekf.running and ekf.distrusted:
+        initialization.widen(ekf, records)
+    elif ekf.running:
+        initialization.level_anew(ekf, tuning, records)
+
+
+@compiled
 def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
+    residual.innovation = residual.variance = np.nan
+    residual.weight, residual.verdict = 0.0, STARTUP
+    if initialization.is_repeat(ekf, tdoa, anchors):
+        residual.verdict = REPEATED
+        return
     initialization.remember(ekf, tdoa, anchors)
     t, was_running = tdoa.t, ekf.running
     if not was_running or not _advance(ekf, tuning, t, records):
-        residual.innovation = residual.variance = np.nan
-        residual.weight, residual.verdict = 0.0, STARTUP
         if not was_running:
             _wait_for_start(ekf, anchors, tuning, t, records)
         return

@@ -35,6 +35,19 @@ def remember(ekf, tdoa, anchors):
 
 
 @compiled
+def is_repeat(ekf, tdoa, anchors):
+    """Whether the window holds a TDOA already, with its stamp, anchors and value: somebody has sent it twice."""
+    d = tdoa.d - (anchors[tdoa.b].delay - anchors[tdoa.a].delay)
+    for k in range(ekf.kept - 1, -1, -1):
+        other = ekf.window[k]
+        if other.t != tdoa.t:
+            return False
+        if other.a == tdoa.a and other.b == tdoa.b and other.d == d:
+            return True
+    return False
+
+
+@compiled
 def start(ekf, anchors, tuning, t, anyhow, history):
     """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
     window = _recent(ekf, tuning.start_window)
@@ -155,12 +168,13 @@ def recover(ekf, anchors, tuning, t, history):
 
 
 @compiled
-def widen(ekf):
+def widen(ekf, history):
     """What was integrated lately was wrong: nobody knows by how much, but the TDOAs."""
     for h in range(HYPOTHESES):
         for k in range(3):
             ekf.hypotheses[h].P[k, k] += WRONG_POSITION**2
             ekf.hypotheses[h].P[3 + k, 3 + k] += SPEED**2
+    add_reset(ekf, ekf.t, history)
 
 
 @compiled

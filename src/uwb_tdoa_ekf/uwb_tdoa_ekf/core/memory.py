@@ -47,6 +47,17 @@ IMU_STATE = _record(
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
 )
 
+# Whether an inertial sensor can be right, see plausibility.py.
+PLAUSIBILITY = _record(
+    ("up", float, 3),  # m/s^2, specific force as the gyroscope has turned it
+    ("spun", float),  # rad, turned lately beyond what a tag may
+    ("weighed", float),  # s, stamps: of the last sample in which it bore the tag,
+    ("upright", float),  # in which the tag did not lie on its side,
+    ("contradicted", float),  # and at which something was impossible;
+    ("reason", int),  # what,
+    ("size", float),  # and how large
+)
+
 # A pose that is told. NaN for what is not.
 POSE = _record(
     ("t", float),  # s
@@ -105,7 +116,8 @@ EKF = _record(
     ("barometer", BAROMETER),
     ("velocity", VELOCITY),
     ("next_floor", float),  # s, stamp before which not to say again that the tag is at its fixed height
-    ("distrusted", bool),  # the inertial samples are wrong, somebody says: not used
+    ("plausibility", PLAUSIBILITY),  # of the inertial samples,
+    ("distrusted", bool),  # which are not used, because they cannot be right
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
     ("workspace", float, (2, 3)),  # m, lower and upper bounds, see workspace.py
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
@@ -171,7 +183,7 @@ def new_memory(positions):
     ekf = memory.record
     for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge"):
         ekf[stamp] = -np.inf
-    ekf.imu.t = -np.inf
+    ekf.imu.t = ekf.plausibility.contradicted = -np.inf
     for stamp in ("heard", "changed", "used", "judged", "pulls_since", "ignored_until"):
         ekf.height[stamp] = -np.inf
     ekf.barometer.heard = ekf.barometer.agreed = ekf.velocity.heard = ekf.next_floor = -np.inf

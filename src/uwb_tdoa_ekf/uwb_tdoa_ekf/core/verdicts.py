@@ -1,3 +1,3 @@
 """What became of one measurement; the values of TdoaResidual.VERDICT_*."""
 
-USED, REJECTED, LATE, INVALID, STARTUP, COMPENSATED = range(6)
+USED, REJECTED, LATE, INVALID, STARTUP, COMPENSATED, REPEATED = range(7)

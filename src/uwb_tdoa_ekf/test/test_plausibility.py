@@ -1,0 +1,85 @@
+"""Inertial samples that cannot be right are left out at once, and used again; healthy ones never are (those of measured flights:
+test_stream_watch.py)."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.engine import feed
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_memory, structured
+from uwb_tdoa_ekf.core.plausibility import CLEARED, RATE, TILT, TURN, WEIGHT
+from uwb_tdoa_ekf.core.state import GRAVITY
+
+T = np.arange(3000) / 200.0
+BEGIN, END = 5.0, 9.0  # s, of a fault
+BAD = ((T >= BEGIN) & (T < END))[:, None]
+
+
+def swaying(yaw_rate=0.05):
+    """Rates and specific force of a tag that sways by some 10 degrees and turns."""
+    angles = np.stack([yaw_rate * T, 0.2 * np.sin(1.3 * T), 0.15 * np.sin(1.7 * T)], axis=1)
+    return sensed(Rotation.from_euler("ZYX", angles))
+
+
+def sensed(attitude, acceleration=0.0):
+    """Rates and specific force of attitudes at T, and of accelerations (n, 3) m/s^2 in the world."""
+    turns = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(T)[:, None]
+    return np.vstack([turns, turns[-1:]]), attitude.inv().apply(np.broadcast_to(acceleration + np.array([0, 0, GRAVITY]), (len(T), 3)))
+
+
+def left_out(gyro, accel):
+    """[(s, reason)] of the samples that are left out."""
+    memory, tuning, out = new_memory(np.zeros((4, 3))), FilterConfig().tuning(), []
+    for row in structured(IMU_SAMPLE, T, gyro, accel)[:, None]:
+        feed(memory, tuning, Measurements(row, np.empty(0, TDOA)))
+        if memory.record.distrusted:
+            out.append((row["t"][0], int(memory.record.plausibility.reason)))
+    return out
+
+
+FAULTS = {
+    "in g": (lambda w, f: (w, f / GRAVITY), WEIGHT, 0.4),
+    "in mg": (lambda w, f: (w, 1e3 * f / GRAVITY), WEIGHT, 0.4),
+    "without gravity": (lambda w, f: (w, f - [0.0, 0.0, GRAVITY]), WEIGHT, 0.4),
+    "silent": (lambda w, f: (0.0 * w, 0.0 * f), WEIGHT, 0.4),
+    "upside down": (lambda w, f: (w, f * [1.0, -1.0, -1.0]), TURN, 0.1),
+    "axes exchanged": (lambda w, f: (w, f[:, [2, 0, 1]]), TURN, 0.4),
+    "degrees/s": (lambda w, f: (np.rad2deg(w), f), TURN, 1.0),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_seen_within_a_second_and_its_end_after_another(fault):
+    change, reason, within = FAULTS[fault]
+    gyro, accel = swaying()
+    wrong = (np.where(BAD, changed, right) for changed, right in zip(change(gyro, accel), (gyro, accel)))
+    stamps, reasons = map(np.array, zip(*left_out(*wrong)))
+    assert reasons[0] == reason
+    assert BEGIN <= stamps[0] < BEGIN + within and END < stamps[-1] < END + CLEARED + 0.3
+    assert np.sum(stamps < END) > 0.9 * 200.0 * (END - stamps[0])
+
+
+def test_a_spin_about_the_vertical_in_degrees_is_faster_than_anything_turns():
+    gyro, accel = sensed(Rotation.from_euler("Z", 0.5 * T))
+    stamps, reasons = map(np.array, zip(*left_out(np.where(BAD, np.rad2deg(gyro), gyro), accel)))
+    assert reasons[0] == RATE and stamps[0] < BEGIN + 0.4
+
+
+def test_what_a_tag_may_do_is_no_fault():
+    """It falls, is hit, spins, banks with its thrust (all that a multirotor feels), and is turned on its back for a while."""
+    fall = np.where((T > 5.0) & (T < 5.2), -GRAVITY, 0.0) + np.where((T > 5.2) & (T < 5.25), 4.0 * GRAVITY, 0.0)
+    bank = np.interp(T, [5.0, 5.5, 7.0, 7.5], np.deg2rad([0.0, 60.0, 60.0, 0.0]))
+    over = np.interp(T, [5.0, 6.0, 8.0, 9.0], [0.0, np.pi, np.pi, 0.0])
+    thrust = (GRAVITY / np.cos(bank))[:, None] * [0.0, 0.0, 1.0]
+    rest = Rotation.from_euler("X", 0.0 * T)
+    for gyro, accel in (
+        sensed(rest, fall[:, None] * [0.0, 0.0, 1.0]), sensed(Rotation.from_euler("Z", 9.0 * T)),
+        sensed(Rotation.from_euler("X", over)), (sensed(Rotation.from_euler("X", bank))[0], thrust),
+    ):  # fmt: skip
+        assert left_out(gyro, accel) == []
+
+
+def test_a_tag_that_lies_on_its_back_goes_without_after_some_seconds():
+    said = left_out(*sensed(Rotation.from_euler("X", np.interp(T, [3.0, 4.0], [0.0, np.pi]))))
+    assert 6.0 < said[0][0] < 7.2 and said[0][1] == TILT and said[-1][0] == T[-1]
