@@ -6,8 +6,9 @@ from ..streams import NOTE, StreamRules, most_severe_first
 from .sign_watch import SignWatch
 from ..streams.stamp_rules import median
 
-KEPT = 5  # windows of a second that are judged together
-FEWEST = 3  # of them, below which nothing is said; the latest so many must say it too, or it is over
+KEPT = 4  # windows of a second that are judged together
+FEWEST = 3  # of them, below which nothing is said
+LATEST = 2  # of them, which must say it too, or it is over
 # Said by `check`, and no warning in flight: the filter knows what a shaking accelerometer is worth.
 NOT_IN_FLIGHT = {"imu_shaking"}
 FEW_ANCHORS = "few_anchors"  # a tag with a fixed height needs three
@@ -50,7 +51,7 @@ class StreamWatch:
             self._sign.feed(t, a, b, d)
         if max(len(rules.imu), len(rules.tdoa)) < FEWEST:
             return []
-        still = {finding.rule for finding in rules.findings(FEWEST)}
+        still = {finding.rule for finding in rules.findings(LATEST)}
         found = [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
         return most_severe_first([*found, *filter(None, [self._sign.finding])])
 

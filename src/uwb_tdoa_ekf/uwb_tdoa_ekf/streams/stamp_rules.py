@@ -34,9 +34,23 @@ def median(windows, field):
     return float(np.median(values)) if values else math.nan
 
 
+def pace_of(windows):
+    """Seconds of stamps per second of arrival; NaN where arrivals are not known.
+
+    From the first to the last message of a window, which blocks upset, or by the smallest latencies of successive windows, which
+    leaps of the stamps upset: the one of both that is nearer to 1.
+    """
+    known = np.array([(window.end, window.latency) for window in windows if math.isfinite(window.latency)])
+    ratios = [median(windows, "pace")]
+    if len(known) > 1:
+        time, latency = np.diff(known, axis=0).T
+        ratios += [1.0 - float(np.median(latency / time))] if (time > 0.0).all() else []
+    return min(ratios, key=lambda ratio: abs(ratio - 1.0) if math.isfinite(ratio) else math.inf)
+
+
 def orderly(windows):
     """False for stamps with which nothing else can be told: of 0, standing still, leaping, or of another unit."""
-    count, ratio = total(windows, "count"), median(windows, "pace")
+    count, ratio = total(windows, "count"), pace_of(windows)
     broken = total(windows, "zeros") > 0.01 * count or total(windows, "same") > 0.98 * count or total(windows, "jumps")
     return not broken and not abs(ratio - 1.0) > PACE
 
@@ -87,7 +101,7 @@ def falls(name, windows):
 
 def jumps(name, windows):
     count = total(windows, "jumps")
-    if not count or abs(median(windows, "pace") - 1.0) > PACE:
+    if not count or abs(pace_of(windows) - 1.0) > PACE:
         return None
     farthest = max((window.jump for window in windows), key=abs)
     evidence = f"{count} leaps, the farthest of {farthest:+.3f} s"
@@ -125,7 +139,7 @@ def rate(name, windows):
 
 def pace(name, windows):
     """Seconds of stamps per second of arrival."""
-    ratio = median(windows, "pace")
+    ratio = pace_of(windows)
     if (
         not abs(ratio - 1.0) > PACE
         or total(windows, "zeros")
