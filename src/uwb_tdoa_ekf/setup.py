@@ -35,6 +35,7 @@ setup(
         "console_scripts": [
             "debias_node = uwb_tdoa_ekf.executables:debias_node",
             "ekf_node = uwb_tdoa_ekf.executables:ekf_node",
+            "localization_node = uwb_tdoa_ekf.executables:localization_node",
         ]
     },
 )

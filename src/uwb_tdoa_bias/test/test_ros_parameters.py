@@ -92,7 +92,7 @@ def test_what_changes_nothing_is_said(node_with, said, tmp_path):
     files = [str(tmp_path / name) for name in ("other", "empty")]
     node = node_with("--params-file", files[0], "-p", "qos_overrides./x.publisher.depth:=3")
     assert declare_all(node, PARAMETERS)["gate"] == 3.0
-    say_unused(node, files)
+    say_unused([node], files)
     assert len(said) == 2
     assert said[0].startswith(f"{files[0]}: none of its parameters is for /tag1/some_node")
     assert said[1].startswith("qos_overrides./x.publisher.depth: changes nothing")
@@ -105,5 +105,5 @@ def test_a_file_that_counts_is_not_said(node_with, said, tmp_path):
     node = node_with(*arguments)
     assert declare_all(node, PARAMETERS)["gate"] == 5.0
     assert files_of(["node", "--ros-args", *arguments]) == [str(file)]
-    say_unused(node, files_of(arguments))
+    say_unused([node], files_of(arguments))
     assert not said

@@ -16,7 +16,7 @@ from .foundation import ros
 from .foundation.errors import InputError
 from .foundation.ros_anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
 from .foundation.ros_frames import TF_STATIC_QOS
-from .foundation.ros_parameters import Parameter, declare_all, refuse_unknown, say_unused
+from .foundation.ros_parameters import Parameter, declare_all, files_of, refuse_unknown, say_unused
 from .foundation.survey import read_survey
 
 PARAMETERS = {  # in the order of config/anchors_node.yaml
@@ -31,8 +31,8 @@ class AnchorsNode(Node):
 
     NAME = "anchors_node"
 
-    def __init__(self, files=()):
-        """files : parameter files that were given, to say which do not match."""
+    def __init__(self, arguments=()):
+        """arguments : of the process."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
@@ -46,7 +46,7 @@ class AnchorsNode(Node):
             ("uwb/anchors/markers", ANCHORS_QOS, markers(message, own["marker_size"])),
         ):
             self.create_publisher(type(content), topic, qos).publish(content)
-        say_unused(self, files)
+        say_unused([self], files_of(arguments))
         self.get_logger().info(f"{len(anchors)} anchors of {own['anchors_file']} in frame '{anchors.frame}'")
 
 

@@ -14,7 +14,6 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
-from rclpy.node import Node
 from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
 from .foundation import ros
@@ -24,12 +23,12 @@ from .effects import EffectSet
 from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from .foundation.ros_frames import FramesInput, unknown_frame
-from .foundation.ros_parameters import Parameter, declare_all, refuse_unknown, say_unused
-from .foundation.ros_streams import Streams
+from .foundation.ros_parameters import Parameter, declare_all, files_of, refuse_unknown, say_unused
+from .foundation.ros_streams import StreamOutput, Streams, Turns
 from .foundation.ros_wire import Wire
 from .correction.pose_queue import PoseQueue
 from .correction.network import UNASKED, load_network, unasked
-from .correction.poses import known_yaw_std
+from .correction.poses import parts_of
 from .foundation.stamps import StampGate
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
@@ -52,8 +51,8 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
         "base_link", "frame of the odometry's body; TDOAs in another frame are of an antenna that /tf_static places in it"
     ),
 }
-ROTATIONS = [21, 28, 35]  # places of the variances about the axes in the covariance of a pose
-POSE = "pose.pose.position", "pose.pose.orientation", "pose.covariance"  # what is read of an Odometry,
+POSE = ("pose",)  # what is read of an Odometry, its numbers,
+POSE_NUMBERS = 3 + 4 + 36
 MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a Tdoa
 CORRECTED = (  # what is written of a TdoaCorrected
     "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status",
@@ -62,16 +61,17 @@ EARLY = 2000  # TDOAs kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
-class BiasNode(Node):
+class BiasNode(ros.StreamNode):
     """Converts messages for a Corrector and keeps the accounts: received = published + waiting + dropped."""
 
     NAME = "bias_node"
 
-    def __init__(self, files=()):
-        """files : parameter files that were given, to say which do not match."""
-        super().__init__(self.NAME)
+    def __init__(self, arguments=(), member=None, **options):
+        """arguments : of the process; member : of a localization_node, which has it take its turns and hands it the odometry:
+        names of parameters that are for others, too; options : of Node."""
+        super().__init__(self.NAME, **options)
         own = declare_all(self, PARAMETERS)
-        refuse_unknown(self)
+        refuse_unknown(self, member or ())
         effects_file, model_file = own["effects_file"], own["model_file"]
         self._lag, self._limit, self._body = own["pose_lag"], own["hold"], own["body_frame"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
@@ -87,21 +87,23 @@ class BiasNode(Node):
         self._wire, self._templates = Wire(TdoaCorrected, *CORRECTED), {}  # by frame and model
         self._frame, self._frame_trouble = self._body, None  # of the TDOAs
         self._declared = self._effects  # without the arm of the antenna
-        self._publisher = ros.publish_stream(self, TdoaCorrected, "uwb/tdoa_corrected")
+        self.output = StreamOutput(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
-        self._streams = Streams(self, self._epoch, self._release)
-        self._streams.add(Wire(Odometry, *POSE), "odometry", self._on_odometry)
-        self._streams.add(Wire(Tdoa, *MEASURED), "uwb/tdoa", self._on_tdoa)
-        say_unused(self, files)
+        self.streams = Streams(self, self._epoch, self._release)
+        self.streams.add(Wire(Odometry, *POSE), "odometry", self._on_odometry, handed=member is not None)
+        self.streams.add(Wire(Tdoa, *MEASURED), "uwb/tdoa", self._on_tdoa)
         self._diagnostics = ros.Diagnostics(self, self._report)
         self._anchors.start()
+        if member is None:
+            say_unused([self], files_of(arguments))
+            self._turns = Turns(self, [self.streams])
         self.get_logger().info(f"ready; correcting with: {self._model[NETWORK]}")
 
     def _warm_up(self):
         """Compile and load whatever the first correction would; returns what to call each status's bias."""
         corrector = Corrector(Anchors.from_positions(np.eye(3)), self._effects, self._network, self._lag)
-        corrector.add_pose(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        corrector.add_pose(np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6)))
         corrector.correct(np.array([1.0]), np.array([0]), np.array([1]), np.array([0.0]))
         return {PASSED: "none", EFFECTS: self._effects.name, NETWORK: corrector.model, FADED: corrector.model}
 
@@ -172,10 +174,7 @@ class BiasNode(Node):
             self._add_poses(np.array([stamp]), row)
 
     def _add_poses(self, t, rows):
-        turns = np.sqrt(np.maximum(rows["pose.covariance"][:, ROTATIONS], 0.0))
-        q = rows["pose.pose.orientation"]
-        q = np.where(q.any(axis=1)[:, None], q, math.nan)  # (0, 0, 0, 0) says: not known
-        self._corrector.add_pose(t, rows["pose.pose.position"], q, known_yaw_std(turns))
+        self._corrector.add_pose(t, *parts_of(np.array(rows["pose"])))
 
     def _on_tdoa(self, frame, t, rows, arrival):
         self._counts["received"] += len(t)
@@ -247,8 +246,7 @@ class BiasNode(Node):
             rows = self._template(*kind).rows(some.stop - some.start)
             for name, column in zip(("sec", "nanosec", *CORRECTED), values):
                 rows[name] = column[some]
-            for message in self._template(*kind).messages(rows):
-                self._publisher.publish(message)
+            self.output.publish(kind[0], self._template(*kind), rows)
         self._counts["published"] += len(items)
         self._counts.update(STATUS[one] for one in status.tolist())
 
@@ -265,7 +263,7 @@ class BiasNode(Node):
         received, self._reported_received = counts["received"] - self._reported_received, counts["received"]
         poses, self._reported_poses = counts["poses"] - self._reported_poses, counts["poses"]
         recent = {"uwb/tdoa": received, "odometry": poses}
-        wiring = [end.trouble(recent[name]) for name, end in self._streams.inputs.items()]
+        wiring = [end.trouble(recent[name]) for name, end in self.streams.inputs.items()]
         wiring.append(ros.several_publishers(self, "uwb/tdoa_corrected"))
         unready, self._reported_unready = counts["unready"] - self._reported_unready, counts["unready"]
         values = {"model": self._model[NETWORK], "received": counts["received"], "published": counts["published"]}
@@ -273,9 +271,9 @@ class BiasNode(Node):
         values |= {name: counts[name] for name in STATUS.values()}
         values |= {"released before their pose": counts["unready"], "invalid": counts["invalid"]}
         values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
-        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._streams.inputs.items()}
-        values |= {"subscribers of uwb/tdoa_corrected": self._publisher.get_subscription_count()}
-        values |= {f"lost on {name}": end.lost for name, end in self._streams.inputs.items()}
+        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self.streams.inputs.items()}
+        values |= {"subscribers of uwb/tdoa_corrected": self.output.publisher.get_subscription_count()}
+        values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
         level, text = self._health(rate, unready)
         if level != DiagnosticStatus.ERROR and any(wiring):
             level, text = DiagnosticStatus.WARN, next(filter(None, wiring))

@@ -17,7 +17,7 @@ from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all, refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all, files_of, refuse_unknown, say_unused
 
 from .debias import BiasMap, LayerConfig, Layers
 
@@ -43,8 +43,8 @@ class DebiasNode(Node):
 
     NAME = "debias_node"
 
-    def __init__(self, files=()):
-        """files : parameter files that were given, to say which do not match."""
+    def __init__(self, arguments=()):
+        """arguments : of the process."""
         super().__init__(self.NAME)
         layers = declare_all(self, PARAMETERS)
         refuse_unknown(self)
@@ -57,7 +57,7 @@ class DebiasNode(Node):
         self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
         self._publisher = ros.publish_stream(self, Odometry, "odometry/debiased")
         self._input = ros.StreamInput(self, Odometry, "odometry", self._on_odometry)
-        say_unused(self, files)
+        say_unused([self], files_of(arguments))
         self._diagnostics = ros.Diagnostics(self, self._report)
         self.get_logger().info(f"ready; {len(self._map.at)} markers, {self._map.interpolator}")
 

@@ -10,7 +10,7 @@ Every parameter is documented in config/ekf_node.yaml.
 """
 
 from collections import Counter, deque
-from functools import partial
+from functools import cache, partial
 import math
 import sys
 import time
@@ -18,7 +18,6 @@ import time
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import FluidPressure, Imu, Range
 from std_srvs.srv import Trigger
@@ -29,8 +28,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
 from uwb_tdoa_bias.foundation.ros_frames import FramesInput, unknown_frame
-from uwb_tdoa_bias.foundation.ros_parameters import refuse_unknown, say_unused
-from uwb_tdoa_bias.foundation.ros_streams import Streams
+from uwb_tdoa_bias.foundation.ros_parameters import files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_streams import Streams, Turns
 from uwb_tdoa_bias.foundation.ros_wire import Wire
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
@@ -38,11 +37,10 @@ from .core import aids
 from .core.config import RENAMED
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import STREAMS, VERDICTS, Estimator, invalid
-from .frames import to_odometry
 from .imu_mount import ImuMount
 from .monitoring.health import OK, WARN, Health
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
-from .outputs import Outputs
+from .outputs import Outputs, pose_and_twist
 from .streams import most_severe_first
 from .told_pose import told_pose
 
@@ -66,14 +64,15 @@ EARLY = 5000  # messages kept while there are no anchors
 UNKNOWN_VARIANCE = 1e6  # (m/s)^2, at which and above a velocity is not measured
 
 
-class EkfNode(Node):
+class EkfNode(ros.StreamNode):
     """Converts messages for an Estimator and publishes what it says. The filter is all in there."""
 
     NAME = "ekf_node"
 
-    def __init__(self, files=()):
-        """files : parameter files that were given, to say which do not match."""
-        super().__init__(self.NAME)
+    def __init__(self, arguments=(), member=None, **options):
+        """arguments : of the process; member : of a localization_node, which has it take its turns and hands it the corrected TDOAs:
+        names of parameters that are for others, too; options : of Node."""
+        super().__init__(self.NAME, **options)
         self._config, own = declare_parameters(self)
         self._reorder, self._lag, self._world, self._body = (
             own[name] for name in ("reorder", "lag", "world_frame", "body_frame")
@@ -90,24 +89,26 @@ class EkfNode(Node):
         self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
         self._imu_frame, self._imu_mount, self._frame_trouble = own["body_frame"], None, None
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
-        refuse_unknown(self, RENAMED)
+        refuse_unknown(self, {*RENAMED, *(member or ())})
         self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute")
-        _warm_up(self._config)
+        _warm_up()
         moving = own["publish_tf"] == ODOM
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames, moving)
-        self._outputs = Outputs(self, self._epoch, self._frames.frames, self._body, own["publish_tf"], own["odom_frame"])
+        self.outputs = Outputs(self, self._epoch, self._frames.frames, self._body, own["publish_tf"], own["odom_frame"])
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
-        self._streams = self._subscribe()
+        self.streams = self._subscribe({"uwb/tdoa_corrected"} if member is not None else ())
         self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
         self._reset = self.create_service(Trigger, "~/reset", self._on_reset)
         follow_changes(self, lambda: self._config, self._on_config)
-        say_unused(self, files)
         self._diagnostics = ros.Diagnostics(self, self._report)
         self._anchors.start()
+        if member is None:
+            say_unused([self], files_of(arguments))
+            self._turns = Turns(self, [self.streams])
         self.get_logger().info("ready")
 
-    def _subscribe(self):
-        """Streams of everything that the filter takes."""
+    def _subscribe(self, handed):
+        """Streams of everything that the filter takes. handed : topics that a node of this process hands over."""
         streams = Streams(self, self._epoch, self._advance, self._frames.catch_up)
         self._takers = {
             "imu": self._take_imu, "tdoa": self._take_tdoa, "height": self._take_height,
@@ -117,8 +118,13 @@ class EkfNode(Node):
             if stream in aids.STREAMS and not getattr(self._config, f"use_{stream}"):
                 continue
             for topic, kind, *fields in topics:
-                streams.add(Wire(kind, *fields), topic, partial(self._receive, stream))
+                streams.add(Wire(kind, *fields), topic, partial(self._receive, stream), topic in handed)
+        streams.wait_for("uwb/tdoa_corrected", self.due)
         return streams
+
+    def due(self):
+        """Stamp, s since 1970, up to which no odometry will come."""
+        return -math.inf if self._estimator is None else self._estimator.next_odometry + self._epoch.begin
 
     def _on_anchors(self, anchors):
         if self._estimator is not None:
@@ -128,7 +134,7 @@ class EkfNode(Node):
         self._imu_corrector = ImuCorrector(self._effects.effects)
         ignored = [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else []
         self._watch, self._restarts = StreamWatch(anchors, self._lag, ignored), 0
-        self._outputs.set_world(self._world or anchors.frame)
+        self.outputs.set_world(self._world or anchors.frame)
         early, self._early = self._early, deque()
         for stream, part in early:
             self._takers[stream](*part)
@@ -154,7 +160,7 @@ class EkfNode(Node):
         try:
             if self._estimator is None:
                 raise InputError("there are no anchors yet; give the pose again when there are.")
-            self._estimator.tell_pose(*told_pose(message, self._outputs.world, self._epoch, self._estimator.newest))
+            self._estimator.tell_pose(*told_pose(message, self.outputs.world, self._epoch, self._estimator.newest))
         except InputError as error:
             self.get_logger().warning(f"initialpose: not taken: {error}")
 
@@ -193,7 +199,7 @@ class EkfNode(Node):
             stream, (_, t, rows, _) = self._early.popleft()
             self._past["invalid" if stream == "tdoa" else f"{stream}_invalid"] += 1
             if stream == "tdoa":
-                self._outputs.publish_residuals(invalid(t, rows["anchor_a"], rows["anchor_b"]))
+                self.outputs.publish_residuals(invalid(t, rows["anchor_a"], rows["anchor_b"]))
 
     def _advance(self):
         if self._estimator is not None:
@@ -245,11 +251,11 @@ class EkfNode(Node):
         if len(odometry.t):
             # the variance is that of the mean over one odometry interval
             variance = self._config.gyro_noise**2 * self._config.odometry_rate
-            self._outputs.publish_odometry(odometry, self._estimator.rates_at(odometry.t) - odometry.gyro_bias, variance)
+            self.outputs.publish_odometry(odometry, self._estimator.rates_at(odometry.t) - odometry.gyro_bias, variance)
             self._health.last_odometry = time.monotonic()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
         if len(residuals.t):
-            self._outputs.publish_residuals(residuals)
+            self.outputs.publish_residuals(residuals)
 
     def _arrived(self, arrival):
         """When messages arrived on the clock of the node, (n,) s; NaN while it has none."""
@@ -270,7 +276,7 @@ class EkfNode(Node):
         """What is wrong with who publishes what to whom, a list of sentences."""
         received = {topics[0][0]: self._health.received[stream] for stream, topics in TOPICS.items()}
         troubles = []
-        for topic, end in self._streams.inputs.items():
+        for topic, end in self.streams.inputs.items():
             total = received.get(topic, 0)
             troubles.append(end.trouble(total - self._received_before.get(topic, 0)))
         self._received_before = received
@@ -278,9 +284,9 @@ class EkfNode(Node):
 
     def _behind(self):
         """s from the stamp of the newest odometry to now, by the clock of the node; None without odometry."""
-        if not self._outputs.published:
+        if not self.outputs.published:
             return None
-        return 1e-9 * (self.get_clock().now().nanoseconds - Time.from_msg(self._outputs.stamp).nanoseconds)
+        return 1e-9 * (self.get_clock().now().nanoseconds - Time.from_msg(self.outputs.stamp).nanoseconds)
 
     def _report(self):
         counts, estimator = Counter(self._past), self._estimator
@@ -292,28 +298,29 @@ class EkfNode(Node):
         troubles = self._wiring(), self._stream_findings()
         level, text, values = self._health.report(self._anchors.refused, estimator, counts, *troubles)
         alarms = estimator.alarms if estimator is not None else []
-        others = [*filter(None, [self._frame_trouble, self._outputs.trouble, *alarms])]
+        others = [*filter(None, [self._frame_trouble, self.outputs.trouble, *alarms])]
         if level == OK and others:
             level, text = WARN, others[0]
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
         values |= {"TDOAs received": self._health.received["tdoa"]} | {name: counts[name] for name in VERDICTS.values()}
         values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.received["imu"]}
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
-        values |= {"imu_waiting": waiting["imu"], "odometry published": self._outputs.published}
+        values |= {"imu_waiting": waiting["imu"], "odometry published": self.outputs.published}
         values |= {name: counts[name] for name in ("recoveries", "restarts")}
         for aid in aids.STREAMS:
             values |= {f"{aid}_received": self._health.received[aid], f"{aid}_waiting": waiting[aid]}
             values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}
-        values |= {f"lost on {name}": end.lost for name, end in self._streams.inputs.items()}
-        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self._streams.inputs.items()}
-        values |= {"subscribers of odometry": self._outputs.odometry.get_subscription_count()}
-        values |= {"subscribers of uwb/residual": self._outputs.residual.get_subscription_count()}
+        values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
+        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self.streams.inputs.items()}
+        values |= {"subscribers of odometry": self.outputs.odometry.publisher.get_subscription_count()}
+        values |= {"subscribers of uwb/residual": self.outputs.residual.publisher.get_subscription_count()}
         return level, text, values
 
 
-def _warm_up(config):
+@cache
+def _warm_up():
     """Compile, or load from numba's cache, what the first messages would."""
-    estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]), config)
+    estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]))
     watch, steps = StreamWatch(estimator.anchors, 0.25), np.arange(400)
     watch.add_imu(0.01 * steps, 0.01 * steps, np.zeros((400, 3)), np.tile((0.0, 0.0, 9.81), (400, 1)))
     watch.add_tdoa(0.01 * steps, 0.01 * steps, steps % 4, (steps + 1) % 4, np.zeros(400))
@@ -324,7 +331,7 @@ def _warm_up(config):
         estimator.add_pressure(0.01 * step, 1e5)
         estimator.add_velocity(0.01 * step, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
         odometry, _ = estimator.advance()
-    to_odometry(odometry.q, odometry.v, odometry.covariance)
+    pose_and_twist(odometry, estimator.rates_at(odometry.t), 0.0)
     watch.findings()
     estimator.tell_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
     estimator.finish()

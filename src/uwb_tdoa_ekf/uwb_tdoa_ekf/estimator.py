@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, StampGate
 
@@ -17,6 +18,7 @@ from .core.validity import usable_all, usable_imu
 from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, REPEATED, STARTUP, USED
 from .monitoring.implausible import implausible
 from .monitoring.monitor import Monitor
+from .order import Order
 from .waiting import Waiting
 
 VERDICTS = {
@@ -70,8 +72,8 @@ class Estimator:
     """Time-ordered buffer, filter and accounts.
 
     Messages wait until every stream has passed them and are used in stamp order. A stream that is silent is waited for
-    for `lag` seconds of stamps, an aid (height, pressure, velocity) only if it was there a second ago; TDOAs wait `reorder`
-    more for late siblings. What is older than what was used is late. A stream that falls back in time starts the filter
+    for `lag` seconds of stamps, an aid (height, pressure, velocity) only if it was there a second ago; `reorder` more for
+    late siblings, unless they have come in order so far (Order). What is older than what was used is late. A stream that falls back in time starts the filter
     anew; a single stamp far from its neighbours only counts as late, or as invalid if it lies ahead.
     """
 
@@ -90,7 +92,7 @@ class Estimator:
     def _clear(self):
         self._memory, self._monitor = new_memory(self.anchors.positions), Monitor(self.anchors)
         self._waiting = [Waiting(kind) for kind in KINDS]
-        self._gates = [StampGate() for _ in STREAMS]
+        self._gates, self._orders = [StampGate() for _ in STREAMS], [Order() for _ in STREAMS]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
         self._poses = []  # (1,) of POSE, told and not reached yet
         self._fed_imu = [np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)]  # lately, after the one before them
@@ -104,6 +106,11 @@ class Estimator:
     def newest(self):
         """Stamp of the newest measurement, s; -inf before the first."""
         return max(gate.newest for gate in self._gates)
+
+    @property
+    def next_odometry(self):
+        """Stamp, s, up to which no odometry will come."""
+        return float(self._memory.ekf["next_odometry"][0])
 
     @property
     def recoveries(self):
@@ -193,12 +200,14 @@ class Estimator:
 
     def advance(self):
         """Use every message that nothing earlier can precede any more. Returns (Odometry, Residuals), possibly empty."""
-        imu, tdoa, *others = (gate.newest for gate in self._gates)
-        newest = max(imu, tdoa)
-        awaited = [tdoa, *(t for t in others if newest - SILENT < t < newest)]
-        if self.config.use_imu:
-            awaited.append(imu)
-        return self._feed(max(min(awaited) - self.reorder, newest - self.lag))
+        stamps = [gate.newest for gate in self._gates]
+        newest = max(stamps[IMU_STREAM], stamps[TDOA_STREAM])
+        passed = []  # by each stream that is waited for
+        for stream, (t, order) in enumerate(zip(stamps, self._orders)):
+            if (newest - SILENT < t < newest) if stream >= FIRST_AID else (stream == TDOA_STREAM or self.config.use_imu):
+                passed.append(t if order.trusted(t) else t - self.reorder)
+        before = math.nextafter(min(passed), -math.inf)  # more with that very stamp may come
+        return self._feed(max(before, newest - self.lag))
 
     def finish(self):
         """Use everything that still waits. Returns (Odometry, Residuals)."""
@@ -209,11 +218,9 @@ class Estimator:
     def rates_at(self, t):
         """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample
         is near."""
-        fed = np.concatenate(self._fed_imu)
-        place = np.searchsorted(fed["t"], t, side="right") - 1
-        sample = fed[np.maximum(place, 0)]
-        near = (place >= 0) & (np.abs(t - sample["t"]) <= self.config.imu_timeout)
-        return np.where(near[:, None], sample["gyro"], math.nan)
+        out = np.empty((len(t), 3))
+        _look_up(np.ascontiguousarray(t), np.concatenate(self._fed_imu), self.config.imu_timeout, out)
+        return out
 
     def _add(self, stream, rows, usable):
         """Take rows of a stream, of which some may not be usable: those count as invalid (TDOAs are refused already)."""
@@ -222,6 +229,7 @@ class Estimator:
             newest = self._waiting[stream].append(rows, gate.newest, self._fed_until)
             if newest == newest:
                 gate.newest = newest
+                self._orders[stream].begin(rows["t"][0])
                 return
         for k, (t, good) in enumerate(zip(rows["t"].tolist(), usable.tolist())):
             if good:
@@ -233,12 +241,18 @@ class Estimator:
 
     def _take(self, stream, t, row):
         """Keep a row of a stream, and one that was held because of its stamp, if their stamps are accepted."""
+        newest = self._gates[stream].newest
         accepted, outliers, jumped_back = self._gates[stream].take(t, row)
         if jumped_back:
             self._start_anew(stream)
+            newest = -math.inf
         self._refuse_outliers(stream, outliers)
-        for _, row in accepted:
-            self._keep(stream, row)
+        for t, row in accepted:
+            if self._orders[stream].is_late(t, newest):
+                self._refuse(stream, row, LATE)
+            else:
+                self._keep(stream, row)
+            newest = max(newest, t)
 
     def _keep(self, stream, rows):
         """Have rows wait in the order of their stamps, but those that come after what was used."""
@@ -333,6 +347,18 @@ class Estimator:
         for verdict in columns[-1].tolist():
             self.counts[VERDICTS[verdict]] += 1
         return Residuals(*columns)
+
+
+@compiled
+def _look_up(t, samples, timeout, out):
+    """Rates of the last of IMU_SAMPLE, in the order of their stamps, up to each of t (n,) s, NaN where it is older than that."""
+    for i in range(len(t)):
+        out[i] = np.nan
+        for k in range(len(samples) - 1, -1, -1):
+            if samples[k].t <= t[i]:
+                if t[i] - samples[k].t <= timeout:
+                    out[i] = samples[k].gyro
+                break
 
 
 NONE = [np.empty(0, kind) for kind in KINDS]

@@ -1,13 +1,16 @@
 """What ekf_node publishes: odometry, transforms, residuals."""
 
+import math
+
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage
-from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.ros_frames import TF_QOS
+from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
 from uwb_tdoa_bias.foundation.ros_wire import Wire
 from uwb_tdoa_msgs.msg import TdoaResidual
 
@@ -15,17 +18,15 @@ from .ekf_parameters import NONE, ODOM
 from .frames import to_odometry
 
 UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
-ODOMETRY = (
-    "pose.pose.position", "pose.pose.orientation", "pose.covariance", "twist.twist.linear", "twist.twist.angular",
-    "twist.covariance",
-)  # fmt: skip
+ODOMETRY = "pose", "twist"
 RESIDUAL = "anchor_a", "anchor_b", "innovation", "innovation_variance", "weight", "verdict"
+POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a TwistWithCovariance
 UNPLACED = 100  # odometries in a row without odom -> body on /tf, before it is a trouble
 
 
 class Outputs:
-    """published : number of messages on odometry; stamp : of the newest; world : name of its frame; odometry, residual : the
-    publishers."""
+    """published : number of messages on odometry; stamp : of the newest; world : name of its frame; odometry, residual :
+    StreamOutputs."""
 
     def __init__(self, node, epoch, frames, body, publish_tf, odom):
         """epoch : ros.Epoch; frames : transforms.Frames; body, odom : names of frames; publish_tf : of PUBLISH_TF."""
@@ -37,8 +38,8 @@ class Outputs:
         self._tf = TFMessage(transforms=[self._transform])  # one for all: what is published is copied
         self.stamp = Time()  # of the newest odometry
         self.set_world("")
-        self.odometry = ros.publish_stream(node, Odometry, "odometry")
-        self.residual = ros.publish_stream(node, TdoaResidual, "uwb/residual")
+        self.odometry = StreamOutput(node, Odometry, "odometry")
+        self.residual = StreamOutput(node, TdoaResidual, "uwb/residual")
         self._tf_publisher = node.create_publisher(TFMessage, "/tf", TF_QOS) if publish_tf != NONE else None
 
     def set_world(self, frame):
@@ -61,7 +62,7 @@ class Outputs:
 
     def publish_residuals(self, residuals):
         """Publish Residuals."""
-        if not self.residual.get_subscription_count():
+        if not self.residual.publisher.get_subscription_count():
             return  # nobody can come and ask for them later
         rows = self._residual.rows(len(residuals.t))
         rows["sec"], rows["nanosec"] = self._epoch.parts(residuals.t)
@@ -70,30 +71,19 @@ class Outputs:
         )  # fmt: skip
         for name, column in zip(RESIDUAL, columns):
             rows[name] = column
-        for message in self._residual.messages(rows):
-            self.residual.publish(message)
+        self.residual.publish(self.world, self._residual, rows)
 
     def publish_odometry(self, odometry, rates, rate_variance):
         """Publish Odometry. rates (n, 3) rad/s, NaN where not known, and their variance, rad^2/s^2."""
-        n, known = len(odometry), np.isfinite(rates[:, 0])
-        velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
-        twist = np.zeros((n, 6, 6))
-        twist[:, :3, :3] = covariance[:, 6:, 6:]
-        twist[:, [3, 4, 5], [3, 4, 5]] = np.where(known, rate_variance, UNKNOWN_RATE)[:, None]
+        n = len(odometry)
         rows = self._odometry.rows(n)
         rows["sec"], rows["nanosec"] = self._epoch.parts(odometry.t)
-        columns = (
-            odometry.p, odometry.q, covariance[:, :6, :6].reshape(n, 36), velocity, np.where(known[:, None], rates, 0.0),
-            twist.reshape(n, 36),
-        )  # fmt: skip
-        for name, column in zip(ODOMETRY, columns):
-            rows[name] = column
+        rows["pose"], rows["twist"] = pose_and_twist(odometry, rates, rate_variance)
         transformed = self._tf_publisher is not None and (self._odom or self._tf_publisher.get_subscription_count())
-        for k, message in enumerate(self._odometry.messages(rows)):
-            self.odometry.publish(message)
-            if transformed:
-                self.stamp = self._epoch.stamp(odometry.t[k].item())
-                self._publish_transform(odometry.t[k], odometry.p[k].tolist(), odometry.q[k].tolist())
+        self.odometry.publish(self.world, self._odometry, rows)
+        for k in range(n) if transformed else ():
+            self.stamp = self._epoch.stamp(odometry.t[k].item())
+            self._publish_transform(odometry.t[k], odometry.p[k].tolist(), odometry.q[k].tolist())
         if n:
             self.stamp = self._epoch.stamp(odometry.t[-1].item())
         self.published += n
@@ -112,3 +102,27 @@ class Outputs:
         out.translation.x, out.translation.y, out.translation.z = p
         out.rotation.x, out.rotation.y, out.rotation.z, out.rotation.w = q
         self._tf_publisher.publish(self._tf)
+
+
+def pose_and_twist(odometry, rates, rate_variance):
+    """The numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST), see `publish_odometry`."""
+    velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
+    pose, twist = np.empty((len(odometry), POSE)), np.zeros((len(odometry), TWIST))
+    p, q = np.ascontiguousarray(odometry.p), np.ascontiguousarray(odometry.q)
+    _fill(p, q, velocity, covariance, rates, rate_variance, pose, twist)
+    return pose, twist
+
+
+@compiled
+def _fill(p, q, velocity, covariance, rates, rate_variance, pose, twist):
+    for n in range(len(p)):
+        pose[n, :3], pose[n, 3:7], twist[n, :3] = p[n], q[n], velocity[n]
+        known = math.isfinite(rates[n, 0])
+        for i in range(6):
+            for j in range(6):
+                pose[n, 7 + 6 * i + j] = covariance[n, i, j]
+        for i in range(3):
+            twist[n, 3 + i] = rates[n, i] if known else 0.0
+            twist[n, 6 + 7 * (3 + i)] = rate_variance if known else UNKNOWN_RATE
+            for j in range(3):
+                twist[n, 6 + 6 * i + j] = covariance[n, 6 + i, 6 + j]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BACK
+from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD
 
 ROOM = 256  # rows, to begin with
 
@@ -23,8 +23,8 @@ class Waiting:
         return self._room[self._first : self._end]
 
     def append(self, rows, newest, after):
-        """Append rows (k,), k > 0, if their stamps rise, are after `after`, s, and plausible for a stream whose newest stamp was
-        `newest`, s (see StampGate). Returns the newest stamp now, s; NaN if they were not appended."""
+        """Append rows (k,), k > 0, if their stamps rise, are after `after`, s, and in order and plausible for a stream whose
+        newest stamp was `newest`, s (see StampGate). Returns the newest stamp now, s; NaN if they were not appended."""
         self._make_room(len(rows))
         newest = _append(self._room, self._first, self._end, rows, newest, after)
         if newest == newest:
@@ -61,9 +61,9 @@ def _append(room, first, end, rows, newest, after):
         newest = rows[0].t
     for k in range(len(rows)):
         t = rows[k].t
-        if not newest - LARGEST_STEP_BACK <= t <= newest + LARGEST_STEP_AHEAD or t <= last or t < after:
+        if not newest <= t <= newest + LARGEST_STEP_AHEAD or t <= last or t < after:
             return np.nan
-        newest, last = max(newest, t), t
+        newest = last = t
     for k in range(len(rows)):
         room[end + k] = rows[k]
     return newest

@@ -108,8 +108,8 @@ def test_latency_is_that_of_the_first_odometry_that_contains_a_tdoa():
 
 def test_ready_is_read_from_the_log():
     log = "[INFO] [17.5] [tag1.ekf_node]: loading\nnot ready\n[INFO] [18.25] [tag1.ekf_node]: ready\n"
-    assert nodes.READY.findall(log) == ["18.25"]
-    assert not nodes.READY.findall(log[:-30])
+    assert nodes.ready_at("ekf_node", log) == ["18.25"]
+    assert not nodes.ready_at("ekf_node", log[:-30]) and not nodes.ready_at("localization_node", log)
 
 
 def test_bad_usage(tmp_path, capsys):

@@ -1,5 +1,7 @@
 """The poses of the last seconds."""
 
+import math
+
 import numpy as np
 
 from ..foundation.compiled import compiled
@@ -38,8 +40,8 @@ class Poses:
         """Append one pose, or several: t (k,), p (k, 3), q (k, 4), yaw_std (k,) rad. Those not later than all before them
         are ignored."""
         new = [np.reshape(part, (-1, *column.shape[1:])) for part, column in zip((t, p, q, yaw_std), self._columns)]
-        rising = new[0] > np.maximum.accumulate(np.concatenate([[self.newest], new[0]]))[:-1]
-        if not rising.all():
+        if not _rising(new[0], self.newest):
+            rising = new[0] > np.maximum.accumulate(np.concatenate([[self.newest], new[0]]))[:-1]
             new = [part[rising] for part in new]
         for first in range(0, len(new[0]), self._history):
             self._append([part[first : first + self._history] for part in new])
@@ -64,6 +66,14 @@ class Poses:
         self._count = end
 
 
+def _rising(stamps, newest):
+    for t in stamps.tolist():
+        if not t > newest:
+            return False
+        newest = t
+    return True
+
+
 @compiled
 def _look_up(t, count, stamps, p, q, yaw_std, places, p_out, q_out, yaw_std_out):
     for i in range(len(t)):
@@ -80,7 +90,25 @@ def known_yaw_std(std):
 
     It is 0 where the tilt is not known either: then no attitude is estimated, and level at yaw 0 is what is meant.
     """
-    return np.where(std[:, :2].max(axis=1) < TILT, std[:, 2], 0.0)
+    return np.where(np.maximum(std[:, 0], std[:, 1]) < TILT, std[:, 2], 0.0)
+
+
+def parts_of(poses):
+    """(p (n, 3) m, q (n, 4) x y z w, yaw_std (n,) rad) of geometry_msgs/PoseWithCovariance: (n, 43), its numbers in their
+    order. An orientation of (0, 0, 0, 0) says that it is not known: NaN."""
+    p, q, std = np.empty((len(poses), 3)), np.empty((len(poses), 4)), np.empty((len(poses), 3))
+    _part(poses, p, q, std)
+    return p, q, known_yaw_std(std)
+
+
+@compiled
+def _part(poses, p, q, std):
+    for n in range(len(poses)):
+        p[n], q[n] = poses[n, :3], poses[n, 3:7]
+        if not q[n].any():
+            q[n] = np.nan
+        for axis in range(3):
+            std[n, axis] = math.sqrt(max(poses[n, 7 + 7 * (3 + axis)], 0.0))
 
 
 def rotated_in_yaw(q, quarters):

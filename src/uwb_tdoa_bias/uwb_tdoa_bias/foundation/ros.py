@@ -15,6 +15,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
+from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
@@ -23,7 +24,6 @@ from rclpy.utilities import remove_ros_args
 
 from .errors import InputError
 from .executable import interrupt
-from .ros_parameters import files_of
 
 try:  # not in rclpy before 7.1.4; takes a third of the CPU time
     from rclpy.experimental import EventsExecutor
@@ -46,28 +46,58 @@ def publish_stream(node, kind, topic):
     return node.create_publisher(kind, topic, copy(OUTPUT_QOS), qos_overriding_options=OVERRIDES)
 
 
+class StreamNode(Node):
+    """A node that may have subscriptions which no executor serves. members : nodes that live and end with it."""
+
+    members = ()
+
+    def __init__(self, *arguments, **options):
+        self._unserved = []
+        super().__init__(*arguments, **options)
+
+    @property
+    def subscriptions(self):
+        """Those that an executor serves."""
+        yield from (one for one in super().subscriptions if one not in self._unserved)
+
+    def leave_to_itself(self, subscription):
+        """Have no executor serve a subscription."""
+        self._unserved.append(subscription)
+
+
 class StreamInput:
     """Subscription of a stream. QoS by parameter: qos_overrides.<topic>.subscription.reliability and .depth.
 
     lost : messages that were sent and that DDS did not deliver, as far as it knows.
     """
 
-    def __init__(self, node, kind, topic, callback, raw=False):
-        """raw : messages as bytes, which `drain` needs."""
+    def __init__(self, node, kind, topic, callback=None):
+        """callback(message); None: the node, a StreamNode, fetches them as bytes."""
         self.lost, self._before = 0, 0
         self._node, self._topic = node, topic
         events = SubscriptionEventCallbacks(message_lost=self._on_lost)
         self._subscription = node.create_subscription(
-            kind, topic, callback, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES, raw=raw
-        )
+            kind, topic, callback or _unused, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES,
+            raw=callback is None,
+        )  # fmt: skip
+        if callback is None:
+            node.leave_to_itself(self._subscription)
 
-    def drain(self, keep):
-        """Take what has arrived: keep(data, arrival) is called for each message, which arrived then, ns since 1970."""
-        kind, handle = self._subscription.msg_type, self._subscription.handle
+    def fetch(self, wire):
+        """What has arrived, by a Wire: [(frame, rows (n,), arrivals (n,) s since 1970)], each of successive messages of one
+        frame."""
+        kind, handle, messages, arrivals = self._subscription.msg_type, self._subscription.handle, [], []
         with handle:
             while (taken := handle.take_message(kind, True)) is not None:
-                data, about = taken
-                keep(data, about["received_timestamp"] or time.time_ns())
+                messages.append(taken[0])
+                arrivals.append(taken[1]["received_timestamp"] or time.time_ns())
+        if not messages:
+            return []
+        arrivals, first, out = 1e-9 * np.array(arrivals), 0, []
+        for frame, rows in wire.read(messages):
+            out.append((frame, rows, arrivals[first : first + len(rows)]))
+            first += len(rows)
+        return out
 
     def _on_lost(self, status):
         self.lost += status.total_count_change
@@ -87,6 +117,10 @@ class StreamInput:
                 f"of machine and network, or set qos_overrides.{self._subscription.topic_name}.subscription.reliability"
             )
         return None
+
+
+def _unused(_):
+    """Callback of a subscription that no executor serves."""
 
 
 def several_publishers(node, topic):
@@ -208,8 +242,8 @@ def run(node_class, description, argv=None):
     """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an InputError, or 128 and the
     number of a signal that came before the node was ready.
 
-    node_class(files) makes the node, in an initialised rclpy, of parameter files that were given; it has the executable's
-    NAME. description : for --help.
+    node_class(arguments) makes the node, in an initialised rclpy, of the arguments of the process; it has the executable's
+    NAME, and may have `members`. description : for --help.
     """
     name = node_class.NAME
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
@@ -226,12 +260,13 @@ def run(node_class, description, argv=None):
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
-    node = executor = None
+    nodes, executor = [], None
     try:
         _init(parser, arguments)
-        node = node_class(files_of(arguments))
-        executor = EventsExecutor()
-        executor.add_node(node)
+        node = node_class(arguments)
+        executor, nodes = EventsExecutor(), [node, *getattr(node, "members", ())]
+        for each in nodes:
+            executor.add_node(each)
         gc.collect()
         gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
         interruptible = False
@@ -251,10 +286,11 @@ def run(node_class, description, argv=None):
     finally:
         interruptible = False
         if executor is not None:
-            executor.remove_node(node)
+            for each in nodes:
+                executor.remove_node(each)
             executor.shutdown()
-        if node is not None:
-            node.destroy_node()
+        for each in nodes:
+            each.destroy_node()
         rclpy.try_shutdown()
     return 0
 

@@ -67,7 +67,7 @@ def declare_all(node, parameters):
 
 def refuse_unknown(node, others=()):
     """Raise InputError for a parameter that was given and that the node, which has declared its own, does not have.
-    others : old names that were taken."""
+    others : names that are for somebody else, or old ones that were taken."""
     for name in sorted(node._parameter_overrides):
         if name.startswith(QOS) or name in others or node.has_parameter(name):
             continue
@@ -76,19 +76,19 @@ def refuse_unknown(node, others=()):
         raise InputError(f"{name}: {node.get_name()} has no such parameter; {remedy} (config/{node.NAME}.yaml has all).")
 
 
-def say_unused(node, files):
-    """Say which QoS overrides, and which of the parameter files given, change nothing. To be called when the node has all
-    of its topics. files : their paths."""
-    given, logger = node._parameter_overrides, node.get_logger()
+def say_unused(nodes, files):
+    """Say which QoS overrides, and which of the parameter files given, change nothing. To be called when the nodes of a
+    process have all of their topics. files : their paths."""
+    given, logger = {name for node in nodes for name in node._parameter_overrides}, nodes[0].get_logger()
     for file in files:
         names = _names(read_yaml(file))
-        if names and not names & given.keys():
+        if names and not names & given:
             logger.warning(
-                f"{file}: none of its parameters is for {node.get_fully_qualified_name()}: they are not used; begin it "
+                f"{file}: none of its parameters is for {nodes[0].get_fully_qualified_name()}: they are not used; begin it "
                 "with '/**:', or with the name of this node"
             )
     for name in sorted(given):
-        if name.startswith(QOS) and not node.has_parameter(name):
+        if name.startswith(QOS) and not any(node.has_parameter(name) for node in nodes):
             logger.warning(f"{name}: changes nothing, because this node has no such topic or policy")
 
 

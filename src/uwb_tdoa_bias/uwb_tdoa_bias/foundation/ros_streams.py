@@ -1,48 +1,79 @@
-"""The streams of a node, taken together: being woken up costs more than a message."""
+"""The streams of a node: everything that has arrived is taken together, in turns; being woken up costs more than a message."""
 
 import time
 
 import numpy as np
+from rclpy.clock import Clock, ClockType
 
 from . import ros
 from .stamps import LARGEST_STEP_BACK
 
-PERIOD = 0.002  # s from one time that a node takes what has arrived to the next
+PERIOD = 0.002  # s from one turn to the next
+LONGEST_WAIT = 0.02  # s without a turn in which anything is taken, whatever it waits for
+REST, LONGEST_REST = 1.0, 0.01  # after a turn, times as long as it took, and s at most: more is then taken at a time
+
+
+class Turns:
+    """Has nodes take what has arrived for them, one after the other."""
+
+    def __init__(self, node, streams):
+        """node : whose executor serves the turns; streams : list of Streams, those that hand over to others first."""
+        self._streams, self._next = streams, -np.inf
+        self._timer = node.create_timer(PERIOD, self._take, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _take(self):
+        began = time.monotonic()
+        if began < self._next:
+            return
+        for streams in self._streams:
+            streams.take()
+        now = time.monotonic()
+        self._next = now + min(REST * (now - began), LONGEST_REST)
 
 
 class Streams:
-    """Subscriptions of a node, none of which has a callback of its own: the first message wakes the node up, which then takes
-    what has arrived on all of them."""
+    """Subscriptions of a ros.StreamNode, which no executor serves: they hold what arrives until it is taken."""
 
     def __init__(self, node, epoch, on_taken, catch_up=lambda: None):
-        """epoch : ros.Epoch; catch_up() is called before anything is taken, on_taken() when everything was given to those
-        that take it."""
-        self.inputs = {}  # ros.StreamInput by topic, in the order in which they are taken
+        """epoch : ros.Epoch; catch_up() is called before anything is given to those that take it, on_taken() afterwards."""
+        self.inputs = {}  # ros.StreamInput or Handed by topic, in the order in which they are taken
         self._node, self._epoch, self._on_taken, self._catch_up = node, epoch, on_taken, catch_up
-        self._streams, self._next = [], -np.inf
+        self._streams, self._unheard, self._by_topic = [], [], {}
+        self._awaited, self._due, self._until = None, None, -np.inf
 
-    def add(self, wire, topic, take):
+    def wait_for(self, topic, due):
+        """Take nothing before a message of this topic is stamped after due(), s since 1970, for LONGEST_WAIT: less could not
+        be done with it yet."""
+        self._awaited, self._due = self._by_topic[topic], due
+
+    def add(self, wire, topic, take, handed=False):
         """Subscribe. wire : Wire; take(frame, t, rows, arrival) gets successive messages of one frame: their stamps (n,) s,
-        rows (n,) of the Wire, and when they arrived, (n,) s since 1970."""
-        stream = _Stream(wire, take)
-        stream.input = ros.StreamInput(
-            self._node, wire.kind, topic, lambda data: self._on_message(stream, data), raw=True
-        )
-        self.inputs[topic] = stream.input
+        rows (n,) of the Wire, and when they arrived, (n,) s since 1970. handed : a node of this process hands them over."""
+        kind = Handed if handed else ros.StreamInput
+        self.inputs[topic] = kind(self._node, wire.kind, topic)
+        stream = self._by_topic[topic] = _Stream(wire, take, self.inputs[topic])
         self._streams.append(stream)
+        self._unheard.append(stream)
 
-    def _on_message(self, stream, data):
-        stream.keep(data, time.time_ns())
-        left = self._next - time.monotonic()
-        if left > 0.0:
-            time.sleep(left)
-        self._next = time.monotonic() + PERIOD
-        self._catch_up()
-        parts = []
+    def take(self):
+        """Give everything that has arrived to those that take it."""
+        if self._awaited is not None:
+            self._awaited.fetch()
+            now = time.monotonic()
+            if now < self._until and not self._awaited.newest_waiting > self._due():
+                return
+            self._until = now + LONGEST_WAIT
+        if self._unheard:  # of what has never come, one is asked for at a time
+            self._unheard = [*self._unheard[1:], self._unheard[0]]
+            self._unheard[-1].fetch()
+            self._unheard = [stream for stream in self._unheard if not stream.heard]
         for stream in self._streams:
-            if stream.heard:  # what has never come is not asked for
-                stream.input.drain(stream.keep)
-                parts += stream.parts(self._epoch)
+            if stream.heard:
+                stream.fetch()
+        if not any(stream.waiting for stream in self._streams):
+            return
+        self._catch_up()
+        parts = [part for stream in self._streams if stream.waiting for part in stream.parts(self._epoch)]
         if any(stream.fell for stream in self._streams):  # then it matters which stream was first
             parts = sorted((piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0])
         for take, *part in parts:
@@ -50,34 +81,83 @@ class Streams:
         self._on_taken()
 
 
+class StreamOutput:
+    """Publisher of a stream of messages that templates make."""
+
+    def __init__(self, node, kind, topic):
+        self.publisher, self._receiver = ros.publish_stream(node, kind, topic), None
+
+    def hand_to(self, receiver):
+        """Give everything to Handed, too."""
+        self._receiver = receiver
+
+    def publish(self, frame, template, rows):
+        """Publish rows (n,) of a Template, whose messages are of this frame."""
+        if self._receiver is not None:
+            self._receiver.hand(frame, rows)
+        if self.publisher.get_subscription_count():  # nobody can come and ask for them later
+            for message in template.messages(rows):
+                self.publisher.publish(message)
+
+
+class Handed:
+    """Stands for the subscription of a stream that a node of this process hands over in memory."""
+
+    lost = 0
+
+    def __init__(self, node, kind, topic):
+        self._node, self._topic, self._parts = node, topic, []
+
+    def hand(self, frame, rows):
+        """Take rows (n,) with the fields of a Wire, all of one frame."""
+        self._parts.append((frame, rows, np.full(len(rows), 1e-9 * time.time_ns())))
+
+    def fetch(self, wire):
+        """[(frame, rows, arrivals)] since the last time."""
+        parts, self._parts = self._parts, []
+        return parts
+
+    def get_publisher_count(self):
+        """How many publish it."""
+        return self._node.count_publishers(self._topic)
+
+    def trouble(self, received):
+        """What is wrong with the stream as ROS sees it, or None."""
+        return ros.several_publishers(self._node, self._topic)
+
+
 class _Stream:
-    """What has arrived on one of them. heard : anything at all; fell : the stamps of what was taken last have fallen back."""
+    """What has arrived on one of them. heard : anything at all; waiting : parts; fell : the stamps of what was taken last have
+    fallen back."""
 
-    def __init__(self, wire, take):
-        self.input, self.heard, self.fell = None, False, False
-        self._wire, self._take, self._newest = wire, take, -np.inf
-        self._messages, self._arrivals = [], []
+    def __init__(self, wire, take, source):
+        self.heard, self.waiting, self.fell = False, [], False
+        self._wire, self._take, self._source, self._newest = wire, take, source, -np.inf
 
-    def keep(self, data, arrival):
-        self.heard = True
-        self._messages.append(data)
-        self._arrivals.append(arrival)
+    def fetch(self):
+        self.waiting += self._source.fetch(self._wire)
+        self.heard = self.heard or bool(self.waiting)
+
+    @property
+    def newest_waiting(self):
+        """Stamp, s since 1970, of what was fetched last; -inf if nothing waits."""
+        if not self.waiting:
+            return -np.inf
+        rows = self.waiting[-1][1]
+        return rows["sec"][-1] + 1e-9 * rows["nanosec"][-1]
 
     def parts(self, epoch):
-        """What was kept, as [(take, frame, stamps, rows, arrivals)]."""
-        self.fell = False
-        if not self._messages:
-            return []
-        # when the first came only the executor knows, but before the second
-        parts, first, arrivals = [], 0, 1e-9 * np.minimum.accumulate(self._arrivals[::-1])[::-1]
-        for frame, rows in self._wire.read(self._messages):
+        """What was fetched, as [(take, frame, stamps, rows, arrivals)]."""
+        self.fell, parts = False, []
+        for frame, rows, arrivals in self.waiting:
             t = epoch.seconds_of(rows["sec"], rows["nanosec"])
-            parts.append((self._take, frame, t, rows, arrivals[first : first + len(rows)]))
-            first += len(rows)
-            before = np.maximum.accumulate(np.concatenate([[self._newest], t]))[:-1]
-            self.fell = self.fell or bool((t < before - LARGEST_STEP_BACK).any())
-            self._newest = t[-1]
-        self._messages, self._arrivals = [], []
+            parts.append((self._take, frame, t, rows, arrivals))
+            newest = self._newest
+            for stamp in t.tolist():
+                self.fell = self.fell or stamp < newest - LARGEST_STEP_BACK
+                newest = max(newest, stamp)
+            self._newest = stamp
+        self.waiting = []
         return parts
 
 

@@ -12,17 +12,18 @@ SHORTEST = 16.0  # s that the simulation needs to take off and land
 TDOA_RATE = 400.0  # Hz
 
 
-def make_flight(seconds, anchors=8, **more):
-    """A Flight of at least `seconds` among so many anchors; more : of SimulationConfig. Its first `seconds` count."""
+def make_flight(seconds, anchors=8, tdoa_rate=TDOA_RATE, **more):
+    """A Flight of at least `seconds` among so many anchors; tdoa_rate : Hz; more : of SimulationConfig. Its first `seconds`
+    count."""
     room = "corners" if anchors == 8 else f"random-1-{anchors}"
     flight = simulate(SimulationConfig(seed=1, constellation=room, duration=max(seconds, SHORTEST), **more))
-    return first(thinned(flight), seconds)
+    return first(thinned(flight, tdoa_rate), seconds)
 
 
-def thinned(flight):
-    """The flight with TDOA_RATE of its TDOAs, evenly left out."""
+def thinned(flight, rate):
+    """The flight with `rate` of its TDOAs, Hz, evenly left out."""
     duration = flight.imu.t[-1] - flight.imu.t[0]
-    kept = np.linspace(0, len(flight.tdoa) - 1, min(len(flight.tdoa), round(TDOA_RATE * duration))).astype(int)
+    kept = np.linspace(0, len(flight.tdoa) - 1, min(len(flight.tdoa), round(rate * duration))).astype(int)
     return replace(flight, tdoa=_rows(flight.tdoa, kept))
 
 

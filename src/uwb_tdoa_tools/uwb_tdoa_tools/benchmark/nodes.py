@@ -1,6 +1,7 @@
 """The nodes live, in real time: CPU, memory, latency, losses, time to ready; for one tag and for several."""
 
 import json
+import os
 import re
 import time
 from contextlib import contextmanager
@@ -17,13 +18,14 @@ from .flights import make_flight
 from .source import Source, latencies
 from .usage import cpu_seconds, memory
 
-NODES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf"}
+PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf", "localization_node": "uwb_tdoa_ekf"}
+NODES = "bias_node", "ekf_node"
 SHARED = ("imu/data", "uwb/tdoa", "uwb/anchors")  # published once for all tags, so that the source stays the same
 BLOCK = 3.0  # s over which CPU and latencies are taken: their median and quartiles are of blocks
 READY_LIMIT, MATCH_LIMIT, SETTLE_LIMIT = 300.0, 60.0, 60.0  # s; the very first start compiles the filter
-TAGS = (1, 2, 4, 8)
-TARGET_CPU, TARGET_LATENCY, TARGET_READY = 60.0, 15.0, 3.0  # % of one core, ms, s
-READY = re.compile(r"^\[INFO\] \[([0-9.]+)\] \[\S+\]: ready", re.MULTILINE)
+FLEETS = (1, 1000.0, 400.0), (2, 1000.0, 400.0), (4, 1000.0, 400.0), (8, 1000.0, 400.0), (30, 100.0, 100.0)  # tags, Hz, Hz
+TARGET_CPU, TARGET_LATENCY, TARGET_READY = 25.0, 10.0, 0.5  # % of one core, ms, s
+TARGET_LATENCY_OF_FLEET = 30.0  # ms
 SECTION = "both nodes live at 1 kHz IMU + 400 Hz TDOA, default parameters and QoS"
 
 
@@ -52,44 +54,64 @@ def measure(progress, folder, quick=False):
         progress("nodes, start")
         ready.append(start(folder))
     progress(f"nodes, {seconds:g} s live")
-    live = fly(make_flight(seconds), folder, [""])
+    flight = make_flight(seconds)
+    live = fly(flight, folder, [""], pairs([""]))
     ready.append(live.ready)
     for name in NODES:
         yield Figure.of(SECTION, f"ready after its start, {name}", "s", [one[name] for one in ready], TARGET_READY)
-    yield from _figures(SECTION, live, TARGET_CPU, TARGET_LATENCY)
+    yield from _figures(SECTION, live)
+    progress(f"localization_node, {seconds:g} s live")
+    together = fly(flight, folder, [""], pool([""], 1))
+    yield from _figures(f"{SECTION}, in one process", together, TARGET_CPU, TARGET_LATENCY)
     if not quick:
         progress(f"nodes, 64 anchors, {seconds:g} s live")
-        yield from _figures(f"{SECTION}, 64 anchors", fly(make_flight(seconds, 64), folder, [""]))
+        yield from _figures(f"{SECTION}, 64 anchors", fly(make_flight(seconds, 64), folder, [""], pairs([""])))
 
 
 def measure_tags(progress, folder, quick=False):
-    """Generator of Figures for 1, 2, 4 and 8 tags that all hear the same streams."""
-    seconds = 10.0 if quick else 20.0
-    flight = make_flight(seconds)
+    """Generator of Figures for several tags that all hear the same streams, in a localization_node for each core."""
+    seconds, cores = 10.0 if quick else 20.0, len(os.sched_getaffinity(0))
     progress("tags, first start")
     start(folder)  # whoever compiles the filter keeps the memory that took
-    for tags in TAGS:
+    for tags, imu_rate, tdoa_rate in FLEETS[3:] if quick else FLEETS:
         progress(f"{tags} tags, {seconds:g} s live")
         spaces = [f"/tag{k + 1}" for k in range(tags)]
-        section = f"{tags} tag{'s' * (tags > 1)}, as many pairs of nodes in namespaces"
-        yield from _figures(section, fly(flight, folder, spaces))
+        starts = pool(spaces, min(cores, tags))
+        section = f"{tags} tag{'s' * (tags > 1)} at {imu_rate:g} Hz IMU + {tdoa_rate:g} Hz TDOA, {len(starts)} localization_node"
+        flight = make_flight(seconds, tdoa_rate=tdoa_rate, imu_rate=imu_rate)
+        yield from _figures(section, fly(flight, folder, spaces, starts), None, TARGET_LATENCY_OF_FLEET)
 
 
 def start(folder):
     """{node: s from its start until it says that it is ready}, one after the other."""
     with _surroundings(folder) as (node, processes):
-        return {name: _start(processes, node, name, "") for name in NODES}
+        return {name: _start(processes, node, name, name, []) for name in NODES}
 
 
-def fly(flight, folder, namespaces):
-    """Measured of a flight in real time through the nodes of each namespace ("" or "/name")."""
+def pairs(namespaces):
+    """A bias_node and an ekf_node for each namespace: {title: (executable, arguments)}."""
+    return {_title(space, name): (name, _arguments(space, name)) for space in namespaces for name in NODES}
+
+
+def pool(namespaces, processes):
+    """So many localization_nodes, which share the namespaces: {title: (executable, arguments)}."""
+    name, shared = "localization_node", [part for topic in SHARED for part in ("-r", f"{topic}:=/{topic}")]
+    if namespaces == [""]:
+        return {name: (name, [])}
+    tags = [json.dumps([space.strip("/") for space in namespaces[k::processes]]) for k in range(processes)]
+    own = [["-p", f"tags:={each}", "-r", f"__node:={name}_{k + 1}"] for k, each in enumerate(tags)]
+    return {f"{k + 1}/{name}": (name, ["--ros-args", *arguments, *shared]) for k, arguments in enumerate(own)}
+
+
+def fly(flight, folder, namespaces, starts):
+    """Measured of a flight in real time through the nodes of each namespace ("" or "/name"); starts : of `pairs` or `pool`."""
     out = Measured()
     with _surroundings(folder) as (node, processes):
         diagnostics, source = Diagnostics(node), Source(node, namespaces)
-        for space in namespaces:
-            for name in NODES:
-                out.ready[_title(space, name)] = _start(processes, node, name, space)
-        matched = partial(_matched, node, source, diagnostics, out.ready)
+        for title, (name, arguments) in starts.items():
+            out.ready[title] = _start(processes, node, title, name, arguments)
+        titles = [_title(space, name) for space in namespaces for name in NODES]
+        matched = partial(_matched, node, source, diagnostics, titles)
         wait(MATCH_LIMIT, "all to find each other", processes, node, matched)
         samples = []
 
@@ -116,31 +138,38 @@ def fly(flight, folder, namespaces):
 
 @contextmanager
 def _surroundings(folder):
-    """(node of ours, Processes) in a domain of their own, whose logs READY understands."""
+    """(node of ours, Processes) in a domain of their own, whose logs ready_at understands."""
     form = "[{severity}] [{time}] [{name}]: {message}"
     logs = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": form, "RCUTILS_COLORIZED_OUTPUT": "0"}
     with own_domain(), variables(logs), session("bench", []) as (node, stop), Processes(folder, stop) as processes:
         yield node, processes
 
 
-def _start(processes, node, name, space):
-    """Start a node and wait until it is ready; returns the s that took, by the clock of its log."""
-    title, arguments = _title(space, name), []
-    if space:
-        remaps = [f"__ns:={space}", *(f"{topic}:=/{topic}" for topic in SHARED)]
-        arguments = ["--ros-args", *(part for remap in remaps for part in ("-r", remap))]
-        if name == "ekf_node":
-            arguments += ["-p", f"body_frame:={json.dumps(space.strip('/'))}"]
+def _arguments(space, name):
+    if not space:
+        return []
+    remaps = [f"__ns:={space}", *(f"{topic}:=/{topic}" for topic in SHARED)]
+    own = ["-p", f"body_frame:={json.dumps(space.strip('/'))}"] if name == "ekf_node" else []
+    return ["--ros-args", *(part for remap in remaps for part in ("-r", remap)), *own]
+
+
+def _start(processes, node, title, name, arguments):
+    """Start an executable and wait until it is ready; returns the s that took, by the clock of its log."""
     began = time.time()
-    processes.start(NODES[name], name, *arguments, title=title)
+    processes.start(PACKAGES[name], name, *arguments, title=title)
     said = []
 
     def is_ready():
-        said[:] = READY.findall(processes.file(title).read_text(errors="replace"))
+        said[:] = ready_at(name, processes.file(title).read_text(errors="replace"))
         return said
 
     wait(READY_LIMIT, f"{title} to be ready", processes, node, is_ready)
     return float(said[0]) - began
+
+
+def ready_at(name, log):
+    """When an executable said in its log that it is ready: [s since 1970, as text]."""
+    return re.findall(rf"^\[INFO\] \[([0-9.]+)\] \[\S*{name}\S*\]: ready", log, re.MULTILINE)
 
 
 def _title(space, name):
@@ -176,8 +205,10 @@ def _count(out, flight, namespaces, diagnostics, source):
 
 def _figures(section, measured, target_cpu=None, target_latency=None):
     """Figures of a Measured. CPU and latency: medians and quartiles of blocks; memory: of nodes."""
-    for name in NODES:
+    for name in PACKAGES:
         titles = [title for title in measured.cpu if title.endswith(name)]
+        if not titles:
+            continue
         of = f"{name}s" if len(titles) > 1 else name
         yield Figure.of(section, f"CPU, {of}", "% of a core", 100.0 * sum(measured.cpu[title] for title in titles))
         yield Figure.of(section, f"resident memory, each {name}", "MB", [1e-6 * measured.memory[t] for t in titles])

@@ -13,7 +13,7 @@ tags, and replays. Figures are medians with their quartiles, beside their target
   core    us per IMU prediction and per robust TDOA update, by anchors and kind of robustness
   offline seconds for a recording of 45 s, with correction, network and smoother
   nodes   time to ready, CPU, memory, latency and losses of both nodes at 1 kHz IMU + 400 Hz TDOA
-  tags    the same for 1, 2, 4 and 8 tags, all of which hear the same streams
+  tags    the same for 1 to 8 tags, and for 30 at 100 Hz, in localization_nodes; all tags hear the same streams
   replay  how fast a bag goes through both nodes without loss
 
 Real nodes run in a ROS domain of their own. Whatever else the machine does shows in the figures, above all in the
