@@ -100,6 +100,11 @@ class BiasNode(ros.StreamNode):
             self._turns = Turns(self, [self.streams])
         self.get_logger().info(f"ready; correcting with: {self._model[NETWORK]}")
 
+    @property
+    def holds(self):
+        """How many TDOAs wait for their pose."""
+        return len(self._hold)
+
     def _warm_up(self):
         """Compile and load whatever the first correction would; returns what to call each status's bias."""
         corrector = Corrector(Anchors.from_positions(np.eye(3)), self._effects, self._network, self._lag)

@@ -27,7 +27,10 @@ PARAMETERS = {  # in the order of config/ekf_node.yaml
         "", "effects.yaml, the same as bias_node's: what it says of gyroscope, accelerometer, height and velocity is taken out"
     ),
     "reorder": Parameter(
-        0.003, "s of stamps; how long a TDOA waits for older ones that are still on their way", 0.0, 10.0
+        0.003,
+        "s of stamps; how long messages wait for older ones that are still on their way, until 2 s of their stream were in order",
+        0.0,
+        10.0,
     ),
     "lag": Parameter(
         0.25, "s of stamps; how long a silent stream is waited for; what comes later than that is late", 0.0, 100.0

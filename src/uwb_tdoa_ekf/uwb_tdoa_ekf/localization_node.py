@@ -36,26 +36,39 @@ class LocalizationNode(ros.StreamNode):
         tags = declare_all(self, PARAMETERS)["tags"]
         if not tags or len(set(tags)) < len(tags):
             raise InputError(f"tags: {list(tags)!r} must be a list of different namespaces, e.g. ['tag1', 'tag2'].")
-        self.members, streams = [], []
-        for tag in tags:
-            pair = self._start(tag, list(arguments))
-            self.members += pair
-            streams += [node.streams for node in pair]
+        pairs = [Pair(*self._start(tag, list(arguments))) for tag in tags]
+        self.members = [node for pair in pairs for node in (pair.bias, pair.ekf)]
         say_unused([self, *self.members], files_of(arguments))
-        self._turns = Turns(self, streams)
+        self._turns = Turns(self, pairs)
         self.get_logger().info(f"ready; tags: {', '.join(tags) or 'one'}")
 
     def _start(self, tag, arguments):
-        """(BiasNode, EkfNode) of a tag, which hand over to each other."""
+        """(BiasNode, EkfNode) of a tag."""
         namespace = f"{self.get_namespace().rstrip('/')}/{tag}".rstrip("/") or "/"
         given = ["--ros-args", *(["-p", f"body_frame:={tag}/base_link"] if tag else []), "--", *_for_all(arguments)]
         options = {"namespace": namespace, "cli_args": given, "use_global_arguments": False}
         names = {*bias_node.PARAMETERS, *names_of_parameters(), *RENAMED, *PARAMETERS}
-        bias, ekf = (kind(member=names, **options) for kind in (BiasNode, EkfNode))
-        bias.output.hand_to(ekf.streams.inputs["uwb/tdoa_corrected"])
-        ekf.outputs.odometry.hand_to(bias.streams.inputs["odometry"])
+        return tuple(kind(member=names, **options) for kind in (BiasNode, EkfNode))
+
+
+class Pair:
+    """The nodes of a tag, which hand over to each other."""
+
+    def __init__(self, bias, ekf):
+        """bias : BiasNode; ekf : EkfNode."""
+        self.bias, self.ekf = bias, ekf
+        self._corrected, self._odometry = ekf.streams.inputs["uwb/tdoa_corrected"], bias.streams.inputs["odometry"]
+        bias.output.hand_to(self._corrected)
+        ekf.outputs.odometry.hand_to(self._odometry)
         bias.streams.wait_for("uwb/tdoa", ekf.due)
-        return bias, ekf
+
+    def take(self):
+        """Give everything that has arrived to those that take it."""
+        self.bias.streams.take()
+        self.ekf.streams.take()
+        while self.bias.holds and len(self._odometry):  # poses that TDOAs wait for
+            self.bias.streams.take(at_once=True)
+            self.ekf.streams.take(at_once=True)
 
 
 def _for_all(arguments):

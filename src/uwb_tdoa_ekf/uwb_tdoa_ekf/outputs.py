@@ -6,9 +6,9 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.later import rotations
 from uwb_tdoa_bias.foundation.ros_frames import TF_QOS
 from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
 from uwb_tdoa_bias.foundation.ros_wire import Wire
@@ -95,7 +95,7 @@ class Outputs:
             self._unplaced = self._unplaced + 1 if between is None else 0
             if between is None:
                 return
-            turn = Rotation.from_quat(q) * between[0].inv()
+            turn = rotations.Rotation.from_quat(q) * between[0].inv()
             p, q = (p - turn.apply(between[1])).tolist(), turn.as_quat().tolist()
         out = self._transform.transform
         self._transform.header.stamp = self.stamp

@@ -36,9 +36,14 @@ def everything(samples):
     unknown."""
     out = np.empty((len(samples), len(NAMES)))
     anchors = samples.anchors
-    _fill(samples.p, samples.q, samples.a, samples.b, anchors.positions, anchors.orientations, out)
-    _fill_place(samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, out[:, len(FEATURES) :])
+    _fill_all(samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, anchors.orientations, out)
     return out
+
+
+@compiled
+def _fill_all(p, q, a, b, ids, positions, orientations, out):
+    _fill(p, q, a, b, positions, orientations, out)
+    _fill_place(p, q, a, b, ids, positions, out[:, len(FEATURES) :])
 
 
 @compiled

@@ -18,17 +18,21 @@ there: it has already faded bias and deviation itself.
 """
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 
+from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
 from .features import NAMES, everything
+from .onnx_file import Unreadable, read_graph
+from .tape import Tape, Unplayable
 
 MODELS = Path(__file__).parent / "models"
 SHIPPED = "default"  # instead of a path: the model that comes with the package
 UNASKED = "auto"  # where nobody named a model: see `unasked`
+NO_NUMBERS = np.empty(0)
 _COLUMN = {name: column for column, name in enumerate(NAMES)}
 
 
@@ -46,26 +50,20 @@ def unasked(effects):
 
 
 class Network:
-    """An ONNX bias model, run on one thread. meta : all its metadata, dict of str; trained_with : names of the effects
+    """An ONNX bias model. meta : all its metadata, dict of str; trained_with : names of the effects
     that were taken out before it was trained, and have to be corrected beside it; share : how much of its prediction is
     taken out, 0 ... 1."""
 
     def __init__(self, path):
         """Load `path`; raises InputError if it is no model or its metadata do not fit."""
         self._path = Path(path).absolute()
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what goes wrong is told here
         if not Path(path).is_file():
             raise InputError(f"model: {path} does not exist; give an .onnx file or leave the model empty.")
         try:
-            self._session = onnxruntime.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
-            )
-            self.meta = self._session.get_modelmeta().custom_metadata_map
-            inputs = [(entry.name, entry.shape) for entry in self._session.get_inputs()]
+            self._model = _load(path)
         except Exception as error:  # onnxruntime raises its own family of exceptions, with no common public base
             raise InputError(f"model: {path} cannot be loaded as ONNX ({_first_line(error)}).") from error
+        self.meta, inputs = self._model.meta, self._model.inputs
         try:
             self._read(self.meta)
         except (KeyError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
@@ -75,11 +73,11 @@ class Network:
             ) from error
         if len(inputs) != 1 or not inputs[0][1]:
             raise InputError(f"model: {path}: has {len(inputs)} inputs; it must have one, of n rows of features.")
-        (self._input, shape), n = inputs[0], len(self._inputs)
+        (name, shape), n = inputs[0], len(self._inputs)
         width = shape[-1]
         if not (n == len(self._offset) == len(self._scale) == width) or (self._scale == 0).any():
             raise InputError(
-                f"model: {path}: input {self._input!r} has {width} columns, the metadata name {n} features, "
+                f"model: {path}: input {name!r} has {width} columns, the metadata name {n} features, "
                 f"{len(self._offset)} offsets and {len(self._scale)} scales; they must agree, and no scale may be 0."
             )
         self._ask(path)
@@ -88,7 +86,7 @@ class Network:
         """Ask it for the mean of all features. Raises InputError: a model may load and fail only when it is asked."""
         for rows in (1, 3):
             try:
-                out = self._session.run(None, {self._input: np.zeros((rows, len(self._inputs)), np.float32)})[0]
+                out = self._model.run(np.zeros((rows, len(self._inputs))))
             except Exception as error:  # as above
                 raise InputError(f"model: {path} cannot be run ({_first_line(error)}).") from error
             shape = getattr(out, "shape", None)
@@ -126,26 +124,60 @@ class Network:
     def predict(self, samples):
         """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
         (n,) arrays. The first two are NaN where a feature that is needed is unknown."""
-        table = everything(samples)
-        x = (table.take(self._inputs, axis=1) - self._offset) / self._scale
-        out = self._session.run(None, {self._input: x.astype(np.float32)})[0].astype(float)
-        bias = np.minimum(np.maximum(out[:, 0], -self.clip), self.clip)  # a fifth of what np.clip takes
-        std = out[:, 1] if out.shape[1] > 1 else np.zeros(len(out))
-        known = out[:, 2] if out.shape[1] > 2 else np.ones(len(out))
-        if len(self._judged):
-            value = table[:, self._judged]
-            beyond = np.maximum(self._lower - value, value - self._upper) / self._margin
-            trust = 1.0 - np.clip(beyond.max(axis=1), 0.0, 1.0)
+        table, n = everything(samples), len(samples)
+        x, found = np.empty((n, len(self._inputs))), np.empty((3, n))
+        _select(table, self._inputs, self._offset, self._scale, x)
+        out = np.asarray(self._model.run(x), dtype=float)
+        yaw_std = NO_NUMBERS if samples.yaw_std is None else np.ascontiguousarray(samples.yaw_std, dtype=float)
+        limits = self.clip, self._fade_std, self.share, self._largest_yaw_std
+        _judge(out, table, self._judged, self._lower, self._upper, self._margin, limits, yaw_std, found)
+        return tuple(found)
+
+
+def _load(path):
+    """What runs a model: a Tape, or where that cannot hold it, onnxruntime."""
+    try:
+        return Tape(read_graph(path))
+    except (Unreadable, Unplayable):
+        from .session import Session  # takes a third of a second
+
+        return Session(path)
+
+
+@compiled
+def _select(table, columns, offset, scale, x):
+    for i in range(len(table)):
+        for k in range(len(columns)):
+            x[i, k] = (table[i, columns[k]] - offset[k]) / scale[k]
+
+
+@compiled
+def _judge(out, table, judged, lower, upper, margin, limits, yaw_std, found):
+    """What the network says, (n, 1 to 3), becomes bias, std and known, (3, n)."""
+    clip, fade_std, share, largest_yaw_std = limits
+    for i in range(len(out)):
+        bias, std, known = out[i, 0], 0.0, 1.0
+        if abs(bias) > clip:
+            bias = math.copysign(clip, bias)
+        if out.shape[1] > 1:
+            std = out[i, 1]
+        if out.shape[1] > 2:
+            known = out[i, 2]
+        if len(judged):
+            beyond = 0.0
+            for k in range(len(judged)):
+                value = table[i, judged[k]]
+                far = max(lower[k] - value, value - upper[k]) / margin[k]
+                beyond = far if far > beyond or value != value else beyond
+            trust = 1.0 - min(beyond, 1.0) if beyond == beyond else np.nan
             bias, known = trust * bias, trust * known
-            std = np.sqrt((trust * std) ** 2 + (1.0 - trust**2) * self._fade_std**2)
-        if self.share < 1.0:
-            std, bias = np.hypot(std, (1.0 - self.share) * bias), self.share * bias
-        if samples.yaw_std is not None:
-            undecided = samples.yaw_std > self._largest_yaw_std
-            if undecided.any():
-                std[undecided] = np.hypot(std[undecided], bias[undecided])
-                bias[undecided] = known[undecided] = 0.0
-        return bias, std, known
+            std = math.sqrt((trust * std) ** 2 + (1.0 - trust**2) * fade_std**2)
+        if share < 1.0:
+            std, bias = math.hypot(std, (1.0 - share) * bias), share * bias
+        if len(yaw_std) and yaw_std[i] > largest_yaw_std:
+            std = math.hypot(std, bias)
+            bias = known = 0.0
+        found[0, i], found[1, i], found[2, i] = bias, std, known
 
 
 def _first_line(error):

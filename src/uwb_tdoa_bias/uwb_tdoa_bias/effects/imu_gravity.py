@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from ..foundation.later import rotations
 from .base import need_truth
 from .affine import Affine
 from .imu_error import ImuEffect, need_imu
@@ -55,7 +55,7 @@ class ImuGravity(ImuEffect):
         imu = flight.imu
         q = Track(flight.truth).attitudes(imu.t)
         up = (
-            Rotation.from_quat(q).inv().apply([0.0, 0.0, self.excess])
+            rotations.Rotation.from_quat(q).inv().apply([0.0, 0.0, self.excess])
             if np.isfinite(q).all()
             else [0.0, 0.0, self.excess]
         )

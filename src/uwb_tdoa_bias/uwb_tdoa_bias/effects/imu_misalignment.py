@@ -1,8 +1,8 @@
 """The IMU is not mounted along the body's axes."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from ..foundation.later import rotations
 from .affine import Affine
 from .imu_error import ImuEffect
 from .wording import listed, measured, significant
@@ -27,7 +27,7 @@ class ImuMisalignment(ImuEffect):
     channels = ("gyro", "accel")
 
     def _turn(self):
-        return Affine(Rotation.from_rotvec(self.vector()).as_matrix().T, np.zeros(3))
+        return Affine(rotations.Rotation.from_rotvec(self.vector()).as_matrix().T, np.zeros(3))
 
     def gyro(self):
         return self._turn()

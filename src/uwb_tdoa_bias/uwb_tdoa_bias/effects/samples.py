@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from ..foundation.anchors import Anchors
+from ..foundation.later import rotations
 from .motion import POSE_LAG, Motion, motion_at, preceding
 
 STEP = 0.1  # s over which the velocity at an instant is taken
@@ -116,7 +116,7 @@ class Track:
         known = np.isfinite(self.q).all(axis=1)
         self._turn, self._ends = None, (0.0, 0.0)
         if known.sum() > 1:
-            self._turn = Slerp(self.t[known], Rotation.from_quat(self.q[known]))
+            self._turn = rotations.Slerp(self.t[known], rotations.Rotation.from_quat(self.q[known]))
             self._ends = self.t[known][0], self.t[known][-1]
 
     def positions(self, t):
@@ -173,6 +173,6 @@ def _up(track, t):
 
 def _reading(stream, track, t):
     if stream == "velocity":
-        return Rotation.from_quat(track.attitudes(t)).inv().apply(track.velocities(t))
+        return rotations.Rotation.from_quat(track.attitudes(t)).inv().apply(track.velocities(t))
     z = track.positions(t)[:, 2]
     return (z / _up(track, t) if stream == "height" else z)[:, None]

@@ -1,9 +1,9 @@
 """The tag's antenna is not at the origin of the body frame."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..foundation.geometry import tdoa, tdoa_jacobian
+from ..foundation.later import rotations
 from .base import Effect
 from .wording import listed, significant, size
 
@@ -57,5 +57,5 @@ def _rotate(q, v):
     known = np.isfinite(q).all(axis=1)
     out = np.full((len(q), 3), np.nan)
     if known.any():
-        out[known] = Rotation.from_quat(q[known]).apply(v)
+        out[known] = rotations.Rotation.from_quat(q[known]).apply(v)
     return out

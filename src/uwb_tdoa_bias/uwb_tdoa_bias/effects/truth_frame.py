@@ -1,9 +1,9 @@
 """The frame of the survey is not quite that of the ground truth."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..foundation.geometry import tdoa
+from ..foundation.later import rotations
 from .base import Effect
 from .marks import Shift
 from .wording import listed, measured, significant
@@ -42,7 +42,7 @@ class TruthFrame(Effect):
 
     def _moved(self, anchors):
         at = np.array([self.values.get(key, 0.0) for key in KEYS])
-        return anchors.positions @ Rotation.from_rotvec(at[3:]).as_matrix().T + at[:3]
+        return anchors.positions @ rotations.Rotation.from_rotvec(at[3:]).as_matrix().T + at[:3]
 
     def bias(self, samples):
         moved = self._moved(samples.anchors)

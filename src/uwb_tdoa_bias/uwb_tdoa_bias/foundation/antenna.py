@@ -7,9 +7,9 @@ Azimuth runs from +x through +y, elevation from the xy plane towards +z.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from .errors import InputError
+from .later import interpolate
 
 # Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These are not measured
 # numbers: they are drawn in the shape of the plots in the DWM1000 data sheet (an uneven doughnut: 3 dB of ripple around
@@ -57,7 +57,7 @@ class Antenna:
                     "around the full circle."
                 )
             angle = np.linspace(0.0, 2.0 * np.pi, len(gains) + 1)
-            cuts.append(CubicSpline(angle, np.append(gains, gains[0]), bc_type="periodic"))
+            cuts.append(interpolate.CubicSpline(angle, np.append(gains, gains[0]), bc_type="periodic"))
         azimuth, first, second = cuts
         right = 0.5 * np.pi
         crossings = {

@@ -14,10 +14,20 @@ from numba import config, njit
 
 def compiled(function):
     """Decorator: compile `function`, which may call others below its folder and of the foundation, and cache it."""
+    return _compiled(function)
+
+
+def contracted(function):
+    """The same, with x * y + z as one operation where the processor has it: twice as fast in large sums of products, and other
+    in the last digit from one kind of processor to another."""
+    return _compiled(function, fastmath={"contract"})
+
+
+def _compiled(function, **options):
     before = config.CACHE_DIR
     config.CACHE_DIR = str(_base() / _digest(Path(function.__code__.co_filename).parent))
     try:
-        return njit(error_model="numpy", cache=True)(function)
+        return njit(error_model="numpy", cache=True, **options)(function)
     finally:
         config.CACHE_DIR = before
 

@@ -17,7 +17,7 @@ class Turns:
     """Has nodes take what has arrived for them, one after the other."""
 
     def __init__(self, node, streams):
-        """node : whose executor serves the turns; streams : list of Streams, those that hand over to others first."""
+        """node : whose executor serves the turns; streams : list of Streams, or of what else has take()."""
         self._streams, self._next = streams, -np.inf
         self._timer = node.create_timer(PERIOD, self._take, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -55,9 +55,9 @@ class Streams:
         self._streams.append(stream)
         self._unheard.append(stream)
 
-    def take(self):
-        """Give everything that has arrived to those that take it."""
-        if self._awaited is not None:
+    def take(self, at_once=False):
+        """Give everything that has arrived to those that take it; at_once : whatever they wait for."""
+        if self._awaited is not None and not at_once:
             self._awaited.fetch()
             now = time.monotonic()
             if now < self._until and not self._awaited.newest_waiting > self._due():
@@ -111,6 +111,10 @@ class Handed:
     def hand(self, frame, rows):
         """Take rows (n,) with the fields of a Wire, all of one frame."""
         self._parts.append((frame, rows, np.full(len(rows), 1e-9 * time.time_ns())))
+
+    def __len__(self):
+        """Parts that wait."""
+        return len(self._parts)
 
     def fetch(self, wire):
         """[(frame, rows, arrivals)] since the last time."""

@@ -3,11 +3,11 @@
 import re
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from .anchors import FARTHEST, Anchors
 from .errors import InputError
 from .files import read_bytes
+from .later import rotations
 
 # The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z), arm 3 forward (x).
 # Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this makes a right-handed frame
@@ -63,7 +63,7 @@ def orientation_from_tips(tips):
     Source: Kabsch, Acta Cryst. A 32, 1976 (as implemented by scipy).
     """
     surveyed, nominal = tips - tips.mean(axis=0), ARM_TIPS - ARM_TIPS.mean(axis=0)
-    rotation, _ = Rotation.align_vectors(surveyed, nominal)
+    rotation, _ = rotations.Rotation.align_vectors(surveyed, nominal)
     return rotation.as_quat(), float(np.sqrt(((rotation.apply(nominal) - surveyed) ** 2).sum(axis=1).mean()))
 
 

@@ -4,7 +4,8 @@ from bisect import bisect_right
 from collections import deque
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+
+from .later import rotations
 
 KEPT = 1000  # transforms of a frame that moves
 HELD = 0.5  # s for which the last transform of a frame that moves holds
@@ -20,7 +21,7 @@ class Frames:
     def set(self, parent, child, q, p):
         """A constant transform: x_parent = R(q) x_child + p; q (4,) x y z w, p (3,) m. Returns whether it is new."""
         before = self._static.get(child)
-        entry = parent, Rotation.from_quat(q), np.array(p, dtype=float)
+        entry = parent, rotations.Rotation.from_quat(q), np.array(p, dtype=float)
         self._static[child] = entry
         if before is None or before[0] != parent:
             return True
@@ -48,7 +49,7 @@ class Frames:
 
     def _to_root(self, frame, t):
         """{ancestor: (Rotation, p)} of a frame, itself first."""
-        turn, p = Rotation.identity(), np.zeros(3)
+        turn, p = rotations.Rotation.identity(), np.zeros(3)
         found = {frame: (turn, p)}
         for _ in range(DEEPEST):
             step = self._static.get(frame) or self._at(frame, t)
@@ -70,7 +71,7 @@ class Frames:
             return None
         before, after = course[k - 1], course[min(k, len(course) - 1)]
         if after is before:
-            return parent, Rotation.from_quat(before[1]), np.array(before[2])
+            return parent, rotations.Rotation.from_quat(before[1]), np.array(before[2])
         share = (t - before[0]) / (after[0] - before[0])
-        turn = Slerp([0.0, 1.0], Rotation.from_quat([before[1], after[1]]))(share)
+        turn = rotations.Slerp([0.0, 1.0], rotations.Rotation.from_quat([before[1], after[1]]))(share)
         return parent, turn, (1.0 - share) * np.array(before[2]) + share * np.array(after[2])

@@ -1,12 +1,13 @@
 """Which version of the suite this is: what is written says by which it was written."""
 
 from functools import lru_cache
-from importlib import metadata
 
 
 @lru_cache(maxsize=None)
 def version():
     """Its version, e.g. "0.1.0"; "unknown" where the packages are not installed."""
+    from importlib import metadata  # takes a twentieth of a second
+
     try:
         return metadata.version("uwb_tdoa_bias")
     except metadata.PackageNotFoundError:

@@ -11,7 +11,8 @@ the kernel expects needs a larger change.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
+
+from uwb_tdoa_bias.foundation.later import linalg
 
 from .slices import LENGTH
 
@@ -116,7 +117,7 @@ class ChangeDetector:
         """Steps (m), then ramps (m/s), that began with each slice from `first` on but the youngest: their most likely
         values and their ratios, (2 k, N)."""
         n, window = self._count - first, slice(first, self._count)
-        inverse = solve_triangular(self._factor[window, window], np.eye(n), lower=True)
+        inverse = linalg.solve_triangular(self._factor[window, window], np.eye(n), lower=True)
         response = self._response[window]
         scores = np.einsum("snk,sn->sk", response, inverse.T @ self._white[window])
         information = np.einsum("snk,tnk->stk", response, response) * (inverse.T @ inverse)[:, :, None]
@@ -135,7 +136,7 @@ class ChangeDetector:
         ago = np.abs(self._t[k] - self._t[:k])
         local = np.exp(-0.5 * apart / LOCAL_LENGTH**2 - ago / LOCAL_TIME)
         kernel = MEAN_STD**2 + PLACE_STD**2 * np.exp(-0.5 * apart / PLACE_LENGTH**2) + LOCAL_STD**2 * local
-        row = solve_triangular(self._factor[:k, :k], kernel, lower=True) if k else kernel
+        row = linalg.solve_triangular(self._factor[:k, :k], kernel, lower=True) if k else kernel
         error = self._delays[k] - row @ self._white[:k]
         variance = MEAN_STD**2 + PLACE_STD**2 + LOCAL_STD**2 + NOISE_STD**2 - row @ row
         freedom = max(np.trace(self._response[k]), 1e-3)  # combinations of delays that are measured

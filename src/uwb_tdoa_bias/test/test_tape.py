@@ -1,0 +1,124 @@
+"""What a tape plays is what onnxruntime, the reference, says."""
+
+import numpy as np
+import pytest
+
+onnx = pytest.importorskip("onnx")
+from onnx import TensorProto, helper, numpy_helper  # noqa: E402
+from uwb_tdoa_bias.correction import tape as tapes  # noqa: E402
+from uwb_tdoa_bias.correction.network import MODELS, Network  # noqa: E402
+from uwb_tdoa_bias.correction.onnx_file import Unreadable, read_graph  # noqa: E402
+from uwb_tdoa_bias.correction.session import Session  # noqa: E402
+from uwb_tdoa_bias.correction.tape import BATCH, Tape, Unplayable  # noqa: E402
+
+COLUMN = np.array([[0.5], [-1.0], [2.0], [0.25], [1.5]], np.float32)
+WEIGHTS = np.random.default_rng(1).normal(size=(5, 7)).astype(np.float32)
+
+
+def model(path, nodes, width=5, **constants):
+    """Write a graph of (kind, inputs, outputs, attributes); its input is "x", its output the last node's."""
+    made = [helper.make_node(kind, inputs, outputs, **more) for kind, inputs, outputs, more in nodes]
+    graph = helper.make_graph(
+        made, "test", [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", width])],
+        [helper.make_tensor_value_info(nodes[-1][2][0], TensorProto.FLOAT, None)],
+        [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()],
+    )  # fmt: skip
+    whole = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    helper.set_model_props(whole, {"name": '"test"', "text": "ä"})
+    path.write_bytes(whole.SerializeToString())
+    return path
+
+
+def assert_plays(path, positive=False, atol=1e-6):
+    tape, session = Tape(read_graph(path)), Session(path)
+    assert tape.meta == session.meta and tape.inputs[0][0] == session.inputs[0][0]
+    random = np.random.default_rng(0)
+    for n in (0, 1, 2, 3, BATCH, 2 * BATCH + 1):
+        x = random.normal(size=(n, tape.width))
+        x = np.abs(x) + 0.1 if positive else x
+        if n:
+            np.testing.assert_allclose(tape.run(x), session.run(x), rtol=2e-6, atol=atol)
+        assert tape.run(x).shape == (n, tape.outputs)
+    together = tape.run(x)
+    np.testing.assert_array_equal(together, np.concatenate([tape.run(row[None]) for row in x]))  # to the bit
+
+
+@pytest.mark.parametrize("name", ["default", "known_answer"])
+def test_the_models_that_are_shipped(name):
+    assert_plays(MODELS / f"{name}.onnx")
+
+
+@pytest.mark.parametrize("kind", tapes.UNARY)
+def test_operators_of_one_value(tmp_path, kind):
+    assert_plays(model(tmp_path / "model.onnx", [(kind, ["x"], ["y"], {})]), positive=kind in ("Log", "Sqrt"))
+
+
+@pytest.mark.parametrize("other", ["x", "one", "row", "column"])
+@pytest.mark.parametrize("kind", tapes.BINARY)
+def test_operators_of_two(tmp_path, kind, other):
+    nodes = [("Abs", ["column of x"], ["a"], {}), (kind, ["x", "a" if other == "column" else other], ["y"], {})]
+    nodes = [("MatMul", ["x", "weights"], ["column of x"], {}), *nodes]
+    constants = {"one": np.float32([1.5]), "row": np.float32([[1, 2, 0.5, -1, 3]]), "weights": COLUMN}
+    assert_plays(model(tmp_path / "model.onnx", nodes, **constants), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [("Gemm", ["x", "W", "c"], ["y"], {})],
+        [("Gemm", ["x", "WT", "c"], ["y"], {"transB": 1})],
+        [("Sum", ["x", "x", "r"], ["y"], {})],
+        [("Gather", ["x", "i"], ["y"], {"axis": 1})],
+        [("Reshape", ["x", "s"], ["y"], {}), ("ReduceMax", ["y"], ["z"], {"axes": [1], "keepdims": 1}), ("Reshape", ["z", "t"], ["u"], {})],
+        [("ReduceSum", ["x", "a"], ["y"], {"keepdims": 1}), ("Concat", ["y", "x", "y"], ["z"], {"axis": 1})],
+        [("MatMul", ["x", "W"], ["h"], {}), ("Tanh", ["h"], ["t"], {}), ("MatMul", ["t", "WT"], ["y"], {})],
+    ],
+)
+def test_what_models_are_made_of(tmp_path, nodes):
+    constants = {
+        "W": WEIGHTS, "WT": np.ascontiguousarray(WEIGHTS.T), "c": np.arange(7, dtype=np.float32), "r": np.float32([1, 2, 3, 4, 5]),
+        "i": np.array([4, 0, 0]), "s": np.array([-1, 1]), "t": np.array([-1, 5]), "a": np.array([1]),
+    }  # fmt: skip
+    assert_plays(model(tmp_path / "model.onnx", nodes, **constants))
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [("Erf", ["x"], ["y"], {})],
+        [("Gemm", ["x", "W"], ["y"], {"alpha": 2.0})],
+        [("Reshape", ["x", "s"], ["y"], {})],
+        [("ReduceSum", ["x", "a"], ["y"], {"keepdims": 1})],
+        [("Add", ["x", "rows"], ["y"], {})],
+    ],
+)
+def test_what_a_tape_does_not_know_is_left_to_onnxruntime(tmp_path, nodes):
+    constants = {"W": WEIGHTS, "s": np.array([-1, 2]), "a": np.array([0]), "rows": np.ones((2, 5), np.float32)}
+    with pytest.raises(Unplayable):
+        Tape(read_graph(model(tmp_path / "model.onnx", nodes, **constants)))
+
+
+def test_exponentials_are_those_of_float32():
+    x = np.linspace(-39.9, 87.9, 10_001).astype(np.float32)
+    out = np.empty_like(x)
+    tapes._exponentials(x, out)
+    np.testing.assert_allclose(out, np.exp(x.astype(float)), rtol=3e-7)
+    special = np.array([-np.inf, -50.0, np.nan], np.float32)
+    tapes._exponentials(special, out[:3])
+    np.testing.assert_array_equal(out[:3], [0.0, 0.0, np.nan])
+
+
+def test_a_network_of_another_operator_still_runs(tmp_path):
+    meta = {"features": '["dx_a"]', "offset": "[0.0]", "scale": "[1.0]", "clip": "1.0", "name": '"erf"'}
+    path = model(tmp_path / "erf.onnx", [("Erf", ["x"], ["y"], {})], width=1)
+    whole = onnx.load(path)
+    helper.set_model_props(whole, meta)
+    path.write_bytes(whole.SerializeToString())
+    assert isinstance(Network(path)._model, Session)
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00", b"no model", b"\x3a\xff\xff\xff\xff\x0f"])
+def test_what_is_no_model_is_unreadable(tmp_path, data):
+    (tmp_path / "model.onnx").write_bytes(data)
+    with pytest.raises(Unreadable):
+        read_graph(tmp_path / "model.onnx")

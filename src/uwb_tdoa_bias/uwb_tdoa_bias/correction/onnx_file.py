@@ -1,0 +1,145 @@
+"""What an ONNX file says, read without onnx or onnxruntime, which take longer to load than to run a small model.
+
+Of the protocol buffers of onnx.proto (https://github.com/onnx/onnx, version 1.14) only what a model of dense layers needs; the
+wire format is that of https://protobuf.dev/programming-guides/encoding.
+"""
+
+from collections import defaultdict
+from dataclasses import dataclass
+import struct
+
+import numpy as np
+
+VARINT, EIGHT_BYTES, BYTES, FOUR_BYTES = 0, 1, 2, 5  # wire types
+KINDS = {1: np.float32, 7: np.int64}  # of tensors, by TensorProto.DataType
+
+
+class Unreadable(ValueError):
+    """The file is none, or holds what is not read here."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """kind : name of the operator; inputs, outputs : names of values; attributes : {name: number, (n,) ints or bytes}."""
+
+    kind: str
+    inputs: list
+    outputs: list
+    attributes: dict
+
+
+@dataclass(frozen=True)
+class Graph:
+    """nodes : in the order of their execution; constants : {name: array}; inputs : [(name, shape, with None for what is not
+    fixed)]; outputs : names; meta : {key: text}."""
+
+    nodes: list
+    constants: dict
+    inputs: list
+    outputs: list
+    meta: dict
+
+
+def read_graph(path):
+    """The Graph of a file; raises Unreadable."""
+    try:
+        with open(path, "rb") as file:
+            model = _message(file.read())
+        graph = _message(model[7][0])
+        constants = dict(map(_tensor, graph[5]))
+        inputs = [_value(data) for data in graph[11]]
+        entries = [_message(data) for data in model[14]]
+        return Graph(
+            nodes=[_node(data) for data in graph[1]],
+            constants=constants,
+            inputs=[one for one in inputs if one[0] not in constants],
+            outputs=[_value(data)[0] for data in graph[12]],
+            meta={entry[1][0].decode(): entry[2][0].decode() for entry in entries},
+        )
+    except (IndexError, KeyError, TypeError, AttributeError, ValueError, struct.error) as error:
+        raise Unreadable(f"{path}: {error!r}") from error
+
+
+def _message(data):
+    """{number of a field: its values in their order}: ints or bytes."""
+    out, place = defaultdict(list), 0
+    while place < len(data):
+        key, place = _varint(data, place)
+        if key & 7 == VARINT:
+            value, place = _varint(data, place)
+        else:
+            size = {EIGHT_BYTES: 8, FOUR_BYTES: 4}.get(key & 7)
+            if key & 7 == BYTES:
+                size, place = _varint(data, place)
+            if size is None or place + size > len(data):
+                raise Unreadable("no protocol buffer")
+            value, place = data[place : place + size], place + size
+        out[key >> 3].append(value)
+    return out
+
+
+def _varint(data, place):
+    value = shift = 0
+    while True:
+        byte = data[place]
+        place += 1
+        value |= (byte & 0x7F) << shift
+        shift += 7
+        if byte < 0x80:
+            return (value - (1 << 64) if value >> 63 else value), place
+
+
+def _ints(values):
+    """Of a repeated int64, packed or not."""
+    out = []
+    for value in values:
+        place = 0
+        if isinstance(value, int):
+            out.append(value)
+            continue
+        while place < len(value):
+            one, place = _varint(value, place)
+            out.append(one)
+    return out
+
+
+def _tensor(data):
+    """(name, array) of a TensorProto."""
+    fields = _message(data)
+    kind = KINDS[fields[2][0]]
+    if fields[13] or fields[14] or not (fields[4] or fields[7] or fields[9]):
+        raise Unreadable("a tensor whose numbers are elsewhere")
+    if fields[9]:
+        values = np.frombuffer(fields[9][0], np.dtype(kind).newbyteorder("<"))
+    else:
+        values = np.array(_ints(fields[7])) if fields[7] else np.frombuffer(b"".join(fields[4]), "<f4")
+    return fields[8][0].decode(), values.astype(kind).reshape(_ints(fields[1]))
+
+
+def _node(data):
+    fields = _message(data)
+    if fields[7] and fields[7][0] not in (b"", b"ai.onnx"):
+        raise Unreadable("an operator that is none of ONNX")
+    inputs, outputs = ([name.decode() for name in fields[k]] for k in (1, 2))
+    return Node(fields[4][0].decode(), inputs, outputs, dict(map(_attribute, fields[5])))
+
+
+def _attribute(data):
+    fields = _message(data)
+    if fields[2]:
+        value = struct.unpack("<f", fields[2][0])[0]
+    elif fields[3]:
+        value = fields[3][0]
+    else:
+        value = _ints(fields[8]) if fields[8] else b"".join(fields[4])
+    return fields[1][0].decode(), value
+
+
+def _value(data):
+    """(name, shape) of a ValueInfoProto of a float tensor."""
+    fields = _message(data)
+    tensor = _message(_message(fields[2][0])[1][0])
+    if tensor[1] != [1]:
+        raise Unreadable("a value that is no float32")
+    dimensions = [_message(one) for one in _message(tensor[2][0])[1]]
+    return fields[1][0].decode(), [one[1][0] if one[1] else None for one in dimensions]
