@@ -53,7 +53,7 @@ def read_graph(path):
             nodes=[_node(data) for data in graph[1]],
             constants=constants,
             inputs=[one for one in inputs if one[0] not in constants],
-            outputs=[_value(data)[0] for data in graph[12]],
+            outputs=[_message(data)[1][0].decode() for data in graph[12]],
             meta={entry[1][0].decode(): entry[2][0].decode() for entry in entries},
         )
     except (IndexError, KeyError, TypeError, AttributeError, ValueError, struct.error) as error:

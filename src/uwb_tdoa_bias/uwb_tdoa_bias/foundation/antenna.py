@@ -5,6 +5,7 @@ Azimuth runs from +x through +y, elevation from the xy plane towards +z.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -44,7 +45,7 @@ class Antenna:
     delay_span: float = 0.15
 
     def __post_init__(self):
-        cuts = []
+        cuts = []  # their gains on the axes
         for name, most in (("gain_offset", LARGEST_GAIN), ("delay_span", 10.0)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
@@ -56,24 +57,29 @@ class Antenna:
                     f"antenna: {name} needs a multiple of 4 gains between -{LARGEST_GAIN:g} and {LARGEST_GAIN:g} dBi "
                     "around the full circle."
                 )
-            angle = np.linspace(0.0, 2.0 * np.pi, len(gains) + 1)
-            cuts.append(interpolate.CubicSpline(angle, np.append(gains, gains[0]), bc_type="periodic"))
+            cuts.append(gains[:: len(gains) // 4])
         azimuth, first, second = cuts
-        right = 0.5 * np.pi
         crossings = {
-            "+x": (azimuth(0), first(0)),
-            "-x": (azimuth(2 * right), first(2 * right)),
-            "+y": (azimuth(right), second(0)),
-            "-y": (azimuth(3 * right), second(2 * right)),
-            "+z": (first(right), second(right)),
-            "-z": (first(3 * right), second(3 * right)),
-        }
+            "+x": (azimuth[0], first[0]), "-x": (azimuth[2], first[2]), "+y": (azimuth[1], second[0]),
+            "-y": (azimuth[3], second[2]), "+z": (first[1], second[1]), "-z": (first[3], second[3]),
+        }  # fmt: skip
         for axis, (one, other) in crossings.items():
             if abs(one - other) > 0.01:
                 raise InputError(f"antenna: two cuts cross at {axis} with {one:.2f} and {other:.2f} dBi; make it one.")
+
+    @cached_property
+    def _cuts(self):
+        """Gain around each of the cuts, functions of the angle, rad. Not made before they are asked: scipy takes long to load."""
+        out = []
+        for gains in map(np.asarray, (self.azimuth, self.elevation_1, self.elevation_2)):
+            angle = np.linspace(0.0, 2.0 * np.pi, len(gains) + 1)
+            out.append(interpolate.CubicSpline(angle, np.append(gains, gains[0]), bc_type="periodic"))
+        return tuple(out)
+
+    @cached_property
+    def _peak(self):
         fine = np.linspace(0.0, 2.0 * np.pi, 721)
-        object.__setattr__(self, "_cuts", tuple(cuts))
-        object.__setattr__(self, "_peak", float(max(cut(fine).max() for cut in cuts)))
+        return float(max(cut(fine).max() for cut in self._cuts))
 
     @property
     def peak_gain(self):
