@@ -30,16 +30,20 @@ MODULES = {
     "bias_node": "uwb_tdoa_bias.bias_node",
     "ekf_node": "uwb_tdoa_ekf.ekf_node",
     "debias_node": "uwb_tdoa_ekf.debias_node",
+    "localization_node": "uwb_tdoa_ekf.localization_node",
 }
+MEMBERS = {"localization_node": ("bias_node", "ekf_node")}  # nodes of one process, which hand over to each other
 OUTPUTS = {
     "bias_node": ("uwb/tdoa_corrected",),
     "ekf_node": ("odometry", "uwb/residual"),
     "debias_node": ("odometry/debiased",),
+    "localization_node": ("uwb/tdoa_corrected", "odometry", "uwb/residual"),
 }
 INPUTS = {
     "bias_node": ("uwb/tdoa", "odometry"),
     "ekf_node": ("imu/data", "uwb/tdoa_corrected"),
     "debias_node": ("odometry",),
+    "localization_node": ("imu/data", "uwb/tdoa"),
 }
 STREAMS = {
     "imu/data": Imu,
@@ -159,7 +163,7 @@ class Rig:
         """
         for name in names:
             command = [sys.executable, "-u", "-m", MODULES[name], "--ros-args", "-r", f"__ns:=/{self.namespace}"]
-            if name == "bias_node":
+            if name in ("bias_node", "localization_node"):
                 command += ["-p", "model_file:=''"]  # unless the arguments name one
             if self._reliable:
                 for end in (*(f"{i}.subscription" for i in INPUTS[name]), *(f"{o}.publisher" for o in OUTPUTS[name])):
@@ -178,11 +182,12 @@ class Rig:
             self._publishers[topic] = self.node.create_publisher(STREAMS[topic], topic, self._qos)
 
         def all_matched():
-            heard = [self.values(name).get(f"publishers of {topic}") for name in names for topic in INPUTS[name]]
+            nodes = [node for name in names for node in MEMBERS.get(name, [name])]
+            heard = [self.values(node).get(f"publishers of {topic}") for node in nodes for topic in INPUTS[node]]
             hearing = [
-                self.values(name).get(f"subscribers of {topic}") == str((topic in taken) + (topic in self.received))
-                for name in names
-                for topic in OUTPUTS[name]
+                self.values(node).get(f"subscribers of {topic}") == str((topic in taken) + (topic in self.received))
+                for node in nodes
+                for topic in OUTPUTS[node]
             ]
             return (
                 all(count == "1" for count in heard)

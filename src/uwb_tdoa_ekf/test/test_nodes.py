@@ -45,9 +45,13 @@ SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    "what", [pytest.param("shipped", marks=SLOW), "effects", pytest.param("network", marks=SLOW)]
-)
-def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what):
+    ("what", "processes"),
+    [
+        pytest.param("shipped", 2, marks=SLOW), ("effects", 2), pytest.param("network", 2, marks=SLOW), ("effects", 1),
+        pytest.param("shipped", 1, marks=SLOW),
+    ],
+)  # fmt: skip
+def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, processes):
     flight = recording()
     level = np.tile([0.0, 0.0, 0.0, 1.0], (len(flight.anchors), 1))  # the shipped model needs orientations
     heard = np.abs(flight.tdoa.t - 2.0) > 0.06  # nothing, for longer than a pose lag
@@ -69,7 +73,10 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what):
     if what == "shipped":  # takes nothing out before the yaw is known
         config, told = FilterConfig(initial_yaw_std=0.1), ["-p", "initial_yaw_std:=0.1"]
     rig = make_rig()
-    rig.start("bias_node", "ekf_node", bias_node=parameters, ekf_node=told)
+    if processes == 2:
+        rig.start("bias_node", "ekf_node", bias_node=parameters, ekf_node=told)
+    else:
+        rig.start("localization_node", localization_node=[*told, *parameters])
     rig.send_anchors(flight.anchors)
     rig.play(flight)
     ekf = rig.counts("ekf_node", IMU_samples_received=len(flight.imu), TDOAs_received=len(flight.tdoa))

@@ -71,7 +71,7 @@ def refuse_unknown(node, others=()):
     for name in sorted(node._parameter_overrides):
         if name.startswith(QOS) or name in others or node.has_parameter(name):
             continue
-        near = get_close_matches(name, node._parameters, n=1, cutoff=0.5)
+        near = get_close_matches(name, {*node._parameters, *others}, n=1, cutoff=0.5)
         remedy = f"write {near[0]}" if near else "leave it out"
         raise InputError(f"{name}: {node.get_name()} has no such parameter; {remedy} (config/{node.NAME}.yaml has all).")
 
