@@ -1,17 +1,36 @@
-"""Modules that take long to import and that a node hardly ever needs: imported when something of them is used."""
-
-from importlib import import_module
+"""Parts of scipy that take long to import and that a node hardly ever needs: imported when something of them is used."""
 
 
 class Later:
     """Stands for a module."""
 
-    def __init__(self, name):
-        self._name = name
+    def __init__(self, load):
+        """load() imports and returns it."""
+        self._load = load
 
     def __getattr__(self, name):
-        return getattr(import_module(self._name), name)
+        return getattr(self._load(), name)
 
 
-interpolate, linalg = Later("scipy.interpolate"), Later("scipy.linalg")
-rotations = Later("scipy.spatial.transform")
+@Later
+def interpolate():
+    """scipy.interpolate"""
+    from scipy import interpolate as module
+
+    return module
+
+
+@Later
+def linalg():
+    """scipy.linalg"""
+    from scipy import linalg as module
+
+    return module
+
+
+@Later
+def rotations():
+    """scipy.spatial.transform"""
+    from scipy.spatial import transform as module
+
+    return module
