@@ -36,8 +36,9 @@ class Source:
         ]
         self.received = [[] for _ in namespaces]  # (arrival, stamp), ns
 
-    def play(self, flight, block, on_block):
-        """Publish a Flight as fast as it was flown. on_block(): called first, after every `block` s, and at the end.
+    def play(self, flight, block, on_block, rounds=1):
+        """Publish a Flight as fast as it was flown, so many times, one after the other. on_block(): called first, after every
+        `block` s, and at the end.
 
         Returns (sent, stamps, late): of each TDOA when it was published and its stamp, (n,) ns since 1970; s by which
         each message was late.
@@ -45,10 +46,10 @@ class Source:
         self._anchors.publish(anchors_to_message(flight.anchors))
         start = time.time_ns() // 10**9 + 1  # stamps are of now, too
         events = self._events(flight, start - flight.imu.t[0])
-        began = time.perf_counter() + AHEAD
-        sent, stamps, late, next_block = [], [], np.empty(len(events)), began
-        for k, (due, stamp, publisher, data) in enumerate(events):
-            due += began
+        began, period = time.perf_counter() + AHEAD, round((flight.imu.t[-1] - flight.imu.t[0]) * 1e3 + 1.0) * 10**6
+        sent, stamps, late, next_block = [], [], [], began
+        for turn, (due, stamp, publisher, data) in ((turn, event) for turn in range(rounds) for event in events):
+            due += began + 1e-9 * turn * period
             if due >= next_block:
                 on_block()
                 next_block += block
@@ -56,13 +57,13 @@ class Source:
                 self.take()
                 if left > SHORTEST_SLEEP:
                     time.sleep(max(due - time.perf_counter(), 0.0))
-            late[k] = -left
+            late.append(-left)
             if stamp:
                 sent.append(time.time_ns())
-                stamps.append(stamp)
-            publisher.publish(data)
+                stamps.append(stamp + turn * period)
+            publisher.publish(later(data, turn * period) if turn else data)
         on_block()
-        return np.array(sent), np.array(stamps), late
+        return np.array(sent), np.array(stamps), np.array(late)
 
     def take(self):
         """Keep what has arrived."""
@@ -88,6 +89,13 @@ class Source:
             message.anchor_a, message.anchor_b, message.distance_difference = a, b, d
             events.append((t - imu.t[0], stamp, publisher, serialize_message(message)))
         return sorted(events, key=lambda event: event[0])
+
+
+def later(data, ns):
+    """A message as bytes, stamped so much later."""
+    second, nanosecond = HEADER_STAMP.unpack_from(data, 4)
+    second, nanosecond = divmod(second * 10**9 + nanosecond + ns, 10**9)
+    return data[:4] + HEADER_STAMP.pack(second, nanosecond) + data[4 + HEADER_STAMP.size :]
 
 
 def latencies(sent, stamps, arrivals, of):
