@@ -1,6 +1,6 @@
 """Makes the table of replays in step in docs/reliability.md, in a shell with the workspace sourced (./dev shell):
 
-    python src/uwb_tdoa_tools/test/lockstep_table.py LOG SURVEY --runs 3
+    python src/uwb_tdoa_tools/test/lockstep_table.py LOG SURVEY --runs 10 --from 10 --seconds 15
 """
 
 import argparse
@@ -10,9 +10,12 @@ import subprocess
 import sys
 import tempfile
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from test_lockstep import replayed  # noqa: E402
+from time_offset_table import cut  # noqa: E402
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
@@ -24,34 +27,45 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("log")
     parser.add_argument("survey")
+    parser.add_argument("--from", dest="begin", type=float, default=0.0, help="s after the first TDOA (default 0)")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="of the flight (default: all)")
     parser.add_argument("--runs", type=int, default=3, help="of each rate and load (default 3)")
     parser.add_argument("--rates", type=float, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--loads", type=int, nargs="+", default=[0, 1, 3], help="busy processes beside it")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "flight.bag"
-        write_bag(read_flight(args.log, args.survey), bag)
+        write_bag(cut(read_flight(args.log, args.survey), args.begin, args.begin + args.seconds), bag)
         flight = read_bag(bag)
-        offline = evaluate(flight, network=load_network(SHIPPED))[0].row()["rmse_3d"]
-        print(f"offline {offline:.4f} m\n| rate | load | exit codes | late | 3D RMSE - offline, mm | s |\n|---|---|---|---|---|---|")
+        score, offline = evaluate(flight, network=load_network(SHIPPED))
+        rmse = score.row()["rmse_3d"]
+        print(f"offline {rmse:.4f} m, {len(offline.odometry)} poses; of all runs the largest figure, of the times the median")
+        print("| rate | load | runs | exit code not 0 | late | 3D RMSE - offline, mm | poses not recorded | others apart by, mm | s |")
+        print("|---|---|---|---|---|---|---|---|---|")
         for load in args.loads:
             for rate in args.rates:
-                rows = [run(bag, flight, rate, load, offline) for _ in range(args.runs)]
-                codes, late, apart, took = (", ".join(str(row[k]) for row in rows) for k in range(4))
-                print(f"| {rate:g} | {load} | {codes} | {late} | {apart} | {took} |", flush=True)
+                rows = np.array([run(bag, flight, rate, load, rmse, offline.odometry) for _ in range(args.runs)])
+                codes, late, rmse_apart, missing, apart = np.abs(rows).max(axis=0)[:5]
+                cells = f"{np.count_nonzero(rows[:, 0])} | {late:.0f} | {rmse_apart:.2f} | {missing:.0f} | {apart:.3f} | {np.median(rows[:, 5]):.1f}"
+                print(f"| {rate:g} | {load} | {args.runs} | {cells} |", flush=True)
 
 
-def run(bag, flight, rate, load, offline):
-    """(exit code, TDOAs late, mm from the offline result, s that the replay took) of one replay."""
+def run(bag, flight, rate, load, rmse, offline):
+    """(exit code, TDOAs late, mm of RMSE from the offline one, poses of the offline Odometry that were not recorded, mm of the others
+    from it at most, s that the replay took) of one replay."""
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         for _ in range(load):
             process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
             stack.callback(process.wait)
             stack.callback(process.kill)
         code, said, told, recorded = replayed(bag, Path(folder), "--rate", rate)
-        error = Score("live", read_odometry(recorded), flight.truth).row()["rmse_3d"]
-        took = said.rpartition(" messages in ")[2].partition(" s")[0]
-        return code, told["ekf_node"]["late"], f"{1e3 * (error - offline):+.2f}", took
+        live = read_odometry(recorded)
+        error = Score("live", live, flight.truth).row()["rmse_3d"]
+        took = float(said.rpartition(" messages in ")[2].partition(" s")[0])
+        nearest = np.clip(np.searchsorted(offline.t, live.t - 1e-6), 0, len(offline) - 1)
+        apart = np.linalg.norm(live.p - offline.p[nearest], axis=1).max()
+        missing = len(offline) - len(np.unique(nearest))
+        return code, int(told["ekf_node"]["late"]), 1e3 * (error - rmse), missing, 1e3 * apart, took
 
 
 if __name__ == "__main__":

@@ -102,13 +102,25 @@ def test_stamps_are_read_from_the_bytes():
 
 
 @pytest.fixture
-def filtered(node, speaker):
+def starting(node, speaker):
     """(Follower of TDOAs too, Speaker of what comes out of the filter)."""
     residuals = Speaker(node, "uwb/residual", TdoaResidual)
     follower = Follower(node, "imu/late")
     speaker.matched()
     residuals.matched()
     return follower, residuals
+
+
+@pytest.fixture
+def filtered(starting, speaker, monkeypatch):
+    """The same, when the first pose is long ago."""
+    monkeypatch.setattr(follow, "START", 0)
+    speaker.say(10)
+    until = time.monotonic() + 60.0
+    while starting[0]._is_starting(10 * SECOND):
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    return starting
 
 
 def play(follower, stamps):
@@ -145,6 +157,16 @@ def test_no_tdoa_is_played_while_those_a_step_older_are_in_the_filter(filtered):
     assert play(follower, STAMPS[17:]) == 94
 
 
+def test_steps_are_shorter_while_bias_node_may_know_of_no_pose(starting, speaker, monkeypatch):
+    follower, residuals = starting
+    assert play(follower, STAMPS) == 5
+    residuals.say(*STAMPS[:2])
+    speaker.say(10.01)
+    assert play(follower, STAMPS[5:]) == 2
+    monkeypatch.setattr(follow, "SILENCE", 0.1)
+    assert play(follower, STAMPS[7:18]) == 11  # the IMU of the recording is too far behind for that
+
+
 def test_tdoas_that_are_lost_are_not_waited_for(filtered):
     follower, residuals = filtered
     play(follower, STAMPS)
@@ -165,7 +187,7 @@ def test_a_recording_that_starts_again_is_followed_anew(filtered):
     play(follower, STAMPS)
     residuals.say(*STAMPS)
     assert play(follower, STAMPS[11:]) == 189
-    assert play(follower, [stamp - 5.0 for stamp in STAMPS]) == 11
+    assert play(follower, [stamp - 5.0 for stamp in STAMPS]) == 5  # as at a start
 
 
 def test_a_filter_that_has_gone_silent_is_not_waited_for(filtered, monkeypatch):

@@ -30,8 +30,14 @@ TEXTS = {
     "antenna": ["azimuth: [0, -1, 0, -1]\nelevation_1: [0, -9, 0, -9]\nelevation_2: [-1, -9, -1, -9]\ngain_offset: 2\n"],
     "survey": [SURVEY, "\n".join(survey_lines()[0]) + "\nlandmark,1,2,3\n", "anchors: {0: {position: [1, 2, 3]}}\n"],
     "table": ["true_x,x\n0.5,0.6\n1,1.1\n", 'x,note,true_x\r\n1,"a, b",2\r\n'],
-    "csv": [csv_text(), csv_text("t_tdoa,idA,idB,tdoa_meas", ["0.1,0,1,0.5", "0.2,1,5,-1e-1"])],
-}
+    "csv": [
+        csv_text(), csv_text("t_tdoa,idA,idB,tdoa_meas", ["0.1,0,1,0.5", "0.2,1,5,-1e-1"]),
+        csv_text(  # one inertial sample beside optical flow: found by fuzzing
+            "t_tdoa,idA,idB,tdoa_meas,t_acc,acc_x,acc_y,acc_z,t_gyro,gyro_x,gyro_y,gyro_z,t_tof,tof,t_flow,deltaX,deltaY",
+            ["0.1,0,1,0.5,0.1,0,0,1,0.1,0,0,1,0.1,300,0.1,1,2", "0.2,1,5,-1e-1,,,,,,,,,0.2,301,0.2,2,1"],
+        ),
+    ],
+}  # fmt: skip
 AIDS = {  # streams of a Flight
     "height": Height(np.array([10.0, 10.1]), np.array([1.25, np.inf])),
     "pressure": Pressure(np.array([10.0]), np.array([101325.0])),

@@ -15,6 +15,8 @@ LEAD = 2_000_000_000  # ns of stamps that may be played ahead
 STEP = 100_000_000  # ns: a TDOA that is older than the newest by more has come out of the filter, or is waited for
 # (STEP is more than ekf_node's `reorder`, so that it can have come out, and less than bias_node's `hold` and ekf_node's
 # `lag`, so that neither goes on without what is still on its way.)
+START_STEP, START = 40_000_000, 1_000_000_000
+# ns: the same for so long after the first pose: less than bias_node's `pose_lag`. Before it knows of a pose it passes TDOAs on.
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
 SILENCE = 5.0  # s after which a topic is not waited for any more, until it speaks again
 POLL_PERIOD = 0.001  # s
@@ -38,7 +40,7 @@ class Follower:
             raise InputError(f"--follow: messages on {topic} are {types[0]}: not installed, or without a header.")
         qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)  # taken, never spun
-        self._newest = self._looked = None
+        self._newest = self._looked = self._started = None
         self._silent = False
         self._tdoas = _Tdoas(node)
 
@@ -52,20 +54,35 @@ class Follower:
 
         Returns how long that took, s; stop : true once the wait shall end.
         """
-        return self._tdoas.wait(stop) + self._wait_for_stamps(stamp, stop)
+        return self._tdoas.wait(self._is_starting(stamp), stop) + self._wait_for_stamps(stamp, stop)
+
+    def _is_starting(self, stamp):
+        """Whether bias_node may not know yet that there are poses, for what is stamped so, ns."""
+        if self._started is not None and stamp < self._started - LEAD:  # a recording that starts again
+            self._started = None
+        if self._started is None:
+            self._hear()
+        return self._started is None or stamp < self._started + START
+
+    def _hear(self):
+        """Whether the topic has said something."""
+        taken = _taken(self._subscription)
+        if taken:
+            self._newest, self._silent = stamp_of(taken[-1]), False
+            self._started = self._newest if self._started is None else self._started
+        return bool(taken)
 
     def _wait_for_stamps(self, stamp, stop):
-        if self._newest is None:
-            self._newest = self._looked = stamp
+        self._newest = stamp if self._newest is None else self._newest
+        self._looked = stamp if self._looked is None else self._looked
         in_step = self._silent or stamp - self._newest <= LEAD
         if in_step and 0 <= stamp - self._looked <= LOOK_PERIOD:
             return 0.0
         self._looked = stamp
         began = heard = time.monotonic()
         while not stop:
-            if taken := _taken(self._subscription):
-                self._newest = stamp_of(taken[-1])
-                heard, self._silent = time.monotonic(), False
+            if self._hear():
+                heard = time.monotonic()
             if stamp - self._newest <= LEAD or self._silent:
                 break
             self._silent = time.monotonic() - heard > SILENCE
@@ -90,7 +107,7 @@ class _Tdoas:
         self._begin = self._newest = None  # ns: none up to here is waited for; newest stamp that was played
         self._out, self._silent = -math.inf, False  # ns, newest stamp that has come out
         self._first, self._shift = deque(), 0  # stamps that were played first; by how much those that come out are less
-        self._learned = 0
+        self._learned, self._behind = 0, False  # whether START_STEP is too little, because the recorded IMU is behind its TDOAs
 
     def note(self, stamp):
         if self._newest is not None and stamp < self._newest - LEAD:  # a recording that starts again
@@ -101,24 +118,26 @@ class _Tdoas:
         if self._learned < LEARNED:
             self._first.append(stamp)
 
-    def wait(self, stop):
+    def wait(self, starting, stop):
         if self._subscription is None or self._newest is None:
             return 0.0
-        if self._is_in_step():
+        step = START_STEP if starting and not self._behind else STEP
+        if self._is_in_step(step):
             return 0.0
         began = heard = time.monotonic()
         while not stop:
             if taken := _taken(self._subscription):
                 self._learn(list(map(stamp_of, taken)))
                 heard, self._silent = time.monotonic(), False
-            if self._is_in_step() or self._silent:
+            if self._is_in_step(step) or self._silent:
                 break
             self._silent = time.monotonic() - heard > SILENCE
+            self._behind = self._behind or self._silent and step == START_STEP
             time.sleep(POLL_PERIOD)
         return time.monotonic() - began
 
-    def _is_in_step(self):
-        return self._newest - STEP <= max(self._begin, self._out + self._shift)
+    def _is_in_step(self, step):
+        return self._newest - step <= max(self._begin, self._out + self._shift)
 
     def _learn(self, stamps):
         """Note stamps that have come out. An effect may have shifted them: the first ones tell by how much."""

@@ -60,7 +60,7 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
     if "baro" in streams:
         baro = _readings(streams["baro"], "baro")
         pressure = Pressure(baro["t"], pressure_at(baro["baro"]))
-    if "flow" in streams and imu is not None and height is not None and np.isfinite(height.range).sum() > 1:
+    if "flow" in streams and imu is not None and height is not None and min(len(imu.t), np.isfinite(height.range).sum()) > 1:
         velocity = velocity_of(*(np.asarray(streams["flow"][name], dtype=float) for name in "txy"), height, imu)
         velocity = velocity if len(velocity.t) else None
     if not meta["remarks"]:
