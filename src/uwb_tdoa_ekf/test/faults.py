@@ -32,6 +32,12 @@ def second_tag(columns, rng):
     return merged(columns, put(other, T, other[T] + 0.003))
 
 
+def repeated(columns, rng):
+    """Every inertial sample ten times, a millisecond apart."""
+    parts = (put(put(columns, T, columns[T] + 0.001 * k), ARRIVAL, columns[ARRIVAL] + 0.001 * k) for k in range(10))
+    return merged(*parts)
+
+
 def merged(*parts):
     columns = [np.concatenate(column) for column in zip(*parts)]
     order = np.argsort(columns[ARRIVAL], kind="stable")
@@ -50,6 +56,7 @@ FAULTS = {  # name: (what it does to the columns of a flight, what is said)
     "a second tag": (of_tdoa(second_tag), "two tags share"),
     "every TDOA twice": (of_tdoa(lambda c, rng: merged(c, c)), "published twice"),
     "TDOAs shuffled by 50 ms": (of_tdoa(lambda c, rng: put(c, T, c[T] - 0.05 * rng.random(len(c[T])))), "out of order.*reorder"),
+    "IMU at ten times its rate": (of_imu(repeated), "published more than once"),
     "IMU upside down": (of_imu(lambda c, rng: put(c, ACCEL, c[ACCEL] * [1.0, -1.0, -1.0])), "-z points up"),
 }
 OF_THE_CLOCK = {"all 10 s ahead"}  # which no stream shows by itself
@@ -78,7 +85,7 @@ def columns_of(begin, parts):
     out = []
     for low, high, name in parts:
         pieces = [tuple(c[(s[T] - begin >= low) & (s[T] - begin < high)] for c in s) for s in (imu, tdoa)]
-        for fault in name:
+        for fault in FAULTS.keys() & set(name):
             pieces = FAULTS[fault][0](*pieces, rng)
         out.append(pieces)
     return [merged(*stream) for stream in zip(*out)]

@@ -14,7 +14,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from faults import FAULTS  # noqa: E402
 from rig import make_rig  # noqa: E402, F401
-from stream_faults import PUBLISHERS, lanes_of, play, publish_twice  # noqa: E402
+from stream_faults import PUBLISHERS, lanes_of, play, process_of, publish_twice  # noqa: E402
 
 SECONDS = 6.0  # s of each fault, and within which it is named
 FLIGHTS = [(), ("IMU in g", "TDOAs stamped 0")]  # in lanes side by side; faults that do not hide each other
@@ -61,8 +61,3 @@ def test_faults_are_named_and_a_healthy_flight_runs(make_rig):
     counted = lambda: more("IMU samples received") + more("lost on imu/data") == sent  # noqa: E731
     lane.rig.wait(counted, "every sample to be received or counted as lost", 30.0)
     assert more("lost on imu/data") > 0
-
-
-def process_of(lane):
-    (node,) = lane.rig._processes.values()
-    return node.process
