@@ -1,10 +1,11 @@
 """Makes the table of replays in step in docs/reliability.md, in a shell with the workspace sourced (./dev shell):
 
-    python src/uwb_tdoa_tools/test/lockstep_table.py LOG SURVEY --runs 10 --from 10 --seconds 15
+    python src/uwb_tdoa_tools/test/lockstep_table.py LOG SURVEY --runs 10 --from 10 --seconds 8
 """
 
 import argparse
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 import subprocess
 import sys
@@ -17,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from test_lockstep import replayed  # noqa: E402
 from time_offset_table import cut  # noqa: E402
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
+from uwb_tdoa_bias.foundation.flight import Truth  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
@@ -35,7 +37,9 @@ def main():
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "flight.bag"
-        write_bag(cut(read_flight(args.log, args.survey), args.begin, args.begin + args.seconds), bag)
+        flight = cut(read_flight(args.log, args.survey), args.begin, args.begin + args.seconds)
+        judged = (flight.truth.t >= flight.tdoa.t[0]) & (flight.truth.t <= flight.tdoa.t[-1])
+        write_bag(replace(flight, truth=Truth(*(column[judged] for column in vars(flight.truth).values()))), bag)
         flight = read_bag(bag)
         score, offline = evaluate(flight, network=load_network(SHIPPED))
         rmse = score.row()["rmse_3d"]

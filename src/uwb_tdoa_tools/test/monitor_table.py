@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from time_offset_table import measured
+from time_offset_table import cut, measured
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import Estimator
@@ -43,6 +43,28 @@ def late(flight, row, size, since):
     tdoa, anchor = flight.tdoa, flight.anchors.ids[row]
     sign = (tdoa.b == anchor).astype(float) - (tdoa.a == anchor)
     return replace(flight, tdoa=replace(tdoa, d=tdoa.d + size * sign * (tdoa.t > since)))
+
+
+def silenced(flight, ids, since):
+    """The Flight in which the first of these anchors is not heard from a stamp on."""
+    tdoa = flight.tdoa
+    heard = (tdoa.t < since) | ((tdoa.a != ids[0]) & (tdoa.b != ids[0]))
+    return replace(flight, tdoa=type(tdoa)(*(column[heard] for column in vars(tdoa).values())))
+
+
+def exchanged(flight, ids, since):
+    """The Flight in which two anchors have each other's id from a stamp on."""
+    def other(column):
+        return np.where(flight.tdoa.t < since, column, np.where(column == ids[0], ids[1], np.where(column == ids[1], ids[0], column)))
+
+    return replace(flight, tdoa=replace(flight.tdoa, a=other(flight.tdoa.a), b=other(flight.tdoa.b)))
+
+
+EVENTS = {  # what is put into flights, and what is to be said of anchors, first {} and second {}, within EVENT_LIMIT
+    "silent": (silenced, "anchor {0} is not heard any more"),
+    "exchanged": (exchanged, "two anchors are exchanged, {0} and {1}"),
+}
+EVENT_LIMIT = 5.0  # s
 
 
 def run(flight, config):
@@ -118,14 +140,40 @@ def faults(flights, config, draws, seed):
             print(f"  {name} / unharmed: median {np.median(column):.2f}, at most 1.2 in {100 * np.mean(column <= 1.2):.0f} %")
 
 
+def events(flights, config, draws, seed):
+    """Prints how often a silent anchor, and two that were exchanged, are named."""
+    rng = np.random.default_rng(seed)
+    print(f"| anchors | cases | named within {EVENT_LIMIT:g} s | something else named first | median after, s |\n|---|---|---|---|---|")
+    for name, (change, sentence) in EVENTS.items():
+        after, wrong, n = [], 0, 0
+        for row in range(min(len(flight.anchors) for flight in flights)):
+            for _ in range(draws):
+                flight = flights[rng.integers(len(flights))]
+                begin, end = airborne(flight)
+                since = begin + (end - begin) * rng.uniform(*MIDDLE)
+                other = rng.choice(np.delete(np.arange(len(flight.anchors)), row))
+                ids = flight.anchors.ids[sorted([row, other]) if name == "exchanged" else [row, other]]
+                said, _ = run(cut(change(flight, ids, since), 0.0, since + EVENT_LIMIT + STEP - flight.tdoa.t[0]), config)
+                told = next(((t, s[0]) for t, s in said if t > since and s), (np.inf, ""))
+                n += 1
+                right = told[1].startswith(sentence.format(*ids)) and told[0] - since <= EVENT_LIMIT + STEP
+                after += [told[0] - since] if right else []
+                wrong += bool(told[1]) and not told[1].startswith(sentence.format(*ids))
+        print(f"| {name} | {n} | {100 * len(after) / n:.0f} % | {100 * wrong / n:.0f} % | {np.median(after):.1f} |", flush=True)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--days", nargs="+", default=["0422", "0425", "0426", "0607"])
     parser.add_argument("--draws", type=int, default=10, help="of flight and time, for each anchor; 0: unharmed flights alone")
+    parser.add_argument("--events", action="store_true", help="anchors that are silent or exchanged, instead of late ones")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     flights = flights_of(arguments.data, arguments.days)
+    if arguments.events:
+        events(flights, FilterConfig(), arguments.draws, arguments.seed)
+        return
     clean(flights, FilterConfig())
     if arguments.draws:
         faults(flights, FilterConfig(), arguments.draws, arguments.seed)
