@@ -6,9 +6,9 @@ import pytest
 from training_flights import flight
 
 from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_tools.scoring.borne_out import SHARES, BorneOut, choose
 from uwb_tdoa_tools.studies.training import splits
 from uwb_tdoa_tools.training import shrinking, structured
-from uwb_tdoa_tools.training.shrinking import SHARES, BorneOut, choose
 
 OPTIONS = structured.Options(centres=10, link_centres=10)
 
@@ -38,7 +38,7 @@ def test_effects_alone_are_taken_as_they_are():
 def test_a_flight_is_judged_by_what_it_took_no_part_in():
     late = EFFECTS["anchor_delay"]({"3": 0.4, "5": -0.4})
     flights = [late.inject(flight(seed)) for seed in range(2)] + [flight(2)]
-    told = shrinking.bear_out("structured", flights, 0, OPTIONS)
+    told = shrinking.bear_out("structured", flights, shrinking.uncorrected(flights), 0, OPTIONS)
     assert set(told.errors) == {one.name for one in flights}
     alike, other = (told.errors[flights[k].name] for k in (0, 2))
     assert alike[1.0] < 0.95 * alike[None] and other[1.0] > 1.05 * other[None]

@@ -5,7 +5,7 @@ of its prediction. Whole flights: samples of one are too alike. The effects are 
 values fitted to the others alone: `physics.find` has judged them on flights left out already.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,46 +15,18 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ..parallel import in_one_thread
+from ..scoring.borne_out import SHARES, BorneOut, choose
 from ..scoring.evaluation import evaluate
 from . import models, physics, structured
 
-SHARES = 0.0, 0.5, 0.75, 1.0
 FOLDS = 5
 
 
-@dataclass(frozen=True)
-class BorneOut:
-    """What flights left out say. share : of the prediction that is to be taken out; errors : {flight: {share: 3D RMSE of the
-    filter, m}}, under None without any correction."""
-
-    share: float
-    errors: dict
-
-    @property
-    def gains(self):
-        """(n,): by how much the error of each flight gets smaller with the share, relative to that without correction."""
-        return np.array([1.0 - of[self.share] / of[None] for of in self.errors.values()])
-
-    def as_text(self):
-        """One sentence."""
-        gains = self.gains
-        return (
-            f"expected of flights like these: the 3D RMSE falls by {gains.mean():.0%} +- {_spread(gains):.0%} "
-            f"(of {len(gains)} flights, each left out; the worst {gains.min():+.0%}), with {self.share:g} of the prediction taken out"
-        )
-
-    def as_dict(self):
-        """For JSON."""
-        gains = self.gains
-        errors = {name: {str(share): error for share, error in of.items()} for name, of in self.errors.items()}
-        return {"share": self.share, "gain": gains.mean(), "spread": _spread(gains), "worst": gains.min(), "left_out": errors}
-
-
 @in_one_thread
-def bear_out(kind, flights, seed, options=structured.Options(), found=None, progress=lambda text: None):
+def bear_out(kind, flights, plain, seed, options=structured.Options(), found=None, progress=lambda text: None):
     """BorneOut of a kind of model trained on Flights.
 
-    found : Physics of these flights, in this order, for kinds with effects.
+    plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with effects.
     """
     order = np.random.default_rng(seed).permutation(len(flights))
     errors = {}
@@ -62,29 +34,24 @@ def bear_out(kind, flights, seed, options=structured.Options(), found=None, prog
         others = [k for k in range(len(flights)) if k not in fold]
         effects, network = _without(kind, flights, others, seed, options, found)
         for flight in (flights[k] for k in fold):
-            errors[flight.name] = judged(flight, effects, network)
+            errors[flight.name] = judged(flight, plain, effects, network)
             progress("{} left out: {:.3f} m without, {:.3f} m with all".format(flight.name, errors[flight.name][None], errors[flight.name][1.0]))
     return BorneOut(choose(errors), errors)
 
 
-def judged(flight, effects, network):
-    """{share: 3D RMSE of the filter on a Flight, m, from TDOAs and IMU alone}, under None without any correction."""
-    out = {None: _error(flight)}
-    for share in SHARES if network else ():
+def uncorrected(flights):
+    """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction."""
+    return {flight.name: _error(flight) for flight in flights}
+
+
+def judged(flight, plain, effects, network, shares=SHARES):
+    """{share: 3D RMSE of the filter on a Flight, m, from TDOAs and IMU alone}, under None without any correction, as `plain`
+    says. Without a network there is one share, 1."""
+    out = {None: plain[flight.name]}
+    for share in shares if network else ():
         network.share = share
         out[share] = _error(flight, effects, network)
     return out if network else {**out, 1.0: _error(flight, effects)}
-
-
-def choose(errors):
-    """The share whose error, relative to that without correction, is smallest a standard deviation above its mean over the
-    flights left out. errors : as of BorneOut.
-
-    The mean alone takes all of a model that gains much on three flights and loses a little on the fourth; the flights to come
-    are more varied than these.
-    """
-    ratios = {share: np.array([of[share] / of[None] for of in errors.values()]) for share in SHARES if all(share in of for of in errors.values())}
-    return min(ratios, key=lambda share: ratios[share].mean() + _spread(ratios[share]))
 
 
 def train(kind, training, validation, seed, name, options=structured.Options(), progress=lambda text: None):
@@ -95,7 +62,7 @@ def train(kind, training, validation, seed, name, options=structured.Options(), 
         progress("looking for effects")
         found = physics.find(flights)
     trained = models.train(kind, training, validation, seed, name, options, progress, found)
-    borne_out = bear_out(kind, flights, seed, options, found, progress)
+    borne_out = bear_out(kind, flights, uncorrected(flights), seed, options, found, progress)
     if trained.model:
         trained = replace(trained, meta={**trained.meta, "share": borne_out.share})
     return trained, borne_out
@@ -113,7 +80,3 @@ def _without(kind, flights, others, seed, options, found):
 
 def _error(flight, effects=None, network=None):
     return evaluate(flight.without(*AIDS), None, effects, network)[0].row()["rmse_3d"]
-
-
-def _spread(gains):
-    return float(gains.std(ddof=1)) if len(gains) > 1 else 0.0

@@ -169,13 +169,13 @@ class Structured:
     def variance(self, samples):
         """Of the maps, for Samples: (n,) m^2, without the floor."""
         phi = self.site.features(samples.p / self.options.length)
-        known, sites = np.einsum("ni,ij,nj->n", phi, self.site_covariance, phi), self._site_of(samples.anchors)
+        known, sites = _quadratic(phi, self.site_covariance), self._site_of(samples.anchors)
         at_site = sites < len(self.site_ids)
         total = sum(np.where(at_site[rows], known, self.site.variance) for rows in (samples.a, samples.b))
         for viewer, link in self.links.items():
             for side in "ab":
                 phi = link.features(link_inputs(samples, side, viewer))
-                total += np.einsum("ni,ij,nj->n", phi, self.link_covariances[viewer], phi)
+                total += _quadratic(phi, self.link_covariances[viewer])
         return total
 
     def _end_inputs(self, side="a"):
@@ -245,6 +245,11 @@ class Structured:
         values = graph.op("Exp", graph.op("Gemm", x, np.hstack(slopes), np.concatenate(levels)))
         mean = graph.op("MatMul", values, np.concatenate(weights)[:, None])
         return mean, _power(graph, values, block_diag(*factors))
+
+
+def _quadratic(phi, covariance):
+    """Variance of each row of phi (n, m) times weights with a covariance (m, m): (n,)."""
+    return np.einsum("ni,ni->n", phi @ covariance, phi)
 
 
 def link_inputs(samples, side, viewer):

@@ -14,6 +14,7 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...readers import inputs
+from ...scoring.borne_out import choose
 from ...training import models, physics, shrinking
 
 WORSE = 1.05  # ratio of errors beyond which a judged flight counts as harmed
@@ -33,30 +34,32 @@ def add_options(add):
 def run(args):
     """Do the splits that are missing, and print the table of all."""
     flights = [flight.without(*AIDS) for flight in inputs.Reading(args.survey).flights(args.flights)]
-    seeds = range(args.first, args.first + args.splits)
+    seeds, plain = range(args.first, args.first + args.splits), shrinking.uncorrected(flights)
     done = {(row["kind"], row["seed"]) for row in _read(args.out)}
     with open(args.out, "a") as file:
         for seed in tqdm(seeds, unit="split", disable=None):
-            for row in split(flights, seed, args.fit, [kind for kind in args.models if (kind, seed) not in done]):
+            for row in split(flights, plain, seed, args.fit, [kind for kind in args.models if (kind, seed) not in done]):
                 file.write(json.dumps(row) + "\n")
                 file.flush()
     rows = [row for row in _read(args.out) if row["seed"] in seeds and row["kind"] in args.models]
     print(table(rows, shrunk=False) + "\n" + table(rows, shrunk=True))
 
 
-def split(flights, seed, fit, kinds):
-    """Yield, for each kind, a dict of one split: names, 3D RMSE of every left-out and every judged flight by share."""
+def split(flights, plain, seed, fit, kinds):
+    """Yield, for each kind, a dict of one split: 3D RMSE of every left-out flight by share, and of every judged flight with the
+    share that is borne out, and with all. plain : of `shrinking.uncorrected`."""
     order = np.random.default_rng([seed, fit]).permutation(len(flights))
     chosen, others = ([flights[k] for k in part] for part in (order[:fit], order[fit:]))
     found = physics.find(chosen) if any(kind.startswith("physics") for kind in kinds) else None
     for kind in kinds:
         known = found if kind.startswith("physics") else None
-        borne_out = shrinking.bear_out(kind, chosen, seed, found=known)
+        borne_out = shrinking.bear_out(kind, chosen, plain, seed, found=known)
         with TemporaryDirectory() as folder:
             trained = models.train(kind, chosen[:-1], chosen[-1:], seed, kind, found=known, curve=False)
             model, _ = models.save(trained, Path(folder))
             network = Network(model) if model else None
-            errors = {flight.name: shrinking.judged(flight, trained.effects, network) for flight in others}
+            shares = sorted({borne_out.share, 1.0})
+            errors = {flight.name: shrinking.judged(flight, plain, trained.effects, network, shares) for flight in others}
         yield {"seed": seed, "kind": kind, "left_out": borne_out.as_dict()["left_out"], "judged": _text(errors)}
 
 
@@ -69,7 +72,7 @@ def table(rows, shrunk):
     for row in rows:
         by_kind[row["kind"]].append(row)
     for kind, some in by_kind.items():
-        shares = [shrinking.choose(_numbers(row["left_out"])) if shrunk else 1.0 for row in some]
+        shares = [choose(_numbers(row["left_out"])) if shrunk else 1.0 for row in some]
         ratios = [_ratios(row["judged"], share) for row, share in zip(some, shares)]
         expected = np.mean([1.0 - _ratios(row["left_out"], share).mean() for row, share in zip(some, shares)])
         gains, every = np.array([1.0 - each.mean() for each in ratios]), np.concatenate(ratios)
