@@ -68,6 +68,19 @@ def test_flights_make_a_map_and_are_judged_by_it(tmp_path, flights, capsys):
     assert json.loads((tmp_path / "judge.json").read_text())["runs"] == [row]
 
 
+def test_as_much_of_a_map_is_taken_as_flights_left_out_bear_out(tmp_path, flights, capsys):
+    both, out = [str(flights / "one.bag"), str(flights / "two.bag")], str(tmp_path / "m.npz")
+    assert main(["fit", *both, "--out", out, "--json", str(tmp_path / "fit.json"), "--jobs", "1"]) == 0
+    told = json.loads((tmp_path / "fit.json").read_text())["borne_out"]
+    assert len(told["left_out"]) == 2 and told["gain"] > 0.0 and told["share"] > 0.0  # both bags hold flights of one name
+    assert "expected of flights like these" in capsys.readouterr().out
+    whole = BiasMap.load(out)
+    half = whole.scaled(0.5)
+    np.testing.assert_allclose(half.bias, 0.5 * whole.bias)
+    added = np.linalg.eigvalsh(half.added - 0.25 * whole.added)
+    assert added.min() > -1e-9 and added.max() > 0.0  # what stays is uncertain
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

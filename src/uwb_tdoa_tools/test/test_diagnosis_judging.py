@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.detectors import Detection
-from uwb_tdoa_tools.diagnosis.judging import Case, borne_out, compare, cross_fitted, useful
+from uwb_tdoa_tools.diagnosis.judging import Case, _gain_interval, borne_out, compare, cross_fitted, useful, why_not
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
 
@@ -118,3 +118,17 @@ def test_a_flight_that_the_filter_gives_no_estimate_of_ends_in_a_sentence(flight
     few = replace(flights[0], imu=None, tdoa=replace(tdoa, **{f.name: getattr(tdoa, f.name)[:3] for f in fields(tdoa)}))
     with pytest.raises(InputError, match=f"{few.name}: the filter gives no estimate"):
         compare([Case(few, NONE)], NONE)
+
+
+def test_a_gain_that_a_shift_of_the_reference_can_feign_is_none():
+    rng = np.random.default_rng(0)
+    errors = [rng.normal(size=(12, 3)) * 0.02 + off for off in ([0.0, 0.0, 0.15], [0.0, 0.0, 0.02])]
+    before, after = ([np.column_stack([100 * np.sum(e**2, axis=1), np.full(12, 100.0), 100 * e])] for e in errors)
+    sure, unsure = (_gain_interval(before, after, ["a"], lambda name, std=std: np.full(3, std)) for std in (0.0, 0.1))
+    assert sure[0] > 0.5 and unsure[0] < 0.0 < unsure[1]
+    sides = [{"pooled": {"rmse_3d": 0.15}}, {"pooled": {"rmse_3d": 0.04, "rmse_3d_gain_ci": sure}}]
+    assert why_not(*sides, 0.0) is None and why_not(*sides, 0.1) is None
+    sides[1]["pooled"]["rmse_3d_gain_ci"] = unsure
+    assert why_not(*sides, 0.0) is None and "may be 10 cm from where" in why_not(*sides, 0.1)
+    sides[1]["pooled"]["rmse_3d"] = 0.16
+    assert "do not make the error smaller" in why_not(*sides, 0.0)

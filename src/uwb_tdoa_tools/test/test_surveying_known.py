@@ -140,6 +140,35 @@ def test_a_path_laid_beside_the_filters_is_where_the_tag_was_and_takes_its_shift
         reference.prepare(flights[1])
 
 
+def test_marks_on_the_floor_tell_nothing_and_those_in_the_air_judge_each_other(flights):
+    flight = at(flights[0], flights[0].anchors.positions + [0.0, 0.0, 0.2])
+    floor = [replace(mark, position=(mark.position[0], mark.position[1], 5.0)) for mark in ends(flights[0])]
+    results = [survey([flight], Tape(0.3), constraints=some) for some in ((), floor, marks_in_the_air(flights[0]))]
+    np.testing.assert_array_equal(results[0].surveyed.anchors.positions, results[1].surveyed.anchors.positions)
+    assert results[1].surveyed.grounded == 2 and results[1].surveyed.marks is None and "2 marks are on the floor" in results[1].as_text()
+    before, after = results[2].surveyed.marks
+    assert after < 0.6 * before and results[2].why_not is None and "each left out once" in results[2].as_text()
+    against = replace(results[2], surveyed=replace(results[2].surveyed, marks=(after, before)))
+    assert "the position would suffer" in against.why_not
+
+
+def marks_in_the_air(flight):
+    """[Mark] of four places of a Flight, 1 s each."""
+    truth, begin = flight.truth, flight.tdoa.t[0]
+    rows = [np.searchsorted(truth.t, begin + since + 0.5) for since in (8.0, 14.0, 20.0, 26.0)]
+    return [Mark(flight.name, truth.t[row] - begin - 0.5, truth.t[row] - begin + 0.5, tuple(truth.p[row]), 0.05) for row in rows]
+
+
+def test_what_a_path_may_be_off_by_shrinks_with_marks(flights):
+    known, other = ([odometry_of(flights[0]), *some] for some in (ends(flights[0]), []))
+    stds = []
+    for some in (known, other):
+        reference = Odometry(None, some)
+        reference.prepare(flights[0])
+        stds.append(reference.shift_std(flights[0].name)[0])
+    assert 0.02 < stds[0] < 0.1 < 0.2 < stds[1] < 0.4
+
+
 def test_the_frame_of_an_odometry_makes_no_difference(flights):
     flight = replace(flights[0], truth=None)
     one, other = (Odometry(None, [odometry_of(flights[0], 0.0, yaw)]).prepare(flight).truth for yaw in (0.3, -2.0))

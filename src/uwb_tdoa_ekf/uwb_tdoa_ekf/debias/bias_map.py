@@ -1,7 +1,7 @@
 """The map from a measured position to its bias, after Grasso et al. (Sensors 2022, 22, 9136), eqs. 20 and 21; and its
 file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
@@ -87,6 +87,10 @@ class BiasMap:
     def planar(self):
         """Whether it knows x and y only; z is then left as it is."""
         return self.at.shape[1] == 2
+
+    def scaled(self, share):
+        """The BiasMap of a share, 0 ... 1, of all biases; the rest, which is not taken out, is in `added`."""
+        return replace(self, bias=share * self.bias, added=share**2 * self.added + (1.0 - share) ** 2 * self._mean_square)
 
     def validity(self, p):
         """How far the map is valid at positions p (m, 3), m: (m,), 1 inside of the known region, 0 from FADE beyond it."""

@@ -10,6 +10,7 @@ from .. import cli, options, parallel
 from ..debiasing import report
 from ..debiasing.judge import Estimator
 from ..debiasing.mapping import fit_map
+from ..debiasing.shrinking import bear_out
 
 DESCRIPTION = """Map the bias of estimated positions over the room, after Grasso et al. (Sensors 2022, 22, 9136), and
 take it out.
@@ -67,10 +68,15 @@ def _fit(args):
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
     fitted = list(parallel.over(estimator, recordings, args.jobs, args.dask))
-    made = fit_map(fitted, args.static, estimator, args.step, args.planar, args.interpolator)
+    settings = {"step": args.step, "planar": args.planar, "interpolator": args.interpolator}
+    borne_out = bear_out(fitted, args.static, estimator, **settings)
+    made = fit_map(fitted, args.static, estimator, **settings)
+    made = made.scaled(borne_out.share) if borne_out else made
     made.save(args.out)
     print(f"wrote {args.out}: {report.about(made)}")
+    print(borne_out.as_text() if borne_out else "how much of it flights to come bear out is not known: give several flights")
     figures = {"map": report.about_figures(made), "fitted": report.rows(fitted, made, estimator.effects)}
+    figures["borne_out"] = borne_out.as_dict() if borne_out else None
     report.say_rows("in sample", figures["fitted"])
     if held:
         figures["held out"] = _judged(args, estimator, held, made)

@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from .. import cli
-from ..studies import aids, crazyflie, recalibrating, surveying
+from ..studies import aids, crazyflie, noise, recalibrating, surveying
 from ..studies.checking import figures as checking, in_flight
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
@@ -20,6 +20,7 @@ STUDIES = {
     "default-model": default,
     "diagnosis": figures,
     "in-flight": in_flight,
+    "noise": noise,
     "random-splits": splits,
     "recalibrating": recalibrating,
     "spin": spin,
@@ -37,6 +38,7 @@ of measured flights: flights/, util/, surveys/.
   default-model    the model that bias_node ships
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
+  noise            whether covariances are honest after a calibration (docs/calibration.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
@@ -66,6 +68,7 @@ def parser():
         "study diagnosis measured --data DATA --out bench/",
         "study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
         "study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
+        "study noise --data DATA --split const1",
         "study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "study recalibrating --data DATA --only const1",
         "study spin --out spin.png",

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from ..readers.inputs import Reading
@@ -18,7 +19,13 @@ def debiased(odometry, bias_map):
 
 
 def fly(flight, config=None, effects=None):
-    """(Flight, Score, odometry) of a Flight with ground truth, run through the filter. Raises InputError."""
+    """(Flight, Score, odometry) of a Flight with ground truth, run through the filter. Raises InputError: what diagnose finds with
+    less, heights, odometry or marks, is corrected before the filter, and a map of that path would only repeat the filter's own error."""
+    if flight.truth is None:
+        raise InputError(
+            f"{flight.name}: it holds no ground truth to map the bias with; diagnose --reference heights, odometry or marks finds what is "
+            "wrong without it, and --effects takes that."
+        )
     score, run = evaluate(flight, config, effects)
     return flight, score, run.odometry
 

@@ -28,14 +28,14 @@ EXPLAINED = 0.1  # share of the slow innovations that must be explained
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """selection : Selection of all positions and delays of anchors; left : m, scale of the slow innovations that they leave;
-    explained : share of them that they explain; long_enough : whether the flights can tell; placed : whether more than
-    TDOAs and IMU told where the tag was; changes : (Change, ...) since the last calibration."""
+    explained : share of them that they explain; long_enough : whether the flights can tell; marks : as of Surveyed;
+    changes : (Change, ...) since the last calibration."""
 
     selection: Selection
     left: float
     explained: float
     long_enough: bool
-    placed: bool = False
+    marks: tuple | None = None
     changes: tuple = ()
 
     @property
@@ -43,8 +43,8 @@ class Calibration:
         """Why it must not be applied; None if it may."""
         if not self.long_enough:
             return f"the flights are too short: {MIN_BLOCKS * BLOCK:g} s in the air are needed without ground truth"
-        if self.placed:
-            return None
+        if self.marks:
+            return None if self.marks[1] < self.marks[0] else why_marks_speak_against(self.marks)
         if self.left > LEFT:
             return (
                 f"positions and delays of anchors leave {100 * self.left:.1f} cm of what is slow in the innovations, more than "
@@ -73,8 +73,16 @@ def calibrate(flights, attribution, base, config=None, constraints=(), progress=
     fitted = replace(fit(table, columns), beta=beta, cov=cov, residual=table.y - table.matrix(columns) @ beta)
     selection = Selection(table, chosen, fitted, (0.0,) * len(chosen), ((),) * len(chosen))
     explained, long_enough = 1.0 - (found.left / found.before) ** 2, len(np.unique(table.block)) >= MIN_BLOCKS
-    placed = any(one.flight is not None for one in constraints)
-    return Calibration(selection, found.left, explained, long_enough, placed, found.changes)
+    return Calibration(selection, found.left, explained, long_enough, found.marks, found.changes)
+
+
+def why_marks_speak_against(marks):
+    """Why a survey must not be applied of which marks, each left out once, say that it makes the position worse. marks : of
+    Surveyed."""
+    return (
+        f"at marks, each left out once, the estimate is off by {100 * marks[0]:.1f} cm with the anchors as given, and by {100 * marks[1]:.1f} cm with "
+        "others: the position would suffer; measure more marks, or fly where it is known"
+    )
 
 
 def merged(base, found, selection):

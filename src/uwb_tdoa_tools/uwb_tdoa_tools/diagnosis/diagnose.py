@@ -91,8 +91,9 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     judged = judging.judge(model, flights, holdout, base, effects, reference, config, saying("judging"))
     before, after, judged_on = judged
     refused = [*attribution.refused, *kept.refused]
-    if reference.judges and after["pooled"]["rmse_3d"] >= before["pooled"]["rmse_3d"] and len(effects) > len(base):
-        refused.append(Refused("all", "together they do not make the error smaller on held-out data"))
+    why_not = judging.why_not(before, after, max(reference.shift_std(flight.name).max() for flight in flights)) if reference.judges else None
+    if why_not and len(effects) > len(base):
+        refused.append(Refused("all", why_not))
         effects, after, kept = base, before, judging.nothing(attribution)
         model = attribution.of(kept)
     remaining = [residuals(flight, reference, effects) for flight in flights]

@@ -181,13 +181,29 @@ def judge(attribution, flights, holdout, base, effects, reference, config=None, 
     else:
         cases = [Case(flight, effects) for flight in flights]
         on = "the flights that were fitted, by their innovations alone"
-    before, after = (compare if reference.judges else _innovations)(cases, base, config, progress)
-    return before, after, on
+    if reference.judges:
+        return *compare(cases, base, config, progress, reference.shift_std), on
+    return *_innovations(cases, base, config, progress), on
 
 
-def compare(cases, base, config=None, progress=lambda: None):
+def why_not(before, after, shift_std):
+    """Why what was found must not be applied, after `compare`; None if it may. shift_std : m, what a reference may be off by in all
+    of a flight; the gain must be larger than what that can feign."""
+    gain, interval = after["pooled"]["rmse_3d"] < before["pooled"]["rmse_3d"], after["pooled"]["rmse_3d_gain_ci"]
+    if not gain:
+        return "together they do not make the error smaller on held-out data"
+    if shift_std > 0.0 and (interval is None or interval[0] <= 0.0):
+        return (
+            f"all of a flight may be {100 * shift_std:.0f} cm from where the reference says, on each axis, and the gain is less than that "
+            "can feign; measure more marks, or better ones"
+        )
+    return None
+
+
+def compare(cases, base, config=None, progress=lambda: None, shift_std=lambda name: np.zeros(3)):
     """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, besides
-    residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s)."""
+    residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts
+    what the references of whole flights may be off by too. shift_std : of a Reference."""
     sides, draws = [], []
     for after in (False, True):
         scores, rows, blocks = [], [], []
@@ -203,7 +219,7 @@ def compare(cases, base, config=None, progress=lambda: None):
         together = {**as_json(pooled(scores)), "residual_spread": float(np.mean(spreads)) if spreads else None}
         sides.append({"runs": rows, "pooled": {**together, "rmse_3d_ci": _interval(blocks)}, "scores": scores})
         draws.append(blocks)
-    sides[1]["pooled"]["rmse_3d_gain_ci"] = _gain_interval(*draws)
+    sides[1]["pooled"]["rmse_3d_gain_ci"] = _gain_interval(*draws, [case.flight.name for case in cases], shift_std)
     return sides
 
 
@@ -242,31 +258,38 @@ def _spread(run):
 
 
 def _blocks(judged):
-    """(sums of squared 3D errors, counts) per block of 5 s."""
+    """(b, 5) per block of 5 s: sums of squared 3D errors, counts, sums of errors."""
     if not len(judged.t):
-        return np.zeros((1, 2))
+        return np.zeros((1, 5))
     block = ((judged.t - judged.t[0]) / BLOCK).astype(int)
     power = np.sum(judged.error**2, axis=1)
-    return np.stack([np.bincount(block, power), np.bincount(block)], axis=1)
+    return np.stack([np.bincount(block, power), np.bincount(block), *(np.bincount(block, e) for e in judged.error.T)], axis=1)
 
 
 def _interval(blocks):
     """95 % interval of the 3D RMSE: [low, high], m."""
-    draws = _draws(np.concatenate(blocks))
+    blocks = np.concatenate(blocks)
+    draws = _draws(blocks, np.zeros((BOOTSTRAPS, len(blocks), 3)))
     return [float(x) for x in np.quantile(draws, [0.025, 0.975])] if np.isfinite(draws).all() else None
 
 
-def _draws(blocks):
-    rng = np.random.default_rng(0)
-    chosen = rng.integers(0, len(blocks), (BOOTSTRAPS, len(blocks)))
-    total = blocks[chosen].sum(axis=1)
-    return np.sqrt(total[:, 0] / np.maximum(total[:, 1], 1))
+def _draws(blocks, shifts):
+    """(BOOTSTRAPS,) m: the 3D RMSE of blocks (b, 5) drawn at random, whose errors are all off by shifts (BOOTSTRAPS, b, 3), m."""
+    chosen = np.random.default_rng(0).integers(0, len(blocks), (BOOTSTRAPS, len(blocks)))
+    power, count, error = blocks[chosen, 0], blocks[chosen, 1], blocks[chosen, 2:]
+    off = np.take_along_axis(shifts, chosen[:, :, None], axis=1)
+    power = power + 2.0 * np.sum(off * error, axis=2) + count * np.sum(off**2, axis=2)
+    return np.sqrt(np.maximum(power.sum(axis=1), 0.0) / np.maximum(count.sum(axis=1), 1))
 
 
-def _gain_interval(before, after):
-    """95 % interval of the share of the 3D RMSE that is gone, the same blocks drawn for both."""
+def _gain_interval(before, after, names, shift_std):
+    """95 % interval of the share of the 3D RMSE that is gone, the same blocks drawn for both, with references that are off by what
+    they may be, alike in all of a flight. before, after : [(b, 5)], blocks of each case; names : of their flights."""
     blocks, others = np.concatenate(before), np.concatenate(after)
     if len(blocks) != len(others):
         return None
-    gain = 1.0 - _draws(others) / np.maximum(_draws(blocks), 1e-12)
+    rng = np.random.default_rng(1)
+    off = {name: rng.standard_normal((BOOTSTRAPS, 3)) * shift_std(name) for name in dict.fromkeys(names)}
+    shifts = np.concatenate([np.repeat(off[name][:, None], len(some), axis=1) for name, some in zip(names, before)], axis=1)
+    gain = 1.0 - _draws(others, shifts) / np.maximum(_draws(blocks, shifts), 1e-12)
     return [float(x) for x in np.quantile(gain, [0.025, 0.975])] if np.isfinite(gain).all() else None

@@ -18,6 +18,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .channels import CHANNELS, Comparison
 from .prior import DELAY, POSITION, Prior, keys_of, solve
+from .references.base import MARGIN
 from .references.nothing import Nothing
 from .regression.fit import NU, student_scale
 
@@ -35,7 +36,9 @@ class Surveyed:
     """anchors : Anchors; delays (N,) m; covariance (4N, 4N) m^2, of positions, anchor by anchor, and then of delays;
     seconds : s in the air that tell; before, left : m, scale of the slow innovations with the anchors as given, and with these; tdoa_std : m, for the filter: so
     that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of the
-    size of delays, and of functions of the place; changes : (Change, ...) since the last calibration."""
+    size of delays, and of functions of the place; changes : (Change, ...) since the last calibration; marks : (before, after), root
+    mean square of what estimates at marks in the air are off by, m, each after a fit without it; None where there are none;
+    grounded : how many marks are on the floor, which tell nothing: TDOAs there are metres off."""
 
     anchors: Anchors
     delays: np.ndarray
@@ -47,6 +50,8 @@ class Surveyed:
     delay_std: float
     function_std: float
     changes: tuple = ()
+    marks: tuple | None = None
+    grounded: int = 0
 
     @property
     def position_std(self):
@@ -85,36 +90,55 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     n, prior = len(given), Prior.of(given, position_std, base.covariance)
     start = np.concatenate([given.positions.ravel(), np.zeros(n)])
     config = config or FilterConfig()
-    best, found = start, None
+    best, found, spans = start, None, {}
     for _ in range(ROUNDS):
         anchors = given.at(best[: 3 * n].reshape(n, 3))
-        gram, vector, alike, slow, seconds = 0.0, 0.0, [], [], 0.0
+        gram, vector, alike, slow, seconds, marks = 0.0, 0.0, [], [], 0.0, []
         for flight in flights:
-            here = [one for one in constraints if one.flight == flight.name]
-            part = _residual(replace(flight, anchors=anchors), best[3 * n :], base, reference)
+            part = _residual(replace(flight, anchors=anchors), best[3 * n :], base, reference, spans)
+            here = [one for one in constraints if one.flight == flight.name and _aloft(one, flight, spans[flight.name])]
             slow.append(_slow(part))
             grams, vectors, known = _equations(part, flight, here)
             seconds += BLOCK * len(grams)
             alike.append(_inflation(grams[:, : 4 * n, : 4 * n], vectors[:, : 4 * n], prior.loose))
             inflation = SYSTEMATIC * alike[-1]
-            gram = gram + grams.sum(axis=0) / inflation + known[0]
-            vector = vector + vectors.sum(axis=0) / inflation + known[1]
+            gram = gram + grams.sum(axis=0) / inflation + sum(one.gram for one in known)
+            vector = vector + vectors.sum(axis=0) / inflation + sum(one.vector for one in known)
+            marks += known
             progress()
         for one in (one for one in constraints if one.flight is None):
             known = one.equations(anchors, len(vector))
             gram, vector = gram + known[0], vector + known[1]
         if found is None:
-            before = student_scale(np.concatenate(slow))
+            before, left_out = student_scale(np.concatenate(slow)), _left_out(gram, vector, prior, marks)
         found = solve(gram, vector, prior, best - start)
         tdoa_std = config.tdoa_std * float(np.sqrt(np.mean(alike) / config.tdoa_correlation_length))
         best = best + found.step
     moved = given.at(best[: 3 * n].reshape(n, 3))
-    parts = [_residual(replace(flight, anchors=moved), best[3 * n :], base, reference) for flight in flights]
+    parts = [_residual(replace(flight, anchors=moved), best[3 * n :], base, reference, spans) for flight in flights]
     left = student_scale(np.concatenate([_slow(part) for part in parts]))
     changes = _changes(prior, found, best - start)
+    grounded = sum(one.flight is not None for one in constraints) - len(marks)
     return Surveyed(
-        moved, best[3 * n :], found.covariance, seconds, before, left, tdoa_std, found.delay_std, found.function_std, changes
-    )
+        moved, best[3 * n :], found.covariance, seconds, before, left, tdoa_std, found.delay_std, found.function_std, changes,
+        left_out, grounded,
+    )  # fmt: skip
+
+
+def _aloft(constraint, flight, span):
+    """Whether a constraint of a Flight is of the time in the air."""
+    return span[0] - MARGIN <= float(np.mean(constraint.stamps(flight.tdoa.t[0]))) <= span[1] + MARGIN
+
+
+def _left_out(gram, vector, prior, marks):
+    """(before, after) of Surveyed.marks: each of _Marks is left out of the normal equations of all."""
+    if not marks:
+        return None
+    n, off = len(prior.covariance), []
+    for one in marks:
+        step = solve(gram - one.gram, vector - one.vector, prior, np.zeros(n)).step
+        off.append((one.off, one.off - one.columns[:, :n] @ step))
+    return tuple(float(np.sqrt(np.mean(np.sum(np.square(some), axis=1)))) for some in zip(*off))
 
 
 def _changes(prior, found, offset):
@@ -148,10 +172,16 @@ def delay_effect(anchors, delays):
     return EFFECTS[DELAY]({str(i): float(delay) for i, delay in zip(anchors.ids, delays)})
 
 
-def _residual(flight, delays, base, reference):
-    """TdoaResidual of a prepared Flight with late anchors: the innovations of a run."""
+def _residual(flight, delays, base, reference, spans):
+    """TdoaResidual of a prepared Flight with late anchors: the innovations of a run.
+
+    spans : {flight: (first, last) s in the air}, as its first run says: other anchors may move the path to the floor, but not
+    the tag.
+    """
     effects = EffectSet((*base.effects, delay_effect(flight.anchors, delays))) if delays.any() else base
-    part = CHANNELS["tdoa"].residual(Comparison.of(flight, reference, effects))
+    comparison = Comparison.of(flight, reference, effects, spans.get(flight.name))
+    spans[flight.name] = comparison.span
+    part = CHANNELS["tdoa"].residual(comparison)
     if part is None:
         raise InputError(f"{flight.name}: has no TDOAs in the air to survey with; fly for half a minute at least.")
     return part
@@ -164,8 +194,8 @@ def _slow(part):
 
 
 def _equations(part, flight, constraints):
-    """(grams (b, k, k), vectors (b, k)) of the normal equations that a TdoaResidual gives, block by block, and (gram (k, k),
-    vector (k,)) of those that constraints of its Flight give."""
+    """(grams (b, k, k), vectors (b, k)) of the normal equations that a TdoaResidual gives, block by block, and [_Mark] of
+    constraints of its Flight."""
     samples, air, anchors = part.samples, part.airborne, part.samples.anchors
     ids = [str(i) for i in anchors.ids]
     positions = EFFECTS[POSITION]().regressors(samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
@@ -186,19 +216,29 @@ def _equations(part, flight, constraints):
     return grams, vectors, _known(constraints, stamps, moved, part.innovations.run.odometry)
 
 
+@dataclass(frozen=True, eq=False)
+class _Mark:
+    """Normal equations of a constraint of a flight: gram (k, k), vector (k,); off (3,) m, columns (3, k): as of Mark.off."""
+
+    gram: np.ndarray
+    vector: np.ndarray
+    off: np.ndarray
+    columns: np.ndarray
+
+
 def _known(constraints, stamps, moved, odometry):
-    """(gram (k, k), vector (k,)) of constraints of a flight that ask for the estimate at stamps. moved (m, 3, k): its
-    derivative at all of them in turn."""
-    gram, vector = np.zeros((moved.shape[2],) * 2), np.zeros(moved.shape[2])
+    """[_Mark] of constraints of a flight that ask for the estimate at stamps. moved (m, 3, k): its derivative at all of them in
+    turn."""
     order = np.argsort(np.concatenate([[], *stamps]), kind="stable")
     moved = moved[np.argsort(order, kind="stable")]
-    first = 0
+    first, out = 0, []
     for one, t in zip(constraints, stamps):
         estimate = np.stack([np.interp(t, odometry.t, odometry.p[:, k]) for k in range(3)], axis=1)
         rows = np.minimum(np.searchsorted(odometry.t, t), len(odometry.t) - 1)
-        known = one.equations(t, estimate, odometry.covariance[rows, :3, :3], moved[first : first + len(t)])
-        gram, vector, first = gram + known[0], vector + known[1], first + len(t)
-    return gram, vector
+        here = moved[first : first + len(t)]
+        out.append(_Mark(*one.equations(t, estimate, odometry.covariance[rows, :3, :3], here), *one.off(estimate, here)))
+        first += len(t)
+    return out
 
 
 def _inflation(grams, vectors, sizes):

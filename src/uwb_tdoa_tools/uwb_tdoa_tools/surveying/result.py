@@ -6,7 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
 
-from ..diagnosis.calibration import LEFT
+from ..diagnosis.calibration import LEFT, why_marks_speak_against
 from ..diagnosis.self_survey import Surveyed, calibrated
 
 IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
@@ -16,21 +16,21 @@ KNOWN_WELL = 0.02  # m, standard deviation as given that leaves nothing to wish 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names; base : EffectSet that was in the model; placed :
-    whether more than TDOAs and IMU told where the tag was."""
+    """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names; base : EffectSet that was in the model."""
 
     given: object
     given_std: np.ndarray
     surveyed: Surveyed
     flights: tuple
     base: EffectSet = EffectSet()
-    placed: bool = False
 
     @property
     def why_not(self):
         """Why it must not be used instead of what was given; None if it may."""
-        before, left = self.surveyed.before, self.surveyed.left
-        if self.placed or left <= LEFT or before > CLEARLY * left:
+        before, left, marks = self.surveyed.before, self.surveyed.left, self.surveyed.marks
+        if marks:
+            return None if marks[1] < marks[0] else why_marks_speak_against(marks)
+        if left <= LEFT or before > CLEARLY * left:
             return None
         return (
             f"{100 * before:.1f} cm of the innovations are slow with the anchors as given, and {100 * left:.1f} cm with others: more than "
@@ -82,6 +82,8 @@ class Result:
                 for one in found.changes
             ],
             "applied": self.why_not is None,
+            "marks_left_out": found.marks,
+            "marks_on_the_floor": found.grounded,
             "slow_before": found.before,
             "slow_left": found.left,
             "covariance": found.covariance.tolist(),
@@ -109,6 +111,11 @@ class Result:
         if self.base.covariance is not None:
             lines += [f"since the last calibration: {change.as_text()}" for change in found.changes]
             lines += [] if found.changes else ["nothing has changed clearly since the last calibration"]
+        if found.marks:
+            before, after = (100 * value for value in found.marks)
+            lines.append(f"marks, each left out once: the estimate there is off by {before:.1f} cm as given, {after:.1f} cm with the others' survey")
+        if found.grounded:
+            lines.append(f"{found.grounded} marks are on the floor, where TDOAs are metres off, and tell nothing: mark places in the air")
         if self.why_not:
             lines.append(f"nothing is applied, anchors stay as given: {self.why_not}")
         return "\n".join(lines)

@@ -41,5 +41,4 @@ def survey(flights, tape, base=EffectSet(), config=None, constraints=(), progres
         raise InputError(f"the flights are {found.seconds:g} s in the air together; {LEAST:g} s are needed: fly for longer.")
     prior = Prior.of(given, std, base.covariance)
     std = np.sqrt(np.diag(prior.covariance))[: std.size].reshape(-1, 3)
-    placed = any(one.flight is not None for one in constraints)
-    return Result(given, std, found, tuple(flight.name for flight in flights), base, placed)
+    return Result(given, std, found, tuple(flight.name for flight in flights), base)

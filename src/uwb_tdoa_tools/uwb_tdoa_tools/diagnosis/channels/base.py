@@ -25,11 +25,11 @@ class Comparison:
     span: tuple
 
     @classmethod
-    def of(cls, flight, reference, effects):
-        """Comparison of a prepared Flight with a Reference."""
+    def of(cls, flight, reference, effects, span=None):
+        """Comparison of a prepared Flight with a Reference. span : as another Comparison of it has found."""
         view = reference.view(flight, effects)
         corrected = effects.correct_streams(replace(flight, truth=None))
-        return cls(corrected, reference, effects, view, reference.span(flight, view.poses))
+        return cls(corrected, reference, effects, view, span or reference.span(flight, view.poses))
 
     @property
     def poses(self):

@@ -26,7 +26,10 @@ class Mark:
 
         t (m,) s: `stamps`; estimate (m, 3) m, covariance (m, 3, 3) m^2, moved (m, 3, k): its derivative by the parameters, all at the stamps.
         """
-        columns = moved.mean(axis=0)
+        off, columns = self.off(estimate, moved)
         weight = 1.0 / (np.diag(covariance[WITHIN // 2]) + self.std**2)
-        off = estimate.mean(axis=0) - self.position
         return (columns * weight[:, None]).T @ columns, columns.T @ (weight * off)
+
+    def off(self, estimate, moved):
+        """((3,) m, by how much the estimate is off; (3, k), by how much it is less so for each unit of the parameters)."""
+        return estimate.mean(axis=0) - self.position, moved.mean(axis=0)

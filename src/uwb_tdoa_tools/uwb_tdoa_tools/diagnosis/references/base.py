@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 
@@ -39,6 +41,10 @@ class Reference:
     def view(self, flight, effects):
         """View of a prepared Flight under the EffectSet `effects`."""
         raise NotImplementedError
+
+    def shift_std(self, name):
+        """(3,) m: standard deviation of what all positions of the prepared flight of a name may be off by together, each axis."""
+        return np.zeros(3)
 
     def span(self, flight, poses):
         """(first, last) stamp, s, of what is diagnosed: in the air, without its ends. Raises InputError if that is short."""

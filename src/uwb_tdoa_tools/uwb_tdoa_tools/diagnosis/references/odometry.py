@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.smoother import smooth
 
 from .ground_truth import GroundTruth
 from .nothing import without_truth
-from .path import OdometryPath
+from .path import SPACING, OdometryPath
 
 FEWEST = 5  # stamps to lay it beside the filter's path
 
@@ -30,6 +30,7 @@ class Odometry(GroundTruth):
         self._config, self._paths = config, {one.flight: one for one in constraints if isinstance(one, OdometryPath)}
         self._marks = [one for one in constraints if one.flight is not None and not isinstance(one, OdometryPath)]
         through = "laid through marks" if self._marks else "laid beside the filter's path: a shift of all of a flight is not seen"
+        self._shift_std = {}
         self.words = f"another odometry in a frame of its own, {through}"
 
     def prepare(self, flight):
@@ -38,11 +39,15 @@ class Odometry(GroundTruth):
             raise InputError(f"{flight.name}: --odometry holds no path of it; record one, or give --no-truth.")
         alone, begin = without_truth(flight), float(flight.tdoa.t[0])
         own = smooth(alone, self._config, Corrector(flight.anchors)).odometry
-        t = path.stamps(own.t[0], own.t[-1])
+        first, last = path.aloft or (0.0, 0.0)  # by itself: laid a little too high, the time on the floor would count as in the air
+        chosen = (own.t >= first) & (own.t <= last)
+        t = np.arange(*own.t[chosen][[0, -1]], SPACING) if chosen.any() else ()
         if len(t) < FEWEST:
             raise InputError(f"{flight.name}: its odometry is above the floor for {len(t)} stamps only; fly for half a minute.")
         estimate = np.stack([np.interp(t, own.t, column) for column in own.p.T], axis=1)
-        chosen = (own.t >= path.t[0]) & (own.t <= path.t[-1])
         marks = [mark for mark in self._marks if mark.flight == flight.name]
-        p = path.laid(t, estimate, marks, begin, own.t[chosen])
+        p, self._shift_std[flight.name] = path.laid(t, estimate, marks, begin, own.t[chosen])
         return replace(alone, truth=Truth(own.t[chosen], p, own.q[chosen]))
+
+    def shift_std(self, name):
+        return np.full(3, self._shift_std[name])

@@ -9,6 +9,7 @@ SPACING = 2.0  # s between the stamps at which it is compared
 ALOFT = 0.3  # m above where it was lowest from which on it counts: on the floor TDOAs are metres off
 FRAME_STD = 10.0  # m: where its frame began, after it was laid beside another path
 LASTING_STD = 0.3  # m, of an estimate from TDOAs, each axis: what lasts for seconds
+MOST = 200  # stamps over which its common error is averaged
 COMMON_STD = 0.3  # m, the same of what all of a flight has in common
 
 
@@ -28,13 +29,15 @@ class OdometryPath:
         """(m, 3) m in its own frame."""
         return np.stack([np.interp(t, self.t, column) for column in self.p.T], axis=1)
 
-    def stamps(self, first, last):
-        """(m,) s, SPACING apart, while it was aloft, from `first` to `last`, s."""
-        aloft = self.t[(self.p[:, 2] > self.p[:, 2].min() + ALOFT) & (self.t > first) & (self.t < last)]
-        return np.arange(aloft[0], aloft[-1], SPACING) if len(aloft) else np.zeros(0)
+    @property
+    def aloft(self):
+        """(first, last) s: between which it was above where it was lowest by ALOFT; None if it never was."""
+        high = self.t[self.p[:, 2] > self.p[:, 2].min() + ALOFT]
+        return (float(high[0]), float(high[-1])) if len(high) else None
 
     def laid(self, t, estimate, marks, begin, wanted):
-        """(k, 3) m: where the tag was at stamps `wanted` (k,), in the frame of an estimate (m, 3) m at stamps t (m,) and of Marks.
+        """Where the tag was at stamps `wanted` (k,), in the frame of an estimate (m, 3) m at stamps t (m,) and of Marks: (k, 3) m; and
+        standard deviation of what all of that is off by together, each axis, m.
 
         Turned about the vertical and moved as fits the estimate best; then by as much as the frame began elsewhere and has
         drifted, the mean of a random walk given the estimate, whose errors last, and the marks. begin : stamp of the first TDOA.
@@ -48,11 +51,14 @@ class OdometryPath:
         away = [mark.position - (turn.apply(self.at(s)) + shift).mean(axis=0) for mark, s in zip(marks, stamps)]
         away = np.concatenate([estimate - turn.apply(there) - shift, np.reshape(away, (-1, 3))])
         known = np.concatenate([t, [s.mean() for s in stamps]])
-        n, m = len(known), len(t)
+        m = len(t)
         noise = np.diag(np.concatenate([np.full(m, LASTING_STD), [mark.std for mark in marks]]) ** 2.0)
         noise[:m, :m] += COMMON_STD**2
-        weights = np.linalg.solve(self._walk(known, known) + noise, away)
-        return turn.apply(self.at(wanted)) + shift + self._walk(wanted, known) @ weights.reshape(n, 3)
+        information = np.linalg.inv(self._walk(known, known) + noise)
+        cross, some = self._walk(wanted, known), wanted[:: -(-len(wanted) // MOST)]
+        mean = self._walk(some, known).mean(axis=0)
+        std = np.sqrt(self._walk(some, some).mean() - mean @ information @ mean)
+        return turn.apply(self.at(wanted)) + shift + cross @ (information @ away), float(std)
 
     def _walk(self, one, other):
         """(k, n) m^2: covariance of one axis of where the frame is, at stamps one (k,) and other (n,)."""

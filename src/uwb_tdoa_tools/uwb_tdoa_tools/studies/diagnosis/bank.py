@@ -6,10 +6,10 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...scoring.evaluation import evaluate
 from ...simulation import ImuErrors, SimulationConfig, simulate
+from ...diagnosis import diagnose
 from ...diagnosis.attribution import attribute
 from ...diagnosis.findings import usable
 from ...diagnosis.references import GroundTruth, Nothing
-from ...diagnosis.regression.confounding import unobservable
 
 PATHS = ("sines", "rising_circle", "square", "sines", "rising_circle")
 # Without effects: white noise, outliers within the nominal 2 %, an inertial sensor without bias.
@@ -75,6 +75,7 @@ INVISIBLE = (
     "imu_misalignment",
     "imu_gravity",
 )
+WORSE = 1.03  # ratio of errors beyond which a case counts as made worse
 AIDED = tuple(name for name in SIZES if set(EFFECTS[name].channels) <= set(AIDS))  # effects on height, pressure, velocity
 NOISES = {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
 
@@ -114,35 +115,55 @@ def names_found(attribution):
     return [f.effect.name for f in declared] + [f"{effect.channel}/{effect.covariate}" for effect in unnamed]
 
 
-def diagnose_case(effects, seed, truth=True, aided=False):
+def diagnose_case(effects, seed, aided=False):
     """dict of one case: what was put in, found, how near the parameters, and the errors of the filter on a second
     flight with the same effects: before, corrected as found, corrected as it is."""
-    rng = np.random.default_rng([seed, 77])
+    flight, other = _flown(effects, seed, aided)
+    reference = GroundTruth()
+    attribution = attribute([reference.prepare(flight)], reference)
+    case = _case(effects, seed, attribution)
+    for name, model in (("before", EffectSet()), ("found_rmse", usable(attribution.effects)), ("told_rmse", EffectSet(tuple(effects)))):
+        case[name] = _rmse(other, model)
+    return case
 
-    def flown(number):
+
+def case_without_truth(effects, seed):
+    """dict of one case diagnosed without ground truth: what was put in, found, said to be unobservable, and applied; and the
+    errors of the filter on a second flight with the same effects, before and after that."""
+    flight, other = _flown(effects, seed)
+    result = diagnose([flight], reference=Nothing())
+    case = _case(effects, seed, result.attribution)
+    case["unobservable"] = sorted({item.effect for item in result.unobservable})
+    case["applied"] = [effect.name for effect in result.effects.effects]
+    case["before"] = _rmse(other, EffectSet())
+    case["after"] = _rmse(other, result.effects) if case["applied"] else case["before"]
+    return case
+
+
+def _flown(effects, seed, aided=False):
+    """Two Flights with effects, of a seed and of another."""
+    rng, out = np.random.default_rng([seed, 77]), []
+    for number in (seed, seed + 5000):
         flight = clean_flight(number, aided=aided)
         for effect in effects:
             flight = effect.inject(flight, rng)
-        return flight
+        out.append(flight)
+    return out
 
-    reference = GroundTruth() if truth else Nothing()
-    attribution = attribute([reference.prepare(flown(seed))], reference)
-    found = names_found(attribution)
+
+def _case(effects, seed, attribution):
     ambiguous = {other.effect for f in attribution.findings() for other in f.alternatives if other.gap is not None}
-    case = {
+    return {
         "put_in": [effect.name for effect in effects],
         "seed": seed,
-        "found": found,
+        "found": names_found(attribution),
         "ambiguous": sorted(ambiguous),
         "parameters_right": _right(effects, attribution),
     }
-    if not truth:
-        case["unobservable"] = sorted({item.effect for item in unobservable(attribution.selection, attribution.candidates)})
-        return case
-    other = flown(seed + 5000)
-    for name, model in (("before", EffectSet()), ("found_rmse", usable(attribution.effects)), ("told_rmse", EffectSet(tuple(effects)))):
-        case[name] = evaluate(other, effects=model)[0].row()["rmse_3d"]
-    return case
+
+
+def _rmse(flight, effects):
+    return evaluate(flight, effects=effects)[0].row()["rmse_3d"]
 
 
 def _right(effects, attribution):
@@ -164,22 +185,22 @@ def _right(effects, attribution):
     return True
 
 
-def cases(seeds, aided=False):
+def cases(seeds, aided=False, first=0):
     """[(kind, effects, seed)] of the whole bank: small, large, pair, clean. aided : of effects on height, pressure and
-    velocity, for flights that have these."""
+    velocity, for flights that have these; first : of the seeds."""
     out = []
     for name in (name for name in SIZES if (name in AIDED) == aided):
         out += [
             ("small" if not large else "large", (effect_of(name, large, s),), 100 + s)
             for large in (False, True)
-            for s in range(seeds)
+            for s in range(first, first + seeds)
         ]
     out += [
         ("pair", (effect_of(a, True, s), effect_of(b, True, s + 1)), 200 + s)
         for a, b in (() if aided else PAIRS)
-        for s in range(min(seeds, 2))
+        for s in range(first, first + min(seeds, 2))
     ]
-    out += [("clean", (), 300 + s) for s in range(8 * seeds)]
+    out += [("clean", (), 300 + s) for s in range(8 * first, 8 * (first + seeds))]
     return out
 
 
@@ -209,7 +230,25 @@ def figures(results):
     return out
 
 
+def figures_without_truth(results):
+    """Figures of several `case_without_truth`, with "kind"."""
+    put_in = [r for r in results if r["put_in"]]
+    seen, hidden = ([r for r in put_in if (r["put_in"][0] in INVISIBLE) is unseen] for unseen in (False, True))
+    harmed = [r for r in results if r["after"] > WORSE * r["before"]]
+    return {
+        "observable": len(seen),
+        "right first": share(r["found"][:1] == r["put_in"] for r in seen),
+        "not observable": len(hidden),
+        "named as such, and nothing found": share(r["put_in"][0] in r["unobservable"] and not r["found"] for r in hidden),
+        "clean": len(results) - len(put_in),
+        "false alarms": sum(bool(r["found"]) for r in results if not r["put_in"]),
+        "applied": sum(bool(r["applied"]) for r in results),
+        "after over before, where applied": share(r["after"] / r["before"] for r in results if r["applied"]),
+        "worse by 3 % on another flight": [(r["put_in"], r["seed"], r["before"], r["after"]) for r in harmed],
+    }
+
+
 def share(values):
-    """Mean of truth values; None of none."""
+    """Mean of truth values, or of ratios; None of none."""
     values = list(values)
     return round(float(np.mean(values)), 3) if values else None

@@ -27,7 +27,7 @@ def add_options(add):
     add("part", choices=PARTS, help="what to run")
     add("--out", metavar="DIR", type=Path, required=True, help="where to write")
     add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, or cases of blind and faults (default: 5)")
-    add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind (default: %(default)s)")
+    add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind and no-truth (default: %(default)s)")
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
     add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
 
@@ -82,19 +82,10 @@ def _aids(args):
 
 
 def _no_truth(args):
-    cases = [case for case in bank.cases(min(args.seeds, 2)) if case[0] == "large"]
-    results = _each(cases, lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed, truth=False)})
-    seen = [r for r in results if r["put_in"][0] not in bank.INVISIBLE]
-    hidden = [r for r in results if r["put_in"][0] in bank.INVISIBLE]
-    figures = {
-        "observable": len(seen),
-        "right first": bank.share(r["found"][:1] == r["put_in"] for r in seen),
-        "not observable": len(hidden),
-        "named as such, and nothing found": bank.share(
-            r["put_in"][0] in r["unobservable"] and not r["found"] for r in hidden
-        ),
-    }
-    return {"figures": figures, "cases": results}
+    cases = [case for case in bank.cases(min(args.seeds, 2), first=args.first) if case[0] == "large"]
+    cases += [case for case in bank.cases(args.seeds, first=args.first) if case[0] == "clean"]
+    results = _each(cases, lambda kind, effects, seed: {"kind": kind, **bank.case_without_truth(effects, seed)})
+    return {"figures": bank.figures_without_truth(results), "cases": results}
 
 
 def _undeclared(args):
