@@ -16,18 +16,19 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
+from ..scoring.metrics import AIRBORNE
 from .channels import CHANNELS, Comparison
 from .prior import DELAY, POSITION, Prior, keys_of, solve
-from .references.base import MARGIN
 from .references.nothing import Nothing
 from .regression.fit import NU, student_scale
+from .unexplained import FEWEST, unexplained
 
-FEWEST = 4  # TDOAs in a cell; noise of fewer hides what is slow
 ROUNDS = 2  # linear solutions, each about the last
 BLOCK = 3.0  # s over which sums of scores show how alike errors are
 SYSTEMATIC = 12.0  # by which the information is divided beside that: errors that last are no noise
 PRELIMINARY = 20.0  # the same for the solution about which that is measured
 DETERMINED = 1e-4  # share of the largest eigenvalue that a direction must have to count there
+BELIEVED = 11.3  # normalised error squared of an estimate on the floor, 99 % of chi squared (3); TDOAs there can be metres off
 FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 
 
@@ -38,7 +39,8 @@ class Surveyed:
     that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of the
     size of delays, and of functions of the place; changes : (Change, ...) since the last calibration; marks : (before, after), root
     mean square of what estimates at marks in the air are off by, m, each after a fit without it; None where there are none;
-    grounded : how many marks are on the floor, which tell nothing: TDOAs there are metres off."""
+    grounded : how many marks were left out, because they are on the floor and the estimate there is further off than it says; unexplained : in words, where what positions
+    and delays do not explain is most, if that stands out."""
 
     anchors: Anchors
     delays: np.ndarray
@@ -52,6 +54,7 @@ class Surveyed:
     changes: tuple = ()
     marks: tuple | None = None
     grounded: int = 0
+    unexplained: str = ""
 
     @property
     def position_std(self):
@@ -90,15 +93,17 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     n, prior = len(given), Prior.of(given, position_std, base.covariance)
     start = np.concatenate([given.positions.ravel(), np.zeros(n)])
     config = config or FilterConfig()
-    best, found, spans = start, None, {}
+    best, found, spans, grounded = start, None, {}, set()
     for _ in range(ROUNDS):
         anchors = given.at(best[: 3 * n].reshape(n, 3))
         gram, vector, alike, slow, seconds, marks = 0.0, 0.0, [], [], 0.0, []
         for flight in flights:
             part = _residual(replace(flight, anchors=anchors), best[3 * n :], base, reference, spans)
-            here = [one for one in constraints if one.flight == flight.name and _aloft(one, flight, spans[flight.name])]
+            here = [one for one in constraints if one.flight == flight.name and one not in grounded]
             slow.append(_slow(part))
             grams, vectors, known = _equations(part, flight, here)
+            grounded |= {one for one, mark in zip(here, known) if one.position[2] <= AIRBORNE and mark.distance > BELIEVED}
+            known = [mark for one, mark in zip(here, known) if one not in grounded]
             seconds += BLOCK * len(grams)
             alike.append(_inflation(grams[:, : 4 * n, : 4 * n], vectors[:, : 4 * n], prior.loose))
             inflation = SYSTEMATIC * alike[-1]
@@ -118,16 +123,10 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     parts = [_residual(replace(flight, anchors=moved), best[3 * n :], base, reference, spans) for flight in flights]
     left = student_scale(np.concatenate([_slow(part) for part in parts]))
     changes = _changes(prior, found, best - start)
-    grounded = sum(one.flight is not None for one in constraints) - len(marks)
     return Surveyed(
         moved, best[3 * n :], found.covariance, seconds, before, left, tdoa_std, found.delay_std, found.function_std, changes,
-        left_out, grounded,
+        left_out, len(grounded), unexplained(flights, parts),
     )  # fmt: skip
-
-
-def _aloft(constraint, flight, span):
-    """Whether a constraint of a Flight is of the time in the air."""
-    return span[0] - MARGIN <= float(np.mean(constraint.stamps(flight.tdoa.t[0]))) <= span[1] + MARGIN
 
 
 def _left_out(gram, vector, prior, marks):
@@ -218,8 +217,10 @@ def _equations(part, flight, constraints):
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """Normal equations of a constraint of a flight: gram (k, k), vector (k,); off (3,) m, columns (3, k): as of Mark.off."""
+    """Normal equations of a constraint of a flight: gram (k, k), vector (k,); off (3,) m, columns (3, k): as of Mark.off; distance :
+    normalised error squared of the estimate there."""
 
+    distance: float
     gram: np.ndarray
     vector: np.ndarray
     off: np.ndarray
@@ -236,7 +237,9 @@ def _known(constraints, stamps, moved, odometry):
         estimate = np.stack([np.interp(t, odometry.t, odometry.p[:, k]) for k in range(3)], axis=1)
         rows = np.minimum(np.searchsorted(odometry.t, t), len(odometry.t) - 1)
         here = moved[first : first + len(t)]
-        out.append(_Mark(*one.equations(t, estimate, odometry.covariance[rows, :3, :3], here), *one.off(estimate, here)))
+        covariance, (off, columns) = odometry.covariance[rows, :3, :3], one.off(estimate, here)
+        distance = float(np.sum(off**2 / (np.diag(covariance[len(t) // 2]) + one.std**2)))
+        out.append(_Mark(distance, *one.equations(t, estimate, covariance, here), off, columns))
         first += len(t)
     return out
 

@@ -22,6 +22,9 @@ CHANGES = {  # in words: effect of what changed
     "anchor 3 moved by 15 cm in x": EFFECTS["anchor_position"]({"3.x": 0.15}),
     "anchor 1 moved by 14 cm in y and z": EFFECTS["anchor_position"]({"1.y": -0.1, "1.z": 0.1}),
     "anchor 5 later by 15 cm": EFFECTS["anchor_delay"]({"5": 0.15}),
+    "anchor 4 late by 60 cm within 1 m of (-1, -1, 1.2)": EFFECTS["nlos"](
+        {"4.x": -1.0, "4.y": -1.0, "4.z": 1.2, "4.radius": 1.0, "4.delay": 0.6}
+    ),
     "anchor 2 moved by 36 cm in x and y": EFFECTS["anchor_position"]({"2.x": -0.3, "2.y": -0.2}),
 }
 
@@ -43,7 +46,8 @@ def run(args):
             flown = [at(change.inject(flight), anchors.positions) for flight in (second, judged)]
             today = survey([replace(flown[0], truth=None)], Tape(), known)
             errors = rmse(flown[1:], known), rmse([at(flown[1], today.surveyed.anchors.positions)], taken(today, known))
-            said = "; ".join(one.as_text() for one in today.surveyed.changes) or "nothing has changed"
+            said = "; ".join(one.as_text() for one in today.surveyed.changes) or "no anchor has changed"
+            said += f"; {today.surveyed.unexplained}" if today.surveyed.unexplained else ""
             print(f"| {name} | {words} | {errors[0]:.3f} | {errors[1]:.3f} | {said} |", flush=True)
 
 

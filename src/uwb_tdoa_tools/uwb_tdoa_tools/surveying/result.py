@@ -82,6 +82,7 @@ class Result:
                 for one in found.changes
             ],
             "applied": self.why_not is None,
+            "unexplained": found.unexplained,
             "marks_left_out": found.marks,
             "marks_on_the_floor": found.grounded,
             "slow_before": found.before,
@@ -110,12 +111,13 @@ class Result:
             lines.append(f"nothing new is told of anchors {', '.join(unseen)}: fly closer to them, on all sides, high and low")
         if self.base.covariance is not None:
             lines += [f"since the last calibration: {change.as_text()}" for change in found.changes]
-            lines += [] if found.changes else ["nothing has changed clearly since the last calibration"]
+            lines += [] if found.changes else ["no anchor has changed clearly since the last calibration"]
+        lines += [found.unexplained] if found.unexplained else []
         if found.marks:
             before, after = (100 * value for value in found.marks)
             lines.append(f"marks, each left out once: the estimate there is off by {before:.1f} cm as given, {after:.1f} cm with the others' survey")
         if found.grounded:
-            lines.append(f"{found.grounded} marks are on the floor, where TDOAs are metres off, and tell nothing: mark places in the air")
+            lines.append(f"left out: {found.grounded} marks on the floor, where the estimate is further off than it knows; mark places in the air")
         if self.why_not:
             lines.append(f"nothing is applied, anchors stay as given: {self.why_not}")
         return "\n".join(lines)

@@ -12,9 +12,10 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...diagnosis import diagnose
-from ...diagnosis.attribution import attribute
-from ...diagnosis.references import GroundTruth
+from ...diagnosis.references import Heights, Nothing
 from ...scoring.plots import plt
+from ...surveying.survey import survey
+from ...surveying.tape import Tape
 from . import bank, blind, faults, measured, referenced, undeclared
 
 PARTS = (
@@ -142,11 +143,25 @@ def _references(args):
 
 
 def _speed(args):
-    flight = bank.effect_of("anchor_delay", True, 1).inject(bank.clean_flight(500, 126.0))
-    attribute([bank.clean_flight(501, 30.0)], GroundTruth())  # compile
-    started = time.monotonic()
-    result = diagnose([flight])
-    return {"figures": {"seconds for 120 s of flight": round(time.monotonic() - started, 1)}, "cases": result.as_text()}
+    """Seconds of one core: 120 s of one flight with its ground truth, and two flights of a minute with less."""
+    effect = bank.effect_of("anchor_delay", True, 1)
+    flight = effect.inject(bank.clean_flight(500, 126.0))
+    two = [effect.inject(bank.clean_flight(seed, 60.0, aided=True)) for seed in (502, 503)]
+    bare = [one.without(*AIDS) for one in two]
+    calls = {
+        "120 s of flight": lambda: diagnose([flight]),
+        "survey, two of a minute": lambda: survey(bare, Tape()),
+        "diagnose --no-truth, two of a minute": lambda: diagnose(bare, reference=Nothing()),
+        "diagnose --reference heights, two of a minute": lambda: diagnose(two, reference=Heights()),
+    }
+    short = bank.clean_flight(501, 40.0, aided=True)
+    diagnose([short], reference=Heights()), survey([short.without(*AIDS)], Tape())  # compile
+    figures = {}
+    for name, call in calls.items():
+        started = time.process_time()
+        call()
+        figures[name] = round(time.process_time() - started, 1)
+    return {"figures": figures, "cases": []}
 
 
 def _confusions(results, path):
