@@ -12,6 +12,7 @@ from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
+from uwb_tdoa_tools.diagnosis.noise import tdoa_std_of
 from uwb_tdoa_tools.diagnosis.self_survey import delay_effect
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
@@ -66,6 +67,12 @@ def test_a_flight_that_took_no_part_gains(flights, result):
     after = evaluate(at(other, found.anchors.positions), config, effects=effects)[0].row()
     assert after["rmse_3d"] < 0.5 * before and after["rmse_3d"] < 1.2 * error(other)
     assert found.tdoa_std < 0.25 and 0.5 < after["nees_mean"] < 6.0  # of white noise of 0.05 m
+
+
+def test_the_noise_beside_a_calibration_is_that_of_the_flights_without_their_ground_truth(flights):
+    late = EffectSet((EFFECTS["anchor_delay"]({"3": 0.15}),))
+    bare = [replace(flight, truth=None) for flight in flights[:1]]
+    assert tdoa_std_of(flights[:1], late) == tdoa_std_of(bare, late) < tdoa_std_of(bare, EffectSet())
 
 
 def test_ground_truth_is_not_looked_at(flights, result):

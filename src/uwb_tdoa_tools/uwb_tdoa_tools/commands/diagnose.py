@@ -9,6 +9,7 @@ from .. import cli, options
 from ..checking.check import different_surveys
 from ..checking.remarks import survey_remarks
 from ..diagnosis import diagnose
+from ..diagnosis.noise import tdoa_std_of, write_parameters
 from ..diagnosis.references import REFERENCES
 from ..progress import Progress
 from ..surveying.paths import DRIFT, read_paths
@@ -17,7 +18,8 @@ DESCRIPTION = """Find out what is wrong with the measurements of some flights, a
 
 Finds the residuals of every channel, traces them to effects that the model lacks, says how sure it is and what else it
 could be, adds what helps, and reports the error before and after on data that took no part in the fit.
-Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node) and report.html."""
+Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
+assume with them; --config of evaluate) and report.html."""
 
 
 def main(argv=None):
@@ -83,12 +85,25 @@ def _diagnose(args):
     reference = REFERENCES[args.reference](config, known)
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress)
+        progress("measuring the noise")
+        tdoa_std = _noise(result, config)
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(out / "diagnosis.json", result.as_json())
     result.effects.to_yaml(out / "effects.yaml")
     (out / "report.html").write_text(result.as_html())
+    if tdoa_std is not None:
+        write_parameters(out / "ekf_node.yaml", tdoa_std)
     print(result.as_text())
-    print(f"wrote diagnosis.json, effects.yaml and report.html to {out}")
+    print(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
+
+
+def _noise(result, config):
+    """tdoa_std, m, of the flights of a Diagnosis beside its effects; None where they are too short to tell."""
+    try:
+        return tdoa_std_of(result.flights, result.effects, config)
+    except InputError as error:
+        cli.say("diagnose", f"no ekf_node.yaml: {error}")
+        return None
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import sys
 from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, options
+from ..diagnosis.noise import write_parameters
 from ..progress import Progress
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
@@ -23,10 +24,6 @@ anchors, and how well all is known), ekf_node.yaml (noise that the filter should
 to --out.
 
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
-PARAMETERS = """/**:
-  ros__parameters:
-    tdoa_std: {:.3f}  # m; measured: as many TDOAs count as independent as there are
-"""
 
 
 def main(argv=None):
@@ -73,7 +70,7 @@ def _survey(args):
     rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
     (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
     result.effects.to_yaml(out / "effects.yaml")
-    (out / "ekf_node.yaml").write_text(PARAMETERS.format(result.surveyed.tdoa_std))
+    write_parameters(out / "ekf_node.yaml", result.surveyed.tdoa_std)
     cli.write_json(out / "survey.json", result.as_dict())
     result.picture(out / "survey.png")
     print(result.as_text())

@@ -18,7 +18,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 
 from ..scoring.metrics import AIRBORNE
 from .channels import CHANNELS, Comparison
-from .prior import DELAY, POSITION, Prior, keys_of, solve
+from .prior import DELAY, MOVED, POSITION, Prior, keys_of, solve
 from .references.nothing import Nothing
 from .regression.fit import NU, student_scale
 from .unexplained import FEWEST, unexplained
@@ -88,54 +88,97 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known. The frame is that of the
     coordinates with the smallest std. Raises InputError for a flight that is too short.
     """
-    given, reference = flights[0].anchors, Nothing(config)
-    flights = [reference.prepare(flight) for flight in flights]
+    config = config or FilterConfig()
+    given, runs = flights[0].anchors, _Runs(flights, base, config, constraints)
     n, prior = len(given), Prior.of(given, position_std, base.covariance)
     start = np.concatenate([given.positions.ravel(), np.zeros(n)])
-    config = config or FilterConfig()
-    best, found, spans, grounded = start, None, {}, set()
+    best, rounds, found = start, [], None
     for _ in range(ROUNDS):
-        anchors = given.at(best[: 3 * n].reshape(n, 3))
-        gram, vector, alike, slow, seconds, marks = 0.0, 0.0, [], [], 0.0, []
-        for flight in flights:
-            part = _residual(replace(flight, anchors=anchors), best[3 * n :], base, reference, spans)
-            here = [one for one in constraints if one.flight == flight.name and one not in grounded]
-            slow.append(_slow(part))
-            grams, vectors, known = _equations(part, flight, here)
-            grounded |= {one for one, mark in zip(here, known) if one.position[2] <= AIRBORNE and mark.distance > BELIEVED}
-            known = [mark for one, mark in zip(here, known) if one not in grounded]
-            seconds += BLOCK * len(grams)
-            alike.append(_inflation(grams[:, : 4 * n, : 4 * n], vectors[:, : 4 * n], prior.loose))
-            inflation = SYSTEMATIC * alike[-1]
-            gram = gram + grams.sum(axis=0) / inflation + sum(one.gram for one in known)
-            vector = vector + vectors.sum(axis=0) / inflation + sum(one.vector for one in known)
-            marks += known
-            progress()
-        for one in (one for one in constraints if one.flight is None):
-            known = one.equations(anchors, len(vector))
-            gram, vector = gram + known[0], vector + known[1]
-        if found is None:
-            before, left_out = student_scale(np.concatenate(slow)), _left_out(gram, vector, prior, marks)
-        found = solve(gram, vector, prior, best - start)
-        tdoa_std = config.tdoa_std * float(np.sqrt(np.mean(alike) / config.tdoa_correlation_length))
+        rounds.append(runs.equations(given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :], prior.loose, progress))
+        found = solve(rounds[-1].gram, rounds[-1].vector, prior, best - start)
         best = best + found.step
-    moved = given.at(best[: 3 * n].reshape(n, 3))
-    parts = [_residual(replace(flight, anchors=moved), best[3 * n :], base, reference, spans) for flight in flights]
+    first, last = rounds[0], rounds[-1]
+    moved, delays = given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :]
+    parts = [runs.residual(flight, moved, delays) for flight in runs.flights]
     left = student_scale(np.concatenate([_slow(part) for part in parts]))
-    changes = _changes(prior, found, best - start)
     return Surveyed(
-        moved, best[3 * n :], found.covariance, seconds, before, left, tdoa_std, found.delay_std, found.function_std, changes,
-        left_out, len(grounded), unexplained(flights, parts),
+        moved, delays, found.covariance, last.seconds, first.slow, left, last.tdoa_std(config), found.delay_std, found.function_std,
+        _changes(prior, found, best - start), _left_out(first, prior), len(runs.grounded), unexplained(runs.flights, parts),
     )  # fmt: skip
 
 
-def _left_out(gram, vector, prior, marks):
-    """(before, after) of Surveyed.marks: each of _Marks is left out of the normal equations of all."""
-    if not marks:
+def noise_of(flights, effects, config):
+    """m, the tdoa_std that Flights call for beside the EffectSet `effects`; their ground truth is not used."""
+    anchors = flights[0].anchors
+    loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
+    return _Runs(flights, effects, config).equations(anchors, np.zeros(len(anchors)), loose).tdoa_std(config)
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations of all flights: gram (k, k), vector (k,); marks : [_Mark] that are in them; slow : m, scale of the slow
+    innovations; alike : by how much larger sums of scores are than those of independent errors; seconds : s that tell."""
+
+    gram: np.ndarray
+    vector: np.ndarray
+    marks: list
+    slow: float
+    alike: float
+    seconds: float
+
+    def tdoa_std(self, config):
+        """m: as many independent TDOAs as there are tell as much as the filter then believes."""
+        return config.tdoa_std * float(np.sqrt(self.alike / config.tdoa_correlation_length))
+
+
+class _Runs:
+    """Runs of Flights with anchors that are moved and late. spans : {flight: (first, last) s in the air}, as the first run of each
+    says: other anchors may move the path to the floor, but not the tag; grounded : constraints that are left out."""
+
+    def __init__(self, flights, base, config, constraints=()):
+        """base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known."""
+        self._base, self._reference, self._constraints = base, Nothing(config), constraints
+        self.flights = [self._reference.prepare(flight) for flight in flights]
+        self.spans, self.grounded = {}, set()
+
+    def residual(self, flight, anchors, delays):
+        """TdoaResidual of one of `flights` with Anchors that are late by delays (N,) m: the innovations of a run."""
+        effects = EffectSet((*self._base.effects, delay_effect(anchors, delays))) if delays.any() else self._base
+        comparison = Comparison.of(replace(flight, anchors=anchors), self._reference, effects, self.spans.get(flight.name))
+        self.spans[flight.name] = comparison.span
+        part = CHANNELS["tdoa"].residual(comparison)
+        if part is None:
+            raise InputError(f"{flight.name}: has no TDOAs in the air to survey with; fly for half a minute at least.")
+        return part
+
+    def equations(self, anchors, delays, loose, progress=lambda: None):
+        """_Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may be."""
+        n, gram, vector, marks, slow, alike, seconds = len(loose), 0.0, 0.0, [], [], [], 0.0
+        for flight in self.flights:
+            part = self.residual(flight, anchors, delays)
+            slow.append(_slow(part))
+            here = [one for one in self._constraints if one.flight == flight.name and one not in self.grounded]
+            grams, vectors, known = _equations(part, flight, here)
+            self.grounded |= {one for one, mark in zip(here, known) if one.position[2] <= AIRBORNE and mark.distance > BELIEVED}
+            marks += [mark for one, mark in zip(here, known) if one not in self.grounded]
+            seconds += BLOCK * len(grams)
+            alike.append(_inflation(grams[:, :n, :n], vectors[:, :n], loose))
+            gram = gram + grams.sum(axis=0) / (SYSTEMATIC * alike[-1])
+            vector = vector + vectors.sum(axis=0) / (SYSTEMATIC * alike[-1])
+            progress()
+        of_anchors = [one.equations(anchors, len(vector)) for one in self._constraints if one.flight is None]
+        for more, right in [*((mark.gram, mark.vector) for mark in marks), *of_anchors]:
+            gram, vector = gram + more, vector + right
+        return _Equations(gram, vector, marks, student_scale(np.concatenate(slow)), float(np.mean(alike)), seconds)
+
+
+def _left_out(equations, prior):
+    """(before, after) of Surveyed.marks: each is left out of _Equations about the anchors as given."""
+    if not equations.marks:
         return None
     n, off = len(prior.covariance), []
-    for one in marks:
-        step = solve(gram - one.gram, vector - one.vector, prior, np.zeros(n)).step
+    for one in equations.marks:
+        step = solve(equations.gram - one.gram, equations.vector - one.vector, prior, np.zeros(n)).step
         off.append((one.off, one.off - one.columns[:, :n] @ step))
     return tuple(float(np.sqrt(np.mean(np.sum(np.square(some), axis=1)))) for some in zip(*off))
 
@@ -169,21 +212,6 @@ def calibrated(base, anchors, shifts, delays, covariance):
 def delay_effect(anchors, delays):
     """The effect anchor_delay with delays (N,) m of Anchors."""
     return EFFECTS[DELAY]({str(i): float(delay) for i, delay in zip(anchors.ids, delays)})
-
-
-def _residual(flight, delays, base, reference, spans):
-    """TdoaResidual of a prepared Flight with late anchors: the innovations of a run.
-
-    spans : {flight: (first, last) s in the air}, as its first run says: other anchors may move the path to the floor, but not
-    the tag.
-    """
-    effects = EffectSet((*base.effects, delay_effect(flight.anchors, delays))) if delays.any() else base
-    comparison = Comparison.of(flight, reference, effects, spans.get(flight.name))
-    spans[flight.name] = comparison.span
-    part = CHANNELS["tdoa"].residual(comparison)
-    if part is None:
-        raise InputError(f"{flight.name}: has no TDOAs in the air to survey with; fly for half a minute at least.")
-    return part
 
 
 def _slow(part):

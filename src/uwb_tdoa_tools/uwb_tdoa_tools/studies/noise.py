@@ -1,5 +1,5 @@
 """noise: whether the covariance of the position is honest after a calibration (NEES, 3 is right), on flights that took no part in it,
-with IMU and without, with the parameters of the filter as they are and as `survey` writes them."""
+with IMU and without, with the parameters of the filter as they are and as `survey` and `diagnose` write them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +9,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 
+from ..diagnosis.noise import tdoa_std_of
 from ..scoring.evaluation import evaluate
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
@@ -55,7 +56,7 @@ def calibrations(name, flights, diagnosed):
     path = diagnosed / name.replace(" ", "-") / "effects.yaml" if diagnosed else None
     if path is not None and path.is_file():
         effects = EffectSet.from_yaml(path)
-        yield "diagnose, ground truth", given, effects, survey(bare, Tape(), effects).surveyed.tdoa_std
+        yield "diagnose, ground truth", given, effects, tdoa_std_of(bare, effects)
 
 
 def figures(flights, config, effects):
