@@ -28,7 +28,6 @@ BLOCK = 3.0  # s over which sums of scores show how alike errors are
 SYSTEMATIC = 12.0  # by which the information is divided beside that: errors that last are no noise
 PRELIMINARY = 20.0  # the same for the solution about which that is measured
 DETERMINED = 1e-4  # share of the largest eigenvalue that a direction must have to count there
-BELIEVED = 11.3  # normalised error squared of an estimate on the floor, 99 % of chi squared (3); TDOAs there can be metres off
 FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 
 
@@ -39,7 +38,7 @@ class Surveyed:
     that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of the
     size of delays, and of functions of the place; changes : (Change, ...) since the last calibration; marks : (before, after), root
     mean square of what estimates at marks in the air are off by, m, each after a fit without it; None where there are none;
-    grounded : how many marks were left out, because they are on the floor and the estimate there is further off than it says; unexplained : in words, where what positions
+    grounded : how many marks were left out, because they are on the floor: estimates there are metres off and do not know it; unexplained : in words, where what positions
     and delays do not explain is most, if that stands out."""
 
     anchors: Anchors
@@ -103,7 +102,7 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     left = student_scale(np.concatenate([_slow(part) for part in parts]))
     return Surveyed(
         moved, delays, found.covariance, last.seconds, first.slow, left, last.tdoa_std(config), found.delay_std, found.function_std,
-        _changes(prior, found, best - start), _left_out(first, prior), len(runs.grounded), unexplained(runs.flights, parts),
+        _changes(prior, found, best - start), _left_out(first, prior), runs.grounded, unexplained(runs.flights, parts),
     )  # fmt: skip
 
 
@@ -133,13 +132,15 @@ class _Equations:
 
 class _Runs:
     """Runs of Flights with anchors that are moved and late. spans : {flight: (first, last) s in the air}, as the first run of each
-    says: other anchors may move the path to the floor, but not the tag; grounded : constraints that are left out."""
+    says: other anchors may move the path to the floor, but not the tag; grounded : how many marks are on the floor, and left out."""
 
     def __init__(self, flights, base, config, constraints=()):
         """base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known."""
-        self._base, self._reference, self._constraints = base, Nothing(config), constraints
+        self._base, self._reference, self.spans = base, Nothing(config), {}
         self.flights = [self._reference.prepare(flight) for flight in flights]
-        self.spans, self.grounded = {}, set()
+        self._of_anchors, marks = ([one for one in constraints if (one.flight is None) is what] for what in (True, False))
+        self._marks = [one for one in marks if one.position[2] > AIRBORNE]
+        self.grounded = len(marks) - len(self._marks)
 
     def residual(self, flight, anchors, delays):
         """TdoaResidual of one of `flights` with Anchors that are late by delays (N,) m: the innovations of a run."""
@@ -157,16 +158,15 @@ class _Runs:
         for flight in self.flights:
             part = self.residual(flight, anchors, delays)
             slow.append(_slow(part))
-            here = [one for one in self._constraints if one.flight == flight.name and one not in self.grounded]
+            here = [one for one in self._marks if one.flight == flight.name]
             grams, vectors, known = _equations(part, flight, here)
-            self.grounded |= {one for one, mark in zip(here, known) if one.position[2] <= AIRBORNE and mark.distance > BELIEVED}
-            marks += [mark for one, mark in zip(here, known) if one not in self.grounded]
+            marks += known
             seconds += BLOCK * len(grams)
             alike.append(_inflation(grams[:, :n, :n], vectors[:, :n], loose))
             gram = gram + grams.sum(axis=0) / (SYSTEMATIC * alike[-1])
             vector = vector + vectors.sum(axis=0) / (SYSTEMATIC * alike[-1])
             progress()
-        of_anchors = [one.equations(anchors, len(vector)) for one in self._constraints if one.flight is None]
+        of_anchors = [one.equations(anchors, len(vector)) for one in self._of_anchors]
         for more, right in [*((mark.gram, mark.vector) for mark in marks), *of_anchors]:
             gram, vector = gram + more, vector + right
         return _Equations(gram, vector, marks, student_scale(np.concatenate(slow)), float(np.mean(alike)), seconds)
@@ -245,10 +245,8 @@ def _equations(part, flight, constraints):
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """Normal equations of a constraint of a flight: gram (k, k), vector (k,); off (3,) m, columns (3, k): as of Mark.off; distance :
-    normalised error squared of the estimate there."""
+    """Normal equations of a constraint of a flight: gram (k, k), vector (k,); off (3,) m, columns (3, k): as of Mark.off."""
 
-    distance: float
     gram: np.ndarray
     vector: np.ndarray
     off: np.ndarray
@@ -265,9 +263,7 @@ def _known(constraints, stamps, moved, odometry):
         estimate = np.stack([np.interp(t, odometry.t, odometry.p[:, k]) for k in range(3)], axis=1)
         rows = np.minimum(np.searchsorted(odometry.t, t), len(odometry.t) - 1)
         here = moved[first : first + len(t)]
-        covariance, (off, columns) = odometry.covariance[rows, :3, :3], one.off(estimate, here)
-        distance = float(np.sum(off**2 / (np.diag(covariance[len(t) // 2]) + one.std**2)))
-        out.append(_Mark(distance, *one.equations(t, estimate, covariance, here), off, columns))
+        out.append(_Mark(*one.equations(t, estimate, odometry.covariance[rows, :3, :3], here), *one.off(estimate, here)))
         first += len(t)
     return out
 

@@ -117,7 +117,7 @@ class Result:
             before, after = (100 * value for value in found.marks)
             lines.append(f"marks, each left out once: the estimate there is off by {before:.1f} cm as given, {after:.1f} cm with the others' survey")
         if found.grounded:
-            lines.append(f"left out: {found.grounded} marks on the floor, where the estimate is further off than it knows; mark places in the air")
+            lines.append(f"left out: {found.grounded} marks on the floor, where estimates are metres off and do not know it; mark places in the air")
         if self.why_not:
             lines.append(f"nothing is applied, anchors stay as given: {self.why_not}")
         return "\n".join(lines)
