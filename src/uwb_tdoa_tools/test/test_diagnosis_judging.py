@@ -72,6 +72,12 @@ def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_n
     assert kept.detections == () and "does not make the filter better" in kept.refused[-1].why
 
 
+def test_noise_on_the_floor_is_never_added(flights, attribution):
+    """An estimate that is wrongly there would believe no TDOA, and stay."""
+    floor = Detection(EFFECTS["floor_multipath"]({"size": 17.0}), "tdoa", {})
+    assert useful(replace(attribution, detections=(floor,)), flights, NONE).detections == ()
+
+
 def test_a_rehearsal_with_the_same_model_is_the_run_itself(flights):
     effects = EffectSet((AnchorDelay({"1": 0.3}), TagLeverArm({"x": 0.1, "z": 0.1})))
     recording = RecordingCorrector(flights[0].anchors, effects)

@@ -25,6 +25,7 @@ class FloorMultipath(ArrivalEffect):
     reference = "two-ray model; TDOAs on the floor are wrong by metres in the measured flights"
     portable = False
     fitted = False
+    usable = False  # an estimate that is wrongly on the floor would believe no TDOA any more, and stay there
 
     @classmethod
     def groups(cls, anchors, pairs):

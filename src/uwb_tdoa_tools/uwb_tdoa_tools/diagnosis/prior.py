@@ -2,7 +2,8 @@
 
 The last calibration holds where nothing has changed since. What has, an anchor that was moved, a module that was replaced, is
 found by evidence (MacKay, Bayesian interpolation, Neural Computation 1992), one change after the other, as long as each makes
-the flights ODDS times as probable.
+the flights ODDS times as probable. So are delays, where nothing is known of them: the smallest are taken that do not make the
+flights ODDS times less probable than larger ones, because delays take what nothing else explains.
 """
 
 from dataclasses import dataclass, field
@@ -101,8 +102,9 @@ def solve(gram, vector, prior, offset):
         return max((_solution(part, covariance, offset) for part in parts), key=lambda one: one.evidence)
 
     if not prior.told.any():
-        trials = ((best(prior.with_delays(std)), std) for std in DELAY_STDS)
-        found, std = max(trials, key=lambda trial: trial[0].evidence)
+        trials = [(best(prior.with_delays(std)), std) for std in DELAY_STDS]
+        enough = max(found.evidence for found, _ in trials) - np.log(ODDS)
+        found, std = next(trial for trial in trials if trial[0].evidence >= enough)
         return Solution(found.evidence, found.step, found.covariance, found.function_std, std)
     found, possible, changed = best(prior.covariance), prior.changes(), {}
     while len(changed) < len(possible):
