@@ -48,6 +48,13 @@ def test_without_reference_the_residual_is_the_innovation_and_a_shift_of_all_lea
     assert np.sqrt(np.mean(shift**2)) < 0.1 < np.sqrt(np.mean(delay**2))
 
 
+def test_at_rest_the_gyroscope_is_no_function_of_what_it_measures_itself():
+    part = residuals(Nothing().prepare(clean_flight(103, 30.0)), Nothing(), EffectSet())["gyro"]
+    names = {term.covariate for term in CHANNELS["gyro"].smooth_terms([part])}
+    assert not {name for name in names if name == "turning_rate" or name.startswith("rate_")}
+    assert not part.samples.reading.any() and part.residual.any()
+
+
 def test_without_attitude_the_gyroscope_is_judged_at_rest_and_the_accelerometer_not_at_all():
     reference = Nothing()
     parts = residuals(reference.prepare(clean_flight(103, 30.0)), reference, EffectSet())

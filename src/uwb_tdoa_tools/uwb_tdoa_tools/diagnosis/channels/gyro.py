@@ -9,6 +9,7 @@ from .inertial import CELL, ImuResidual, Inertial, cells_in_the_air, features_of
 
 SHIFT = 0.05  # s, for derivatives by time, of what was measured: noise of the truth would shrink what is fitted to them
 STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration and rad/s, below which the vehicle stands
+TURNING = [column for column, name in enumerate(OF_IMU) if name == "turning_rate" or name.startswith("rate_")]
 FEWEST_ATTITUDES, FEWEST_CELLS = 10, 4
 
 
@@ -44,8 +45,10 @@ class Gyro(Inertial):
         still = np.flatnonzero(np.cumsum(moving) == 0)[:-1]
         if len(still) < FEWEST_CELLS:
             return None
-        middles, measured = 0.5 * (edges[:-1] + edges[1:])[still], measured[still]
-        samples = self._samples(comparison, middles, measured, features[still], np.zeros_like(measured))
+        middles, measured, features = 0.5 * (edges[:-1] + edges[1:])[still], measured[still], features[still]
+        features[:, TURNING] = 0.0  # it does not turn: what it measures is the residual, which would be a function of itself
+        nothing = np.zeros_like(measured)
+        samples = self._samples(comparison, middles, nothing, features, nothing)
         return ImuResidual(samples, measured, self.unit)
 
 
