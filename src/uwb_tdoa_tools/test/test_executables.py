@@ -28,7 +28,9 @@ NODES = {
     "bias_node": "uwb_tdoa_bias.bias_node",
     "debias_node": "uwb_tdoa_ekf.debias_node",
     "ekf_node": "uwb_tdoa_ekf.ekf_node",
+    "localization_node": "uwb_tdoa_ekf.localization_node",
 }
+MEMBERS = {"localization_node": ("bias_node", "ekf_node")}  # whose parameters it takes, too
 COMMANDS = {
     path.stem: f"uwb_tdoa_tools.commands.{path.stem}"
     for path in sorted((ROOT / "src/uwb_tdoa_tools/uwb_tdoa_tools/commands").glob("[a-z]*.py"))
@@ -98,7 +100,7 @@ def parameters(name):
     """Names of a node's parameters, which its parameter file lists (see the tests of the nodes)."""
     package = NODES[name].partition(".")[0]
     (content,) = yaml.safe_load((ROOT / "src" / package / "config" / f"{name}.yaml").read_text()).values()
-    return set(content["ros__parameters"])
+    return set(content["ros__parameters"]).union(*map(parameters, MEMBERS.get(name, ())))
 
 
 @pytest.fixture(scope="module")
