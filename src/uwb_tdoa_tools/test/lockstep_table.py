@@ -63,6 +63,8 @@ def run(bag, flight, rate, load, rmse, offline):
             stack.callback(process.wait)
             stack.callback(process.kill)
         code, said, told, recorded = replayed(bag, Path(folder), "--rate", rate)
+        if code:
+            print(said, file=sys.stderr)
         live = read_odometry(recorded)
         error = Score("live", live, flight.truth).row()["rmse_3d"]
         took = float(said.rpartition(" messages in ")[2].partition(" s")[0])
