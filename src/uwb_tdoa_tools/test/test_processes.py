@@ -1,7 +1,9 @@
 """The life of the processes of a live run, and what they say."""
 
+from contextlib import nullcontext
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -81,9 +83,23 @@ def test_a_signal_to_us_ends_the_run(start):
         start.processes.check()
 
 
+class Queue(nullcontext):
+    """The handle of a subscription, with messages that wait to be read."""
+
+    def __init__(self):
+        super().__init__()
+        self.messages = []
+
+    def take_message(self, *_):
+        return self.messages.pop(0) if self.messages else None
+
+
 class NoNode:
+    def __init__(self):
+        self.queue = Queue()
+
     def create_subscription(self, *_):
-        pass
+        return SimpleNamespace(handle=self.queue)
 
 
 def status(node, **values):
@@ -92,10 +108,12 @@ def status(node, **values):
 
 
 def test_settled_when_every_node_repeats_its_counts():
-    diagnostics = processes.Diagnostics(NoNode())
+    diagnostics = processes.Diagnostics(node := NoNode())
     diagnostics._take(status("bias_node", received=5, rate="3.0 Hz"))
     diagnostics._take(status("ekf_node", received=4, rate="3.0 Hz"))
+    node.queue.messages += ["said before", "said before, too"]
     diagnostics.forget()
+    assert not node.queue.messages  # nothing that was said before can settle it
     assert not diagnostics.is_settled()
     diagnostics._take(status("bias_node", received=5, rate="0.0 Hz"))
     assert not diagnostics.is_settled()  # the other has not spoken

@@ -60,7 +60,7 @@ class Diagnostics:
 
     def __init__(self, node):
         self._newest, self._repeated = {}, {}
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
+        self._subscription = node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
 
     def _take(self, message):
         for status in message.status:
@@ -77,7 +77,12 @@ class Diagnostics:
         return self._newest.get(name, {})
 
     def forget(self):
-        """Count anew how often a status has repeated."""
+        """Count anew how often a status repeats, from what is said from here on. What still waits to be read is older: of a node
+        that was not spun it would seem settled before anything happened."""
+        handle = self._subscription.handle
+        with handle:
+            while handle.take_message(DiagnosticArray, True) is not None:
+                pass
         self._repeated.clear()
 
     def is_settled(self):
