@@ -14,9 +14,8 @@ from uwb_tdoa_bias.foundation.errors import Failure
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.live.session import message_class, session, subscription_qos
 
-SETTLED = 1.5  # s without news of the graph after which it is complete,
-ALONE = 3.0  # and s after which there are none
-PATIENCE = 5.0  # s for a topic, a node or an answer of it
+SETTLED = 1.5  # s without news of the graph after which it is complete
+PATIENCE = 10.0  # s for a first topic or node to be seen, and for a node to answer
 WINDOW = 1000  # messages that a rate is averaged over
 
 DESCRIPTION = """Topics, nodes and parameters, as the command of ROS 2 shows them; for those who have no ROS.
@@ -209,7 +208,7 @@ def _nodes(node, stop):
 
 def _client(node, stop, name, missing_ok=False):
     """Client of the parameters of a node, which is there."""
-    client, until = AsyncParameterClient(node, name), time.monotonic() + (1.0 if missing_ok else PATIENCE)
+    client, until = AsyncParameterClient(node, name), time.monotonic() + PATIENCE
     while not client.services_are_ready():
         if stop:
             raise KeyboardInterrupt
@@ -234,7 +233,7 @@ def _answer(node, stop, future):
 
 def _settled(look, stop):
     """What look() gives when it has not changed for a while."""
-    seen, until = look(), time.monotonic() + ALONE
+    seen, until = look(), time.monotonic() + PATIENCE
     while not stop and time.monotonic() < until:
         time.sleep(0.05)
         now = look()

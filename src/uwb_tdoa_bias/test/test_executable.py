@@ -7,7 +7,7 @@ from signal import SIGINT
 
 import pytest
 
-from uwb_tdoa_bias.foundation.executable import executable
+from uwb_tdoa_bias.foundation.executable import executable, node_executable
 
 SLOW = """
 import time
@@ -96,3 +96,11 @@ def test_what_is_not_installed_is_told_in_one_sentence(write, capsys, missing, r
 def test_a_part_of_ours_that_is_missing_is_a_defect():
     with pytest.raises(ModuleNotFoundError):
         executable("uwb_tdoa_bias.nowhere")()
+
+
+@pytest.mark.parametrize("given, kept", [(None, "1"), ("3", "3")])
+def test_the_linear_algebra_of_a_node_takes_one_thread_unless_the_user_says_more(write, monkeypatch, given, kept):
+    name = f"tells_{kept}"
+    write(name, "import os\nseen = os.environ['OMP_NUM_THREADS']\ndef main(): return seen")
+    monkeypatch.setenv("OMP_NUM_THREADS", given) if given else monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    assert node_executable(name)() == kept  # before anything is imported

@@ -57,7 +57,7 @@ MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a
 CORRECTED = (  # what is written of a TdoaCorrected
     "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status",
 )  # fmt: skip
-EARLY = 2000  # TDOAs kept while there are no anchors
+EARLY, EARLY_POSES = 2000, 500  # TDOAs, and parts of the odometry, kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
@@ -81,7 +81,7 @@ class BiasNode(ros.StreamNode):
         self._idle = self._model[NETWORK] == "none"
         self._corrector = None
         self._epoch, self._counts, self._rate = ros.Epoch(), Counter(), ros.Rate()
-        self._early, self._hold = deque(), PoseQueue(self._limit)
+        self._early, self._early_poses, self._hold = deque(), deque(maxlen=EARLY_POSES), PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
         self._wire, self._templates = Wire(TdoaCorrected, *CORRECTED), {}  # by frame and model
@@ -97,7 +97,7 @@ class BiasNode(ros.StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self._turns = Turns(self, [self.streams])
+            self.turns = Turns([self.streams])
         self.get_logger().info(f"ready; correcting with: {self._model[NETWORK]}")
 
     @property
@@ -120,6 +120,8 @@ class BiasNode(ros.StreamNode):
 
     def _on_anchors(self, _):
         self._start_over()
+        while self._early_poses:
+            self._take_poses(*self._early_poses.popleft())
         early, self._early = self._early, deque()
         self._take([self._seconds(item) for item in early], early)
         self._release()
@@ -153,8 +155,14 @@ class BiasNode(ros.StreamNode):
 
     def _on_odometry(self, frame, t, rows, arrival):
         self._counts["poses"] += len(t)
-        if self._corrector is None or self._idle:
+        if self._idle:
             return
+        if self._corrector is None:
+            self._early_poses.append((frame, t, rows))
+        else:
+            self._take_poses(frame, t, rows)
+
+    def _take_poses(self, frame, t, rows):
         if frame != self._corrector.anchors.frame:
             self.get_logger().warning(
                 f"odometry is in frame '{frame}', the anchors in '{self._corrector.anchors.frame}': "

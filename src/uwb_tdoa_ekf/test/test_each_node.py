@@ -88,9 +88,9 @@ def test_late_stamps_are_moved(make_rig, tmp_path):
 def test_a_measurement_does_not_wait_for_ever(make_rig, delays):
     rig = make_rig()
     rig.start("bias_node", bias_node=delays)
-    rig.send_anchors(ANCHORS)
     rig.send_pose(0.5)
     rig.counts("bias_node", poses=1)
+    rig.send_anchors(ANCHORS)  # after the pose, which is kept
     for t in (1.0, 1.1, 1.2):
         rig.send_tdoa(t, 14, 10, 1.0)
     assert rig.counts("bias_node", received=3)["waiting"] == 3

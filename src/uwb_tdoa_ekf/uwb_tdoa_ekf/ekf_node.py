@@ -104,7 +104,7 @@ class EkfNode(ros.StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self._turns = Turns(self, [self.streams])
+            self.turns = Turns([self.streams])
         self.get_logger().info("ready")
 
     def _subscribe(self, handed):

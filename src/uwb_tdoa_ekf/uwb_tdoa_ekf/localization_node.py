@@ -39,7 +39,7 @@ class LocalizationNode(ros.StreamNode):
         pairs = [Pair(*self._start(tag, list(arguments))) for tag in tags]
         self.members = [node for pair in pairs for node in (pair.bias, pair.ekf)]
         say_unused([self, *self.members], files_of(arguments))
-        self._turns = Turns(self, pairs)
+        self.turns = Turns(pairs)
         self.get_logger().info(f"ready; tags: {', '.join(tags) or 'one'}")
 
     def _start(self, tag, arguments):

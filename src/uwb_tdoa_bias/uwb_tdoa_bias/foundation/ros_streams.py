@@ -1,34 +1,31 @@
-"""The streams of a node: everything that has arrived is taken together, in turns; being woken up costs more than a message."""
+"""The streams of a node: everything that has arrived is taken together, in turns; to be woken up by
+an executor costs more than a message."""
 
 import time
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
 
 from . import ros
 from .stamps import LARGEST_STEP_BACK
 
-PERIOD = 0.002  # s from one turn to the next
+PERIOD = 0.001  # s, at least, from one turn to the next
 LONGEST_WAIT = 0.02  # s without a turn in which anything is taken, whatever it waits for
-REST, LONGEST_REST = 1.0, 0.01  # after a turn, times as long as it took, and s at most: more is then taken at a time
+LONGEST_REST = 0.01  # s; after a turn there is a rest as long as it took, at most so long: more is then taken at a time
 
 
 class Turns:
-    """Has nodes take what has arrived for them, one after the other."""
+    """Has nodes take what has arrived for them, one after the other. A node that has `turns` is given them by ros.run."""
 
-    def __init__(self, node, streams):
-        """node : whose executor serves the turns; streams : list of Streams, or of what else has take()."""
-        self._streams, self._next = streams, -np.inf
-        self._timer = node.create_timer(PERIOD, self._take, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    def __init__(self, streams):
+        """streams : list of Streams, or of what else has take()."""
+        self._streams = streams
 
-    def _take(self):
+    def take(self):
+        """One turn; returns the s until the next."""
         began = time.monotonic()
-        if began < self._next:
-            return
         for streams in self._streams:
             streams.take()
-        now = time.monotonic()
-        self._next = now + min(REST * (now - began), LONGEST_REST)
+        return min(max(time.monotonic() - began, PERIOD), LONGEST_REST)
 
 
 class Streams:

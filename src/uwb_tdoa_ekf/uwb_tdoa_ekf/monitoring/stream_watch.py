@@ -4,7 +4,7 @@ import numpy as np
 
 from ..streams import NOTE, StreamRules, most_severe_first
 from .sign_watch import SignWatch
-from ..streams.stamp_rules import median
+from ..streams.stamp_rules import usual
 
 KEPT = 4  # windows of a second that are judged together
 FEWEST = 3  # of them, below which nothing is said
@@ -51,8 +51,9 @@ class StreamWatch:
             self._sign.feed(t, a, b, d)
         if max(len(rules.imu), len(rules.tdoa)) < FEWEST:
             return []
-        still = {finding.rule for finding in rules.findings(LATEST)}
-        found = [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
+        still, found = {finding.rule for finding in rules.findings(LATEST)}, []
+        if still:
+            found = [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
         return most_severe_first([*found, *filter(None, [self._sign.finding])])
 
     def _counts(self, finding):
@@ -67,7 +68,7 @@ class StreamWatch:
     def _starved(self):
         """Whether both streams arrive in blocks: then it is this node that was not scheduled."""
         spreads = [
-            median([window.stamps for window in windows], "spread")
+            usual([window.stamps for window in windows], "spread")
             for windows in (self._rules.imu, self._rules.tdoa)
             if windows
         ]

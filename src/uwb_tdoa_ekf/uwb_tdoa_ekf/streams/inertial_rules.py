@@ -3,6 +3,7 @@
 import numpy as np
 
 from .finding import ERROR, WARNING, Finding
+from .median import median
 
 GRAVITY = 9.81
 FORCE_RANGE = 7.0, 14.0  # m/s^2, median length of the mean specific force; healthy 9.7 - 10.5
@@ -26,7 +27,7 @@ def force_of(windows):
 
 def weight(windows):
     """Median length of the mean specific force: gravity, whatever the tag does, as long as it does not fly away."""
-    return float(np.median([np.linalg.norm(window.mean[3:]) for window in windows]))
+    return median(np.linalg.norm(window.mean[3:]) for window in windows)
 
 
 def steadiness(windows):
@@ -38,7 +39,7 @@ def steadiness(windows):
 
 def silent(windows):
     """Every sample the same: nobody measures."""
-    share = float(np.median([window.repeated for window in windows]))
+    share = median(window.repeated for window in windows)
     if share < DEAD:
         return None
     remedy = "ros2 topic echo imu/data  # the sensor is not read: check its driver"
@@ -47,10 +48,10 @@ def silent(windows):
 
 
 def repeated(windows):
-    share = float(np.median([window.repeated for window in windows]))
+    share = median(window.repeated for window in windows)
     if not REPEATS < share < DEAD:
         return None
-    rate = 1.0 / max(float(np.median([window.stamps.step for window in windows])), 1e-9)
+    rate = 1.0 / max(median(window.stamps.step for window in windows), 1e-9)
     measured = rate * (1.0 - share)
     evidence = f"{100.0 * share:.0f} % equal the one before: {rate:.0f} Hz are published, {measured:.0f} Hz measured"
     remedy = "publish a sample when there is a new one, not by a timer"
@@ -78,7 +79,7 @@ def invalid(windows):
 def no_gravity(windows):
     """Little mean, and what there is does not outweigh the motion: gravity was taken out."""
     length = weight(windows)
-    motion = float(np.median([np.linalg.norm(window.deviation[3:]) for window in windows]))
+    motion = median(np.linalg.norm(window.deviation[3:]) for window in windows)
     if silent(windows) or length > FORCE_RANGE[0] or (motion < WEIGHTLESS * length and steadiness(windows) > STEADY):
         return None
     cause = "gravity was taken out of the acceleration; specific force, with gravity, is needed"
@@ -126,7 +127,7 @@ def turn_excess(windows):
         across = np.linalg.norm(rate - up * (rate @ up))
         if time > 0.0:
             values.append(across - np.arccos(np.clip(up @ then, -1.0, 1.0)) / time)
-    return float(np.median(values)) if values else np.nan
+    return median(values)
 
 
 def upright(windows):

@@ -3,6 +3,7 @@
 import numpy as np
 
 from .finding import ERROR, NOTE, WARNING, Finding
+from .median import median
 from .ranging import GRIDS
 
 LARGE = 0.2  # share of TDOAs longer than their anchors are apart; healthy 0.008 at most
@@ -23,7 +24,7 @@ def share_of(windows, field, among="known"):
 
 def impossible(windows):
     share = share_of(windows, "impossible")
-    size = float(np.median([w.size for w in windows]))
+    size = median(w.size for w in windows)
     evidence = f"{100.0 * share:.1f} % are longer than their anchors are apart, mean size {size:.3g}"
     if share > LARGE:
         remedy = "message.distance_difference = ...  # metres: seconds times 299792458, DW1000 ticks times 0.0046918"
@@ -118,7 +119,7 @@ def clipped(windows):
 
 def heard(windows):
     """Anchors heard in a window, on average."""
-    count = float(np.median([np.count_nonzero(w.heard) for w in windows]))
+    count = median(np.count_nonzero(w.heard) for w in windows)
     if count < FEW:
         evidence = f"{count:.0f} anchors in a second; four are needed, five or more are good"
         remedy = "switch on more anchors, or bring the tag among them"

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from .finding import ERROR, NOTE, WARNING, Finding
+from .median import median
 
 STAMP_LINE = "message.header.stamp = ...  # when the sample was measured, ROS time, in seconds and nanoseconds"
 SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
@@ -28,10 +29,9 @@ def total(windows, field):
     return sum(getattr(window, field) for window in windows)
 
 
-def median(windows, field):
+def usual(windows, field):
     """Median of a field of StampWindow over windows, NaN left out; NaN if there is none."""
-    values = [value for window in windows if math.isfinite(value := getattr(window, field))]
-    return float(np.median(values)) if values else math.nan
+    return median(value for window in windows if math.isfinite(value := getattr(window, field)))
 
 
 def pace_of(windows):
@@ -40,11 +40,11 @@ def pace_of(windows):
     From the first to the last message of a window, which blocks upset, or by the smallest latencies of successive windows, which
     leaps of the stamps upset: the one of both that is nearer to 1.
     """
-    known = np.array([(window.end, window.latency) for window in windows if math.isfinite(window.latency)])
-    ratios = [median(windows, "pace")]
-    if len(known) > 1:
-        time, latency = np.diff(known, axis=0).T
-        ratios += [1.0 - float(np.median(latency / time))] if (time > 0.0).all() else []
+    known = [(window.end, window.latency) for window in windows if math.isfinite(window.latency)]
+    ratios = [usual(windows, "pace")]
+    steps = [(then - end, later - latency) for (end, latency), (then, later) in zip(known, known[1:])]
+    if steps and all(time > 0.0 for time, _ in steps):
+        ratios.append(1.0 - median(latency / time for time, latency in steps))
     return min(ratios, key=lambda ratio: abs(ratio - 1.0) if math.isfinite(ratio) else math.inf)
 
 
@@ -70,8 +70,8 @@ def standing(name, windows):
     if share > 0.98:
         cause = f"the stamps of {name} stand still"
         return Finding("stamps_stand", ERROR, cause, f"{100.0 * share:.0f} % repeat the one before", STAMP_LINE, share)
-    scatter, step = median(windows, "scatter"), median(windows, "gap")
-    packets = share > REPEATED and median(windows, "step") > LEAP * (1.0 - share)
+    scatter, step = usual(windows, "scatter"), usual(windows, "gap")
+    packets = share > REPEATED and usual(windows, "step") > LEAP * (1.0 - share)
     if not (packets or scatter > SCATTER):
         return None
     evidence = f"{100.0 * share:.0f} % repeat the one before, then they leap by {step:.3f} s"
@@ -81,7 +81,7 @@ def standing(name, windows):
         )
     else:
         cause = f"the messages of {name} are stamped when they are read, in bursts, or nanosec holds microseconds"
-        evidence = f"steps of {median(windows, 'step'):.4f} s on average scatter by {scatter:.1f} times that"
+        evidence = f"steps of {usual(windows, 'step'):.4f} s on average scatter by {scatter:.1f} times that"
     severity = ERROR if step > LAG else WARNING
     return Finding("stamps_coarse", severity, cause, evidence, STAMP_LINE, step)
 
@@ -112,8 +112,8 @@ def gaps(name, windows):
     longest, limit = max(window.gap for window in windows), LONGEST_GAP[name]
     if (
         longest <= limit
-        or median(windows, "scatter") > SCATTER
-        or median(windows, "step") > limit
+        or usual(windows, "scatter") > SCATTER
+        or usual(windows, "step") > limit
         or not orderly(windows)
     ):
         return None
@@ -125,7 +125,7 @@ def gaps(name, windows):
 
 def rate(name, windows):
     """Too few per second of stamps; far too few: the stamps are in another unit."""
-    step = median(windows, "step")
+    step = usual(windows, "step")
     if not step > 1.0 / SLOWEST[name]:
         return None
     for scale, unit in UNITS.items():
@@ -153,8 +153,8 @@ def pace(name, windows):
 
 def blocks(name, windows):
     """Late by very different times: kept together and sent in blocks."""
-    spread = median(windows, "spread")
-    if not spread > BLOCK or median(windows, "scatter") > SCATTER or not orderly(windows):
+    spread = usual(windows, "spread")
+    if not spread > BLOCK or usual(windows, "scatter") > SCATTER or not orderly(windows):
         return None
     severity = ERROR if spread > LAG else WARNING
     cause = f"the messages of {name} arrive in blocks"
@@ -198,10 +198,10 @@ def offset(imu, tdoa):
     """The streams against each other: by their latencies where arrivals are known, else by where they begin and end."""
     if not (orderly(imu) and orderly(tdoa)):
         return None
-    by_arrival = median(tdoa, "latency") - median(imu, "latency")
+    by_arrival = usual(tdoa, "latency") - usual(imu, "latency")
     if math.isfinite(by_arrival):
-        ahead, evidence = by_arrival, f"stamp minus arrival: {-median(imu, 'latency'):+.3f} s of the IMU, "
-        evidence += f"{-median(tdoa, 'latency'):+.3f} s of the TDOAs"
+        ahead, evidence = by_arrival, f"stamp minus arrival: {-usual(imu, 'latency'):+.3f} s of the IMU, "
+        evidence += f"{-usual(tdoa, 'latency'):+.3f} s of the TDOAs"
     else:
         begin, end = imu[0].begin - tdoa[0].begin, imu[-1].end - tdoa[-1].end
         ahead = 0.5 * (begin + end)
@@ -218,10 +218,10 @@ def offset(imu, tdoa):
 
 def other_clock(imu, tdoa):
     """Both streams of one clock, but not of the recorder's."""
-    latency = median(tdoa, "latency")
+    latency = usual(tdoa, "latency")
     if not (orderly(imu) and orderly(tdoa)):
         return None
-    if not abs(latency) > 1.0 or abs(latency - median(imu, "latency")) > LAG:
+    if not abs(latency) > 1.0 or abs(latency - usual(imu, "latency")) > LAG:
         return None
     evidence = f"they arrive {latency:.3f} s after their stamps"
     line = "message.header.stamp = node.get_clock().now().to_msg()  # or what you measured, on that clock"
