@@ -55,9 +55,8 @@ class Streams:
     def take(self, at_once=False):
         """Give everything that has arrived to those that take it; at_once : whatever they wait for."""
         if self._awaited is not None and not at_once:
-            self._awaited.fetch()
-            now = time.monotonic()
-            if now < self._until and not self._awaited.newest_waiting > self._due():
+            arrived, now = self._awaited.fetch(), time.monotonic()
+            if now < self._until and not (arrived and self._awaited.newest_waiting > self._due()):
                 return
             self._until = now + LONGEST_WAIT
         if self._unheard:  # of what has never come, one is asked for at a time
@@ -136,8 +135,13 @@ class _Stream:
         self._wire, self._take, self._source, self._newest = wire, take, source, -np.inf
 
     def fetch(self):
-        self.waiting += self._source.fetch(self._wire)
-        self.heard = self.heard or bool(self.waiting)
+        """Returns whether anything has arrived since the last time."""
+        parts = self._source.fetch(self._wire)
+        if not parts:
+            return False
+        self.waiting += parts
+        self.heard = True
+        return True
 
     @property
     def newest_waiting(self):
