@@ -39,7 +39,7 @@ class Failure(Exception):
     """The set-up cannot go on. The message is one sentence that says what is missing and what to do."""
 
 
-def main():
+def main(command):
     LOG.mkdir(exist_ok=True)
     with open(LOG / "dev.lock", "w") as lock:
         try:
@@ -48,6 +48,8 @@ def main():
             say("waiting for another ./dev to finish its set-up")
             fcntl.flock(lock, fcntl.LOCK_EX)
         prepare()
+        if command == "build":
+            compile_nodes()
 
 
 def prepare():
@@ -154,6 +156,16 @@ def build(done):
     write_steps({**done, **sources})
 
 
+def compile_nodes():
+    """Before the first start, and before several tests would do it at once."""
+    done = read_steps()
+    if done.get("compiled") == done["packages"]:
+        return
+    source = f"source {INSTALL}/setup.bash && exec {PYTHON} -m uwb_tdoa_ekf.compile_nodes"
+    run("compile the nodes", "compile", ["bash", "-c", source])
+    write_steps({**done, "compiled": done["packages"]})
+
+
 def digest(paths, *words):
     """Hash of the words and of every file under the paths: names and contents."""
     total = hashlib.sha256("\0".join(words).encode())
@@ -209,7 +221,7 @@ def say(line, end="\n"):
 
 if __name__ == "__main__":
     try:
-        main()
+        main(*sys.argv[1:])
     except Failure as failure:
         sys.exit(f"dev: error: {failure}")
     except KeyboardInterrupt:

@@ -30,9 +30,10 @@ setup(
         (f"share/{NAME}/launch", glob("launch/*.py")),
         (f"share/{NAME}/rviz", glob("rviz/*.rviz")),
     ],
-    zip_safe=False,  # numba keeps its cache beside the modules
+    zip_safe=False,
     entry_points={
         "console_scripts": [
+            "compile_nodes = uwb_tdoa_ekf.executables:compile_nodes",
             "debias_node = uwb_tdoa_ekf.executables:debias_node",
             "ekf_node = uwb_tdoa_ekf.executables:ekf_node",
             "localization_node = uwb_tdoa_ekf.executables:localization_node",

@@ -106,11 +106,9 @@ class BiasNode(ros.StreamNode):
         return len(self._hold)
 
     def _warm_up(self):
-        """Compile and load whatever the first correction would; returns what to call each status's bias."""
-        corrector = Corrector(Anchors.from_positions(np.eye(3)), self._effects, self._network, self._lag)
-        corrector.add_pose(np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6)))
-        corrector.correct(np.array([1.0]), np.array([0]), np.array([1]), np.array([0.0]))
-        return {PASSED: "none", EFFECTS: self._effects.name, NETWORK: corrector.model, FADED: corrector.model}
+        """Returns what to call each status's bias."""
+        name = warm_up(self._effects, self._network, self._lag).model
+        return {PASSED: "none", EFFECTS: self._effects.name, NETWORK: name, FADED: name}
 
     def _start_over(self):
         """Forget poses and whatever waits for one."""
@@ -308,6 +306,14 @@ class BiasNode(ros.StreamNode):
         if unready:
             return DiagnosticStatus.WARN, "odometry is late: TDOAs leave before their pose; check the load of ekf_node"
         return DiagnosticStatus.OK, f"correcting with {self._model[NETWORK]}"
+
+
+def warm_up(effects, network, lag=0.05):
+    """A Corrector, after compiling, or loading from numba's cache, whatever its first correction needs."""
+    corrector = Corrector(Anchors.from_positions(np.eye(3)), effects, network, lag)
+    corrector.add_pose(np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6)))
+    corrector.correct(np.array([1.0]), np.array([0]), np.array([1]), np.array([0.0]))
+    return corrector
 
 
 def main(argv=None):

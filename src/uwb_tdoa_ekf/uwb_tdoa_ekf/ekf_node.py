@@ -90,8 +90,8 @@ class EkfNode(ros.StreamNode):
         self._imu_frame, self._imu_mount, self._frame_trouble = own["body_frame"], None, None
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
         refuse_unknown(self, {*RENAMED, *(member or ())})
-        self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute")
-        _warm_up()
+        self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute, unless compile_nodes has done so")
+        warm_up()
         moving = own["publish_tf"] == ODOM
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames, moving)
         self.outputs = Outputs(self, self._epoch, self._frames.frames, self._body, own["publish_tf"], own["odom_frame"])
@@ -318,7 +318,7 @@ class EkfNode(ros.StreamNode):
 
 
 @cache
-def _warm_up():
+def warm_up():
     """Compile, or load from numba's cache, what the first messages would."""
     estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]))
     watch, steps = StreamWatch(estimator.anchors, 0.25), np.arange(400)

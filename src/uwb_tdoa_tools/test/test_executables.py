@@ -31,7 +31,7 @@ NODES = {
     "localization_node": "uwb_tdoa_ekf.localization_node",
 }
 MEMBERS = {"localization_node": ("bias_node", "ekf_node")}  # whose parameters it takes, too
-COMMANDS = {
+COMMANDS = {"compile_nodes": "uwb_tdoa_ekf.compile_nodes"} | {
     path.stem: f"uwb_tdoa_tools.commands.{path.stem}"
     for path in sorted((ROOT / "src/uwb_tdoa_tools/uwb_tdoa_tools/commands").glob("[a-z]*.py"))
 }

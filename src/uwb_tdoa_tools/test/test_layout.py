@@ -17,7 +17,8 @@ ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
     uwb_tdoa_bias.foundation.ros uwb_tdoa_bias.foundation.ros_anchors uwb_tdoa_bias.foundation.ros_frames
     uwb_tdoa_bias.foundation.ros_parameters uwb_tdoa_bias.foundation.ros_streams uwb_tdoa_bias.foundation.ros_wire
-    uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters uwb_tdoa_ekf.launching
+    uwb_tdoa_ekf.compile_nodes uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters
+    uwb_tdoa_ekf.launching
     uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.localization_node uwb_tdoa_ekf.outputs
     uwb_tdoa_ekf.monitoring.health
     uwb_tdoa_tools.benchmark.nodes uwb_tdoa_tools.benchmark.rates uwb_tdoa_tools.benchmark.source
@@ -216,7 +217,7 @@ def test_every_executable_starts_behind_an_entry_point_of_its_name(package):
     points = re.findall(r'"(\w+) = ([\w.]+):(\w+)"', text)
     assert points
     started = (SRC / package / package / "executables.py").read_text()
-    entries = dict(re.findall(r'^(\w+) = executable\("([\w.]+)"\)$', started, re.MULTILINE))
+    entries = dict(re.findall(r'^(\w+) = (?:node_)?executable\("([\w.]+)"\)$', started, re.MULTILINE))
     assert {name for name, _, _ in points} == set(entries)
     for name, module, attribute in points:
         assert (module, attribute) == (f"{package}.executables", name)
