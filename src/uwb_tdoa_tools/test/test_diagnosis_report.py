@@ -1,5 +1,4 @@
 from dataclasses import replace
-from html.parser import HTMLParser
 import json
 from pathlib import Path
 import re
@@ -8,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from reports import Tags, delay, finding, judged, keys_of, said
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.wording import measured
 from uwb_tdoa_tools.diagnosis import diagnose
@@ -26,8 +26,6 @@ from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 ELSEWHERE = Alternative("pair_offset", 0.95, None, "TDoA3")
 AS_WELL = Alternative("anchor_position", 1.0, 2.0, "a flight on several sides")
-# Keys of diagnosis.json that are names of something: of parameters, anchors, lags.
-NAMES_BELOW = {"parameters", "std", "direction", "values", "autocorrelation"}
 
 
 @pytest.fixture(scope="module")
@@ -48,46 +46,6 @@ def without_truth():
 @pytest.fixture(scope="module")
 def page(result):
     return result.as_html()
-
-
-def said(page):
-    """The words of a page, without markup."""
-    text = re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.S)
-    for code, sign in (
-        ("&lt;", "<"),
-        ("&gt;", ">"),
-        ("&quot;", '"'),
-        ("&#x27;", "'"),
-        ("&amp;", "&"),
-        ("m/s²", "m/s^2"),
-    ):
-        text = text.replace(code, sign)
-    return " ".join(text.split())
-
-
-def finding(effect, added=True, worth=0.02, alternatives=(), tried=True, channel="tdoa"):
-    candidates = (Candidate((Term(effect, tuple(effect.std)),)),) if tried else ()
-    return Finding(effect, channel, {}, 0.1, tuple(alternatives), candidates, added, worth)
-
-
-def delay(value=0.3, std=0.01):
-    return EFFECTS["anchor_delay"]({"3": value}, {"3": std})
-
-
-def run(name, error, diverged=False):
-    return {"flight": name, "rmse_3d": error, "diverged": diverged, "rmse_3d_ci": [0.9 * error, 1.1 * error]}
-
-
-def judged(result, before, after, gain, **changes):
-    """The Diagnosis with other errors: {flight: m}, and the interval of the gain."""
-    sides = []
-    for errors in (before, after):
-        runs = [run(name, *(value if isinstance(value, tuple) else (value,))) for name, value in errors.items()]
-        pooled = {"rmse_3d": float(np.sqrt(np.mean([item["rmse_3d"] ** 2 for item in runs])))}
-        pooled["rmse_3d_ci"] = [0.9 * pooled["rmse_3d"], 1.1 * pooled["rmse_3d"]]
-        sides.append({"runs": runs, "pooled": pooled, "scores": result.before["scores"]})
-    sides[1]["pooled"]["rmse_3d_gain_ci"] = gain
-    return replace(result, before=sides[0], after=sides[1], **changes)
 
 
 # ---------------------------------------------------------------------------------------------------------- verdict
@@ -298,14 +256,6 @@ def test_findings_and_alternatives_in_json(result):
     assert json.loads(json.dumps(content, allow_nan=False)) == content
 
 
-def keys_of(content):
-    if isinstance(content, list):
-        return set().union(*map(keys_of, content))
-    if not isinstance(content, dict):
-        return set()
-    return set(content).union(*(keys_of(item) for key, item in content.items() if key not in NAMES_BELOW))
-
-
 def test_every_key_of_json_is_in_the_document(result, without_truth):
     text = (DOCS / "diagnosis.md").read_text()
     term = SmoothTerm({"c0": 0.1}, {}, knots=(0.0, 1.0))
@@ -315,23 +265,6 @@ def test_every_key_of_json_is_in_the_document(result, without_truth):
 
 
 # ------------------------------------------------------------------------------------------------------------- page
-
-
-class Tags(HTMLParser):
-    """Every tag with those that it is in; what was not closed."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.open, self.seen = [], []
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        self.seen.append((tag, dict(attrs), list(self.open)))
-        if tag not in ("meta", "br", "img"):
-            self.open.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self.open.pop()[0] == tag
 
 
 @pytest.fixture(scope="module")

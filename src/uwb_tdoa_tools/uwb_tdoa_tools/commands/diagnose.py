@@ -9,8 +9,9 @@ from .. import cli, options
 from ..checking.check import different_surveys
 from ..checking.remarks import survey_remarks
 from ..diagnosis import diagnose
-from ..diagnosis.noise import tdoa_std_of, write_parameters
+from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
+from ..diagnosis.self_survey import tdoa_std_of
 from ..progress import Progress
 from ..surveying.paths import DRIFT, read_paths
 

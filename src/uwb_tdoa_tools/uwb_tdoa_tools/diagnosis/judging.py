@@ -23,7 +23,9 @@ from .regression.table import BLOCK
 from .regression.terms import columns_of
 
 BOOTSTRAPS = 400
+Z95 = 1.96  # standard deviations from the middle of a 95 % interval to its ends
 JUDGES = 3  # flights, or halves of one, on which trials are judged
+SURE = 3.0  # standard deviations by which a gain must be above zero where the reference itself may be off by some
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
@@ -188,11 +190,11 @@ def judge(attribution, flights, holdout, base, effects, reference, config=None, 
 
 def why_not(before, after, shift_std):
     """Why what was found must not be applied, after `compare`; None if it may. shift_std : m, what a reference may be off by in all
-    of a flight; the gain must be larger than what that can feign."""
+    of a flight; the gain must be SURE standard deviations of what that can feign."""
     gain, interval = after["pooled"]["rmse_3d"] < before["pooled"]["rmse_3d"], after["pooled"]["rmse_3d_gain_ci"]
     if not gain:
         return "together they do not make the error smaller on held-out data"
-    if shift_std > 0.0 and (interval is None or interval[0] <= 0.0):
+    if shift_std > 0.0 and (interval is None or sum(interval) < SURE / Z95 * (interval[1] - interval[0])):
         return (
             f"all of a flight may be {100 * shift_std:.0f} cm from where the reference says, on each axis, and the gain is less than that "
             "can feign; measure more marks, or better ones"

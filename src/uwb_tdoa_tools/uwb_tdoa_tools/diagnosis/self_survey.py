@@ -106,9 +106,9 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     )  # fmt: skip
 
 
-def noise_of(flights, effects, config):
-    """m, the tdoa_std that Flights call for beside the EffectSet `effects`; their ground truth is not used."""
-    anchors = flights[0].anchors
+def tdoa_std_of(flights, effects, config=None):
+    """m, the tdoa_std that the innovations of Flights call for beside the EffectSet `effects`; their ground truth is not used."""
+    config, anchors = config or FilterConfig(), flights[0].anchors
     loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
     return _Runs(flights, effects, config).equations(anchors, np.zeros(len(anchors)), loose).tdoa_std(config)
 

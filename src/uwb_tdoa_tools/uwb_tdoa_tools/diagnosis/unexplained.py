@@ -1,4 +1,4 @@
-"""Where innovations stay slow that positions and delays of anchors do not explain: something that came, a reflector or a cabinet."""
+"""Where innovations stay slow that positions and delays of anchors do not explain: a reflector or a cabinet."""
 
 import numpy as np
 
@@ -31,5 +31,5 @@ def unexplained(flights, parts):
     told = f"from {first:.0f} to {last:.0f} s of {flights[flight].name}" if spread else f"mostly where the tag is near ({where}) m"
     return (
         f"pairs of anchor {flights[0].anchors.ids[worst]} stay {100 * sizes[worst]:.0f} cm off that neither positions nor delays explain, {told}: "
-        "something may have come that blocks or reflects"
+        "something there may block or reflect"
     )

@@ -9,7 +9,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 
-from ..diagnosis.noise import tdoa_std_of
+from ..diagnosis.self_survey import tdoa_std_of
 from ..scoring.evaluation import evaluate
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
