@@ -2,22 +2,19 @@
 
 from dataclasses import replace
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
-from uwb_tdoa_tools.diagnosis.channels.base import Rows
 from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark
 from uwb_tdoa_tools.diagnosis.references import Odometry, OdometryPath
-from uwb_tdoa_tools.diagnosis.unexplained import unexplained
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from uwb_tdoa_tools.surveying.blocked import large, with_blocked
 from uwb_tdoa_tools.surveying.distances import read_distances
 from uwb_tdoa_tools.surveying.paths import read_paths
 from uwb_tdoa_tools.surveying.survey import survey
@@ -163,23 +160,19 @@ def marks_in_the_air(flight):
     return [Mark(flight.name, truth.t[row] - begin - 0.5, truth.t[row] - begin + 0.5, tuple(truth.p[row]), 0.05) for row in rows]
 
 
-@pytest.mark.parametrize(
-    "late, words",
-    [
-        (lambda t, x: t < -1.0, ""),
-        (lambda t, x: (t > 20.0) & (t < 25.0), "pairs of anchor 13 stay .* from 2. to 2. s of one"),
-        (lambda t, x: x > 1.0, "pairs of anchor 13 stay .* near \\(1"),
-    ],
-)
-def test_what_anchors_do_not_explain_is_said_with_its_place_or_time(late, words):
-    t = np.repeat(np.arange(0.0, 60.0, 0.5), 8)
-    x, pair = 2.0 * np.sin(t), np.tile([8 * k + (k + 1) % 8 for k in range(8)], len(t) // 8)
-    y = 0.02 * np.random.default_rng(0).standard_normal(len(t))
-    y[np.isin(pair, (8 * 2 + 3, 8 * 3 + 4)) & late(t, x)] += 0.5
-    rows = Rows(y, pair, t, np.full(len(t), 5.0), np.stack([x, 0.0 * x, 1.0 + 0.0 * x], axis=1))
-    flight = SimpleNamespace(name="one", anchors=Anchors(np.arange(10, 18), np.zeros((8, 3)), np.zeros((8, 4))))
-    said = unexplained([flight], [SimpleNamespace(rows=lambda: rows)])
-    assert re.search(words, said) if words else not said
+@pytest.mark.slow
+def test_what_blocks_an_anchor_is_said_with_its_place(flights, last_week):
+    centre = flights[0].truth.p[len(flights[0].truth) // 2]
+    region = EFFECTS["nlos"]({**dict(zip(("5.x", "5.y", "5.z"), centre.tolist())), "5.radius": 1.2, "5.delay": 0.6})
+    assert with_blocked(last_week, flights[:1]).blocked == ()
+    (sentence,) = with_blocked(last_week, [region.inject(flights[0], np.random.default_rng(0))]).blocked
+    assert re.search("between anchor 5 and .* heard 0.[56].* m late", sentence)
+
+
+def test_what_is_little_blocks_nothing():
+    both = {"3.delay": 0.1, "3.start": 2.0, "3.end": 9.0, "4.delay": 0.4, "4.start": 1.0, "4.end": 8.0}
+    kept = large(EFFECTS["nlos"](both, {"3.delay": 0.01, "4.delay": 0.01}))
+    assert {key[0] for key in kept.values} == {key[0] for key in kept.std} == {"4"} and len(kept.values) == 3
 
 
 def test_what_a_path_may_be_off_by_shrinks_with_marks(flights):

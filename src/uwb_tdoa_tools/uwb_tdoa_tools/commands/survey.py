@@ -7,6 +7,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from .. import cli, options
 from ..diagnosis.noise import write_parameters
 from ..progress import Progress
+from ..surveying.blocked import with_blocked
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
 
@@ -64,6 +65,7 @@ def _survey(args):
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
         result = survey(flights, tape, base, config, known, lambda: progress("solving"))
+        result = with_blocked(result, flights, config, lambda: progress("looking for what blocks anchors"))
     out.mkdir(parents=True, exist_ok=True)
     anchors = result.anchors
     anchors.to_yaml(out / "anchors.yaml")

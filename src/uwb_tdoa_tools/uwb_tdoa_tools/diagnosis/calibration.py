@@ -17,8 +17,7 @@ from .regression.fit import MIN_BLOCKS, fit
 from .regression.select import Selection
 from .regression.table import BLOCK, table_of
 from .regression.terms import columns_of
-from .self_survey import survey
-from .unexplained import FEWEST
+from .self_survey import FEWEST, survey
 
 CALIBRATED = POSITION, DELAY
 POSITION_STD = 0.1  # m, of the coordinates of anchors as they are given

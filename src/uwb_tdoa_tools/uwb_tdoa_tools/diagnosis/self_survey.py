@@ -21,13 +21,13 @@ from .channels import CHANNELS, Comparison
 from .prior import DELAY, MOVED, POSITION, Prior, keys_of, solve
 from .references.nothing import Nothing
 from .regression.fit import NU, student_scale
-from .unexplained import FEWEST, unexplained
 
 ROUNDS = 2  # linear solutions, each about the last
 BLOCK = 3.0  # s over which sums of scores show how alike errors are
 SYSTEMATIC = 12.0  # by which the information is divided beside that: errors that last are no noise
 PRELIMINARY = 20.0  # the same for the solution about which that is measured
 DETERMINED = 1e-4  # share of the largest eigenvalue that a direction must have to count there
+FEWEST = 4  # TDOAs in a cell; noise of fewer hides what is slow
 FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 
 
@@ -38,8 +38,7 @@ class Surveyed:
     that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of the
     size of delays, and of functions of the place; changes : (Change, ...) since the last calibration; marks : (before, after), root
     mean square of what estimates at marks in the air are off by, m, each after a fit without it; None where there are none;
-    grounded : how many marks were left out, because they are on the floor: estimates there are metres off and do not know it; unexplained : in words, where what positions
-    and delays do not explain is most, if that stands out."""
+    grounded : how many marks were left out, because they are on the floor: estimates there are metres off and do not know it."""
 
     anchors: Anchors
     delays: np.ndarray
@@ -53,7 +52,6 @@ class Surveyed:
     changes: tuple = ()
     marks: tuple | None = None
     grounded: int = 0
-    unexplained: str = ""
 
     @property
     def position_std(self):
@@ -102,7 +100,7 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     left = student_scale(np.concatenate([_slow(part) for part in parts]))
     return Surveyed(
         moved, delays, found.covariance, last.seconds, first.slow, left, last.tdoa_std(config), found.delay_std, found.function_std,
-        _changes(prior, found, best - start), _left_out(first, prior), runs.grounded, unexplained(runs.flights, parts),
+        _changes(prior, found, best - start), _left_out(first, prior), runs.grounded,
     )  # fmt: skip
 
 

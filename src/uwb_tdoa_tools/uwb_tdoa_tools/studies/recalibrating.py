@@ -10,6 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS
 
 from ..diagnosis.self_survey import calibrated
+from ..surveying.blocked import with_blocked
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
 from .surveying import at, measured_flights, rmse
@@ -44,10 +45,10 @@ def run(args):
         known, anchors = taken(week, week.base), week.surveyed.anchors
         for words, change in CHANGES.items():
             flown = [at(change.inject(flight), anchors.positions) for flight in (second, judged)]
-            today = survey([replace(flown[0], truth=None)], Tape(), known)
+            today = with_blocked(survey([replace(flown[0], truth=None)], Tape(), known), flown[:1])
             errors = rmse(flown[1:], known), rmse([at(flown[1], today.surveyed.anchors.positions)], taken(today, known))
             said = "; ".join(one.as_text() for one in today.surveyed.changes) or "no anchor has changed"
-            said += f"; {today.surveyed.unexplained}" if today.surveyed.unexplained else ""
+            said = ". ".join([said, *today.blocked])
             print(f"| {name} | {words} | {errors[0]:.3f} | {errors[1]:.3f} | {said} |", flush=True)
 
 

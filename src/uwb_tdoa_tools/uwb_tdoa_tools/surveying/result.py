@@ -16,13 +16,15 @@ KNOWN_WELL = 0.02  # m, standard deviation as given that leaves nothing to wish 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names; base : EffectSet that was in the model."""
+    """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names; base : EffectSet that was in the model;
+    blocked : sentences on what makes anchors late somewhere, once somebody has looked (`blocked.py`)."""
 
     given: object
     given_std: np.ndarray
     surveyed: Surveyed
     flights: tuple
     base: EffectSet = EffectSet()
+    blocked: tuple = ()
 
     @property
     def why_not(self):
@@ -82,7 +84,7 @@ class Result:
                 for one in found.changes
             ],
             "applied": self.why_not is None,
-            "unexplained": found.unexplained,
+            "blocked": list(self.blocked),
             "marks_left_out": found.marks,
             "marks_on_the_floor": found.grounded,
             "slow_before": found.before,
@@ -112,7 +114,7 @@ class Result:
         if self.base.covariance is not None:
             lines += [f"since the last calibration: {change.as_text()}" for change in found.changes]
             lines += [] if found.changes else ["no anchor has changed clearly since the last calibration"]
-        lines += [found.unexplained] if found.unexplained else []
+        lines += self.blocked
         if found.marks:
             before, after = (100 * value for value in found.marks)
             lines.append(f"marks, each left out once: the estimate there is off by {before:.1f} cm as given, {after:.1f} cm with the others' survey")

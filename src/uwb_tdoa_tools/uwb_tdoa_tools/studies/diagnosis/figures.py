@@ -14,6 +14,7 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 from ...diagnosis import diagnose
 from ...diagnosis.references import Heights, Nothing
 from ...scoring.plots import plt
+from ...surveying.blocked import with_blocked
 from ...surveying.survey import survey
 from ...surveying.tape import Tape
 from . import bank, blind, faults, measured, referenced, undeclared
@@ -150,12 +151,12 @@ def _speed(args):
     bare = [one.without(*AIDS) for one in two]
     calls = {
         "120 s of flight": lambda: diagnose([flight]),
-        "survey, two of a minute": lambda: survey(bare, Tape()),
+        "survey, two of a minute": lambda: with_blocked(survey(bare, Tape()), bare),
         "diagnose --no-truth, two of a minute": lambda: diagnose(bare, reference=Nothing()),
         "diagnose --reference heights, two of a minute": lambda: diagnose(two, reference=Heights()),
     }
     short = bank.clean_flight(501, 40.0, aided=True)
-    diagnose([short], reference=Heights()), survey([short.without(*AIDS)], Tape())  # compile
+    diagnose([short], reference=Heights()), survey([short.without(*AIDS)], Tape())  # compiles
     figures = {}
     for name, call in calls.items():
         started = time.process_time()

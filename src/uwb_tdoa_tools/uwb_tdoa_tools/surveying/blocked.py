@@ -1,0 +1,27 @@
+"""What positions and delays of anchors do not explain: regions, or times, in which something makes one of them late."""
+
+from dataclasses import replace
+
+from uwb_tdoa_bias.effects import EffectSet
+
+from ..diagnosis.attribution import attribute
+from ..diagnosis.references import Nothing
+from ..diagnosis.self_survey import delay_effect
+
+LEAST = 0.2  # m by which an anchor must be late there; antennas alone make up to that
+
+
+def with_blocked(result, flights, config=None, progress=lambda: None):
+    """The Result of a survey of Flights with what blocks its anchors, looked for beside all that was found."""
+    found, reference = result.surveyed, Nothing(config)
+    moved = [reference.prepare(replace(flight, anchors=found.anchors)) for flight in flights]
+    base = EffectSet((*result.base.effects, delay_effect(found.anchors, found.delays)))
+    effects = attribute(moved, reference, base, ("nlos",), undeclared=False, progress=progress).effects
+    return replace(result, blocked=tuple(sentence for effect in effects for sentence in large(effect).advice()))
+
+
+def large(effect):
+    """The effect nlos with those of its anchors alone that are late by LEAST."""
+    late = {key.partition(".")[0] for key, value in effect.values.items() if key.endswith(".delay") and value >= LEAST}
+    values, std = ({key: some[key] for key in some if key.partition(".")[0] in late} for some in (effect.values, effect.std))
+    return replace(effect, values=values, std=std)
