@@ -18,6 +18,7 @@ setup(
     install_requires=[
         "setuptools",
         "numpy>=1.26",
+        "PyYAML>=6.0",
         "scipy>=1.11",
         "uwb_tdoa_bias",
     ],

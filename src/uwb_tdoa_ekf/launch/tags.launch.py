@@ -1,6 +1,7 @@
 """Several tags of one YAML file, each in its own namespace and with its own frame.
 
 ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml
+ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml processes:=2     # takes a fraction of the CPU time
 
     anchors_file: anchors.yaml        # what all share: any parameters of bias_node and ekf_node
     tags:
@@ -12,10 +13,11 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from uwb_tdoa_ekf.launching import tags, typed
+from uwb_tdoa_ekf.launching import pooled, tags, typed
 from uwb_tdoa_ekf.launching_actions import node_action, rviz_action
 
 OTHERS = {
+    "processes": ("0", "localization_nodes that share the tags, e.g. one for each core; 0: two nodes for each tag"),
     "use_sim_time": ("", "true for bags that are played with --clock"),
     "log_level": ("info", "debug, info, warn, error"),
     "rviz": ("false", "true opens RViz with the frames and the anchors"),
@@ -33,7 +35,9 @@ def generate_launch_description():
 
 def _nodes(context):
     path, *given = (LaunchConfiguration(name).perform(context) for name in ("tags", *OTHERS))
-    sim_time, log_level, rviz = given
+    processes, sim_time, log_level, rviz = given
     values = typed({"use_sim_time": sim_time})
-    actions = [node_action(Node, each) for each in tags(path, values, log_level)]
+    starts = tags(path, values, log_level)
+    starts = pooled(starts, int(processes)) if int(processes) > 0 else starts
+    actions = [node_action(Node, each) for each in starts]
     return actions + ([rviz_action(Node, values.get("use_sim_time", False))] if rviz == "true" else [])

@@ -15,7 +15,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from nav_msgs.msg import Odometry  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_ekf.launching import NODES, start, tag, tags, typed  # noqa: E402
+from uwb_tdoa_ekf.launching import NODES, pooled, start, tag, tags, typed  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -128,6 +128,21 @@ def test_several_tags(launched, tmp_path):
     frames = [node.parameters[-1] for node in nodes if node.executable == "ekf_node"]
     assert [frame["body_frame"] for frame in frames] == ["a/base_link", "b/base_link", "c/base_link", "drone"]  # no two alike
     assert frames[2]["odom_frame"] == "c/odom"
+
+
+def test_several_tags_in_a_pool_of_processes(launched, tmp_path):
+    (tmp_path / "tags.yaml").write_text("anchors_file: a.yaml\ntags: {a: {}, b: {tdoa_std: 0.3}, c: {map: map.npz}}")
+    nodes = launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"), processes="2")
+    assert [node.executable for node in nodes] == ["debias_node", "anchors_node", "localization_node", "localization_node"]
+    one, other = nodes[2:]
+    assert (one.name, other.name, one.namespace) == ("localization_node_1", "localization_node_2", "")
+    assert [node.parameters[1] for node in (one, other)] == [{"tags": ["a", "c"]}, {"tags": ["b"]}]
+    told = yaml.safe_load(Path(one.parameters[0]).read_text())
+    assert told.keys() == {f"/{tag}/{node}_node" for tag in "abc" for node in ("bias", "ekf")}
+    shared = {"anchors_file": str(tmp_path / "a.yaml")}
+    assert told["/b/ekf_node"] == {"ros__parameters": {"body_frame": "b/base_link", "tdoa_std": 0.3} | shared}
+    with pytest.raises(InputError, match="params_file: does not go with processes"):
+        pooled([start("ekf_node", "a", {}, ["mine.yaml"])], 2)
 
 
 def test_a_bag_is_played_on_its_time(launched):

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+import tempfile
 
+import yaml
 from uwb_tdoa_bias import anchors_node, bias_node
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
@@ -23,13 +25,15 @@ OF_FILES = {"params_file"}  # a parameter file for both nodes of a tag, which th
 
 @dataclass(frozen=True)
 class Start:
-    """One node. parameters : paths of files and {name: value}, of which later ones count."""
+    """One node. parameters : paths of files and {name: value}, of which later ones count; name : of the node, if it is another than
+    the executable's."""
 
     package: str
     executable: str
     namespace: str
     parameters: list
     log_level: str = "info"
+    name: str | None = None
 
 
 def start(executable, namespace, values, files=(), log_level="info"):
@@ -76,6 +80,22 @@ def tags(path, values, log_level="info"):
         shared = {"anchors_file": anchors.pop(), **{name: values[name] for name in EVERYWHERE if name in values}}
         starts.append(start("anchors_node", "", shared, (), log_level))
     return starts
+
+
+def pooled(starts, processes):
+    """The same of `tags` with so many localization_nodes instead of bias_nodes and ekf_nodes; what these are told is in a file that
+    is written for them. Raises InputError where a tag has a parameter file of its own."""
+    members = [each for each in starts if each.executable in ("bias_node", "ekf_node")]
+    if any(isinstance(part, str) for each in members for part in each.parameters):
+        raise InputError("params_file: does not go with processes; write its values into the file of the tags.")
+    told = {f"/{each.namespace}/{each.executable}": {"ros__parameters": each.parameters[-1]} for each in members if each.parameters}
+    with tempfile.NamedTemporaryFile("w", prefix="uwb_tdoa_tags_", suffix=".yaml", delete=False) as file:
+        yaml.safe_dump(told, file)
+    namespaces, out = list(dict.fromkeys(each.namespace for each in members)), [each for each in starts if each not in members]
+    for k in range(min(processes, len(namespaces))):
+        parameters, name = [file.name, {"tags": namespaces[k::processes]}], f"localization_node_{k + 1}"
+        out.append(Start("uwb_tdoa_ekf", "localization_node", "", parameters, members[0].log_level, name))
+    return out
 
 
 def refuse_unknown(values, *executables):

@@ -8,6 +8,7 @@ def node_action(node, start):
     return node(
         package=start.package,
         executable=start.executable,
+        name=start.name,
         namespace=start.namespace,
         parameters=start.parameters,
         arguments=["--ros-args", "--log-level", start.log_level],

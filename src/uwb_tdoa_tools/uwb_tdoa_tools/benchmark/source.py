@@ -31,7 +31,7 @@ class Source:
         self._anchors = node.create_publisher(AnchorArray, "/uwb/anchors", ANCHORS_QOS)
         # never spun, so that no callback runs
         self.subscriptions = [
-            node.create_subscription(Odometry, f"{space}/odometry", lambda _: None, ros.STREAM_QOS, raw=True)
+            node.create_subscription(Odometry, f"{space}/odometry", lambda _: None, ros.OUTPUT_QOS, raw=True)
             for space in namespaces
         ]
         self.received = [[] for _ in namespaces]  # (arrival, stamp), ns
