@@ -22,6 +22,7 @@ from .self_survey import FEWEST, survey
 CALIBRATED = POSITION, DELAY
 POSITION_STD = 0.1  # m, of the coordinates of anchors as they are given
 LEFT = 0.055  # m that may be left of slow innovations
+NEARER = 0.75  # share of marks, each left out once, at which the estimate must come nearer
 EXPLAINED = 0.1  # share of the slow innovations that must be explained
 
 
@@ -44,7 +45,7 @@ class Calibration:
         if not self.long_enough:
             return f"the flights are too short: {MIN_BLOCKS * BLOCK:g} s in the air are needed without ground truth"
         if self.marks:
-            return None if self.marks[1] < self.marks[0] else why_marks_speak_against(self.marks)
+            return why_marks_speak_against(self.marks)
         if self.left > LEFT:
             return (
                 f"positions and delays of anchors leave {100 * self.left:.1f} cm of what is slow in the innovations, more than "
@@ -77,11 +78,14 @@ def calibrate(flights, attribution, base, config=None, constraints=(), progress=
 
 
 def why_marks_speak_against(marks):
-    """Why a survey must not be applied of which marks, each left out once, say that it makes the position worse. marks : of
-    Surveyed."""
+    """Why a survey must not be applied, after what its marks say, each left out once; None if it may: the estimate must come nearer
+    to them on average, and to NEARER of them. marks : of Surveyed."""
+    before, after, nearer = marks
+    if after < before and nearer >= NEARER:
+        return None
     return (
-        f"at marks, each left out once, the estimate is off by {100 * marks[0]:.1f} cm with the anchors as given, and by {100 * marks[1]:.1f} cm with "
-        "others: the position would suffer; measure more marks, or fly where it is known"
+        f"at marks, each left out once, the estimate is off by {100 * before:.1f} cm with the anchors as given, and by {100 * after:.1f} cm with "
+        f"others, and nearer at {nearer:.0%} of them: the position would suffer; measure more marks, or fly where it is known"
     )
 
 

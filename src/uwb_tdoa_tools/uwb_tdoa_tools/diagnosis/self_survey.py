@@ -36,8 +36,9 @@ class Surveyed:
     """anchors : Anchors; delays (N,) m; covariance (4N, 4N) m^2, of positions, anchor by anchor, and then of delays;
     seconds : s in the air that tell; before, left : m, scale of the slow innovations with the anchors as given, and with these; tdoa_std : m, for the filter: so
     that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of the
-    size of delays, and of functions of the place; changes : (Change, ...) since the last calibration; marks : (before, after), root
-    mean square of what estimates at marks in the air are off by, m, each after a fit without it; None where there are none;
+    size of delays, and of functions of the place; changes : (Change, ...) since the last calibration; marks : (before, after, nearer),
+    root mean square of what estimates at marks in the air are off by, m, and share of marks that they come nearer to, each after a fit without it;
+    None where there are none;
     grounded : how many marks were left out, because they are on the floor: estimates there are metres off and do not know it."""
 
     anchors: Anchors
@@ -171,14 +172,15 @@ class _Runs:
 
 
 def _left_out(equations, prior):
-    """(before, after) of Surveyed.marks: each is left out of _Equations about the anchors as given."""
+    """Surveyed.marks: each is left out of _Equations about the anchors as given."""
     if not equations.marks:
         return None
     n, off = len(prior.covariance), []
     for one in equations.marks:
         step = solve(equations.gram - one.gram, equations.vector - one.vector, prior, np.zeros(n)).step
         off.append((one.off, one.off - one.columns[:, :n] @ step))
-    return tuple(float(np.sqrt(np.mean(np.sum(np.square(some), axis=1)))) for some in zip(*off))
+    before, after = np.sum(np.square(off), axis=2).T
+    return float(np.sqrt(before.mean())), float(np.sqrt(after.mean())), float(np.mean(after < before))
 
 
 def _changes(prior, found, offset):

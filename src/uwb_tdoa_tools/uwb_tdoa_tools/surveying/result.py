@@ -31,7 +31,7 @@ class Result:
         """Why it must not be used instead of what was given; None if it may."""
         before, left, marks = self.surveyed.before, self.surveyed.left, self.surveyed.marks
         if marks:
-            return None if marks[1] < marks[0] else why_marks_speak_against(marks)
+            return why_marks_speak_against(marks)
         if left <= LEFT or before > CLEARLY * left:
             return None
         return (
@@ -116,8 +116,9 @@ class Result:
             lines += [] if found.changes else ["no anchor has changed clearly since the last calibration"]
         lines += self.blocked
         if found.marks:
-            before, after = (100 * value for value in found.marks)
-            lines.append(f"marks, each left out once: the estimate there is off by {before:.1f} cm as given, {after:.1f} cm with the others' survey")
+            before, after, nearer = found.marks
+            off = f"off by {100 * before:.1f} cm as given, {100 * after:.1f} cm with the others' survey"
+            lines.append(f"marks, each left out once: the estimate there is {off}, and nearer at {nearer:.0%} of them")
         if found.grounded:
             lines.append(f"left out: {found.grounded} marks on the floor, where estimates are metres off and do not know it; mark places in the air")
         if self.why_not:
