@@ -48,7 +48,7 @@ def run(args):
             today = with_blocked(survey([replace(flown[0], truth=None)], Tape(), known), flown[:1])
             errors = rmse(flown[1:], known), rmse([at(flown[1], today.surveyed.anchors.positions)], taken(today, known))
             said = "; ".join(one.as_text() for one in today.surveyed.changes) or "no anchor has changed"
-            said = ". ".join([said, *today.blocked])
+            said = " ".join([said + ".", *today.blocked])
             print(f"| {name} | {words} | {errors[0]:.3f} | {errors[1]:.3f} | {said} |", flush=True)
 
 
