@@ -25,7 +25,9 @@ from .regression.terms import columns_of
 BOOTSTRAPS = 400
 Z95 = 1.96  # standard deviations from the middle of a 95 % interval to its ends
 JUDGES = 3  # flights, or halves of one, on which trials are judged
-SURE = 3.0  # standard deviations by which a gain must be above zero where the reference itself may be off by some
+# Standard deviations by which a gain must be above zero where the reference itself may be off. What is fitted follows what the
+# references have in common, in whatever direction that is: chi with three degrees of freedom, 99.9 %.
+SURE = 4.0
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
