@@ -58,8 +58,7 @@ def test_at_rest_the_gyroscope_is_no_function_of_what_it_measures_itself():
 def test_without_attitude_the_gyroscope_is_judged_at_rest_and_the_accelerometer_not_at_all():
     reference, flight = Nothing(), clean_flight(110, 30.0)  # turns slowly, soon after it has left the floor
     parts = residuals(reference.prepare(flight), reference, EffectSet())
-    assert "accel" not in parts and np.abs(parts["gyro"].residual).max() < 0.005
-    assert np.interp(parts["gyro"].samples.t, flight.truth.t, flight.truth.p[:, 2]).max() < 0.1
+    assert "accel" not in parts and len(parts["gyro"].residual) > 15 and np.abs(parts["gyro"].residual).max() < 0.003
 
 
 def test_without_reference_height_pressure_and_velocity_are_not_judged():

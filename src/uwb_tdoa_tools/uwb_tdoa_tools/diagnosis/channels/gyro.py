@@ -8,7 +8,9 @@ from uwb_tdoa_bias.effects.covariates import OF_IMU
 from .inertial import CELL, ImuResidual, Inertial, cells_in_the_air, features_of, means
 
 SHIFT = 0.05  # s, for derivatives by time, of what was measured: noise of the truth would shrink what is fitted to them
-STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration, or of change since the start, and rad/s, below which the vehicle stands
+STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration and rad/s, below which the vehicle stands
+STILL_CHANGE = 0.02  # rad/s, the same of what is measured less what was measured at the start
+BEGINNING = 2  # cells before, in which it may begin to turn
 TURNING = [column for column, name in enumerate(OF_IMU) if name == "turning_rate" or name.startswith("rate_")]
 FEWEST_ATTITUDES, FEWEST_CELLS = 10, 4
 
@@ -42,9 +44,8 @@ class Gyro(Inertial):
         features, measured = means(imu.t, features_of(imu), edges), means(imu.t, imu.gyro, edges)
         moving = features[:, OF_IMU.index("vibration")] > STILL_FORCE
         moving |= np.abs(measured).max(axis=1) > STILL_RATE
-        force = np.linalg.norm(means(imu.t, imu.accel, edges), axis=1)
-        moving |= np.abs(force - np.median(force[:FEWEST_CELLS])) > STILL_FORCE  # it lifts off smoothly, and turns a little later
-        still = np.flatnonzero(np.cumsum(moving) == 0)[:-1]
+        moving |= np.abs(measured - np.median(measured[:FEWEST_CELLS], axis=0)).max(axis=1) > STILL_CHANGE
+        still = np.flatnonzero(np.cumsum(moving) == 0)[:-BEGINNING]
         if len(still) < FEWEST_CELLS:
             return None
         middles, measured, features = 0.5 * (edges[:-1] + edges[1:])[still], measured[still], features[still]
