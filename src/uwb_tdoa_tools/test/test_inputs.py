@@ -100,6 +100,23 @@ def test_flights_are_read_with_their_survey(tmp_path):
     np.testing.assert_array_equal(flights[1].anchors.positions, ANCHORS.positions)
 
 
+def test_of_more_flights_than_are_to_be_held_some_are_drawn(tmp_path, capsys, monkeypatch):
+    paths = [tmp_path / f"flight-{k}" for k in range(9)]
+    for path in paths:
+        path.write_bytes(log_bytes())  # of two TDOAs
+    (tmp_path / "survey.csv").write_text(SURVEY)
+    reading, names = Reading(tmp_path / "survey.csv"), [path.name for path in paths]
+    assert [flight.name for flight in reading.flights(paths, 18)] == names
+    assert not capsys.readouterr().err
+    read, read_one = [], Reading.read
+    monkeypatch.setattr(Reading, "read", lambda self, recording: read.append(recording) or read_one(self, recording))
+    drawn = [flight.name for flight in reading.flights(paths, 7)]
+    assert len(drawn) == 3 and drawn == sorted(drawn) and set(drawn) < set(names) and len(read) == 4
+    assert "3 of 9 flights, drawn at random, are taken" in capsys.readouterr().err
+    assert [flight.name for flight in reading.flights(paths, 7)] == drawn
+    assert len(reading.flights(paths, 1)) == 1
+
+
 def test_what_is_missing_in_a_recording_is_told(tmp_path, capsys):
     (tmp_path / "cut").write_bytes(log_bytes()[:-9])
     (tmp_path / "survey.csv").write_text(SURVEY)

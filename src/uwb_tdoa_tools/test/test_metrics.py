@@ -1,3 +1,4 @@
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
-from uwb_tdoa_tools.scoring.metrics import Score, airborne, coverage, nees, nis, pooled, position_errors, summary
+from uwb_tdoa_tools.scoring.metrics import Pool, Result, Score, airborne, coverage, nees, nis, pooled, position_errors, summary
 from uwb_tdoa_tools.scoring.table import line
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
@@ -197,3 +198,39 @@ def test_pooled_with_a_run_that_never_started():
     ]
     together = pooled(scores)
     assert together["rmse_3d"] == pytest.approx(0.1) and together["diverged"] == 1 and together["start_delay"] == np.inf
+
+
+def test_figures_pooled_of_what_runs_leave_are_those_of_all_samples():
+    rng, scores = np.random.default_rng(3), []
+    for seconds in (10.0, 6.0, 8.0):
+        truth, spread = straight(seconds), rng.uniform(0.05, 2.0)
+        innovation = rng.standard_normal(200)
+        told = residuals(innovation, np.full(200, 0.5), np.full(200, USED))
+        made = estimate(truth, lambda t: spread * rng.standard_normal((len(t), 3)), high=seconds)
+        scores.append(Score(f"flight of {seconds:g} s", made, truth, told))
+    error, covariance, of_nees, of_nis = (
+        np.concatenate([getattr(score, name) for score in scores]) for name in ("error", "covariance", "nees", "nis")
+    )
+    expected, together = summary(error, of_nees, of_nis), pooled(scores)
+    for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "frac_gt_1m", "nees_mean", "nis_mean"):
+        assert together[name] == pytest.approx(expected[name], rel=1e-12), name
+    for name in ("median_3d", "nees_median", "nis_median"):
+        assert together[name] == pytest.approx(expected[name], rel=0.01), name
+    np.testing.assert_allclose([together[f"coverage_3sigma_{axis}"] for axis in "xyz"], coverage(error, covariance))
+
+
+def test_what_a_run_leaves_survives_json_and_does_not_grow_with_it():
+    short, long = straight(10.0), straight(200.0)
+    noise = np.random.default_rng(0)
+    sizes = []
+    for truth, end in ((short, 10.0), (long, 200.0)):
+        made = estimate(truth, lambda t: 0.1 * noise.standard_normal((len(t), 3)), high=end)
+        sizes.append(len(json.dumps(Score("flight", made, truth).result().as_dict())))
+    assert sizes[1] < 2.0 * sizes[0]  # 20 times as long
+    never = Score("never", estimate(short, constant(0.0, 0.0, 0.0), low=9.5), short)
+    nan = Score("nan", estimate(short, constant(np.nan, 0.0, 0.0)), short)
+    for score in (Score("flight", made, truth), never, nan):
+        one, other = Pool(), Pool()
+        one.add(score.result())
+        other.add(Result.from_dict(json.loads(json.dumps(score.result().as_dict(), allow_nan=False))))
+        assert repr(one.figures()) == repr(other.figures())

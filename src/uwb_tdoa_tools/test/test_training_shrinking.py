@@ -1,6 +1,6 @@
 """As much of a model as flights left out bear out."""
 
-import json
+import argparse
 
 import pytest
 from training_flights import flight
@@ -45,8 +45,21 @@ def test_a_flight_is_judged_by_what_it_took_no_part_in():
     assert told.share < 1.0 and told.as_dict()["worst"] == told.gains.min()
 
 
-def test_splits_are_done_once_and_summed_up(tmp_path, monkeypatch):
-    rows = [{"seed": seed, "kind": "structured", "left_out": splits._text(errors((1, 0.9, 0.8, 0.7))), "judged": splits._text(errors((1, 0.9, 0.9, 1.2)))} for seed in (0, 1)]  # fmt: skip
-    (tmp_path / "rows").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    text = splits.table(splits._read(tmp_path / "rows"), shrunk=False)
-    assert "| structured | 2 | -20.0% | 0.0% | -20.0% | 1.20 | 2 of 2 | 30.0% | 1.00 |" in text
+def test_splits_are_done_once_and_summed_up(tmp_path, monkeypatch, capsys):
+    made, flights = [], [flight(seed) for seed in range(2)]
+
+    def split(flights, plain, seed, fit, kinds):
+        for kind in kinds:
+            made.append((kind, seed))
+            told = {"left_out": splits._text(errors((1, 0.9, 0.8, 0.7))), "judged": splits._text(errors((1, 0.9, 0.9, 1.2)))}
+            yield {"seed": seed, "kind": kind, **told}
+
+    monkeypatch.setattr(splits, "split", split)
+    monkeypatch.setattr(splits.inputs.Reading, "flights", lambda *_: flights)
+    monkeypatch.setattr(splits.shrinking, "uncorrected", lambda _: {})
+    parser = argparse.ArgumentParser()
+    splits.add_options(parser.add_argument)
+    for count in ("1", "2"):
+        splits.run(parser.parse_args(["x", "--out", str(tmp_path / "rows"), "--models", "structured", "--splits", count]))
+    assert made == [("structured", 0), ("structured", 1)]
+    assert "| structured | 2 | -20.0% | 0.0% | -20.0% | 1.20 | 2 of 2 | 30.0% | 1.00 |" in capsys.readouterr().out

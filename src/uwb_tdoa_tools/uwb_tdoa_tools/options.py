@@ -2,6 +2,7 @@
 
     options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
     options.add_filter(parser)                      # --effects, --config
+    options.add_most(parser, 10**6)                 # --most
     options.add_known(parser)                       # --marks, --distances
     reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
@@ -13,6 +14,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
 from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
+from .parallel import whole_number
 from .readers import inputs
 from .surveying.distances import read_distances
 from .surveying.marks import read_marks
@@ -61,6 +63,14 @@ def filter_of(args):
     """(FilterConfig, EffectSet or None) that --config and --effects name. Raises InputError."""
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
+
+
+def add_most(parser, default):
+    """--most: how many TDOAs to learn from at most."""
+    parser.add_argument(
+        "--most", metavar="N", type=whole_number, default=default,
+        help="TDOAs to hold at most, by which memory and time are bounded: of flights with more, some are drawn (default %(default)s)",
+    )  # fmt: skip
 
 
 def add_known(parser):

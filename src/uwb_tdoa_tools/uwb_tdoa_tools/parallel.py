@@ -25,7 +25,7 @@ in_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 def add_options(parser):
     """Add --jobs N and --dask ADDRESS to a tool that runs over many flights."""
     add = parser.add_mutually_exclusive_group().add_argument
-    add("--jobs", metavar="N", type=_count, help="flights at once (default: as many as there are cores)")
+    add("--jobs", metavar="N", type=whole_number, help="flights at once (default: as many as there are cores)")
     add(
         "--dask", metavar="ADDRESS",
         help="run on the Dask cluster whose scheduler is there, e.g. tcp://10.0.0.1:8786; its workers need these "
@@ -126,7 +126,8 @@ def _cluster(address):
         yield {"backend": "dask", "client": client}
 
 
-def _count(text):
+def whole_number(text):
+    """Above 0, for argparse."""
     if not text.isdecimal() or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
     return int(text)

@@ -22,6 +22,8 @@ could be, adds what helps, and reports the error before and after on data that t
 Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
 assume with them; --config of evaluate) and report.html."""
 
+MOST = 500_000  # TDOAs; of 8 anchors they take 2 GB
+
 
 def main(argv=None):
     """The executable. Returns the exit code."""
@@ -60,6 +62,7 @@ def parser():
         "topic (nav_msgs/Odometry) of the bags; with --marks, e.g. where it took off and landed, it goes through them",
     )  # fmt: skip
     add("--drift", type=float, default=DRIFT, metavar="M", help="of that, m per square root of a second (default %(default)s)")
+    options.add_most(made, MOST)
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
 
@@ -68,7 +71,7 @@ def _diagnose(args):
     out = cli.output_folder(args.out)
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
-    flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)
+    flights, holdout = (reading.flights(paths, args.most) for paths in (args.flights, args.holdout))
     shared = {f.name for f in flights} & {f.name for f in holdout}
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")

@@ -10,9 +10,12 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.aids import STREAMS
 
 from .. import cli, options, parallel
+from ..results_file import asked_of
 from ..scoring import table
-from ..scoring.judge import Judge
-from ..scoring.metrics import as_json, pooled
+from ..scoring.judge import Judge, results
+from ..scoring.metrics import Pool, as_json
+
+NO_MATTER = ("flights", "survey", "json", "markdown", "beside", "resume", "jobs", "dask")  # to what is kept of a flight
 
 
 def main(argv=None):
@@ -34,6 +37,7 @@ def parser():
         "evaluate flight.bag --odometry tags.bag --topic odometry=/tag1/odometry",
         "evaluate flights/ --survey surveys/ -p adapt_noise:=false -p loss:=huber",
         "evaluate flights/ --survey surveys/ --without height --without pressure",
+        "evaluate flights/ --survey surveys/ --resume judged.jsonl --json errors.json",
         "evaluate flights/ --survey surveys/ --dask tcp://10.0.0.1:8786",
     )
     add = made.add_argument
@@ -63,6 +67,10 @@ def parser():
     )  # fmt: skip
     add("--plot", metavar="FILE", help="picture of the errors over time (one FLIGHT)")
     add("--tum", metavar="DIR", help="write estimates and truths as TUM trajectories, e.g. for evo")
+    add(
+        "--resume", metavar="FILE",
+        help="keep each flight's figures there as soon as it is judged, a line of JSON each; what is there is not judged again",
+    )  # fmt: skip
     parallel.add_options(made)
     return made
 
@@ -85,15 +93,17 @@ def _evaluate(args):
         reading, config, None if args.no_bias else effects, network, args.smooth, args.odometry, args.plot,
         Path(args.tum).absolute() if args.tum else None,
     )  # fmt: skip
-    scores = []
     if not args.odometry:
         print(f"correcting with: {'+'.join(part.name for part in (judge.effects, judge.network) if part) or 'nothing'}")
     print(table.head())
-    for score in parallel.over(judge, found, args.jobs, args.dask):
-        scores.append(score)
-        tqdm.write(table.line(score.row()))
-    rows, together = [score.row() for score in scores], pooled(scores)
-    if len(scores) > 1:
+    rows, pool = [], Pool()
+    asked = asked_of(args, NO_MATTER, ("effects", "config", "model"))
+    for result in results(judge, found, args.resume, asked, args.jobs, args.dask):
+        pool.add(result)
+        rows += [result.row] if args.json or args.markdown else []  # else nothing grows with the number of flights
+        tqdm.write(table.line(result.row))
+    together = pool.figures()
+    if len(found) > 1:
         print(table.line(together))
         print(f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
               f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
@@ -101,7 +111,7 @@ def _evaluate(args):
         report = {"runs": [as_json(row) for row in rows], "pooled": as_json(together)}
         cli.write_json(args.json, report)
     if args.markdown:
-        rows += [together] * (len(scores) > 1)
+        rows += [together] * (len(found) > 1)
         others = table.read_others(args.beside) if args.beside else {}
         Path(args.markdown).write_text(table.markdown(rows, others))
     if late := judge.late_tdoas():

@@ -7,6 +7,8 @@ from .. import cli, options
 from ..training import labels as labelling, models, shrinking
 from ..training.plots import plot_curve
 
+MOST = 1_500_000  # TDOAs
+
 
 def main(argv=None):
     """The executable. Returns the exit code."""
@@ -35,6 +37,7 @@ def parser():
     add = made.add_argument
     options.add_recordings(made)
     add("--model", choices=models.KINDS, required=True, help="what to train")
+    options.add_most(made, MOST)
     add("--out", metavar="DIR", type=Path, required=True, help="where to write")
     add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
     add("--name", help="of the model, goes into every corrected message (default: the kind)")
@@ -43,7 +46,7 @@ def parser():
 
 
 def _train(args):
-    flights = {flight.name: flight for flight in options.reading_of(args).flights(args.flights)}
+    flights = {flight.name: flight for flight in options.reading_of(args).flights(args.flights, args.most)}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):
         print(f"{what:13s} {', '.join(some)}")

@@ -64,8 +64,9 @@ def nothing(attribution, refused=()):
     return Kept(attribution.selection.only(()), (), tuple(refused), {})
 
 
-def cross_fitted(attribution, flights, base, candidates, detections):
-    """[Case]: each flight, or each half of a single one, with the effects of `candidates` fitted to the others alone."""
+def cross_fitted(attribution, flights, base, candidates, detections, most=None):
+    """[Case]: each flight, or each half of a single one, with the effects of `candidates` fitted to the others alone; `most` of
+    them, evenly taken, if there are more."""
     table, selection = attribution.selection.table, attribution.selection
     if len(flights) > 1:
         parts = [(k, table.flight != k, None) for k in range(len(flights))]
@@ -75,7 +76,7 @@ def cross_fitted(attribution, flights, base, candidates, detections):
         spans = [(start + table.t.min(), start + middle), (start + middle, start + table.t.max())]
         parts = [(0, ~early, spans[0]), (0, early, spans[1])]
     out, columns = [], columns_of(candidates)
-    for k, rows, span in parts:
+    for k, rows, span in parts[:: -(-len(parts) // (most or len(parts)))]:
         others = replace(selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows))
         found = usable([*effects_of(others), *(detection.effect for detection in detections)])
         out.append(Case(flights[k], EffectSet((*base.effects, *found.effects)), span))
@@ -163,8 +164,7 @@ class _Trials:
         return float(np.mean([self._judge(case, corrector) for case, corrector in zip(cases, correctors)]))
 
     def _cases(self, candidates, detections):
-        cases = cross_fitted(*self._arguments, candidates, detections)
-        return cases[:: -(-len(cases) // JUDGES)]
+        return cross_fitted(*self._arguments, candidates, detections, JUDGES)
 
     def _judge(self, case, corrector):
         self._progress()

@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 import sys
 
+import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -80,10 +81,25 @@ class Reading:
         """Flight of one recording."""
         return self.read((path, survey_for(path, self.survey)))
 
-    def flights(self, paths):
-        """Flights of recordings and folders, with a progress bar: list."""
-        found = tqdm(self.find(paths), desc="reading", unit="flight", disable=None, leave=False)
-        return [self.read(recording) for recording in found]
+    def flights(self, paths, most=None):
+        """Flights of recordings and folders, with a progress bar: list.
+
+        most : TDOAs that they may hold together, the first excepted; of more, as many whole flights as that are drawn at random, alike
+        at every call, and the others not held, so that memory and time are bounded.
+        """
+        found, read, count = self.find(paths), {}, 0
+        order = range(len(found)) if most is None else np.random.default_rng(0).permutation(len(found)).tolist()
+        for number in tqdm(order, desc="reading", unit="flight", disable=None, leave=False):
+            flight = self.read(found[number])
+            count += len(flight.tdoa)
+            if most is not None and read and count > most:
+                tqdm.write(
+                    f"{len(read)} of {len(found)} flights, drawn at random, are taken: all would hold more than {most} TDOAs (--most); "
+                    "evaluate judges on all of them", sys.stderr,
+                )  # fmt: skip
+                break
+            read[number] = flight
+        return [read[number] for number in sorted(read)]
 
 
 def _is_bag(path):

@@ -12,18 +12,20 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
+from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
 from ..checking.remarks import survey_remarks
 from ..readers.inputs import Reading
+from ..results_file import ResultsFile, state_of
 from .evaluation import evaluate, need_truth
-from .metrics import Score
+from .metrics import Result, Score
 from .plots import plot_error
 from .tum import write_tum
 
 
 @dataclass(frozen=True)
 class Judge:
-    """judge((path, survey)) is the Score of a recording: of the filter run over it, or of the odometry in a bag.
+    """judge((path, survey)) is the Result of a recording: of the filter run over it, or of the odometry in a bag.
 
     reading : Reading; config : FilterConfig; effects, network : what the TDOAs are corrected with, or None; smoothed :
     use what came after each estimate too; odometry : path of a bag whose odometry is judged instead, or None; picture :
@@ -58,7 +60,7 @@ class Judge:
             truth, folder = flight.truth, self.trajectories
             write_tum(folder / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
             write_tum(folder / f"{flight.name}_truth.tum", truth.t, truth.p, truth.q)
-        return score
+        return score.result()
 
     def late_tdoas(self):
         """How many TDOAs were late for the odometry that is judged."""
@@ -67,3 +69,24 @@ class Judge:
     @property
     def _where(self):
         return self.reading.namespace, self.reading.salvage, self.reading.topics
+
+
+def results(judge, recordings, path, asked, jobs=None, dask=None):
+    """Generator of the Result of each of some recordings, in turn; those that are in the file `path` are not made again.
+
+    path : of a ResultsFile, or None to keep none; asked : all that results depend on besides the recording, see there; jobs,
+    dask : as of `parallel.over`.
+    """
+    if path is None:
+        yield from parallel.over(judge, recordings, jobs, dask)
+        return
+    keys = [" ".join(map(state_of, recording)) for recording in recordings]
+    with ResultsFile(path, asked) as done:
+        missing = {key: recording for key, recording in zip(keys, recordings) if key not in done}
+        if len(missing) < len(recordings):
+            tqdm.write(f"{path} holds {len(recordings) - len(missing)} of {len(recordings)} flights; going on with the others", sys.stderr)
+        made = parallel.over(judge, missing.values(), jobs, dask)
+        for key in keys:
+            if key not in done:
+                done[key] = next(made).as_dict()
+            yield Result.from_dict(done[key])

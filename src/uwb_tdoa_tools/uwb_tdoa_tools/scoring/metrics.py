@@ -1,11 +1,15 @@
 """How far an estimate is from ground truth, and whether its covariance is honest."""
 
+from collections import Counter
+from dataclasses import dataclass
 import math
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
+
+from .distribution import Distribution
 
 AIRBORNE = 0.3  # m; errors count from the first to the last instant above this height
 LOST = 1.0  # m; a larger error is no estimate
@@ -98,25 +102,92 @@ class Score:
         out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else float("inf")
         return {**out, **_named(coverage(self.error, self.covariance))}
 
+    def result(self):
+        """Result: this run as the figures of many need it."""
+        distance, count = np.linalg.norm(self.error, axis=1), len(self.t)
+        sums = {f"square_{axis}": float(np.sum(self.error[:, k] ** 2)) for k, axis in enumerate("xyz")}
+        sums |= {"square_3d": float(np.sum(distance**2)), "lost": float(np.sum(~(distance <= LOST)))}
+        if count:
+            sums |= {name: count * share for name, share in _named(coverage(self.error, self.covariance)).items()}
+        samples = {"distance": distance, "nees": self.nees, "nis": self.nis}
+        return Result(self.row(), sums, {name: Distribution.of(values) for name, values in samples.items()})
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run leaves for the figures of many, of a size that does not depend on its length. row : Score.row; sums : {name: sum
+    over its samples}; distributions : {quantity: Distribution}."""
+
+    row: dict
+    sums: dict
+    distributions: dict
+
+    def as_dict(self):
+        """For JSON, without loss."""
+        parts = {name: part.as_list() for name, part in self.distributions.items()}
+        return {"row": _as_texts(self.row), "sums": _as_texts(self.sums), "distributions": parts}
+
+    @classmethod
+    def from_dict(cls, content):
+        """Of what `as_dict` gives."""
+        parts = {name: Distribution.from_list(numbers) for name, numbers in content["distributions"].items()}
+        return cls(_from_texts(content["row"]), _from_texts(content["sums"]), parts)
+
+
+class Pool:
+    """The figures of all samples of several runs together, one run after the other."""
+
+    def __init__(self):
+        self._sums, self._distributions, self._runs, self._total, self._largest = Counter(), {}, 0, 0.0, 0.0
+        self._row = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
+
+    def add(self, result):
+        """Count a Result."""
+        row, known = result.row, self._distributions
+        self._runs += 1
+        self._sums.update(result.sums)
+        self._distributions = {name: known[name] + part if name in known else part for name, part in result.distributions.items()}
+        self._total, self._largest = self._total + row["rmse_3d"], float(np.max([self._largest, row["rmse_3d"]]))
+        self._row["start_delay"] = max(self._row["start_delay"], row["start_delay"])
+        for key in ("diverged", "late_start"):
+            self._row[key] += row[key]
+
+    def figures(self):
+        """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE. Medians are right to 1 %. Of one run at least."""
+        distance, count = self._distributions["distance"], self._distributions["distance"].count
+        shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
+        out = {"flight": f"{self._runs} pooled"}
+        out |= {f"rmse_{name}": math.sqrt(shares[f"square_{name}"]) for name in ("x", "y", "z", "3d")}
+        out |= {"median_3d": distance.median, "max_3d": distance.largest if count else math.nan}
+        out["frac_gt_1m"] = shares["lost"] if count else 1.0
+        for name in ("nees", "nis"):
+            part = self._distributions[name]
+            out |= {f"{name}_mean": part.mean, f"{name}_median": part.median}
+        out |= {name: shares.get(name, math.nan) for name in _named(np.zeros(3))} | self._row
+        out["rmse_3d_mean_of_runs"], out["rmse_3d_max_of_runs"] = self._total / self._runs, self._largest
+        return out
+
 
 def pooled(scores):
-    """The figures of all samples of several runs together, and mean and largest of the runs' 3D RMSE: a dict."""
-    rows = [score.row() for score in scores]
-    error = np.concatenate([score.error for score in scores])
-    covariance = np.concatenate([score.covariance for score in scores])
-    parts = (np.concatenate([getattr(score, name) for score in scores]) for name in ("nees", "nis"))
-    out = {"flight": f"{len(scores)} pooled", **summary(error, *parts), **_named(coverage(error, covariance))}
-    out["start_delay"] = max(row["start_delay"] for row in rows)
-    for key in ("diverged", "late_start"):
-        out[key] = sum(row[key] for row in rows)
-    out["rmse_3d_mean_of_runs"] = float(np.mean([row["rmse_3d"] for row in rows]))
-    out["rmse_3d_max_of_runs"] = float(np.max([row["rmse_3d"] for row in rows]))
-    return out
+    """The figures of all samples of several Scores together, see Pool: a dict."""
+    pool = Pool()
+    for score in scores:
+        pool.add(score.result())
+    return pool.figures()
 
 
 def as_json(row):
     """JSON has no NaN and no infinity: null."""
     return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}
+
+
+def _as_texts(numbers):
+    """Floats as texts: JSON has no NaN."""
+    return {key: repr(value) if isinstance(value, float) else value for key, value in numbers.items()}
+
+
+def _from_texts(numbers):
+    return {key: float(value) if isinstance(value, str) and key != "flight" else value for key, value in numbers.items()}
 
 
 def _named(shares):

@@ -3,7 +3,6 @@
 Each split goes to --out as one line of JSON as soon as it is done; what is there already is not done again."""
 
 from collections import defaultdict
-import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,6 +13,7 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...readers import inputs
+from ...results_file import ResultsFile
 from ...scoring.borne_out import choose
 from ...training import models, physics, shrinking
 
@@ -35,13 +35,12 @@ def run(args):
     """Do the splits that are missing, and print the table of all."""
     flights = [flight.without(*AIDS) for flight in inputs.Reading(args.survey).flights(args.flights)]
     seeds, plain = range(args.first, args.first + args.splits), shrinking.uncorrected(flights)
-    done = {(row["kind"], row["seed"]) for row in _read(args.out)}
-    with open(args.out, "a") as file:
+    with ResultsFile(args.out, {"fit": args.fit, "flights": [flight.name for flight in flights]}) as done:
         for seed in tqdm(seeds, unit="split", disable=None):
-            for row in split(flights, plain, seed, args.fit, [kind for kind in args.models if (kind, seed) not in done]):
-                file.write(json.dumps(row) + "\n")
-                file.flush()
-    rows = [row for row in _read(args.out) if row["seed"] in seeds and row["kind"] in args.models]
+            missing = [kind for kind in args.models if f"{kind} {seed}" not in done]
+            for row in split(flights, plain, seed, args.fit, missing):
+                done[f"{row['kind']} {seed}"] = row
+        rows = [done[f"{kind} {seed}"] for kind in args.models for seed in seeds]
     print(table(rows, shrunk=False) + "\n" + table(rows, shrunk=True))
 
 
@@ -94,7 +93,3 @@ def _text(errors):
 
 def _numbers(errors):
     return {name: {None if share == "None" else float(share): error for share, error in of.items()} for name, of in errors.items()}
-
-
-def _read(path):
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []

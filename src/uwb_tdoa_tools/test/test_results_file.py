@@ -1,0 +1,83 @@
+import json
+import os
+from types import SimpleNamespace
+
+import pytest
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.results_file import ResultsFile, asked_of, state_of
+
+
+def fill(path, keys, asked={"seed": 1}):
+    """What had to be made of keys, whose results are their lengths."""
+    made = []
+    with ResultsFile(path, asked) as done:
+        for key in (key for key in keys if key not in done):
+            done[key] = {"length": len(key)}
+            made.append(key)
+        assert [done[key]["length"] for key in keys] == [len(key) for key in keys]
+    return made
+
+
+def test_what_is_there_is_not_made_again(tmp_path):
+    path = tmp_path / "results"
+    assert fill(path, ["a", "bb"]) == ["a", "bb"]
+    assert fill(path, ["bb", "a", "ccc"]) == ["ccc"]
+    assert fill(path, ["a", "bb", "ccc"]) == []
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert lines[0]["asked"]["seed"] == 1 and lines[1:] == [{"key": k, "result": {"length": len(k)}} for k in ("a", "bb", "ccc")]
+
+
+@pytest.mark.parametrize("left", [0, 1, 12, -1, -5])
+def test_a_file_cut_anywhere_goes_on(tmp_path, left):
+    path = tmp_path / "results"
+    fill(path, ["a", "bb", "ccc"])
+    whole = path.read_bytes()
+    os.truncate(path, left % len(whole))
+    assert fill(path, ["a", "bb", "ccc"]) == (["ccc"] if left < 0 else ["a", "bb", "ccc"])
+    assert path.read_bytes() == whole
+
+
+def test_results_are_there_as_soon_as_they_are_made(tmp_path):
+    with ResultsFile(tmp_path / "results", {}) as done:
+        done["a"] = 1
+        assert json.loads((tmp_path / "results").read_text().splitlines()[-1]) == {"key": "a", "result": 1}
+
+
+def test_what_was_asked_otherwise_is_not_mixed(tmp_path):
+    path = tmp_path / "results"
+    fill(path, ["a"], {"seed": 1, "smooth": False, "effects": None})
+    with pytest.raises(InputError, match="made with another effects and seed; ask for the same, or name another file"):
+        fill(path, ["a"], {"seed": 2, "smooth": False, "effects": "1f"})
+
+
+@pytest.mark.parametrize("content", ["flight,rmse\n", "[1]\n", "not a result", '{"runs": []}\n', '{"asked": 1}\n', b"\xff\x00\n"])
+def test_another_file_is_left_alone(tmp_path, content):
+    path = tmp_path / "other"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="other: holds something else"):
+        fill(path, ["a"])
+    assert path.read_bytes() == before
+    with pytest.raises(InputError, match="directory does not exist"):
+        fill(tmp_path / "no" / "results", ["a"])
+
+
+def test_the_state_of_a_recording_changes_with_it(tmp_path):
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "data").write_text("one")
+    before = state_of(tmp_path / "bag")
+    assert str(tmp_path) in before and state_of(tmp_path / "bag") == before
+    (tmp_path / "bag" / "data").write_text("two, longer")
+    assert state_of(tmp_path / "bag") != before and state_of(None) == "None"
+
+
+def test_what_was_asked_is_every_option_that_matters_and_what_stands_in_its_files(tmp_path):
+    file = tmp_path / "effects.yaml"
+    file.write_text("one")
+    args = SimpleNamespace(jobs=3, smooth=True, effects=str(file), model="default", config=None)
+    asked = asked_of(args, ["jobs"], ["effects", "model", "config"])
+    file.write_text("two")
+    changed = asked_of(args, ["jobs"], ["effects", "model", "config"])
+    assert asked == {"smooth": True, "effects": asked["effects"], "model": "default", "config": None}
+    assert changed["effects"] != asked["effects"] and {**changed, "effects": asked["effects"]} == asked

@@ -1,0 +1,117 @@
+"""Results of long work in a file, each as a line of JSON as soon as it is there: what was interrupted goes on where it was.
+
+    with ResultsFile(path, {"seed": 1}) as done:            # what they depend on, besides their keys
+        for key in (key for key in keys if key not in done):
+            done[key] = work(key)
+        results = [done[key] for key in keys]
+
+The first line is what was asked for; every other one is {"key": ..., "result": ...}. Results stay in the file: only the
+places of their lines are held.
+"""
+
+import hashlib
+import json
+import os
+from pathlib import Path
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.version import written_by
+
+BEGIN = b'{"asked"'
+
+
+class ResultsFile:
+    """Results by their keys, texts, in the file `path`; one that is not there is made. Results are what JSON takes, no NaN."""
+
+    def __init__(self, path, asked):
+        """asked : dict for JSON, all that results depend on besides their keys. Raises InputError if the file holds
+        something else, or results that were made by another version, or with something else asked for."""
+        self._path, self._places = Path(path), {}
+        asked = json.loads(json.dumps({"written_by": written_by(), **asked}))
+        if not self._path.absolute().parent.is_dir():
+            raise InputError(f"{path}: its directory does not exist; make it first.")
+        self._file = open(self._path, "a+b")
+        try:
+            self._begin(asked)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _begin(self, asked):
+        self._file.seek(0)
+        first = self._file.readline()
+        if not first.endswith(b"\n"):  # new, or not even its first line was written
+            if not (first.startswith(BEGIN) or BEGIN.startswith(first)):
+                raise self._foreign()
+            self._file.truncate(0)
+            self._append({"asked": asked})
+            return
+        before = self._parsed(first).get("asked")
+        if not isinstance(before, dict):
+            raise self._foreign()
+        different = sorted(key for key in {*before, *asked} if before.get(key) != asked.get(key))
+        if different:
+            raise InputError(
+                f"{self._path}: its results were made with another {' and '.join(different)}; ask for the same, or name another file."
+            )
+        while line := self._file.readline():
+            place = self._file.tell() - len(line)
+            if not line.endswith(b"\n"):  # cut by the interruption
+                self._file.truncate(place)
+                break
+            content = self._parsed(line)
+            if set(content) != {"key", "result"}:
+                raise self._foreign()
+            self._places[content["key"]] = place
+
+    def __contains__(self, key):
+        return key in self._places
+
+    def __getitem__(self, key):
+        self._file.seek(self._places[key])
+        return self._parsed(self._file.readline())["result"]
+
+    def __setitem__(self, key, result):
+        self._places[key] = self._append({"key": key, "result": result})
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._file.close()
+
+    def _append(self, content):
+        """Place of a line that is written at the end."""
+        place = self._file.seek(0, os.SEEK_END)
+        self._file.write(json.dumps(content, allow_nan=False).encode() + b"\n")
+        self._file.flush()
+        return place
+
+    def _parsed(self, line):
+        try:
+            content = json.loads(line)
+        except ValueError:
+            content = None
+        if not isinstance(content, dict):
+            raise self._foreign()
+        return content
+
+    def _foreign(self):
+        return InputError(f"{self._path}: holds something else than results of this tool; name another file.")
+
+
+def state_of(path):
+    """What changes when a file or a folder of files does: a text; of None "None". Raises OSError."""
+    if path is None:
+        return "None"
+    path = Path(path).absolute()
+    files = [path, *(inside for inside in sorted(path.rglob("*")) if path.is_dir())]
+    return f"{path} {sum(file.stat().st_size for file in files if file.is_file())} {max(file.stat().st_mtime_ns for file in files)}"
+
+
+def asked_of(args, besides=(), files=()):
+    """What was asked of a command: {option: value}, JSON. besides : names of options that do not matter; files : of those that name
+    files, whose content counts. Raises OSError."""
+    asked = {name: value for name, value in vars(args).items() if name not in besides}
+    named = {name: Path(asked[name]) for name in files if asked[name] and Path(asked[name]).is_file()}
+    return asked | {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in named.items()}
