@@ -5,6 +5,7 @@ import sys
 
 from .. import cli
 from ..benchmark.figures import as_json, table
+from ..benchmark.peer import Peer
 from ..benchmark.suite import PARTS, measure
 
 DESCRIPTION = """Measure on this machine, in this run: the compiled core, whole recordings, both nodes live, several
@@ -15,6 +16,8 @@ tags, and replays. Figures are medians with their quartiles, beside their target
   nodes   time to ready, CPU, memory, latency and losses of both nodes at 1 kHz IMU + 400 Hz TDOA
   tags    the same for 1 to 8 tags, and for 30 at 100 Hz, in localization_nodes; all tags hear the same streams
   replay  how fast a bag goes through both nodes without loss
+
+With --peer, another filter, e.g. that of a firmware, runs over the same events in turn with ours, and the ratio is printed.
 
 Real nodes run in a ROS domain of their own. Whatever else the machine does shows in the figures, above all in the
 latencies: what others used is printed. The last example keeps them away.
@@ -34,6 +37,7 @@ def parser():
         "bench",
         "bench --json bench.json",
         "bench --quick --only core offline",
+        "bench --only core --peer libpeer.so",
         "bench --only offline --model network.onnx",
         "sudo -E env PATH=$PATH chrt --fifo 10 bench --only nodes tags",
     )
@@ -41,6 +45,10 @@ def parser():
     add("--quick", action="store_true", help="fewer repetitions, shorter flights, fewer cases")
     add("--only", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=f"of {', '.join(PARTS)} (default: all)")
     add("--model", metavar="FILE", help="ONNX bias network for offline (default: the one shipped)")
+    add(
+        "--peer", metavar="LIBRARY",
+        help="measure this shared library of another filter beside ours, event by event (what it exports: docs/speed.md)",
+    )  # fmt: skip
     add(
         "--out", metavar="DIR", type=Path, default=Path("out/bench"),
         help="for the bags and the output of the nodes (default: out/bench)",
@@ -51,7 +59,8 @@ def parser():
 
 def _bench(args):
     cli.check_folders(args.json)
-    machine, figures = measure(args.only, args.out, args.quick, args.model)
+    other = None if args.peer is None else Peer(args.peer)
+    machine, figures = measure(args.only, args.out, args.quick, args.model, other)
     print(f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy {machine['numpy']}")
     print(f"meanwhile others used {machine['others']:.0%} of its CPU time, its host {machine['stolen']:.0%}")
     print("\n".join(table(figures)))

@@ -22,7 +22,7 @@ could be, adds what helps, and reports the error before and after on data that t
 Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
 assume with them; --config of evaluate) and report.html."""
 
-MOST = 500_000  # TDOAs; of 8 anchors they take 2 GB
+MOST = 300_000  # TDOAs; what they take: docs/speed.md
 
 
 def main(argv=None):

@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from .. import cli
-from ..studies import aids, crazyflie, noise, recalibrating, surveying
+from ..studies import aids, crazyflie, noise, recalibrating, scale, surveying
 from ..studies.checking import figures as checking, in_flight
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
@@ -23,6 +23,7 @@ STUDIES = {
     "noise": noise,
     "random-splits": splits,
     "recalibrating": recalibrating,
+    "scale": scale,
     "spin": spin,
     "surveying": surveying,
 }
@@ -41,6 +42,7 @@ of measured flights: flights/, util/, surveys/.
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
+  scale            processor time and memory over flights, anchors and effects (docs/speed.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
   surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
 """
@@ -71,6 +73,7 @@ def parser():
         "study noise --data DATA --split const1",
         "study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "study recalibrating --data DATA --only const1",
+        "study scale --out scale/",
         "study spin --out spin.png",
         "study surveying --data DATA --draws 5 --only const1",
     )

@@ -7,7 +7,7 @@ from .. import cli, options
 from ..training import labels as labelling, models, shrinking
 from ..training.plots import plot_curve
 
-MOST = 1_500_000  # TDOAs
+MOST = 1_500_000  # TDOAs; what they take: docs/speed.md
 
 
 def main(argv=None):

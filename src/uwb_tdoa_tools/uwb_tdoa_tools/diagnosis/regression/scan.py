@@ -44,6 +44,7 @@ class _Shapes:
         if view.cell is not None:
             used, cell = np.unique(view.cell[used], return_inverse=True)
             self.x = np.stack([np.bincount(cell, column) for column in self.x.T], axis=1) / np.bincount(cell)[:, None]
+        self.x = self.x.astype(np.float32)  # of all views together the most that a diagnosis holds
         self.rows = used + offset
 
 

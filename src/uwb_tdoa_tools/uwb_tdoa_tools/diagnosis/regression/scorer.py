@@ -10,6 +10,8 @@ import numpy as np
 
 from .fit import prior_sizes, solve
 
+AT_ONCE = 128  # columns whose products with the base are made together, so that a copy of all of them is never held
+
 
 @dataclass(frozen=True, eq=False)
 class Gain:
@@ -29,9 +31,9 @@ class Scorer:
         judged."""
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
         self._size, self._base = dict(zip(table.channels, model.size)), np.arange(len(base))
-        x, root = table.matrix(list(self._place)), model.information(table)
+        columns, root = list(self._place), model.information(table)
         self._channels = table.present
-        self._parts = [self._part(x, table.y, root, table.rows_of(name)) for name in self._channels]
+        self._parts = [self._part(table, columns, root, table.rows_of(name)) for name in self._channels]
         self._sizes = prior_sizes(list(self._place))
         sizes = self._sizes[self._base]
         gram = sum(part.cross[:, self._base] for part in self._parts)
@@ -41,10 +43,15 @@ class Scorer:
         self._squares = [part.squares(beta, self._base) for part in self._parts]
         self._penalty = float(np.sum((beta / sizes) ** 2))
 
-    def _part(self, x, y, root, rows):
-        weighted = x[rows] * root[rows, None]
-        cross = x[rows][:, self._base].T @ weighted
-        return _Part(x[rows], weighted, cross, weighted.T @ y[rows], float(root[rows] @ y[rows] ** 2))
+    def _part(self, table, columns, root, rows):
+        root, y = root[rows], table.y[rows]
+        weighted = (table.matrix([columns[place] for place in self._base], rows) * root[:, None]).T
+        cross, vector = np.empty((len(self._base), len(columns))), np.empty(len(columns))
+        for first in range(0, len(columns), AT_ONCE):
+            some = slice(first, first + AT_ONCE)
+            x = table.matrix(columns[some], rows)
+            cross[:, some], vector[some] = weighted @ x, x.T @ (root * y)
+        return _Part(table, columns, rows, root, cross, vector, float(root @ y**2))
 
     def judge(self, columns):
         """Gain of having some Columns too; None if all are there already."""
@@ -76,16 +83,20 @@ class Scorer:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One channel: x, weighted (n, k); cross (base, k) and vector (k,): X' W X and X' W y; power : y' W y."""
+    """One channel: its rows in a Table of some columns, with weights root (n,); cross (base, k) and vector (k,): X' W X and X' W y;
+    power : y' W y."""
 
-    x: np.ndarray
-    weighted: np.ndarray
+    table: object
+    columns: list
+    rows: slice
+    root: np.ndarray
     cross: np.ndarray
     vector: np.ndarray
     power: float
 
     def gram(self, places):
-        return self.x[:, places].T @ self.weighted[:, places]
+        x = self.table.matrix([self.columns[place] for place in places], self.rows)
+        return x.T @ (x * self.root[:, None])
 
     def squares(self, beta, places, own=None):
         """Weighted sum of squares that beta (k,) of the columns at `places`, those of the base first, leaves. own : gram

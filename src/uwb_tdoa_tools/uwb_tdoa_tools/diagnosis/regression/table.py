@@ -15,7 +15,7 @@ class Table:
 
     channels : names; y (n,); channel (n,) place in `channels`; series (n,) int, different in every flight; block (n,) number of an independent
     block; flight (n,); t (n,) s since the start; count (n,) samples averaged; place (n, 3) m.
-    parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column: place in X}; x : X, (n, k).
+    parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column: (n,)}, X, whose columns tables share.
     """
 
     channels: tuple
@@ -29,7 +29,6 @@ class Table:
     place: np.ndarray
     parts: tuple
     columns: dict
-    x: np.ndarray
 
     @property
     def present(self):
@@ -46,13 +45,12 @@ class Table:
         place = self.channels.index(channel)
         return slice(*np.searchsorted(self.channel, [place, place + 1]))
 
-    def places(self, columns):
-        """Places in X of some Columns: (k,) int."""
-        return np.array([self.columns[column] for column in columns], dtype=int)
-
-    def matrix(self, columns):
-        """X of some Columns, (n, k)."""
-        return self.x[:, self.places(columns)]
+    def matrix(self, columns, rows=slice(None)):
+        """X of some Columns, (n, k), or some of its rows."""
+        out = np.empty((len(self.y[rows]), len(columns)), order="F")
+        for place, column in enumerate(columns):
+            out[:, place] = self.columns[column][rows]
+        return out
 
     def with_terms(self, terms):
         """A Table that has the columns of some Terms too, at the values that their effects have."""
@@ -61,19 +59,17 @@ class Table:
             effect, keys = wanted.setdefault(term.effect.identity, (term.effect, {}))
             keys.update((column.key, column) for column in term.columns if column not in self.columns)
         wanted = {identity: item for identity, item in wanted.items() if item[1]}
-        new = [column for _, keys in wanted.values() for column in keys.values()]
-        if not new:
+        if not wanted:
             return self
-        x, first = np.zeros((len(self.y), len(new))), 0
+        columns = dict(self.columns)
         for effect, keys in wanted.values():
-            columns = slice(first, first + len(keys))
+            x = np.zeros((len(self.y), len(keys)), order="F")
             for _, channel, row, part in self.parts:
                 if channel in effect.channels:
                     values = part.columns(effect, tuple(keys))
-                    x[row : row + len(values), columns] = np.nan_to_num(values)
-            first = columns.stop
-        places = {column: len(self.columns) + k for k, column in enumerate(new)}
-        return replace(self, columns={**self.columns, **places}, x=np.hstack([self.x, x]))
+                    x[row : row + len(values)] = np.nan_to_num(values)
+            columns.update(zip(keys.values(), x.T))
+        return replace(self, columns=columns)
 
     def with_contribution(self, effects):
         """A Table whose y also holds what Effects, at their values, contribute; it has their columns."""
@@ -106,4 +102,4 @@ def table_of(residuals):
             for key in ("y", "series", "t", "count", "place"):
                 pieces[key].append(getattr(part, key))
     merged = {key: np.concatenate(several) for key, several in pieces.items()}
-    return Table(channels, **merged, parts=tuple(parts), columns={}, x=np.empty((len(merged["y"]), 0)))
+    return Table(channels, **merged, parts=tuple(parts), columns={})

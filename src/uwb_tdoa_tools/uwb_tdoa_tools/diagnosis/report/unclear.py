@@ -83,6 +83,6 @@ def _told_by(item, diagnosis):
 def _contribution(item, diagnosis):
     """Largest contribution to any row: of the combination, and of its parts alone."""
     table = diagnosis.attribution.selection.table
-    places = {(column.effect[0], column.key): place for column, place in table.columns.items()}
-    x = table.x[:, [places[item.effect, key] for key in item.direction]]
+    columns = {(column.effect[0], column.key): column for column in table.columns}
+    x = table.matrix([columns[item.effect, key] for key in item.direction])
     return np.abs(x @ list(item.direction.values())).max(), np.abs(x).max()

@@ -1,0 +1,118 @@
+"""The compiled core beside somebody else's filter, in one run: a shared library that the user built (docs/speed.md).
+
+It exports, in C:
+
+    typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
+    int32_t tdoa_peer_version(void);                                           // VERSION
+    void tdoa_peer_start(const double *anchors, int32_t count, const double *p, const double *q);
+    void tdoa_peer_run(const tdoa_peer_event *events, int32_t count);
+    void tdoa_peer_position(double *p);
+
+An event with a < 0 is an inertial sample (s, rad/s, m/s^2), every other one a TDOA d = |p - b| - |p - a|, m, of the anchors in
+rows a and b of `anchors` (count, 3), m. The filter starts at p, m, with the attitude q, x y z w, body to world, at rest.
+"""
+
+import ctypes
+from pathlib import Path
+import time
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.config import FilterConfig
+
+from .core import BEFORE, MEASURED, RARELY, Core
+from .figures import Figure
+from .flights import make_flight
+
+VERSION = 1
+EVENT = np.dtype([("t", float), ("gyro", float, 3), ("accel", float, 3), ("d", float), ("a", np.int32), ("b", np.int32)])
+SYMBOLS = ("version", "start", "run", "position")
+REPEATS = 41
+
+
+class Peer:
+    """The library at a path. name : of its file. Raises InputError if it cannot be loaded, or is not what this module says."""
+
+    def __init__(self, path):
+        self.name = Path(path).name
+        try:
+            library = ctypes.CDLL(str(Path(path).absolute()))
+        except OSError as error:
+            raise InputError(f"--peer: {path} cannot be loaded as a shared library ({error}); build it anew on this machine.") from error
+        functions = {name: getattr(library, f"tdoa_peer_{name}", None) for name in SYMBOLS}
+        missing = [f"tdoa_peer_{name}" for name, function in functions.items() if function is None]
+        if missing:
+            raise InputError(f"--peer: {path} does not export {missing[0]}; add it as docs/speed.md shows.")
+        self._version, self._start, self._run, self._position = functions.values()
+        self._version.restype = ctypes.c_int32
+        version = self._version()
+        if version != VERSION:
+            raise InputError(f"--peer: {path} is of version {version} of the interface, this is {VERSION}; build it for that.")
+
+    def start(self, anchors, p, q):
+        """Begin anew at p (3,) m, q (4,) x y z w, among anchors (n, 3) m."""
+        self._anchors = np.ascontiguousarray(anchors, dtype=float)  # for as long as it may look at them
+        self._start(_pointer(self._anchors), ctypes.c_int32(len(anchors)), _pointer(np.array(p, float)), _pointer(np.array(q, float)))
+
+    def run(self, events):
+        """s that events (n,) of EVENT take."""
+        data, count = _pointer(events), ctypes.c_int32(len(events))
+        began = time.perf_counter()
+        self._run(data, count)
+        return time.perf_counter() - began
+
+    def position(self):
+        """(3,) m."""
+        out = np.full(3, np.nan)
+        self._position(_pointer(out))
+        return out
+
+
+def events_of(flight, begin, end):
+    """(inertial samples, the same and TDOAs) of a Flight from begin to end, s: two arrays of EVENT in order of their stamps, each
+    TDOA at that of the sample before, as `Core` measures ours."""
+    imu, tdoa = flight.imu, flight.tdoa
+    samples, ranges = np.zeros(len(imu), EVENT), np.zeros(len(tdoa), EVENT)
+    samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
+    ranges["t"] = imu.t[np.maximum(np.searchsorted(imu.t, tdoa.t, side="right") - 1, 0)]
+    ranges["a"], ranges["b"], ranges["d"] = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b), tdoa.d
+    samples, ranges = (part[(part["t"] >= begin) & (part["t"] < end)] for part in (samples, ranges))
+    both = np.concatenate([samples, ranges])
+    return samples, both[np.argsort(both["t"], kind="stable")]
+
+
+def measure(progress, peer, quick=False):
+    """Generator of Figures: ours and those of a Peer, run in turn. progress(text)."""
+    repeats = 9 if quick else REPEATS
+    progress("peer")
+    flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False)
+    core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
+    core.run(BEFORE, core.memory)
+    begin, end, truth = flight.imu.t[0] + BEFORE, flight.imu.t[-1], flight.truth
+    samples, both = events_of(flight, begin, np.inf)
+    first = int(np.searchsorted(truth.t, begin))
+
+    def timed(events):
+        peer.start(flight.anchors.positions, truth.p[first], truth.q[first])
+        return peer.run(events)
+
+    seconds = np.array([[core.timed(False), core.timed(True), timed(samples), timed(both)] for _ in range(repeats + 1)])[1:]
+    off = float(np.linalg.norm(peer.position() - [np.interp(end, truth.t, truth.p[:, k]) for k in range(3)]))
+    section = f"compiled core beside {peer.name}, 8 anchors"
+    ours, theirs = (_per_event(some, len(samples), len(both) - len(samples)) for some in (seconds[:, :2], seconds[:, 2:]))
+    for name, one, other in zip(("prediction", "robust update", "both"), ours, theirs):
+        yield Figure.of(section, f"{name}, ours", "us", one)
+        yield Figure.of(section, f"{name}, the other's", "us", other)
+        yield Figure.of(section, f"{name}, ours over the other's", "ratio", one / other)
+    yield Figure.of(section, "the other's position at the end, off by", "m", off)
+
+
+def _per_event(seconds, samples, tdoas):
+    """us per prediction, update, and both, (repeats,) each. seconds : (repeats, 2), without TDOAs and with."""
+    prediction, update = 1e6 * seconds[:, 0] / samples, 1e6 * (seconds[:, 1] - seconds[:, 0]) / tdoas
+    return prediction, update, prediction + update
+
+
+def _pointer(array):
+    return array.ctypes.data_as(ctypes.c_void_p)
