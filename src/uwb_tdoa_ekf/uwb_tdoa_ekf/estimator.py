@@ -95,7 +95,7 @@ class Estimator:
         self._gates, self._orders = [StampGate() for _ in STREAMS], [Order() for _ in STREAMS]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
         self._poses = []  # (1,) of POSE, told and not reached yet
-        self._fed_imu = [np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE)]  # lately, after the one before them
+        self._fed_imu = np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE), NONE[IMU_STREAM]  # the last; those after it
 
     @property
     def running(self):
@@ -143,7 +143,7 @@ class Estimator:
         """Take corrected TDOAs in the order of their arrival: t (n,) s; a, b (n,) anchor ids; d (n,) m; variance (n,) m^2, of
         what is known beyond tdoa_std. Or one: numbers."""
         t, a, b, d = map(np.atleast_1d, (t, a, b, d))
-        rows = structured(TDOA, t, self.anchors.index(a), self.anchors.index(b), d, np.broadcast_to(variance, d.shape))
+        rows = structured(TDOA, t, self.anchors.index(a), self.anchors.index(b), d, variance)
         usable = usable_all(rows["a"], rows["b"], rows["d"], rows["variance"], self.anchors.positions) & np.isfinite(t)
         refused = zip(*(column[~usable].tolist() for column in (t, a, b))) if not usable.all() else ()
         self._refused += [(*one, INVALID) for one in refused]
@@ -219,7 +219,7 @@ class Estimator:
         """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample
         is near."""
         out = np.empty((len(t), 3))
-        _look_up(np.ascontiguousarray(t), np.concatenate(self._fed_imu), self.config.imu_timeout, out)
+        _look_up(np.ascontiguousarray(t), *self._fed_imu, self.config.imu_timeout, out)
         return out
 
     def _add(self, stream, rows, usable):
@@ -328,7 +328,8 @@ class Estimator:
         for part in (imu, tdoa, felt):
             if len(part):
                 self._fed_until = max(self._fed_until, part["t"][-1])
-        self._fed_imu = [self._fed_imu[-1][-1:], imu] if len(imu) else [self._fed_imu[-1][-1:]]
+        before, lately = self._fed_imu
+        self._fed_imu = lately[-1:] if len(lately) else before, imu
         self.counts["imu_used"] += len(imu)
         out = Odometry.from_rows(odometry), self._residuals(tdoa, outcome)
         self._monitor.add(*out)
@@ -350,15 +351,19 @@ class Estimator:
 
 
 @compiled
-def _look_up(t, samples, timeout, out):
-    """Rates of the last of IMU_SAMPLE, in the order of their stamps, up to each of t (n,) s, NaN where it is older than that."""
+def _look_up(t, before, lately, timeout, out):
+    """Rates of the last of IMU_SAMPLE, one `before` and those that follow in the order of their stamps, up to each of t (n,) s, NaN
+    where it is older than that."""
     for i in range(len(t)):
-        out[i] = np.nan
-        for k in range(len(samples) - 1, -1, -1):
-            if samples[k].t <= t[i]:
-                if t[i] - samples[k].t <= timeout:
-                    out[i] = samples[k].gyro
+        sample = before[0]
+        for k in range(len(lately) - 1, -1, -1):
+            if lately[k].t <= t[i]:
+                sample = lately[k]
                 break
+        if 0.0 <= t[i] - sample.t <= timeout:
+            out[i] = sample.gyro
+        else:
+            out[i] = np.nan
 
 
 NONE = [np.empty(0, kind) for kind in KINDS]

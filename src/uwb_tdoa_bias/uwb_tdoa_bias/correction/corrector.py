@@ -57,7 +57,7 @@ class Corrector:
     def add_pose(self, t, p, q, yaw_std=0.0):
         """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, yaw_std rad: deviation of its rotation about
         the vertical; or several: (k,), (k, 3), (k, 4), (k,). Stamps must rise; others are ignored."""
-        self._poses.add(t, p, q, np.broadcast_to(yaw_std, np.shape(t)))
+        self._poses.add(t, p, q, yaw_std if np.shape(yaw_std) == np.shape(t) else np.broadcast_to(yaw_std, np.shape(t)))
 
     def ready(self, before):
         """True if no pose that is still to come can change the correction of a measurement that follows one stamped so."""
