@@ -8,9 +8,9 @@ from ..live.run import accounts, run_live
 from .figures import Figure
 from .flights import make_flight
 
-RATES = (4.0, 8.0, 16.0, 32.0, 64.0)
+RATES = (4.0, 10.0, 16.0, 32.0, 64.0)
 KEPT_UP = 0.8  # of the rate that was asked for; a run that is slower than that has found the limit
-NEEDED = 4.0
+NEEDED = 10.0
 SECTION = "replay of a bag through both nodes, reliable links, odometry recorded"
 
 
@@ -25,8 +25,8 @@ def measure(progress, folder, quick=False):
         became, reached = accounts(live.ekf, flight), speed(live.recorded)
         lost = became["lost"] + became["imu_lost"]
         late = became["late"] + became["imu_late"]
-        yield Figure.of(SECTION, f"lost at rate {rate:g}", "messages", lost, 0.0 if rate == NEEDED else None)
-        yield Figure.of(SECTION, f"too late at rate {rate:g}", "messages", late, 0.0 if rate == NEEDED else None)
+        yield Figure.of(SECTION, f"lost at rate {rate:g}", "messages", lost, 0.0 if rate <= NEEDED else None)
+        yield Figure.of(SECTION, f"too late at rate {rate:g}", "messages", late, 0.0 if rate <= NEEDED else None)
         yield Figure.of(SECTION, f"reached at rate {rate:g}", "s of flight/s", reached)
         if lost or late:
             break
