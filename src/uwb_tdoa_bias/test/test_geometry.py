@@ -3,7 +3,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 from random_samples import random_rotation
 
-from uwb_tdoa_bias.foundation.geometry import linearized_tdoa, ranges, rotate, tdoa, tdoa_jacobian
+from uwb_tdoa_bias.foundation.geometry import linearized_tdoa, ranges, rotate, rotate_each, tdoa, tdoa_each, tdoa_jacobian
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -83,3 +83,22 @@ def test_rotate_is_the_rotation_of_scipy(seed):
     turn, v, out = random_rotation(rng), rng.uniform(-10.0, 10.0, 3), np.empty(3)
     rotate(turn.as_quat(), v, out)
     np.testing.assert_allclose(out, turn.apply(v), atol=1e-12)
+
+
+@given(seeds)
+def test_one_vector_turned_by_many_attitudes(seed):
+    rng = np.random.default_rng(seed)
+    turns, v = [random_rotation(rng) for _ in range(4)], rng.normal(size=3)
+    q = np.array([turn.as_quat() for turn in turns]) * rng.uniform(0.5, 2.0, (4, 1))  # of any length
+    out = np.empty((6, 3))
+    rotate_each(np.concatenate([q, [[0.0, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0]]]), v, out)
+    np.testing.assert_allclose(out[:4], [turn.apply(v) for turn in turns], atol=1e-12)
+    assert np.isnan(out[4:]).all()
+
+
+@given(seeds)
+def test_many_at_once_have_the_same_bits(seed):
+    p, a, b = np.random.default_rng(seed).uniform(-10.0, 10.0, (3, 7, 3))
+    out = np.empty(7)
+    tdoa_each(p, a, b, out)
+    np.testing.assert_array_equal(out, tdoa(p, a, b))

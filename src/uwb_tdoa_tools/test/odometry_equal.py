@@ -4,7 +4,7 @@
     python odometry_equal.py --compare before.npz FOLDER     # with the new ones: prints the largest difference of each flight
 
 Each raw flight goes through the offline engine, and as it would come live, through an Estimator in batches of up to 20 messages.
-With --network the shipped one corrects it. Exit code 1 if a position differs by more than --limit (default 1e-9 m).
+With --network or --effects it is corrected, off line alone. Exit code 1 if a position differs by more than --limit (default 1e-9 m).
 """
 
 import argparse
@@ -15,15 +15,15 @@ import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network
+from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers import inputs
 
 
-def offline(flight, network):
+def offline(flight, effects, network):
     """(t, p) of the offline engine."""
-    corrector = Corrector(flight.anchors, network=load_network(SHIPPED)) if network else None
-    odometry = run_offline(flight, None, corrector).odometry
+    odometry = run_offline(flight, None, Corrector(flight.anchors, effects, network)).odometry
     return odometry.t, odometry.p
 
 
@@ -53,12 +53,16 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--save", type=Path)
     parser.add_argument("--compare", type=Path)
-    parser.add_argument("--network", action="store_true")
+    parser.add_argument("--network", action="store_true", help="the shipped one")
+    parser.add_argument("--effects", help="effects.yaml")
     parser.add_argument("--limit", type=float, default=1e-9, help="m")
     args = parser.parse_args()
+    effects = EffectSet.from_yaml(args.effects) if args.effects else None
+    network = load_network(SHIPPED) if args.network else None
     before, made, worst = np.load(args.compare) if args.compare else {}, {}, 0.0
     for flight in inputs.Reading(args.folder / "surveys").flights([args.folder / "flights"]):
-        for way, (t, p) in {"offline": offline(flight, args.network), **({} if args.network else {"live": live(flight)})}.items():
+        ways = {"offline": offline(flight, effects, network)} | ({} if effects or network else {"live": live(flight)})
+        for way, (t, p) in ways.items():
             name = f"{flight.name}, {way}"
             made[f"{name}, t"], made[name] = t, p
             if args.compare:

@@ -94,9 +94,10 @@ class Corrector:
         unknown = samples.yaw_std > LARGEST_YAW_STD
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
-            each = np.stack([turning.bias(replace(samples, q=rotated_in_yaw(samples.q, k))) for k in range(4)])
-            bias = np.where(unknown, bias - turning.bias(samples) + each.mean(axis=0), bias)
-            noise = np.where(unknown, np.hypot(noise, each.std(axis=0)), noise)
+            headings = np.concatenate([samples.q, *(rotated_in_yaw(samples.q, k) for k in range(4))])
+            known, *each = turning.bias(replace(samples.repeated(5), q=headings)).reshape(5, -1)
+            bias = np.where(unknown, bias - known + np.mean(each, axis=0), bias)
+            noise = np.where(unknown, np.hypot(noise, np.std(each, axis=0)), noise)
         return bias, noise
 
     def samples(self, t, a, b):

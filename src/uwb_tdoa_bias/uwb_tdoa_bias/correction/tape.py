@@ -222,6 +222,10 @@ def _operate(o, room, n):
     if code == MATMUL:
         _multiply(room, to, a, o.a_row, b, rows, o.inner, columns)
         return
+    step_a, step_b = _step(o.a_row, o.a_column, columns), _step(o.b_row, o.b_column, columns)
+    if IDENTITY < code < GATHER and o.row == columns and step_a >= 0 and step_b >= 0 and (code != EXP or step_a == 1):
+        _all_rows(code, room, a, step_a, b, step_b, room[to : to + rows * columns])
+        return
     for i in range(rows):
         of_a, of_b = a + i * o.a_row, b + i * o.b_row
         row = room[to + i * o.row : to + i * o.row + columns]
@@ -239,6 +243,26 @@ def _operate(o, room, n):
                 row[j] = _unary(code, room[of_a + j * o.a_column])
         else:
             _pairwise(code, room, of_a, o.a_column, of_b, o.b_column, row)
+
+
+@compiled
+def _step(row, column, columns):
+    """From one number of an operand to the next, over all rows: 1 if they lie side by side, 0 if it is the same; else -1."""
+    if row == columns and (column == 1 or columns == 1):
+        return 1
+    return 0 if row == 0 and column == 0 else -1
+
+
+@compiled
+def _all_rows(code, room, a, step_a, b, step_b, out):
+    """Of operands whose rows lie side by side, too: what a row costs beside its numbers is paid once."""
+    if code >= ADD:
+        _pairwise(code, room, a, step_a, b, step_b, out)
+    elif code == EXP:
+        _exponentials(room[a : a + len(out)], out)
+    else:
+        for j in range(len(out)):
+            out[j] = _unary(code, room[a + j * step_a])
 
 
 @contracted

@@ -46,6 +46,11 @@ class Samples:
     def __len__(self):
         return len(self.t)
 
+    def repeated(self, times):
+        """Samples of the same TDOAs, all of them so many times one after the other."""
+        kept = {"anchors": self.anchors, "start": self.start}
+        return Samples(**{name: _repeated(value, times) for name, value in vars(self).items() if name not in kept}, **kept)
+
     @property
     def position_a(self):
         """(n, 3) antennas of the first anchors, m."""
@@ -55,6 +60,16 @@ class Samples:
     def position_b(self):
         """(n, 3) antennas of the second anchors, m."""
         return self.anchors.positions[self.b]
+
+
+def _repeated(value, times):
+    if value is None:
+        return None
+    if isinstance(value, dict):
+        return {name: _repeated(one, times) for name, one in value.items()}
+    if isinstance(value, Motion):
+        return Motion(*(_repeated(one, times) for one in vars(value).values()))
+    return np.concatenate([value] * times)
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from ..foundation.geometry import tdoa, tdoa_jacobian
-from ..foundation.later import rotations
+from ..foundation.geometry import rotate_each, tdoa_each, tdoa_jacobian
 from .base import Effect
 from .wording import listed, significant, size
 
@@ -34,7 +33,10 @@ class TagLeverArm(Effect):
 
     def bias(self, samples):
         a, b = samples.position_a, samples.position_b
-        return tdoa(samples.p + _rotate(samples.q, self._arm()), a, b) - tdoa(samples.p, a, b)
+        of_antenna, of_body = np.empty(len(samples)), np.empty(len(samples))
+        tdoa_each(samples.p + _rotate(samples.q, self._arm()), a, b, of_antenna)
+        tdoa_each(samples.p, a, b, of_body)
+        return of_antenna - of_body
 
     def regressors(self, samples, keys):
         antenna = samples.p + _rotate(samples.q, self._arm())
@@ -54,8 +56,6 @@ class TagLeverArm(Effect):
 
 def _rotate(q, v):
     """R(q) v for (n, 4) quaternions x y z w, NaN where q is NaN; (n, 3)."""
-    known = np.isfinite(q).all(axis=1)
-    out = np.full((len(q), 3), np.nan)
-    if known.any():
-        out[known] = rotations.Rotation.from_quat(q[known]).apply(v)
+    out = np.empty((len(q), 3))
+    rotate_each(np.ascontiguousarray(q, dtype=float), v, out)
     return out

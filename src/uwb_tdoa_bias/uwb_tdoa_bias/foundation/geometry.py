@@ -39,6 +39,15 @@ def tdoa_jacobian(p, a, b):
 
 
 @compiled
+def tdoa_each(p, a, b, out):
+    """`tdoa` (n,) m of p, a, b (n, 3), compiled: for arrays so short that what numpy takes for each operation is most of it."""
+    for i in range(len(p)):
+        ax, ay, az = p[i, 0] - a[i, 0], p[i, 1] - a[i, 1], p[i, 2] - a[i, 2]
+        bx, by, bz = p[i, 0] - b[i, 0], p[i, 1] - b[i, 1], p[i, 2] - b[i, 2]
+        out[i] = math.sqrt(bx * bx + by * by + bz * bz) - math.sqrt(ax * ax + ay * ay + az * az)
+
+
+@compiled
 def linearized_tdoa(p, a, b, jacobian):
     """`tdoa` (m) of p, a, b (3,), compiled; writes `tdoa_jacobian` to `jacobian` (3,)."""
     ax, ay, az = p[0] - a[0], p[1] - a[1], p[2] - a[2]
@@ -63,3 +72,16 @@ def rotate(q, v, out):
     out[0] = v[0] + w * tx + y * tz - z * ty
     out[1] = v[1] + w * ty + z * tx - x * tz
     out[2] = v[2] + w * tz + x * ty - y * tx
+
+
+@compiled
+def rotate_each(q, v, out):
+    """out = R(q) v for quaternions q (n, 4) x y z w, of any length, and one v (3,): (n, 3); NaN where q is not finite, or zero."""
+    unit = np.empty(4)
+    for i in range(len(q)):
+        length = math.sqrt(q[i, 0] ** 2 + q[i, 1] ** 2 + q[i, 2] ** 2 + q[i, 3] ** 2)
+        if length > 0.0 and length < np.inf:
+            unit[:] = q[i] / length
+            rotate(unit, v, out[i])
+        else:
+            out[i] = np.nan
