@@ -151,19 +151,20 @@ def test_several_flights_are_pooled(bag, tmp_path, capsys):
     assert "2 pooled" in out and "diverged 0" in out
 
 
-def test_an_interrupted_run_over_many_goes_on_where_it_was(flight, tmp_path, capsys):
-    bags = [tmp_path / name for name in ("one", "two", "three")]
+def test_an_interrupted_run_over_many_goes_on_where_it_was(tmp_path, capsys):
+    short = simulate(SimulationConfig(seed=2, duration=4.0, start_in_air=True, imu_rate=100.0, truth_rate=50.0, protocol="tdoa3"))
+    bags, kept, alone = [tmp_path / name for name in ("one", "two", "three")], tmp_path / "kept", ["--jobs", "1"]
     for bag in bags:
-        write_bag(flight, bag)
-    whole, kept = report([*bags, "--no-bias"], tmp_path), tmp_path / "kept"
-    assert main([*map(str, bags[:2]), "--no-bias", "--resume", str(kept)]) == 0
+        write_bag(short, bag)
+    whole = report([*bags, "--no-bias", *alone], tmp_path)
+    assert main([*map(str, bags[:2]), "--no-bias", "--resume", str(kept), *alone]) == 0
     first = kept.read_bytes()
     kept.write_bytes(first[:-20])  # the second was being written
     capsys.readouterr()
-    assert report([*bags, "--no-bias", "--resume", kept], tmp_path) == whole
+    assert report([*bags, "--no-bias", "--resume", kept, *alone], tmp_path) == whole
     assert "holds 1 of 3 flights; going on with the others" in capsys.readouterr().err
     assert kept.read_bytes().startswith(first)
-    assert report([*bags, "--no-bias", "--resume", kept], tmp_path) == whole
+    assert report([*bags, "--no-bias", "--resume", kept, *alone], tmp_path) == whole
     assert "holds 3 of 3 flights" in capsys.readouterr().err
     assert main([*map(str, bags), "--smooth", "--resume", str(kept)]) == 2
     assert "made with another no_bias and smooth" in capsys.readouterr().err
