@@ -6,7 +6,7 @@ place of the shifts and delays that it looks like, and the position gets worse. 
 applied then.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -111,5 +111,6 @@ def merged(base, found, selection):
 
 def _rows(table, chosen):
     """Table of some rows, (n,) bool, with the columns that it has."""
-    each = ("y", "channel", "series", "block", "flight", "t", "count", "place", "x")
-    return replace(table, **{field.name: getattr(table, field.name)[chosen] for field in fields(table) if field.name in each})
+    each = ("y", "channel", "series", "block", "flight", "t", "count", "place")
+    arrays = {name: getattr(table, name)[chosen] for name in each}
+    return replace(table, **arrays, columns={column: values[chosen] for column, values in table.columns.items()})
