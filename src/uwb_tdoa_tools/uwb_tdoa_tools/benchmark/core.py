@@ -15,7 +15,7 @@ from .flights import make_flight
 ANCHORS = (4, 8, 16, 32, 64)
 BEFORE, MEASURED = 3.0, 4.0  # s of a flight: until it is measured, and measured
 RARELY = 1e-3  # Hz of odometry: the core alone is measured
-TARGET = 2.5  # us of one prediction and one robust update
+TARGET = 1.5  # us of one prediction and one robust update
 OF_AID = 2.0  # us, of one height, pressure or velocity
 NOISES = {"height": 0.01, "pressure": 0.1, "velocity": 0.05}  # m, m, m/s
 SECTION = "compiled core, one core"

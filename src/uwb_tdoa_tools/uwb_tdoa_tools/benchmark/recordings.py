@@ -14,9 +14,9 @@ from .figures import Figure
 from .flights import make_flight
 
 SECONDS = 45.0
-TARGET = 0.35  # s for such a flight
+TARGET, TARGET_CORRECTED = 0.1, 0.2  # s for such a flight, without and with corrections
 ANCHORS = (4, 16, 32, 64)
-PREDICTION_TARGET = 30.0  # us
+CORRECTION_TARGET = 12.0  # us, of one TDOA alone
 BATCHES = (1, 4, 16)  # TDOAs that arrive together
 
 
@@ -43,16 +43,17 @@ def measure(progress, quick=False, model=None):
         progress(f"recording, {name}")
         function(flight, None, corrector)  # compiles, or loads, what the ways before it did not need
         taken = [_seconds(function, flight, None, corrector) for _ in range(repeats)]
-        yield Figure.of(section, name, "s", taken, None if function is smooth else TARGET)
+        target = TARGET if corrector is None else TARGET_CORRECTED
+        yield Figure.of(section, name, "s", taken, None if function is smooth else target)
         if corrector is None and function is run_offline:
             yield Figure.of(section, "the same per second of flight", "ms/s", [1e3 * s / SECONDS for s in taken])
     progress("single TDOAs")
     name = f"prediction by the network ({network.name}), 1 at a time"
-    yield Figure.of(section, name, "us", _per_prediction(flight, network, repeats), PREDICTION_TARGET)
+    yield Figure.of(section, name, "us", _per_prediction(flight, network, repeats))
     for batch in BATCHES:
         name = f"correction of a TDOA by the network ({network.name}), {batch} at a time"
         corrector = Corrector(flight.anchors, network=network)
-        yield Figure.of(section, name, "us", _per_tdoa(flight, corrector, batch, repeats))
+        yield Figure.of(section, name, "us", _per_tdoa(flight, corrector, batch, repeats), CORRECTION_TARGET if batch == 1 else None)
     for anchors in () if quick else ANCHORS:
         progress(f"recording, {anchors} anchors")
         flight = make_flight(SECONDS, anchors)
