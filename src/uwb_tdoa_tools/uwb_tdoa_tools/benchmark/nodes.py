@@ -123,7 +123,6 @@ def fly(flight, folder, namespaces, starts):
         out.memory = {title: memory(processes.pid(title)) for title in out.ready}
         diagnostics.forget()
         wait(SETTLE_LIMIT, "the nodes to finish", processes, node, lambda: source.take() or diagnostics.is_settled())
-        source.take()  # what they said before they said that they have finished
         for title in out.ready:
             processes.stop(title)
     times = np.array([t for t, _, _ in samples])

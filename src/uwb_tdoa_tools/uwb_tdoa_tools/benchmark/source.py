@@ -1,5 +1,6 @@
 """The surroundings of the nodes: publishes a flight in real time and takes the odometry that comes back."""
 
+from functools import partial
 import struct
 import time
 
@@ -29,12 +30,11 @@ class Source:
             kind: ros.publish_stream(node, kind, topic) for kind, topic in ((Imu, "/imu/data"), (Tdoa, "/uwb/tdoa"))
         }
         self._anchors = node.create_publisher(AnchorArray, "/uwb/anchors", ANCHORS_QOS)
-        # never spun, so that no callback runs
-        self.subscriptions = [
-            node.create_subscription(Odometry, f"{space}/odometry", lambda _: None, ros.OUTPUT_QOS, raw=True)
-            for space in namespaces
-        ]
         self.received = [[] for _ in namespaces]  # (arrival, stamp), ns
+        self.subscriptions = [  # whose callbacks only run while somebody waits, before and after `play`
+            node.create_subscription(Odometry, f"{space}/odometry", partial(_keep, received), ros.OUTPUT_QOS, raw=True)
+            for space, received in zip(namespaces, self.received)
+        ]
 
     def play(self, flight, block, on_block, rounds=1):
         """Publish a Flight as fast as it was flown, so many times, one after the other. on_block(): called first, after every
@@ -71,8 +71,7 @@ class Source:
             with subscription.handle:
                 while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
                     data, information = taken
-                    second, nanosecond = HEADER_STAMP.unpack_from(data, 4)
-                    received.append((information["received_timestamp"], second * 10**9 + nanosecond))
+                    _keep(received, data, information["received_timestamp"])
 
     def _events(self, flight, epoch):
         """(due s, stamp ns of a TDOA or 0, publisher, bytes) in the order in which they are due."""
@@ -89,6 +88,11 @@ class Source:
             message.anchor_a, message.anchor_b, message.distance_difference = a, b, d
             events.append((t - imu.t[0], stamp, publisher, serialize_message(message)))
         return sorted(events, key=lambda event: event[0])
+
+
+def _keep(received, data, arrival=None):
+    second, nanosecond = HEADER_STAMP.unpack_from(data, 4)
+    received.append((arrival or time.time_ns(), second * 10**9 + nanosecond))
 
 
 def later(data, ns):
