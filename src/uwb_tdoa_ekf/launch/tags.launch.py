@@ -17,7 +17,7 @@ from uwb_tdoa_ekf.launching import pooled, tags, typed
 from uwb_tdoa_ekf.launching_actions import node_action, rviz_action
 
 OTHERS = {
-    "processes": ("0", "localization_nodes that share the tags, e.g. one for each core; 0: two nodes for each tag"),
+    "processes": ("", "localization_nodes that share the tags, e.g. one for each core; default: two nodes for each tag"),
     "use_sim_time": ("", "true for bags that are played with --clock"),
     "log_level": ("info", "debug, info, warn, error"),
     "rviz": ("false", "true opens RViz with the frames and the anchors"),
@@ -38,6 +38,6 @@ def _nodes(context):
     processes, sim_time, log_level, rviz = given
     values = typed({"use_sim_time": sim_time})
     starts = tags(path, values, log_level)
-    starts = pooled(starts, int(processes)) if int(processes) > 0 else starts
+    starts = pooled(starts, processes) if processes else starts
     actions = [node_action(Node, each) for each in starts]
     return actions + ([rviz_action(Node, values.get("use_sim_time", False))] if rviz == "true" else [])

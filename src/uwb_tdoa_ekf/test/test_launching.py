@@ -143,6 +143,8 @@ def test_several_tags_in_a_pool_of_processes(launched, tmp_path):
     assert told["/b/ekf_node"] == {"ros__parameters": {"body_frame": "b/base_link", "tdoa_std": 0.3} | shared}
     with pytest.raises(InputError, match="params_file: does not go with processes"):
         pooled([start("ekf_node", "a", {}, ["mine.yaml"])], 2)
+    with pytest.raises(InputError, match="processes: 'two' must be a whole number"):
+        launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"), processes="two")
 
 
 def test_a_bag_is_played_on_its_time(launched):

@@ -84,7 +84,9 @@ def tags(path, values, log_level="info"):
 
 def pooled(starts, processes):
     """The same of `tags` with so many localization_nodes instead of bias_nodes and ekf_nodes; what these are told is in a file that
-    is written for them. Raises InputError where a tag has a parameter file of its own."""
+    is written for them. processes : number, or its text. Raises InputError if it is none, or a tag has a parameter file of its own."""
+    if not str(processes).isdecimal() or not int(processes):
+        raise InputError(f"processes: {processes!r} must be a whole number above 0, or left out for two nodes for each tag.")
     members = [each for each in starts if each.executable in ("bias_node", "ekf_node")]
     if any(isinstance(part, str) for each in members for part in each.parameters):
         raise InputError("params_file: does not go with processes; write its values into the file of the tags.")
@@ -92,8 +94,8 @@ def pooled(starts, processes):
     with tempfile.NamedTemporaryFile("w", prefix="uwb_tdoa_tags_", suffix=".yaml", delete=False) as file:
         yaml.safe_dump(told, file)
     namespaces, out = list(dict.fromkeys(each.namespace for each in members)), [each for each in starts if each not in members]
-    for k in range(min(processes, len(namespaces))):
-        parameters, name = [file.name, {"tags": namespaces[k::processes]}], f"localization_node_{k + 1}"
+    for k in range(min(int(processes), len(namespaces))):
+        parameters, name = [file.name, {"tags": namespaces[k :: int(processes)]}], f"localization_node_{k + 1}"
         out.append(Start("uwb_tdoa_ekf", "localization_node", "", parameters, members[0].log_level, name))
     return out
 

@@ -1,5 +1,4 @@
-"""The streams of a node: everything that has arrived is taken together, in turns; to be woken up by
-an executor costs more than a message."""
+"""The streams of a node: all that has arrived is taken together, in turns; an executor's wake-up costs more than a message."""
 
 import time
 
