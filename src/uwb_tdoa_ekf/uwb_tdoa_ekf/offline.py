@@ -84,7 +84,7 @@ def run_offline(flight, config=None, corrector=None, records=None):
             monitor.judge(math.inf if until is None else until)
             memory.anchors["delay"], memory.anchors["delay_variance"] = monitor.delays
         if not corrector.idle and len(odometry):
-            _report_poses(odometry, corrector)
+            corrector.add_pose(*poses_of(Odometry.from_rows(odometry)))
     residuals = Residuals(tdoa.t, tdoa.a, tdoa.b, *(outcome[name] for name in RESIDUAL.names))
     of_aids = np.concatenate([*outcome_of_aids, _not_fed(1)])  # the last one for those that could not be fed
     of_aids = {stream: of_aids[place] for stream, place in places.items()}
@@ -126,8 +126,6 @@ def _batches(t, a, b, d, corrector, longest, period):
     return batches or [(known, None)]
 
 
-def _report_poses(odometry, corrector):
-    """Give the Corrector the poses of an (n,) of ODOMETRY, as bias_node gets them."""
-    x, covariance = odometry["x"], odometry["covariance"]
-    yaw_std = known_yaw_std(rotation_std(x[:, 6:10], covariance))
-    corrector.add_pose(odometry["t"], x[:, :3], x[:, 6:10], yaw_std)
+def poses_of(odometry):
+    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4), yaw_std (n,) rad)."""
+    return odometry.t, odometry.p, odometry.q, known_yaw_std(rotation_std(odometry.q, odometry.covariance))

@@ -4,10 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.offline import run_offline
 
 from ..checking.numbers import numbers
 from ..parallel import in_one_thread
@@ -82,13 +80,14 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     attribution = attribute(flights, reference, base, progress=saying("tracing residuals to effects"))
     # A finding stays one even if the filter does without it; it is only not added.
     trying = saying("running the filter without each")
+    baseline = judging.Baseline(base, config)
     if reference.judges:
-        kept = judging.useful(attribution, flights, base, config, trying)
+        kept = judging.useful(attribution, flights, baseline, trying)
     else:
         kept = judging.borne_out(attribution, flights, base, config, reference.constraints, trying)
     model = attribution.of(kept)
     effects = merged(base, usable(model.effects).effects, kept.selection)
-    judged = judging.judge(model, flights, holdout, base, effects, reference, config, saying("judging"))
+    judged = judging.judge(model, flights, holdout, baseline, effects, reference, saying("judging"))
     before, after, judged_on = judged
     refused = [*attribution.refused, *kept.refused]
     why_not = judging.why_not(before, after, max(reference.shift_std(flight.name).max() for flight in flights)) if reference.judges else None
@@ -98,7 +97,7 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         model = attribution.of(kept)
     remaining = [residuals(flight, reference, effects) for flight in flights]
     progress("judging")
-    runs = [run_offline(flight, config, Corrector(flight.anchors, base)) for flight in flights]
+    runs = [baseline.run(flight) for flight in flights]
     scores = [
         Score(flight.name, run.odometry, flight.truth, run.residuals)
         for flight, run in zip(flights, runs)

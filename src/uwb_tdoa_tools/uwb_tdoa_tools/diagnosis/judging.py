@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.rehearsal import RecordingCorrector, RehearsedCorrector
+from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.estimator import VERDICTS
-from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.offline import poses_of, run_offline
 
 from ..scoring.metrics import Score, as_json, pooled
 from .attribution import effects_of
@@ -34,11 +34,11 @@ USED = next(value for value, name in VERDICTS.items() if name == "used")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A flight to judge on, and an EffectSet that it took no part in fitting. span : (first, last) s, None for all."""
+    """A flight to judge on, and an EffectSet that it took no part in fitting. spans : ((first, last), ...) s, None for all."""
 
     flight: object
     effects: EffectSet
-    span: tuple | None = None
+    spans: tuple | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,44 +65,50 @@ def nothing(attribution, refused=()):
 
 
 def cross_fitted(attribution, flights, base, candidates, detections, most=None):
-    """[Case]: each flight, or each half of a single one, with the effects of `candidates` fitted to the others alone; `most` of
+    """[Case]: each flight, or each half of a single one, every other block, with the effects of `candidates` fitted to the others alone; `most` of
     them, evenly taken, if there are more."""
     table, selection = attribution.selection.table, attribution.selection
     if len(flights) > 1:
         parts = [(k, table.flight != k, None) for k in range(len(flights))]
     else:
-        start, middle = float(flights[0].tdoa.t[0]), 0.5 * (table.t.min() + table.t.max())
-        early = table.t < middle
-        spans = [(start + table.t.min(), start + middle), (start + middle, start + table.t.max())]
-        parts = [(0, ~early, spans[0]), (0, early, spans[1])]
+        # in turns, so that both parts are of all of the flight
+        start, since = float(flights[0].tdoa.t[0]), table.t - table.t.min()
+        length = min(BLOCK, 0.5 * since.max())
+        number = np.minimum((since / length).astype(int), int(since.max() / length) - 1)
+        edges = start + table.t.min() + length * np.arange(number.max() + 2)
+        edges[-1] = start + table.t.max()
+        spans = list(zip(edges[:-1].tolist(), edges[1:].tolist()))
+        parts = [(0, number % 2 != k, tuple(spans[k::2])) for k in range(2)]
     out, columns = [], columns_of(candidates)
-    for k, rows, span in parts[:: -(-len(parts) // (most or len(parts)))]:
+    for k, rows, spans in parts[:: -(-len(parts) // (most or len(parts)))]:
         others = replace(selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows))
         found = usable([*effects_of(others), *(detection.effect for detection in detections)])
-        out.append(Case(flights[k], EffectSet((*base.effects, *found.effects)), span))
+        out.append(Case(flights[k], EffectSet((*base.effects, *found.effects)), spans))
     return out
 
 
-def useful(attribution, flights, base, config=None, progress=lambda: None):
+def useful(attribution, flights, baseline, progress=lambda: None):
     """Kept: what makes the filter no worse where it was not fitted.
 
     Candidates go, one by one, if the error is smaller without; detections stay only if it is smaller with them. At most
     JUDGES flights are judged. Trials run the filter with the corrections that it would get at the poses of a run with all.
+    After one has gone, those that seemed to do harm too are tried again first; in the end all are tried beside what is kept.
     """
     candidates, detections, refused = list(attribution.selection.chosen), [], []
-    trials = _Trials(attribution, flights, base, config, progress)
+    trials = _Trials(attribution, flights, baseline, progress)
     error = trials.start(candidates, detections)
-    without = {}
+    without, suspects = {}, candidates
     while candidates:
-        without = {one: trials.error([c for c in candidates if c is not one], detections) for one in candidates}
-        worst = min(without, key=without.get)
-        if without[worst] > error * (1.0 - WORSE):
+        without = {one: trials.error([c for c in candidates if c is not one], detections) for one in suspects}
+        harmful = sorted((one for one in suspects if without[one] <= error * (1.0 - WORSE)), key=without.get)
+        if harmful:
+            why = f"the filter does better without it: {error:.3f} m with, {without[harmful[0]]:.3f} m without"
+            refused.append(Refused(harmful[0].label, why))
+            candidates = [one for one in candidates if one is not harmful[0]]
+            error, without = trials.start(candidates, detections), {}
+        elif len(suspects) == len(candidates):
             break
-        why = f"the filter does better without it: {error:.3f} m with, {without[worst]:.3f} m without"
-        refused.append(Refused(worst.label, why))
-        candidates.remove(worst)
-        error = trials.start(candidates, detections)
-        without = {}
+        suspects = harmful[1:] or candidates
     worth = {candidate: trial - error for candidate, trial in without.items()}
     for detection in attribution.detections:
         if not detection.effect.usable:
@@ -141,53 +147,68 @@ def borne_out(attribution, flights, base, config=None, constraints=(), progress=
     return nothing(attribution, [Refused(label, calibration.why_not)])
 
 
-class _Trials:
-    """Mean 3D RMSE, m, of cross-fitted models."""
+class Baseline:
+    """The model before: runs of the filter with it, one for each flight."""
 
-    def __init__(self, attribution, flights, base, config, progress):
-        self._arguments = attribution, flights, base
-        self._config, self._progress, self._samples = config, progress, []
+    def __init__(self, base, config=None):
+        """base : EffectSet; config : FilterConfig."""
+        self.base, self.config, self._runs = base, config, {}
+
+    def run(self, flight):
+        """Run of a Flight, the same one whenever it is asked for."""
+        if id(flight) not in self._runs:
+            corrector = Corrector(flight.anchors, self.base)
+            self._runs[id(flight)] = flight, run_offline(flight, self.config, corrector)  # the flight, so that its id stays
+        return self._runs[id(flight)][1]
+
+
+class _Trials:
+    """Mean 3D RMSE, m, of cross-fitted models. The first is run as the nodes would; then each at the poses of a run with nearly
+    the same model, which takes a tenth of the time."""
+
+    def __init__(self, attribution, flights, baseline, progress):
+        self._attribution, self._flights, self._baseline, self._progress = attribution, flights, baseline, progress
+        self._poses = None
 
     def start(self, candidates, detections):
-        """The error of a model, run as the nodes would; later trials take the poses of this run."""
-        self._samples, errors = [], []
-        for case in self._cases(candidates, detections):
-            corrector = RecordingCorrector(case.flight.anchors, case.effects)
-            errors.append(self._judge(case, corrector))
-            self._samples.append(corrector.recorded())
-        return float(np.mean(errors))
+        """The error of a model; later trials take the poses of its runs."""
+        error, runs = self._judged(candidates, detections)
+        self._poses = [poses_of(run.odometry) for run in runs]
+        return error
 
     def error(self, candidates, detections):
         """The error of another model."""
-        cases = self._cases(candidates, detections)
-        correctors = (RehearsedCorrector(samples, case.effects) for samples, case in zip(self._samples, cases))
-        return float(np.mean([self._judge(case, corrector) for case, corrector in zip(cases, correctors)]))
+        return self._judged(candidates, detections)[0]
 
-    def _cases(self, candidates, detections):
-        return cross_fitted(*self._arguments, candidates, detections, JUDGES)
+    def _judged(self, candidates, detections):
+        cases = cross_fitted(self._attribution, self._flights, self._baseline.base, candidates, detections, JUDGES)
+        runs = [self._run(case, poses) for case, poses in zip(cases, self._poses or [None] * len(cases))]
+        return float(np.mean([score(case, run).row()["rmse_3d"] for case, run in zip(cases, runs)])), runs
 
-    def _judge(self, case, corrector):
+    def _run(self, case, poses):
         self._progress()
-        return score(case, run_offline(case.flight, self._config, corrector)).row()["rmse_3d"]
+        anchors, effects = case.flight.anchors, case.effects
+        corrector = Corrector(anchors, effects) if poses is None else RehearsedCorrector(anchors, effects, poses)
+        return run_offline(case.flight, self._baseline.config, corrector)
 
 
-def judge(attribution, flights, holdout, base, effects, reference, config=None, progress=lambda: None):
+def judge(attribution, flights, holdout, baseline, effects, reference, progress=lambda: None):
     """(before, after, on what): the errors on the hold-out flights if there are any, or cross-fitted, or, where the
     reference tells no errors, what the filter's own innovations say. As `compare` gives them."""
     progress()
     if holdout:
         cases, on = [Case(flight, effects) for flight in holdout], "flights that took no part in the fit"
     elif reference.judges:
-        cases = cross_fitted(attribution, flights, base, attribution.selection.chosen, attribution.detections)
-        on = "each half of the flight with effects fitted to the other"
+        cases = cross_fitted(attribution, flights, baseline.base, attribution.selection.chosen, attribution.detections)
+        on = "each half of the flight, every other 5 s, with effects fitted to the other"
         if len(flights) > 1:
             on = "each flight with effects fitted to the others"
     else:
         cases = [Case(flight, effects) for flight in flights]
         on = "the flights that were fitted, by their innovations alone"
     if reference.judges:
-        return *compare(cases, base, config, progress, reference.shift_std), on
-    return *_innovations(cases, base, config, progress), on
+        return *compare(cases, baseline, progress, reference.shift_std), on
+    return *_innovations(cases, baseline, progress), on
 
 
 def why_not(before, after, shift_std):
@@ -204,7 +225,7 @@ def why_not(before, after, shift_std):
     return None
 
 
-def compare(cases, base, config=None, progress=lambda: None, shift_std=lambda name: np.zeros(3)):
+def compare(cases, baseline, progress=lambda: None, shift_std=lambda name: np.zeros(3)):
     """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, besides
     residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts
     what the references of whole flights may be off by too. shift_std : of a Reference."""
@@ -212,8 +233,8 @@ def compare(cases, base, config=None, progress=lambda: None, shift_std=lambda na
     for after in (False, True):
         scores, rows, blocks = [], [], []
         for case in cases:
-            case = case if after else replace(case, effects=base)
-            run = run_offline(case.flight, config, Corrector(case.flight.anchors, case.effects))
+            case = case if after else replace(case, effects=baseline.base)
+            run = _run(case, baseline, after)
             progress()
             scores.append(score(case, run))
             blocks.append(_blocks(scores[-1]))
@@ -230,8 +251,8 @@ def compare(cases, base, config=None, progress=lambda: None, shift_std=lambda na
 def score(case, run):
     """Score of a Run on a Case. Raises InputError where there is no estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
-    if case.span is not None:
-        inside = (truth.t >= case.span[0]) & (truth.t <= case.span[1])
+    if case.spans is not None:
+        inside = np.any([(truth.t >= first) & (truth.t <= last) for first, last in case.spans], axis=0)
         truth = Truth(truth.t[inside], truth.p[inside], truth.q[inside])
     out = Score(case.flight.name, run.odometry, truth, run.residuals)
     if not len(out.t):
@@ -239,13 +260,18 @@ def score(case, run):
     return out
 
 
-def _innovations(cases, base, config, progress):
+def _run(case, baseline, after):
+    if not after:
+        return baseline.run(case.flight)
+    return run_offline(case.flight, baseline.config, Corrector(case.flight.anchors, case.effects))
+
+
+def _innovations(cases, baseline, progress):
     sides = []
     for after in (False, True):
         rows = []
         for case in cases:
-            effects = case.effects if after else base
-            run = run_offline(case.flight, config, Corrector(case.flight.anchors, effects))
+            run = _run(case, baseline, after)
             progress()
             used = run.residuals.verdict == USED
             nis = run.residuals.innovation[used] ** 2 / run.residuals.variance[used]

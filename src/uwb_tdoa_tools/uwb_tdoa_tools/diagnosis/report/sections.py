@@ -80,7 +80,7 @@ def worth(diagnosis, found):
     rows = [[_name(entry), _worth(entry, largest), _else(entry)] for entry in found]
     note = [
         "By how much the position error (3D RMSE) grows if this one alone is left out, each flight with effects "
-        "fitted to the others, or each half of it. Effects that can stand in for each other are each worth less "
+        "fitted to the others, or every other 5 s of a single one. Effects that can stand in for each other are each worth less "
         "than both together: the figures need not add up to the gain of all."
         if diagnosis.reference.judges
         else "Nobody knows what each is worth for the position: without ground truth there is no error to compare."
@@ -91,7 +91,8 @@ def worth(diagnosis, found):
 def _name(entry):
     effect = entry.findings[0].effect
     physics = effect.physics if entry.findings[0].declared else "structure that no effect of the catalogue explains"
-    return f"<b>{escape(entry.title)}</b><br><small>{escape(physics)}</small>"
+    more = f"<br><small>{escape(entry.over_flights)}</small>" if entry.over_flights else ""
+    return f"<b>{escape(entry.title)}</b><br><small>{escape(physics)}</small>{more}"
 
 
 def _else(entry):
