@@ -2,10 +2,13 @@ import numpy as np
 import pytest
 
 import undeclared
-from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
-from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
+from uwb_tdoa_tools.diagnosis.attribution import _straightened, attribute, effects_of
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.regression.select import select
+from uwb_tdoa_tools.diagnosis.regression.table import table_of
+from uwb_tdoa_tools.diagnosis.regression.terms import candidates_of
 from uwb_tdoa_tools.studies.diagnosis.bank import AIDED, SIZES, clean_flight, effect_of, names_found
 
 TRUTH = GroundTruth()
@@ -45,9 +48,25 @@ def test_a_declared_effect_is_found_with_its_size(flight, name):
         assert found.values[key] == pytest.approx(value, rel=0.1)
 
 
-def test_every_declared_effect_is_in_the_bank():
-    from uwb_tdoa_bias.effects import EFFECTS
+def test_an_anchor_that_is_far_off_is_fitted_where_it_is(flight):
+    """A fit about the surveyed place takes the change of direction for something else: it must be made about its own values."""
+    far = EFFECTS["anchor_position"]({"3.z": -1.3})
 
+    def at(model):
+        return [residuals(TRUTH.prepare(far.inject(flight)), TRUTH, EffectSet(model))]
+
+    candidates = candidates_of(far, flight.anchors, [])
+    table = table_of(at(())).with_terms([term for candidate in candidates for term in candidate.terms])
+    selection = select(table, candidates, np.ones(len(table.channels)))
+    before = np.std(table_of(at(effects_of(selection))).y - selection.fit.residual)
+    after = _straightened(selection, at, candidates)
+    assert before > 0.02
+    assert np.std(table_of(at(effects_of(after))).y - after.fit.residual) < 0.002
+    (effect,) = effects_of(after)
+    assert effect.values["3.z"] == pytest.approx(-1.3, abs=0.05)
+
+
+def test_every_declared_effect_is_in_the_bank():
     assert set(SIZES) == set(EFFECTS)
 
 

@@ -74,5 +74,6 @@ def test_what_has_a_name_in_the_catalogue_is_said_by_that(flight):
 
 
 def test_cases_cost_what_they_must():
-    for seed, effect, flown, plain, base, where in blind.cases(blind.Simulated(), 1):
-        assert all(blind.rmse(one, base) - blind.rmse(none, base) >= blind.LEAST_COST for one, none in zip(flown, plain))
+    drawn = (blind.case(blind.Simulated(), seed) for seed in range(20))
+    effect, flown, plain, base, where = next(one for one in drawn if one is not None)
+    assert all(blind.rmse(one, base) - blind.rmse(none, base) >= blind.LEAST_COST for one, none in zip(flown, plain))

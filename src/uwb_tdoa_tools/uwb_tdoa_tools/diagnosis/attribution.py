@@ -11,6 +11,7 @@ from ..parallel import in_one_thread
 from .channels import CHANNELS, residuals
 from .detectors import DETECTORS
 from .findings import Finding, Refused
+from .over_flights import of_one, shares
 from .regression.confounding import alternatives
 from .regression.fit import fit
 from .regression.held_out import held_out
@@ -20,6 +21,7 @@ from .regression.table import table_of
 from .regression.terms import Candidate, Term, candidates_of, columns_of
 
 ROUNDS = 2  # of linearising about what was found
+STRAIGHT = 0.1  # of the channel's scale: root mean square by which a linear model may be off
 MAPS_GAIN, MAPS_SURE = 20.0, 3.0  # held-out log-likelihood, twice, and its t value over blocks, that maps must bring
 DISGUISED = 4  # times that what disguises itself as noise is searched for before noise is measured
 MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
@@ -28,7 +30,8 @@ MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
 @dataclass(frozen=True, eq=False)
 class Attribution:
     """residuals, remaining : [{channel: ChannelResidual}] under the base model and under the whole; selection : Selection;
-    detections : (Detection, ...); candidates : all declared Candidates; refused : (Refused, ...)."""
+    detections : (Detection, ...); candidates : all declared Candidates; refused : (Refused, ...); names : of the flights; alone :
+    ((name of a flight, Selection), ...) of what one flight shows and the others do not."""
 
     residuals: list
     remaining: list
@@ -36,6 +39,8 @@ class Attribution:
     detections: tuple
     candidates: list
     refused: tuple
+    names: tuple
+    alone: tuple = ()
 
     @property
     def effects(self):
@@ -44,11 +49,15 @@ class Attribution:
 
     def of(self, kept):
         """The Attribution of what was Kept."""
-        return replace(self, selection=kept.selection, detections=kept.detections)
+        return replace(self, selection=kept.selection, detections=kept.detections, alone=())
 
     def findings(self):
-        """[Finding], those by regression first."""
-        return [*_findings(self.selection, self.candidates), *map(_of_detection, self.detections)]
+        """[Finding], those by regression first, those of one flight alone last."""
+        out = _findings(self.selection, self.candidates, self.names)
+        out += map(_of_detection, self.detections)
+        for name, selection in self.alone:
+            out += [replace(finding, flight=name) for finding in _findings(selection, [], (name,))]
+        return out
 
 
 @in_one_thread
@@ -69,9 +78,10 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
     under_base = at(())
     installation = _installation(flights)
     declared = _declared(under_base, reference, kinds, installation)
-    current, model, inflation = under_base, (), None
+    current, model, inflation, tables = under_base, (), None, []
     for last in (number == ROUNDS - 1 for number in range(ROUNDS)):
         table = _linearised(current, declared, model)
+        tables.append(table)
         if inflation is None:
             inflation = _inflation(table, declared, [detector for detector in detectors if detector.disguises])
         progress()
@@ -81,18 +91,28 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
             break
         current = current if last else at(model)
     refused = []
-    selection, smooth, scan = _that_hold_on_other_data(selection, refused), [], None
+    selection, smooth, scans = _that_hold_on_other_data(selection, refused), [], {}
+
+    def scan_of(table):  # one for each number of rows, which other stamps can change
+        if len(table.y) not in scans:
+            scans[len(table.y)] = Scan(table, _views(table))
+        return scans[len(table.y)]
+
     if undeclared:
-        smooth, scan = _smooth(current, installation), Scan(selection.table, _views(current))
-        selection = _with_smooth(selection, declared, smooth, search, scan, progress)
+        smooth = _smooth(current, installation)
+        selection = _with_smooth(selection, tables[0], declared, smooth, search, scan_of, progress)
+        selection = _straightened(selection, at, declared + smooth)
         selection = _that_hold_on_other_data(selection, refused)
-    selection = with_rivals(selection, declared + smooth, scan, progress)
+    selection = with_rivals(selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress)
     if undeclared:
         selection = _with_maps(selection, smooth, refused)
     remaining = at(effects_of(selection))
     detections = (detector.detect(remaining) for detector in detectors)
     found = tuple(detection for detection in detections if detection is not None)
-    return Attribution(under_base, remaining, selection, found, declared, tuple(refused))
+    alone, names = [], tuple(flight.name for flight in flights)
+    if undeclared and len(flights) > 1:
+        alone = [(names[k], own) for k, own in of_one(remaining, inflation, _views, search)]
+    return Attribution(under_base, remaining, selection, found, declared, tuple(refused), names, tuple(alone))
 
 
 def effects_of(selection):
@@ -164,13 +184,12 @@ def _smooth(found, installation):
     return out
 
 
-def _views(found):
-    """{channel: [View]} of what a part of each channel may depend on."""
-    return {
-        name: channel.views([flight[name] for flight in found if name in flight])
-        for name, channel in CHANNELS.items()
-        if any(name in flight for flight in found)
-    }
+def _views(table):
+    """{channel: [View]} of what a part of each channel of a Table may depend on."""
+    parts = {}
+    for _, name, _, part in table.parts:
+        parts.setdefault(name, []).append(part)
+    return {name: CHANNELS[name].views(several) for name, several in parts.items()}
 
 
 def _linearised(found, candidates, model):
@@ -198,16 +217,32 @@ def _inflation(table, declared, detectors):
     return model.inflation
 
 
-def _with_smooth(selection, declared, smooth, search, scan, progress):
-    """The selection carried on with functions without a name; or begun anew with them, if that explains more: the declared
-    effect, or the large group of parameters, was a stopgap."""
+def _straightened(selection, at, candidates):
+    """The selection fitted anew in a Table about its own values, with the columns of `candidates`, where it is not as linear
+    as the Table that it was found in says: positions of anchors that are far off are not."""
+    for _ in range(ROUNDS):
+        model = effects_of(selection)
+        current, table = at(model), selection.table
+        y, limit = _linearised(current, (), model).y, STRAIGHT * selection.fit.scale[table.channel]
+        if len(y) == len(table.y) and np.mean(((y - table.y) / limit) ** 2) <= 1.0:
+            break
+        table = _linearised(current, [*candidates, *selection.chosen], model)
+        refitted = fit(table, columns_of(selection.chosen), selection.fit.inflation)
+        selection = replace(selection, table=table, fit=refitted)
+    return selection
+
+
+def _with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress):
+    """The selection carried on with functions without a name; or begun anew with them in the Table `unmoved`, about nothing, if
+    that explains more: the declared effect, or the large group of parameters, was a stopgap."""
     everything = smooth + declared
-    table = selection.table.with_terms([term for candidate in smooth for term in candidate.terms])
+    terms = [term for candidate in smooth for term in candidate.terms]
+    table = selection.table.with_terms(terms)
     progress()
     inflation = selection.fit.inflation
-    after = select(table, everything, inflation, search, scan, selection.chosen, progress)
+    after = select(table, everything, inflation, search, scan_of(table), selection.chosen, progress)
     if selection.chosen and any(not candidate.declared or len(candidate.columns) > LARGE for candidate in after.chosen):
-        anew = select(table, everything, inflation, search, scan, progress=progress)
+        anew = select(unmoved.with_terms(terms), everything, inflation, search, scan_of(unmoved), progress=progress)
         after = max(after, anew, key=lambda each: worth(each, len(everything)))
     return after
 
@@ -262,7 +297,7 @@ def _recurs(candidate):
     return not any(key.endswith((".start", ".end")) for term in candidate.terms for key in term.effect.values)
 
 
-def _findings(selection, candidates):
+def _findings(selection, candidates, names):
     effects = {_merged_as(effect): effect for effect in effects_of(selection)}
     out = {}
     for candidate, score, loss in zip(selection.chosen, held_out(selection), selection.loss):
@@ -277,7 +312,7 @@ def _findings(selection, candidates):
             covariates = tuple(t.effect.covariate for t in candidate.terms if t is not term) if term.effect.settings else ()
             finding = Finding(
                 effects[identity], candidate.channels[0], evidence, score.explained, others, (candidate,),
-                together_with=covariates,
+                together_with=covariates, shares=shares(selection, candidate, names),
             )  # fmt: skip
             out[identity] = _merged(out[identity], finding) if identity in out else finding
     return list(out.values())

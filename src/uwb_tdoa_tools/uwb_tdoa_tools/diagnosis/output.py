@@ -6,6 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects.wording import listed
 
+from .over_flights import course
 from .report.apply import APPLY
 from .report.entries import doubt_in_words, entries, worth_in_words
 from .report.unclear import by_remedy, untold
@@ -56,7 +57,7 @@ def as_text(diagnosis):
             f"{entry.title}: {entry.values}; {judged}." if entry.findings[0].declared else f"{entry.title}; {judged}."
         )
         lines.append(("found" if entry.findings[0].declared else "no name", what))
-        lines += [("", sentence) for sentence in doubt_in_words(entry)]
+        lines += [("", sentence) for sentence in [entry.over_flights, *doubt_in_words(entry)] if sentence]
     for told_by, what in by_remedy(untold(diagnosis)).items():
         lines.append(("not told", f"{listed(what)}; what would tell: {told_by}."))
     if any(entry.added for entry in found):
@@ -90,6 +91,7 @@ def _finding(finding):
             if other.share is not None
         ],
         "could_be_mistaken_for": list(effect.confounded_with),
+        **_over_flights(finding),
         "added": finding.added,
     }
 
@@ -111,8 +113,13 @@ def _function(finding):
         "together_with": list(finding.together_with),
         "shape": {"at": at, "values": {prefix.rstrip("."): effect.curve(at, prefix) for prefix in prefixes}},
         "usable": effect.usable,
+        **_over_flights(finding),
         "added": finding.added,
     }
+
+
+def _over_flights(finding):
+    return {"shares": [vars(share) for share in finding.shares], "over_flights": course(finding.shares), "flight": finding.flight}
 
 
 def _alternatives(finding):

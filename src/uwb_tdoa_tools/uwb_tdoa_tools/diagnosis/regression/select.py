@@ -112,13 +112,10 @@ def _fitted(table, chosen, model, candidate, choices, even):
 
 
 def worth(selection, choices):
-    """Criterion of a whole Selection against a model with nothing in it, with the weights of its own fit."""
-    chosen, table = selection.chosen, selection.table
-    if not chosen:
-        return 0.0
-    total = Scorer(table, [], selection.fit, columns_of(chosen)).judge(columns_of(chosen)).gain
+    """Criterion of a whole Selection: what its fit explains, less the price of all that is chosen."""
+    chosen, total = selection.chosen, selection.fit.likelihood(selection.table)
     for k, candidate in enumerate(chosen):
-        scorer = Scorer(table, columns_of(chosen[:k]), selection.fit, candidate.columns)
+        scorer = Scorer(selection.table, columns_of(chosen[:k]), selection.fit, candidate.columns)
         judged = scorer.judge(candidate.columns)
         total -= scorer.price(candidate, judged.determined if judged else 0.0, choices)
     return total

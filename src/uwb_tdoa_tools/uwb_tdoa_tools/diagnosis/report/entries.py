@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from uwb_tdoa_bias.effects.wording import listed, measured, significant
 
+from ..over_flights import in_words
+
 CM = 100.0  # in a metre
 OR = "or"
 LEAST_WORTH = 0.0005  # m; less is no difference
@@ -46,6 +48,11 @@ class Entry:
         return self.added and (self.worth is None or self.worth >= LEAST_WORTH)
 
     @property
+    def over_flights(self):
+        """A sentence on how flights differ in it; "" for a single one."""
+        return in_words(self.findings[0].shares)
+
+    @property
     def undecided(self):
         """Alternatives that fit nearly as well, the nearest first."""
         return sorted((other for other in self.alternatives if other.gap is not None), key=lambda other: other.gap)
@@ -57,14 +64,13 @@ class Entry:
 
 
 def entries(diagnosis):
-    """[Entry] of a Diagnosis: what is added, the most worth first, what all anchors share over the room after what is told of
-    some; then what is not added."""
+    """[Entry] of a Diagnosis, the most prominent first; what all anchors share over the room after what is told of some."""
     groups = {}
     for finding in diagnosis.findings:
         key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
         groups.setdefault(key, []).append(finding)
     out = [_entry(tuple(group), diagnosis.refused) for group in groups.values()]
-    return sorted(out, key=lambda entry: (not entry.added, len(entry.findings) > 1, -(entry.worth or 0.0)))
+    return sorted(out, key=lambda entry: (len(entry.findings) > 1, -entry.findings[0].prominence))
 
 
 def worth_in_words(entry):
@@ -138,6 +144,8 @@ def _values(finding):
 def _why_not(finding, refused):
     if finding.added:
         return ""
+    if finding.flight:
+        return f"belongs to {finding.flight} alone"
     label = finding.candidates[0].label if finding.candidates else finding.effect.label
     reasons = {item.what: item.why for item in reversed(refused)}
     if label in reasons:

@@ -3,7 +3,7 @@
 Some effects of the grammar have a name in the catalogue: an anchor that is late from one time to another is nlos.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,7 +36,7 @@ STREAM = {"imu_gravity": "accel", "imu_misalignment": "gyro"}
 @dataclass(frozen=True)
 class Claim:
     """stream; subset : kind of it; who : frozenset of the anchors, or of the axis; covariates : those that it names, the first
-    and what is the same in that flight; shape; text."""
+    and what is the same in that flight; shape; text; usable : nodes can take it out."""
 
     stream: str
     subset: str
@@ -44,6 +44,7 @@ class Claim:
     covariates: tuple
     shape: str
     text: str
+    usable: bool = True
 
     def names(self, true):
         """Whether stream and subset are those of another Claim."""
@@ -67,13 +68,11 @@ def truth_of(effect, flight):
 
 def claims(findings):
     """[Claim] of Findings, those that are worth most first."""
-    ranked = sorted(
-        findings,
-        key=lambda f: (bool(f.together_with), not f.added, -(f.worth or 0.0), -f.evidence.get("criterion", 0.0)),
-    )
+    ranked = sorted(findings, key=lambda finding: (bool(finding.together_with), -finding.prominence))
     out = []
     for finding in ranked:
-        out += _undeclared(finding) if finding.effect.settings else _declared(finding.effect)
+        several = _undeclared(finding) if finding.effect.settings else _declared(finding.effect)
+        out += [replace(claim, usable=finding.effect.usable) for claim in several]
     return out
 
 

@@ -1,6 +1,7 @@
 """diagnosis: the figures of docs/diagnosis.md. Every part prints its figures and writes them, with all cases, to
 PART.json in the output folder; the bank also draws its confusion matrix."""
 
+from functools import partial
 import importlib.util
 import json
 from pathlib import Path
@@ -13,6 +14,8 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ...diagnosis import diagnose
 from ...diagnosis.references import Heights, Nothing
+from ...parallel import over, whole_number
+from ...results_file import ResultsFile
 from ...scoring.plots import plt
 from ...surveying.blocked import with_blocked
 from ...surveying.survey import survey
@@ -31,6 +34,7 @@ def add_options(add):
     add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, or cases of blind and faults (default: 5)")
     add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind and no-truth (default: %(default)s)")
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
+    add("--jobs", metavar="N", type=whole_number, default=1, help="cases of blind at once (default: %(default)s)")
     add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
 
 
@@ -103,8 +107,16 @@ def _undeclared(args):
 
 def _blind(args):
     """In measured flights if there are any, else in simulated ones and in those with nothing."""
-    source = blind.Simulated() if args.data is None else blind.Measured(args.data)
-    results = _each(blind.cases(source, args.seeds, args.first), blind.run)
+    source = blind.Simulated() if args.data is None else blind.Measured(args.data, args.out)
+    results, seed = [], args.first
+    with ResultsFile(args.out / "blind.jsonl", {"data": str(args.data)}) as done:
+        while len(results) < args.seeds:
+            seeds = range(seed, seed + args.seeds - len(results))
+            missing = [one for one in seeds if str(one) not in done]
+            for one, result in zip(missing, over(partial(blind.run, source), missing, args.jobs, unit="case")):
+                done[str(one)] = result
+            results += [done[str(one)] for one in seeds if done[str(one)] is not None]
+            seed = seeds.stop
     figures = blind.figures(results)
     if args.data is None:
         clean = list(blind.false_alarms(args.seeds, args.first))

@@ -73,13 +73,18 @@ def load(data, paths, aids=()):
     return [flight.without(*(name for name in AIDS if name not in aids)) for flight in flights]
 
 
+def folder_of(name):
+    """Name of the folder of a split's results."""
+    return name.replace(" ", "-")
+
+
 def run(data, name, out, aids=()):
     """Diagnose one split; writes its report and effects.yaml. aids : streams that are used where flights hold them. Returns
     dict of the summary and all findings."""
     fit, judge = SPLITS[name]
     started = time.monotonic()
     result = diagnose(load(data, fit, aids), load(data, judge, aids))
-    folder = out / name.replace(" ", "-")
+    folder = out / folder_of(name)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.html").write_text(result.as_html())
     result.effects.to_yaml(folder / "effects.yaml")

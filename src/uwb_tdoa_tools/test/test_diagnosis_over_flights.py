@@ -1,0 +1,67 @@
+from dataclasses import replace
+
+import pytest
+
+from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
+from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.over_flights import ALL, ALONE, DIFFERS, GROWS, Share, course, in_words, shares
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+
+
+def several(*values, std=0.05):
+    return tuple(Share(f"flight-{k}", value, std) for k, value in enumerate(values))
+
+
+@pytest.mark.parametrize(
+    "values, kind",
+    [
+        ((1.0, 0.9, 1.1), ALL),
+        ((0.02, 2.9, 0.1), ALONE),
+        ((0.2, 0.7, 1.3, 1.9), GROWS),
+        ((1.9, 1.3, 0.7, 0.2), GROWS),
+        ((0.2, 1.9, 0.3, 1.6), DIFFERS),
+        ((1.0,), None),
+    ],
+)
+def test_what_several_flights_say(values, kind):
+    assert course(several(*values)) == kind
+
+
+def test_flights_that_tell_nothing_do_not_count():
+    assert course((*several(1.0, 1.1), Share("other", 7.0, 3.0))) == ALL
+    assert course((*several(1.0), Share("other", 7.0, 3.0))) is None
+    assert in_words((*several(1.0), Share("other", 7.0, 3.0))) == ""
+
+
+def test_words_name_the_flights():
+    assert "flight-1 alone" in in_words(several(0.0, 1.0, 0.0))
+    assert "0.2 in flight-0" in in_words(several(0.2, 1.9, 0.3, 1.6))
+    assert "all 2 flights" in in_words(several(1.0, 1.0))
+
+
+def test_shares_are_those_that_were_put_in():
+    flights = [
+        replace(effect_of("anchor_delay", True, 1), values={"2": delay}).inject(clean_flight(100 + k, 30.0))
+        for k, delay in enumerate((0.1, 0.2, 0.3))
+    ]
+    attribution = attribute(flights, GroundTruth(), kinds=("anchor_delay",), undeclared=False)
+    (candidate,) = attribution.selection.chosen
+    found = shares(attribution.selection, candidate, attribution.names)
+    assert [share.share / found[1].share for share in found] == pytest.approx([0.5, 1.0, 1.5], abs=0.05)
+    assert course(found) == GROWS
+
+
+@pytest.mark.slow
+def test_what_came_in_one_flight_is_said_of_that_flight_and_not_applied():
+    """A reflector that makes anchor 3 late beyond x = 0.5 m."""
+    step = SmoothTerm({"3.c0": 0.0, "3.c1": 0.5}, {}, "", "tdoa", "x", "anchor", (-2.0, 0.5, 2.0), "step")
+    flights = [clean_flight(seed, 30.0) for seed in (100, 101, 102)]
+    flights[1] = step.inject(flights[1])
+    result = diagnose(flights)
+    (finding,) = (finding for finding in result.findings if finding.flight)
+    assert finding.flight == flights[1].name and not finding.added and result.effects == EffectSet()
+    assert any(key.startswith("3.") for key in finding.effect.values)
+    assert f"belongs to {flights[1].name} alone" in result.as_text()
+    assert f"belongs to {flights[1].name} alone" in result.as_html()

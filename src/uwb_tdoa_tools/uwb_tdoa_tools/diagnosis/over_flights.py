@@ -1,0 +1,113 @@
+"""Several flights: whether a finding is the same in all, differs, grows from one to the next, or belongs to one alone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .regression.select import select
+from .regression.scan import Scan
+from .regression.table import table_of
+
+TOLD = 0.25  # standard deviation of a share, that a flight must at least tell
+SURE = 4.0  # standard deviations
+ALIKE = 0.3  # share by which flights may differ and count as the same: models are never right to less
+GROWN = 0.5  # share by which the last flight must be beyond the first, to call it growing
+
+ALL, ALONE, GROWS, DIFFERS = "all", "alone", "grows", "differs"
+
+
+@dataclass(frozen=True)
+class Share:
+    """How much of a finding a flight shows. flight : its name; share, std : 1 is what all flights together have told; std is
+    infinite where it tells nothing."""
+
+    flight: str
+    share: float
+    std: float
+
+    @property
+    def told(self):
+        """Whether the flight tells it."""
+        return self.std < TOLD
+
+
+def shares(selection, candidate, names):
+    """(Share, ...) of a chosen Candidate, one for each flight of its Table, which has `names`: a fit of one factor to the rows of
+    each."""
+    table, model = selection.table, selection.fit
+    part = table.matrix(candidate.columns) @ model.values(candidate.columns)
+    return _shares(part, model.residual + part, model.information(table), table.flight, names)
+
+
+def _shares(part, y, information, flight, names):
+    out = []
+    for number, name in enumerate(names):
+        rows = flight == number
+        power = information[rows] @ part[rows] ** 2
+        share = information[rows] @ (part[rows] * y[rows]) / power if power > 0.0 else 0.0
+        out.append(Share(name, float(share), float(power**-0.5) if power > 0.0 else np.inf))
+    return tuple(out)
+
+
+def course(several):
+    """ALL, ALONE, GROWS or DIFFERS of (Share, ...) in the order of the flights; None where fewer than two tell it."""
+    told = [each for each in several if each.told]
+    if len(told) < 2:
+        return None
+    share, std = (np.array([getattr(each, name) for each in told]) for name in ("share", "std"))
+    largest = int(np.argmax(np.abs(share)))
+    others = np.arange(len(told)) != largest
+    apart = np.abs(share[largest] - share[others]) > SURE * np.hypot(std[largest], std[others])
+    if (np.abs(share[others]) < ALIKE * abs(share[largest])).all() and apart.all():
+        return ALONE
+    spread = np.maximum(ALIKE, SURE * std)
+    if (np.abs(share - np.average(share, weights=std**-2)) < spread).all():
+        return ALL
+    order = np.arange(len(told)) - 0.5 * (len(told) - 1)
+    steps = np.diff(share) * np.sign(share[-1] - share[0])
+    slope, sure = order @ share / (order @ order), np.sqrt(order**2 @ std**2) / (order @ order)
+    rising = (steps > -2.0 * np.hypot(std[1:], std[:-1])).all()
+    if len(told) > 2 and rising and abs(slope) > SURE * sure and abs(share[-1] - share[0]) > GROWN:
+        return GROWS
+    return DIFFERS
+
+
+def in_words(several):
+    """A sentence on (Share, ...); "" where flights do not tell."""
+    kind, told = course(several), [each for each in several if each.told]
+    if kind is None:
+        return ""
+    if kind == ALL:
+        return f"The same in all {len(told)} flights that show it."
+    if kind == ALONE:
+        return f"Belongs to {max(told, key=lambda each: abs(each.share)).flight} alone."
+    listed = ", ".join(f"{each.share:.1f} in {each.flight}" for each in told)
+    return f"{'Grows' if kind == GROWS else 'Differs'} from flight to flight: {listed} of it."
+
+
+def of_one(remaining, inflation, views, search):
+    """[(flight, Selection)] of what each flight alone shows of its own, of [{channel: ChannelResidual}] that a model of all leaves.
+
+    inflation : of the fit of all; views(table) -> {channel: [View]}; search : as `select` takes it. What another flight
+    shows too is not of one alone."""
+    out = []
+    for number, residuals in enumerate(remaining):
+        table = table_of([residuals])
+        selection = select(table, [], inflation, search, Scan(table, views(table)))
+        own = [candidate for candidate in selection.chosen if not _elsewhere(selection, candidate, remaining, number)]
+        if own:
+            out.append((number, selection.only(own)))
+    return out
+
+
+def _elsewhere(selection, candidate, remaining, number):
+    """Whether another flight shows a good part of a Candidate that was found in flight `number`."""
+    fit = selection.fit
+    for other in remaining[:number] + remaining[number + 1 :]:
+        table = table_of([other]).with_terms(candidate.terms)
+        part = table.matrix(candidate.columns) @ fit.values(candidate.columns)
+        information = 1.0 / (fit.scale**2 * fit.inflation)[table.channel]
+        (share,) = _shares(part, table.y, information, table.flight, ("",))
+        if share.told and share.share > ALIKE:
+            return True
+    return False
