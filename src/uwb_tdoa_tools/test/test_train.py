@@ -33,7 +33,7 @@ def files(out):
 
 def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_path, capsys):
     out = tmp_path / "model"
-    arguments = [str(folder), "--model", "physics+structured", "--out", str(out), "--seed", "3", "--name", "hall"]
+    arguments = [str(folder), "--model", "physics+structured", "--out", str(out), "--seed", "3", "--name", "hall", "--jobs", "1"]
     assert train.main(arguments) == 0
     assert files(out) == ["effects.yaml", "model.onnx", "training.json", "training.png"]
     printed = capsys.readouterr().out
@@ -63,7 +63,7 @@ def test_the_same_seed_gives_the_same_file(folder, tmp_path):
     contents = []
     for k in range(2):
         out = tmp_path / str(k)
-        train.main([str(folder), "--model", "structured", "--out", str(out), "--validation", "corners-1"])
+        train.main([str(folder), "--model", "structured", "--out", str(out), "--validation", "corners-1", "--jobs", "1"])
         contents.append((out / "model.onnx").read_bytes())
         assert files(out) == ["model.onnx", "training.json", "training.png"]
     assert contents[0] == contents[1]
@@ -71,7 +71,7 @@ def test_the_same_seed_gives_the_same_file(folder, tmp_path):
 
 def test_physics_alone_is_no_network_and_leaves_none_behind(folder, tmp_path):
     (tmp_path / "model.onnx").write_text("of an earlier training")
-    assert train.main([str(folder), "--model", "physics", "--out", str(tmp_path)]) == 0
+    assert train.main([str(folder), "--model", "physics", "--out", str(tmp_path), "--jobs", "1"]) == 0
     assert files(tmp_path) == ["effects.yaml", "training.json", "training.png"]
 
 

@@ -1,11 +1,13 @@
 """As much of a model as flights left out bear out."""
 
 import argparse
+from functools import partial
 
 import pytest
 from training_flights import flight
 
 from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.scoring.borne_out import SHARES, BorneOut, choose
 from uwb_tdoa_tools.studies.training import splits
 from uwb_tdoa_tools.training import shrinking, structured
@@ -43,6 +45,15 @@ def test_a_flight_is_judged_by_what_it_took_no_part_in():
     alike, other = (told.errors[flights[k].name] for k in (0, 2))
     assert alike[1.0] < 0.95 * alike[None] and other[1.0] > 1.05 * other[None]
     assert told.share < 1.0 and told.as_dict()["worst"] == told.gains.min()
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_same_to_the_bit():
+    flights, told = [EFFECTS["anchor_delay"]({"3": 0.4}).inject(flight(seed)) for seed in range(3)], []
+    for jobs in (1, 2):
+        over = partial(parallel.over, jobs=jobs)
+        told.append(shrinking.bear_out("structured", flights, shrinking.uncorrected(flights, over), 0, OPTIONS, over=over))
+    assert told[0] == told[1] and set(told[0].errors) == {one.name for one in flights}
 
 
 def test_splits_are_done_once_and_summed_up(tmp_path, monkeypatch, capsys):

@@ -50,15 +50,16 @@ def over(function, items, jobs=None, dask=None, unit="flight"):
 
 def _results(function, items, jobs, dask):
     first, rest = items[:1], items[1:]
-    if not rest or (jobs == 1 and dask is None):
+    count = min(jobs or cpu_count(), len(rest))
+    if not rest or (count == 1 and dask is None):
         yield from map(function, items)
         return
     with _cluster(dask) as backend:
-        count = min(jobs or cpu_count(), len(rest))
 
         def spread(calls):
             with parallel_config(**backend):  # not around the loop: the caller's own use of joblib is its own affair
-                pool = Parallel(count, return_as="generator", batch_size=1)
+                # Arrays go as they are: numba compiles anew for those mapped from files, which cannot be written to.
+                pool = Parallel(count, return_as="generator", batch_size=1, max_nbytes=None)
             with _children_ignore_interrupts():
                 return pool(calls)
 

@@ -1,9 +1,12 @@
 """train: learn the systematic error of TDOAs from flights with ground truth."""
 
+from functools import partial
 from pathlib import Path
 import sys
 
-from .. import cli, options
+from tqdm import tqdm
+
+from .. import cli, options, parallel
 from ..training import labels as labelling, models, shrinking
 from ..training.plots import plot_curve
 
@@ -42,6 +45,7 @@ def parser():
     add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
     add("--name", help="of the model, goes into every corrected message (default: the kind)")
     add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
+    parallel.add_options(made)
     return made
 
 
@@ -52,7 +56,8 @@ def _train(args):
         print(f"{what:13s} {', '.join(some)}")
     training, validation = ([flights[name] for name in some] for some in names)
     name = args.name or args.model
-    result, borne_out = shrinking.train(args.model, training, validation, args.seed, name, progress=print)
+    over = partial(parallel.over, jobs=args.jobs, dask=args.dask, unit="part")
+    result, borne_out = shrinking.train(args.model, training, validation, args.seed, name, progress=tqdm.write, over=over)
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
     label, x, *errors = result.curve

@@ -20,13 +20,15 @@ PORTABLE = tuple(name for name, effect in EFFECTS.items() if effect.portable)
 
 @dataclass(frozen=True)
 class Physics:
-    """effects : EffectSet, fitted to all flights; attribution : where they come from."""
+    """effects : EffectSet, fitted to all flights; attribution : where they come from, None where their values are to stay."""
 
     effects: EffectSet
-    attribution: Attribution
+    attribution: Attribution | None = None
 
     def fitted_to(self, flights):
         """EffectSet of the same effects, fitted to the flights with these numbers alone; what detectors found stays as it is."""
+        if self.attribution is None:
+            return self.effects
         selection = self.attribution.selection
         rows = np.isin(selection.table.flight, list(flights))
         model = refit(selection.table, columns_of(selection.chosen), selection.fit, rows)

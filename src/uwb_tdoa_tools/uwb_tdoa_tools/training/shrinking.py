@@ -6,6 +6,7 @@ values fitted to the others alone: `physics.find` has judged them on flights lef
 """
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,25 +24,26 @@ FOLDS = 5
 
 
 @in_one_thread
-def bear_out(kind, flights, plain, seed, options=structured.Options(), found=None, progress=lambda text: None):
+def bear_out(kind, flights, plain, seed, options=structured.Options(), found=None, progress=lambda text: None, over=map):
     """BorneOut of a kind of model trained on Flights.
 
-    plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with effects.
+    plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with effects; over(function, folds) :
+    as map, but for the time and the process in which each is done.
     """
-    order = np.random.default_rng(seed).permutation(len(flights))
-    errors = {}
-    for fold in (order[k :: min(FOLDS, len(flights))].tolist() for k in range(min(FOLDS, len(flights)))):
-        others = [k for k in range(len(flights)) if k not in fold]
-        effects, network = _without(kind, flights, others, seed, options, found)
-        for flight in (flights[k] for k in fold):
-            errors[flight.name] = judged(flight, plain, effects, network)
-            progress("{} left out: {:.3f} m without, {:.3f} m with all".format(flight.name, errors[flight.name][None], errors[flight.name][1.0]))
+    order, errors = np.random.default_rng(seed).permutation(len(flights)), {}
+    folds = [order[k :: min(FOLDS, len(flights))].tolist() for k in range(min(FOLDS, len(flights)))]
+    rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
+    known = [found and physics.Physics(found.fitted_to(others)) for others in rest]
+    for of_fold in over(partial(_left_out, kind, flights, plain, seed, options), list(zip(folds, rest, known))):
+        for name, of in of_fold.items():
+            progress("{} left out: {:.3f} m without, {:.3f} m with all".format(name, of[None], of[1.0]))
+        errors |= of_fold
     return BorneOut(choose(errors), errors)
 
 
-def uncorrected(flights):
-    """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction."""
-    return {flight.name: _error(flight) for flight in flights}
+def uncorrected(flights, over=map):
+    """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction. over : as of `bear_out`."""
+    return dict(zip((flight.name for flight in flights), over(_error, flights)))
 
 
 def judged(flight, plain, effects, network, shares=SHARES):
@@ -54,29 +56,32 @@ def judged(flight, plain, effects, network, shares=SHARES):
     return out if network else {**out, 1.0: _error(flight, effects)}
 
 
-def train(kind, training, validation, seed, name, options=structured.Options(), progress=lambda text: None):
-    """(Trained, BorneOut): `models.train`, and as much of it as is borne out."""
+def train(kind, training, validation, seed, name, options=structured.Options(), progress=lambda text: None, over=map):
+    """(Trained, BorneOut): `models.train`, and as much of it as is borne out. over : as of `bear_out`."""
     flights = [*training, *validation]
     found = None
     if kind.startswith("physics"):
         progress("looking for effects")
         found = physics.find(flights)
     trained = models.train(kind, training, validation, seed, name, options, progress, found)
-    borne_out = bear_out(kind, flights, uncorrected(flights), seed, options, found, progress)
+    borne_out = bear_out(kind, flights, uncorrected(flights, over), seed, options, found, progress, over)
     if trained.model:
         trained = replace(trained, meta={**trained.meta, "share": borne_out.share})
     return trained, borne_out
 
 
-def _without(kind, flights, others, seed, options, found):
-    """(EffectSet or None, Network or None) trained on the flights with some numbers alone."""
+@in_one_thread
+def _left_out(kind, flights, plain, seed, options, fold):
+    """{flight: {share: 3D RMSE}} of a fold: (numbers of the flights left out, of the others, Physics fitted to those or None)."""
+    left_out, others, known = fold
     with TemporaryDirectory() as folder:
         some = [flights[k] for k in others]
-        known = replace(found, effects=found.fitted_to(others)) if found else None
         trained = models.train(kind, some[:-1] or some, some[-1:], seed, kind, options, found=known, curve=False)
         model, _ = models.save(trained, Path(folder))
-        return trained.effects, Network(model) if model else None
+        network = Network(model) if model else None
+    return {flights[k].name: judged(flights[k], plain, trained.effects, network) for k in left_out}
 
 
+@in_one_thread
 def _error(flight, effects=None, network=None):
     return evaluate(flight.without(*AIDS), None, effects, network)[0].row()["rmse_3d"]
