@@ -23,7 +23,7 @@ ADDED = 1, 3, 5  # effects
 TOOLS = {
     "evaluate": ("--no-bias", "--jobs", "1"),
     "diagnose": ("--out", "diagnosis"),
-    "train": ("--model", "structured", "--out", "model"),
+    "train": ("--model", "structured", "--jobs", "1", "--out", "model"),
 }
 FEWEST = {"evaluate": 1, "diagnose": 1, "train": 2}
 BESIDE = {  # effects that evaluate takes out of TDOAs, in the order in which they are added
