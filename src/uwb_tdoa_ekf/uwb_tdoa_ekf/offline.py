@@ -12,7 +12,7 @@ from .aid_rows import rows_of
 from .core.config import FilterConfig
 from .core.engine import feed
 from .core.hypotheses import yaw_offset
-from .core.memory import IMU_SAMPLE, RESIDUAL, TDOA, Measurements, new_memory, structured
+from .core.memory import IMU_SAMPLE, ODOMETRY, RESIDUAL, TDOA, Measurements, joined, new_memory, structured
 from .core.validity import usable_all, usable_imu
 from .core.verdicts import INVALID
 from .estimator import VERDICTS, Odometry, Residuals
@@ -79,7 +79,8 @@ def run_offline(flight, config=None, corrector=None, records=None):
         outcome_of_aids.append(of_aids)
         parts.append(odometry)
         if monitor:
-            of_batch = Residuals(t, tdoa.a[batch], tdoa.b[batch], *(outcome[batch][name] for name in RESIDUAL.names))
+            became = outcome[batch]
+            of_batch = Residuals(t, tdoa.a[batch], tdoa.b[batch], *(became[name] for name in RESIDUAL.names))
             monitor.add(Odometry.from_rows(odometry), of_batch)
             monitor.judge(math.inf if until is None else until)
             memory.anchors["delay"], memory.anchors["delay_variance"] = monitor.delays
@@ -88,7 +89,7 @@ def run_offline(flight, config=None, corrector=None, records=None):
     residuals = Residuals(tdoa.t, tdoa.a, tdoa.b, *(outcome[name] for name in RESIDUAL.names))
     of_aids = np.concatenate([*outcome_of_aids, _not_fed(1)])  # the last one for those that could not be fed
     of_aids = {stream: of_aids[place] for stream, place in places.items()}
-    ekf, odometry = memory.record, Odometry.from_rows(np.concatenate(parts))
+    ekf, odometry = memory.record, Odometry.from_rows(joined(ODOMETRY, parts))
     return Run(odometry, residuals, bias, std, int(ekf.recoveries), yaw_offset(int(ekf.best)), of_aids)
 
 

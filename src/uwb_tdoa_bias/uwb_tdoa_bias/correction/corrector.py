@@ -1,11 +1,13 @@
 """From raw TDOAs to corrected ones: the core of bias_node and of the offline engine."""
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
 from ..effects import EffectSet, Samples
-from ..effects.motion import POSE_LAG, motion_at, preceding
+from ..effects.motion import POSE_LAG, motion_at
+from ..foundation.compiled import compiled
 from .poses import Poses, rotated_in_yaw
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
@@ -74,15 +76,10 @@ class Corrector:
         if self.idle or n == 0:
             return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
         samples = self.samples(t, a, b)
-        bias, noise = self.contribution(samples)
-        std = noise
+        bias, std = self.contribution(samples)
         status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
         if self.network is not None:
-            learned, std, share = self.network.predict(samples)
-            known = np.isfinite(learned)
-            bias = bias + np.where(known, learned, 0.0)
-            std = np.hypot(noise, np.where(known & np.isfinite(std), std, 0.0))
-            status[known] = np.where(share[known] < FADED_BELOW, FADED, NETWORK)
+            _add_learned(*self.network.predict(samples), bias, std, status)
         return Correction(bias, std, d - bias, status)
 
     def contribution(self, samples):
@@ -102,10 +99,10 @@ class Corrector:
 
     def samples(self, t, a, b):
         """Samples of a batch at the poses that are known by now."""
-        before = preceding(t, self._newest)
-        self._newest = t.max() if self._newest is None else max(self._newest, t.max())
-        self._first = t[0] if self._first is None else self._first
-        places, p, q, yaw_std = self._poses.before(before - self.lag)
+        if self._newest is None:
+            self._first = self._newest = t[0]
+        places, p, q, yaw_std = self._poses.before(t, self._newest, self.lag)
+        self._newest = max(self._newest, t.max())
         samples = Samples(t, a, b, p, q, self.anchors, self._first, yaw_std=yaw_std)
         if not self.effects.needs_motion:
             return samples
@@ -117,3 +114,14 @@ class Corrector:
             interval=t - np.concatenate([[last_t], t[:-1]]),
             previous=np.concatenate([[last_b], self.anchors.ids[b[:-1]]]),
         )
+
+
+@compiled
+def _add_learned(learned, deviation, known, bias, std, status):
+    """Put what a network predicts, three (n,) arrays, on top of bias and std (n,) m of effects, where it is known."""
+    for i in range(len(bias)):
+        if math.isfinite(learned[i]):
+            bias[i] += learned[i]
+            if math.isfinite(deviation[i]):
+                std[i] = math.hypot(std[i], deviation[i])
+            status[i] = FADED if known[i] < FADED_BELOW else NETWORK

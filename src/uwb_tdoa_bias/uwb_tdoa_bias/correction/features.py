@@ -36,12 +36,13 @@ def everything(samples):
     unknown."""
     out = np.empty((len(samples), len(NAMES)))
     anchors = samples.anchors
-    _fill_all(samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, anchors.orientations, out)
+    fill_all(samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, anchors.orientations, out)
     return out
 
 
 @compiled
-def _fill_all(p, q, a, b, ids, positions, orientations, out):
+def fill_all(p, q, a, b, ids, positions, orientations, out):
+    """`everything`, compiled, written to out (n, 29)."""
     _fill(p, q, a, b, positions, orientations, out)
     _fill_place(p, q, a, b, ids, positions, out[:, len(FEATURES) :])
 

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from ..effects.motion import precede
 from ..foundation.compiled import compiled
 
 TILT = 0.5  # rad; a filter that does not know the tilt better estimates no attitude
@@ -39,45 +40,41 @@ class Poses:
     def add(self, t, p, q, yaw_std):
         """Append one pose, or several: t (k,), p (k, 3), q (k, 4), yaw_std (k,) rad. Those not later than all before them
         are ignored."""
-        new = [np.reshape(part, (-1, *column.shape[1:])) for part, column in zip((t, p, q, yaw_std), self._columns)]
-        if not _rising(new[0], self.newest):
-            rising = new[0] > np.maximum.accumulate(np.concatenate([[self.newest], new[0]]))[:-1]
-            new = [part[rising] for part in new]
-        for first in range(0, len(new[0]), self._history):
-            self._append([part[first : first + self._history] for part in new])
+        if not np.ndim(t):
+            t, p, q, yaw_std = [t], [p], [q], [yaw_std]
+        new = [np.ascontiguousarray(part, dtype=float) for part in (t, p, q, yaw_std)]
+        self._count = _append(self._count, *self._columns, *new)
 
-    def before(self, t):
-        """Of the newest poses stamped no later than t (n,) s: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN
-        where there is none."""
+    def before(self, t, newest, lag):
+        """Of the newest poses stamped no later than `lag` s before the TDOA that precedes each of t (n,) s, as `preceding`
+        says: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN where there is none."""
         n = len(t)
         out = np.empty(n, dtype=np.int64), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)
-        _look_up(t, self._count, *self._columns, *out)
+        _look_up(t, newest, lag, self._count, *self._columns, *out)
         return out
-
-    def _append(self, new):
-        end = self._count + len(new[0])
-        if end > 2 * self._history:  # make room
-            kept = self._count - self._history
-            for column in self._columns:
-                column[: self._history] = column[kept : self._count].copy()
-            self._count, end = self._history, self._history + len(new[0])
-        for column, values in zip(self._columns, new):
-            column[self._count : end] = values
-        self._count = end
-
-
-def _rising(stamps, newest):
-    for t in stamps.tolist():
-        if not t > newest:
-            return False
-        newest = t
-    return True
 
 
 @compiled
-def _look_up(t, count, stamps, p, q, yaw_std, places, p_out, q_out, yaw_std_out):
+def _append(count, stamps, p, q, yaw_std, new_stamps, new_p, new_q, new_yaw_std):
+    """Append what is later than all before it, and returns how many there are. Once there is no room, only the last half is kept."""
+    history = len(stamps) // 2
+    for i in range(len(new_stamps)):
+        if not new_stamps[i] > (stamps[count - 1] if count else -np.inf):
+            continue
+        if count == 2 * history:
+            stamps[:history], yaw_std[:history] = stamps[history:], yaw_std[history:]
+            p[:history], q[:history] = p[history:], q[history:]
+            count = history
+        stamps[count], p[count], q[count], yaw_std[count] = new_stamps[i], new_p[i], new_q[i], new_yaw_std[i]
+        count += 1
+    return count
+
+
+@compiled
+def _look_up(t, newest, lag, count, stamps, p, q, yaw_std, places, p_out, q_out, yaw_std_out):
+    precede(t, newest, yaw_std_out)
     for i in range(len(t)):
-        place = np.searchsorted(stamps[:count], t[i], side="right") - 1
+        place = np.searchsorted(stamps[:count], yaw_std_out[i] - lag, side="right") - 1
         places[i] = place
         if place >= 0:
             p_out[i], q_out[i], yaw_std_out[i] = p[place], q[place], yaw_std[place]

@@ -66,8 +66,14 @@ class Tape:
     def run(self, x):
         """x (n, width) float -> (n, outputs) float."""
         out = np.empty((len(x), self.outputs))
-        _play(self._operations, self._room_of_numbers, self._start, x, self._output, out)
+        operations, room, start, place, _ = self.playable
+        play(operations, room, start, x, place, out)
         return out
+
+    @property
+    def playable(self):
+        """(operations, room of numbers, first of them that is no constant, place of the output, its columns), for `play`."""
+        return self._operations, self._room_of_numbers, self._start, self._output, self.outputs
 
     def _room(self, columns, numbers):
         place, self._used = self._used, self._used + numbers
@@ -201,7 +207,8 @@ class Tape:
 
 
 @compiled
-def _play(operations, room, start, x, output, out):
+def play(operations, room, start, x, output, out):
+    """`Tape.run`, compiled, of the parts of a Tape; x (n, width), out (n, outputs)."""
     width, columns = x.shape[1], out.shape[1]
     for first in range(0, len(x), BATCH):
         n = min(BATCH, len(x) - first)

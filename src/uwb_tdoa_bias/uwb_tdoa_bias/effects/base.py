@@ -14,6 +14,20 @@ from .wording import LARGEST, listed, measured, significant
 __all__ = ["ArrivalEffect", "Effect", "Samples"]
 
 
+def once_per_anchors(method):
+    """A method(self, anchors) that is computed once as long as it is asked for the same Anchors object."""
+    name = f"_{method.__name__}_of"
+
+    @wraps(method)
+    def remembered(self, anchors):
+        known = self.__dict__.get(name)
+        if known is None or known[0] is not anchors:
+            known = self.__dict__[name] = anchors, method(self, anchors)
+        return known[1]
+
+    return remembered
+
+
 @dataclass
 class Effect:
     """A named systematic error with scalar parameters. One effect, one file: subclass and list it in EFFECTS.
@@ -206,8 +220,12 @@ class AnchorEffect(Effect):
         return 1.0
 
     def bias(self, samples):
-        values = np.array([self.values.get(str(i), 0.0) for i in samples.anchors.ids.tolist()])
+        values = self._of_each(samples.anchors)
         return (values[samples.b] - values[samples.a]) * self.delay_per_unit(samples)
+
+    @once_per_anchors
+    def _of_each(self, anchors):
+        return np.array([self.values.get(str(i), 0.0) for i in anchors.ids.tolist()])
 
     def regressors(self, samples, keys):
         ids, wanted = samples.anchors.ids, np.array([int(key) for key in keys])
@@ -235,17 +253,3 @@ def check_anchor(name, text, key):
 def known_anchors(anchors):
     """Ids as text; () without anchors."""
     return () if anchors is None else tuple(str(i) for i in anchors.ids.tolist())
-
-
-def once_per_anchors(method):
-    """A method(self, anchors) that is computed once as long as it is asked for the same Anchors object."""
-    name = f"_{method.__name__}_of"
-
-    @wraps(method)
-    def remembered(self, anchors):
-        known = self.__dict__.get(name)
-        if known is None or known[0] is not anchors:
-            known = self.__dict__[name] = anchors, method(self, anchors)
-        return known[1]
-
-    return remembered

@@ -1,6 +1,7 @@
 """`effects.yaml`: which effects are in the model, with which values."""
 
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from ..foundation.flight import AIDS
 from ..foundation.safe_yaml import read_yaml
 from ..foundation.version import written_by
 from .aid_corrector import AidCorrector
+from .base import Effect
 from .catalogue import EFFECTS
 from .covariance import Covariance
 from .imu_corrector import ImuCorrector
@@ -53,14 +55,21 @@ class EffectSet:
 
     def noise_std(self, samples):
         """Standard deviation that the effects add to d_ab, (n,) metres."""
-        return np.sqrt(sum((effect.noise_std(samples) ** 2 for effect in self.effects), np.zeros(len(samples))))
+        total = np.zeros(len(samples))
+        for effect in self._noisy:
+            total += effect.noise_std(samples) ** 2
+        return np.sqrt(total)
 
-    @property
+    @cached_property
+    def _noisy(self):
+        return [effect for effect in self.effects if type(effect).noise_std is not Effect.noise_std]
+
+    @cached_property
     def of_attitude(self):
         """EffectSet of those whose part of a TDOA changes with the attitude of the tag."""
         return EffectSet(tuple(effect for effect in self.effects if effect.uses_attitude))
 
-    @property
+    @cached_property
     def needs_motion(self):
         """True if an effect looks at more than poses."""
         return any(effect.needs_motion for effect in self.effects)

@@ -33,8 +33,17 @@ def motion_at(t, p, q, places):
 def preceding(t, newest=None):
     """Stamp of the TDOA that precedes each of some: (n,) s. t (n,) s, in order of arrival; newest : latest stamp of all
     before them, s. The first of all precedes itself; a stamp that has fallen back counts as its own."""
-    first = t[0] if newest is None else newest
-    return np.minimum(np.maximum.accumulate(np.concatenate([[first], t]))[:-1], t)
+    out = np.empty(len(t))
+    precede(t, t[0] if newest is None else newest, out)
+    return out
+
+
+@compiled
+def precede(t, newest, out):
+    """`preceding`, compiled, written to out (n,)."""
+    for i in range(len(t)):
+        out[i] = min(newest, t[i])
+        newest = max(newest, t[i])
 
 
 @compiled

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..foundation.compiled import compiled
 from ..foundation.geometry import rotate_each, tdoa_each, tdoa_jacobian
 from .base import Effect
 from .wording import listed, significant, size
@@ -32,11 +33,10 @@ class TagLeverArm(Effect):
         return np.array([self.values.get(key, 0.0) for key in "xyz"])
 
     def bias(self, samples):
-        a, b = samples.position_a, samples.position_b
-        of_antenna, of_body = np.empty(len(samples)), np.empty(len(samples))
-        tdoa_each(samples.p + _rotate(samples.q, self._arm()), a, b, of_antenna)
-        tdoa_each(samples.p, a, b, of_body)
-        return of_antenna - of_body
+        out = np.empty(len(samples))
+        q = np.ascontiguousarray(samples.q, dtype=float)
+        _moved(samples.p, q, self._arm(), samples.a, samples.b, samples.anchors.positions, out)
+        return out
 
     def regressors(self, samples, keys):
         antenna = samples.p + _rotate(samples.q, self._arm())
@@ -52,6 +52,15 @@ class TagLeverArm(Effect):
         return (
             f"Measure where the tag's antenna sits on the vehicle: it is {parts} from the origin of the body frame.",
         )
+
+
+@compiled
+def _moved(p, q, arm, a, b, positions, out):
+    antenna, of_body = np.empty((len(p), 3)), np.empty(len(p))
+    rotate_each(q, arm, antenna)
+    tdoa_each(p + antenna, positions[a], positions[b], out)
+    tdoa_each(p, positions[a], positions[b], of_body)
+    out -= of_body
 
 
 def _rotate(q, v):

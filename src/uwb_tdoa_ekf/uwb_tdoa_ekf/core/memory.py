@@ -203,3 +203,12 @@ def structured(kind, *columns):
     for name, column in zip(kind.names, columns):
         out[name] = column
     return out
+
+
+def joined(kind, parts):
+    """(n,) array of a type of this module, of several one after the other; numpy finds out anew for each what the type of all is."""
+    out, first = np.empty(sum(map(len, parts)), kind), 0
+    for part in parts:
+        out[first : first + len(part)] = part
+        first += len(part)
+    return out
