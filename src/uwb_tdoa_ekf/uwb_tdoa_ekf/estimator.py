@@ -205,9 +205,8 @@ class Estimator:
         passed = []  # by each stream that is waited for
         for stream, (t, order) in enumerate(zip(stamps, self._orders)):
             if (newest - SILENT < t < newest) if stream >= FIRST_AID else (stream == TDOA_STREAM or self.config.use_imu):
-                passed.append(t if order.trusted(t) else t - self.reorder)
-        before = math.nextafter(min(passed), -math.inf)  # more with that very stamp may come
-        return self._feed(max(before, newest - self.lag))
+                passed.append(order.passed(t, self.reorder))
+        return self._feed(max(min(passed), newest - self.lag))
 
     def finish(self):
         """Use everything that still waits. Returns (Odometry, Residuals)."""

@@ -23,8 +23,8 @@ class Waiting:
         return self._room[self._first : self._end]
 
     def append(self, rows, newest, after):
-        """Append rows (k,), k > 0, if their stamps rise, are after `after`, s, and in order and plausible for a stream whose
-        newest stamp was `newest`, s (see StampGate). Returns the newest stamp now, s; NaN if they were not appended."""
+        """Append rows (k,), k > 0, if their stamps rise, are not before `after`, s, but after `newest`, s, the newest stamp of the
+        stream, and plausible for it (see StampGate). Returns the newest stamp now, s; NaN if they were not appended."""
         self._make_room(len(rows))
         newest = _append(self._room, self._first, self._end, rows, newest, after)
         if newest == newest:
@@ -56,12 +56,12 @@ class Waiting:
 
 @compiled
 def _append(room, first, end, rows, newest, after):
-    last = room[end - 1].t if end > first else -np.inf
+    last = max(newest, room[end - 1].t) if end > first else newest
     if newest == -np.inf:
         newest = rows[0].t
     for k in range(len(rows)):
         t = rows[k].t
-        if not newest <= t <= newest + LARGEST_STEP_AHEAD or t <= last or t < after:
+        if not last < t <= newest + LARGEST_STEP_AHEAD or t < after:
             return np.nan
         newest = last = t
     for k in range(len(rows)):

@@ -9,6 +9,7 @@ from .stamps import LARGEST_STEP_BACK
 
 PERIOD = 0.001  # s, at least, from one turn to the next
 LONGEST_WAIT = 0.02  # s without a turn in which anything is taken, whatever it waits for
+ROUNDING = 1e-6  # s by which two ways to compute a stamp since 1970 may differ
 LONGEST_REST = 0.01  # s; after a turn there is a rest as long as it took, at most so long: more is then taken at a time
 
 
@@ -38,7 +39,7 @@ class Streams:
         self._awaited, self._due, self._until = None, None, -np.inf
 
     def wait_for(self, topic, due):
-        """Take nothing before a message of this topic is stamped after due(), s since 1970, for LONGEST_WAIT: less could not
+        """Take nothing before a message of this topic is stamped due(), s since 1970, or later, for LONGEST_WAIT: less could not
         be done with it yet."""
         self._awaited, self._due = self._by_topic[topic], due
 
@@ -55,7 +56,7 @@ class Streams:
         """Give everything that has arrived to those that take it; at_once : whatever they wait for."""
         if self._awaited is not None and not at_once:
             arrived, now = self._awaited.fetch(), time.monotonic()
-            if now < self._until and not (arrived and self._awaited.newest_waiting > self._due()):
+            if now < self._until and not (arrived and self._awaited.newest_waiting > self._due() - ROUNDING):
                 return
             self._until = now + LONGEST_WAIT
         if self._unheard:  # of what has never come, one is asked for at a time
