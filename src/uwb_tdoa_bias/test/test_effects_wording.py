@@ -4,14 +4,15 @@ from hypothesis import assume, given, strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_bias.effects import EFFECTS, LabelEffect
 from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_IMU, OF_TDOA, UNITS
 from uwb_tdoa_bias.effects.wording import counted, listed, measured, significant
 from uwb_tdoa_bias.foundation.anchors import Anchors
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 3], [0, 7, 0], [8, 7, 3]], ids=[0, 1, 3, 7])
 PAIRS = np.array([[0, 1], [3, 7]])
-WITH_ADVICE = [effect for effect in EFFECTS.values() if effect.name != "noise_correlation"]
+ESTIMATED = [effect for effect in EFFECTS.values() if not issubclass(effect, LabelEffect)]
+WITH_ADVICE = [effect for effect in ESTIMATED if effect.name != "noise_correlation"]
 
 
 def filled(effect, value, std):
@@ -68,7 +69,7 @@ def test_advice_is_imperative_sentences_with_the_size(effect):
     assert any("±" in sentence for sentence in sentences)
 
 
-@pytest.mark.parametrize("effect", EFFECTS.values())
+@pytest.mark.parametrize("effect", ESTIMATED)
 @given(st.floats(0.0, 0.2), st.floats(1.001, 5.0))
 def test_nothing_is_advised_on_what_the_data_do_not_tell(effect, value, doubt):
     assume(value > 1e-6)
@@ -90,6 +91,8 @@ def test_nothing_is_advised_on_what_the_data_do_not_tell(effect, value, doubt):
         ("imu_misalignment", {"z": -0.0698}, {"z": 0.005}, ["Turn the IMU by 4.0 ± 0.3 degrees about z"]),
         ("tdoa_time_offset", {"offset": 0.012}, {"offset": 0.001}, ["12 ± 1 ms late"]),
         ("accel_bias", {"x": -2.181, "z": -0.04}, {"x": 0.092, "z": 0.055}, ["2.18 ± 0.09 m/s^2 too little along x"]),
+        ("anchor_ids", {"1": 4}, {}, ["Give the anchors", "called 1 is anchor 4 of the survey"]),
+        ("pair_sign", {"1-4": -1}, {}, ["Look in the driver", "the sign of the TDOA of 1-4"]),
         ("gyro_scale", {"z": 0.03}, {"z": 0.001}, ["3.0 ± 0.1 % too much about z"]),
     ],
 )

@@ -19,7 +19,7 @@ from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 from .foundation import ros
 from .foundation.anchors import Anchors
 from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
-from .effects import EffectSet
+from .effects import EffectSet, LabelCorrector
 from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from .foundation.ros_frames import FramesInput, unknown_frame
@@ -76,6 +76,7 @@ class BiasNode(ros.StreamNode):
         self._lag, self._limit, self._body = own["pose_lag"], own["hold"], own["body_frame"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._late = self._effects.stamp_offset("tdoa")  # s
+        self._labels = LabelCorrector(self._effects.effects)
         self._network = load_network(unasked(effects_file) if model_file == UNASKED else model_file)
         self._model = self._warm_up()
         self._idle = self._model[NETWORK] == "none"
@@ -191,6 +192,8 @@ class BiasNode(ros.StreamNode):
         self._counts["received"] += len(t)
         if frame != self._frame:
             self._place_antenna(frame)
+        if not self._labels.idle:
+            rows = self._relabelled(rows)
         items = [(frame, *row) for row in rows.tolist()]
         if self._idle:
             self._publish(items, np.zeros(len(t)), np.zeros(len(t)), np.full(len(t), PASSED))
@@ -201,6 +204,13 @@ class BiasNode(ros.StreamNode):
                 self._counts["dropped"] += 1
         else:
             self._take(t.tolist(), items)
+
+    def _relabelled(self, rows):
+        """Rows of TDOAs with their ids and signs put right."""
+        rows, names = rows.copy(), MEASURED[:3]
+        for name, column in zip(names, self._labels.correct(*(rows[name] for name in names))):
+            rows[name] = column
+        return rows
 
     def _seconds(self, item):
         _, sec, nanosec, *_ = item

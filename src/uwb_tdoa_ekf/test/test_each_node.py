@@ -85,6 +85,19 @@ def test_late_stamps_are_moved(make_rig, tmp_path):
     assert rig.corrected[0].header.stamp == stamp(1.22) and rig.corrected[0].corrected == 1.0
 
 
+def test_wrong_ids_and_signs_are_put_right(make_rig, tmp_path):
+    text = "effects: {anchor_ids: {values: {99: 10}}, pair_sign: {values: {10-14: -1}}, anchor_delay: {values: {10: 0.1}}}"
+    (tmp_path / "effects.yaml").write_text(text)
+    rig = make_rig()
+    rig.start("bias_node", bias_node=["-p", f"effects_file:={tmp_path / 'effects.yaml'}"])
+    rig.send_anchors(ANCHORS)
+    rig.send_tdoa(0.1, 99, 14, 1.5)
+    rig.send_tdoa(0.2, 14, 99, 1.5)
+    rig.wait(lambda: len(rig.corrected) == 2, "no waiting for poses while there are none at all")
+    assert [(m.anchor_a, m.anchor_b, m.raw) for m in rig.corrected] == [(10, 14, -1.5), (14, 10, 1.5)]
+    assert [m.corrected for m in rig.corrected] == pytest.approx([-1.4, 1.4])
+
+
 def test_a_measurement_does_not_wait_for_ever(make_rig, delays):
     rig = make_rig()
     rig.start("bias_node", bias_node=delays)

@@ -34,7 +34,9 @@ def flight():
 def example(effect):
     if effect.name == "nlos":
         return effect({"2.delay": 0.3, "2.start": 5.0, "2.end": 10.0})
-    return effect({effect.example: 0.05})
+    if effect.name == "anchor_ids":
+        return effect({"1": 4, "4": 1})
+    return effect({effect.example: -1.0 if effect.name == "pair_sign" else 0.05})
 
 
 @pytest.mark.parametrize("effect", EFFECTS.values())
@@ -42,7 +44,7 @@ def test_injected_effect_is_what_the_model_takes_out(flight, effect):
     effect = example(effect)
     changed = effect.inject(flight, np.random.default_rng(1))
     streams = [(flight.tdoa.t, changed.tdoa.t), (flight.tdoa.d, changed.tdoa.d), (flight.truth.t, changed.truth.t)]
-    streams += [(flight.imu.gyro, changed.imu.gyro), (flight.imu.accel, changed.imu.accel)]
+    streams += [(flight.tdoa.a, changed.tdoa.a), (flight.imu.gyro, changed.imu.gyro), (flight.imu.accel, changed.imu.accel)]
     streams += [(getattr(flight, name).t, getattr(changed, name).t) for name in AIDS]
     streams += [(values_of(getattr(flight, name)), values_of(getattr(changed, name))) for name in AIDS]
     assert any(not np.array_equal(before, after) for before, after in streams)

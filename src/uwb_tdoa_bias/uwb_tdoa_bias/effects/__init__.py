@@ -29,11 +29,13 @@ from .catalogue import EFFECTS
 from .covariance import Covariance
 from .effect_set import EffectSet
 from .imu_corrector import ImuCorrector
+from .label_error import LabelCorrector, LabelEffect
 from .samples import AidSamples, ImuSamples, Samples, Track, aid_samples, samples_at, true_samples
 from .smooth_term import SmoothTerm
 from .tag_lever_arm import TagLeverArm
 
 __all__ = [
     "EFFECTS", "AidCorrector", "AidSamples", "AnchorDelay", "ArrivalEffect", "Covariance", "Effect", "EffectSet", "ImuCorrector",
-    "ImuSamples", "Samples", "SmoothTerm", "TagLeverArm", "Track", "aid_samples", "samples_at", "true_samples",
+    "ImuSamples", "LabelCorrector", "LabelEffect", "Samples", "SmoothTerm", "TagLeverArm", "Track", "aid_samples", "samples_at",
+    "true_samples",
 ]  # fmt: skip

@@ -4,6 +4,7 @@ from .accel_bias import AccelBias
 from .accel_scale import AccelScale
 from .anchor_clock_drift import AnchorClockDrift
 from .anchor_delay import AnchorDelay
+from .anchor_ids import AnchorIds
 from .anchor_position import AnchorPosition
 from .antenna_pattern import AntennaPattern
 from .barometer_drift import BarometerDrift
@@ -20,6 +21,7 @@ from .noise_correlation import NoiseCorrelation
 from .noise_level import NoiseLevel
 from .outlier_rate import OutlierRate
 from .pair_offset import PairOffset
+from .pair_sign import PairSign
 from .range_bias import RangeBias
 from .range_scale import RangeScale
 from .received_power_bias import ReceivedPowerBias
@@ -39,6 +41,6 @@ EFFECTS = {
         RangeBias, ReceivedPowerBias, AntennaPattern, AnchorClockDrift, Nlos, FloorMultipath, GyroBias, GyroScale,
         AccelBias, AccelScale, ImuMisalignment, ImuGravity, NoiseLevel, NoiseCorrelation, OutlierRate,
         HeightOffset, HeightScale, FloorStep, BarometerDrift, VelocityScale, VelocityMisalignment, VelocityDelay,
-        VelocitySlip,
+        VelocitySlip, AnchorIds, PairSign,
     )
 }  # fmt: skip

@@ -16,6 +16,7 @@ from .base import Effect
 from .catalogue import EFFECTS
 from .covariance import Covariance
 from .imu_corrector import ImuCorrector
+from .label_error import LabelCorrector
 from .smooth_term import SmoothTerm
 from .stamp_error import shifted
 
@@ -79,8 +80,12 @@ class EffectSet:
         return sum(effect.stamp_offset(stream) for effect in self.effects)
 
     def correct_streams(self, flight):
-        """The Flight without the effects' part in stamps, inertial samples, heights and velocities. TDOA biases are the
-        Corrector's."""
+        """The Flight without the effects' part in ids, signs, stamps, inertial samples, heights and velocities. TDOA biases are
+        the Corrector's."""
+        labels, of = LabelCorrector(self.effects), flight.tdoa
+        if not labels.idle:
+            a, b, d = labels.correct(of.a, of.b, of.d)
+            flight = replace(flight, tdoa=replace(of, a=a, b=b, d=d))
         for stream in STREAMS:
             flight = shifted(flight, stream, -self.stamp_offset(stream))
         flight = self._correct_aids(flight)
