@@ -38,22 +38,14 @@ def missing(view):
     for row in np.flatnonzero(counts > 0):
         share = counts[row] / np.median(counts[counts > 0])
         number = int(view.anchors.ids[row])
-        if share < RARE:
-            evidence = f"{100.0 * share:.0f} % of what is heard of the one in the middle"
-            yield Finding(
-                "anchor_rare",
-                NOTE,
-                f"anchor {number} is hardly heard",
-                evidence,
-                f"look at anchor {number}: power, line of sight",
-                share,
-            )
-            continue
+        remedy = f"look at anchor {number}: power, line of sight"
         since, until = _silence(view.windows, heard[:, row])
         if until - since > SILENT:
             evidence = f"{until - since:.0f} s from {since:.1f} s on"
-            remedy = f"look at anchor {number}: power, line of sight"
             yield Finding("anchor_silent", WARNING, f"anchor {number} falls silent", evidence, remedy, until - since)
+        elif share < RARE:
+            evidence = f"{100.0 * share:.0f} % of what is heard of the one in the middle"
+            yield Finding("anchor_rare", NOTE, f"anchor {number} is hardly heard", evidence, remedy, share)
 
 
 def _silence(windows, heard):

@@ -4,15 +4,22 @@ import numpy as np
 
 from uwb_tdoa_ekf.streams import NOTE, StreamRules, most_severe_first
 
+from . import coverage, inertial_values
 from .against_truth import against_truth
 
 
 def numbers(flight):
-    """[Finding] of a Flight, most severe first: of its streams by themselves, and against its ground truth if it has one."""
+    """[Finding] of a Flight, most severe first: of its streams by themselves, and against its ground truth if it has one. What several
+    rules name by the same name is told once."""
     streams, imu, of = StreamRules(flight.anchors), flight.imu, flight.tdoa
     if imu is not None:
         streams.feed_imu(imu.t, np.full(len(imu), np.nan), imu.gyro, imu.accel)
     streams.feed_tdoa(of.t, np.full(len(of), np.nan), of.a, of.b, of.d)
     streams.finish()
-    found = [finding for finding in streams.findings() if finding.severity != NOTE]
-    return most_severe_first(found + against_truth(flight))
+    found = streams.findings()
+    found += coverage.missing(coverage.View(flight.anchors, list(streams.tdoa), np.empty((0, 3))))
+    if imu is not None and not any(finding.rule == "imu_clipped" for finding in found):
+        found += inertial_values.saturated(flight)
+    found = [finding for finding in found if finding.severity != NOTE]
+    known = {finding.rule for finding in found}
+    return most_severe_first(found + [finding for finding in against_truth(flight) if finding.rule not in known])

@@ -31,8 +31,8 @@ def add_options(add):
     """The options of the study."""
     add("part", choices=PARTS, help="what to run")
     add("--out", metavar="DIR", type=Path, required=True, help="where to write")
-    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, or cases of blind and faults (default: 5)")
-    add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind and no-truth (default: %(default)s)")
+    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, cases of blind, or costly draws of each of the faults (default: 5)")
+    add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind, faults and no-truth (default: %(default)s)")
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
     add("--jobs", metavar="N", type=whole_number, default=1, help="cases of blind at once (default: %(default)s)")
     add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
@@ -126,7 +126,7 @@ def _blind(args):
 
 
 def _faults(args):
-    results = _each(faults.cases(args.seeds), lambda *case: faults.run(args.data, *case))
+    results = list(tqdm(faults.cases(args.data, args.seeds, args.first), unit="draw", disable=None))
     return {"figures": faults.figures(results), "cases": results}
 
 

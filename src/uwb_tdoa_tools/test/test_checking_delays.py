@@ -1,0 +1,51 @@
+"""Delays against a known course."""
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_tools.checking.delays import delays
+
+T = np.arange(0.0, 60.0, 0.02)
+SERIES = np.arange(len(T)) % 3
+
+
+def course(t):
+    return np.sin(1.3 * t) + 0.5 * np.sin(0.7 * t + SERIES)
+
+
+def found(late, noise=0.1):
+    """Delays of three series with noise and constant errors of their own, each sample `late` (n,) s."""
+    measured = course(T - late) + SERIES + noise * np.random.default_rng(0).standard_normal(len(T))
+    return delays(SERIES, T, lambda delay: measured - course(T - delay))
+
+
+def test_nothing_is_late():
+    of = found(np.zeros(len(T)))
+    assert of.constant() == (1.0, pytest.approx(0.0))
+    assert min(of.drift()[0], of.jump()[0]) > 0.99
+
+
+@pytest.mark.parametrize("late", [-0.4, 0.25])
+def test_all_are_late_by_the_same(late):
+    ratio, delay = found(np.full(len(T), late)).constant()
+    assert ratio < 0.9 and delay == pytest.approx(late)
+
+
+def test_one_series_is_late():
+    of = found(0.3 * (SERIES == 1))
+    assert [of.of_series(k)[1] for k in range(3)] == pytest.approx([0.0, 0.3, 0.0])
+    assert of.of_series(1)[0] < 0.6 and of.of_series(0)[0] == 1.0
+
+
+def test_a_clock_that_drifts_and_one_that_jumps():
+    drifting, jumping = found(T / 60.0), found(0.6 * (T > 30.0))
+    (ratio, by), (other, _, _) = drifting.drift(), drifting.jump()
+    assert ratio < 0.9 and ratio < other and by == pytest.approx(0.95, abs=0.1)
+    (other, _), (ratio, step, block) = jumping.drift(), jumping.jump()
+    assert ratio < 0.9 and ratio < other and step == pytest.approx(0.6) and block == 6
+
+
+def test_gross_errors_do_not_count():
+    rng, late = np.random.default_rng(1), np.full(len(T), 0.25)
+    measured = course(T - late) + np.where(rng.random(len(T)) < 0.1, rng.uniform(-50.0, 50.0, len(T)), 0.0)
+    assert delays(SERIES, T, lambda delay: measured - course(T - delay)).constant()[1] == pytest.approx(0.25)

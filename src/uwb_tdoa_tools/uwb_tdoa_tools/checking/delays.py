@@ -1,0 +1,95 @@
+"""Is a stream late against the ground truth, and by how much when? Power of what is left, for every delay that it could have.
+
+What changes slowly, as a systematic error does, is taken out first: a mean for each pair, or axis, and block of time.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.geometry import tdoa
+
+LONGEST, STEP = 1.5, 0.05  # s that are tried to both sides, and between them
+DELAYS = np.arange(-LONGEST, LONGEST + 0.5 * STEP, STEP)
+NONE = len(DELAYS) // 2  # place of the delay 0
+BLOCK, FEWEST = 5.0, 5  # s, and samples that a series must have in one
+MOST = 15000  # TDOAs that are looked at, evenly taken
+LIMIT = 2.0  # standard deviations of a series, robust, beyond which an error counts no more: what is behind obstacles is many
+
+
+@dataclass(frozen=True)
+class Delays:
+    """power (series, blocks, len(DELAYS)) : sum of squares that is left of each series, in units of its variance as it is, with each
+    delay."""
+
+    power: np.ndarray
+
+    def of_series(self, k):
+        """(ratio, s): what is left of a series with its best delay, over what is left with the best one of all; and that delay."""
+        own, common = self.power[k].sum(axis=0), int(np.argmin(self.power.sum(axis=(0, 1))))
+        best = int(np.argmin(own))
+        return float(own[best] / max(own[common], 1e-12)), float(DELAYS[best] - DELAYS[common])
+
+    def constant(self):
+        """(ratio, s): what is left with the best delay of all, over what is left without any; and that delay."""
+        total = self.power.sum(axis=(0, 1))
+        best = int(np.argmin(total))
+        return float(total[best] / max(total[NONE], 1e-12)), float(DELAYS[best])
+
+    def drift(self):
+        """(ratio, s): what is left if the delay changes evenly, over what is left with a constant one; from first to last block."""
+        of = self.power.sum(axis=0)
+        blocks = np.arange(len(of))
+        start, end = np.meshgrid(np.arange(of.shape[1]), np.arange(of.shape[1]), indexing="ij")
+        share = blocks / max(len(of) - 1, 1)
+        place = np.rint(start[..., None] + (end - start)[..., None] * share).astype(int)
+        left = of[blocks, place].sum(axis=-1)
+        best = np.unravel_index(np.argmin(left), left.shape)
+        return float(left[best] / max(of.sum(axis=0).min(), 1e-12)), float(DELAYS[best[1]] - DELAYS[best[0]])
+
+    def jump(self):
+        """(ratio, s, block): what is left if the delay changes once, over what is left with a constant one; by how much, and the
+        first block after that."""
+        of = self.power.sum(axis=0)
+        before = np.cumsum(of, axis=0)
+        after = before[-1] - before
+        left = before.min(axis=1) + after.min(axis=1)
+        k = int(np.argmin(left))
+        step = DELAYS[np.argmin(after[k])] - DELAYS[np.argmin(before[k])]
+        return float(left[k] / max(before[-1].min(), 1e-12)), float(step), k + 1
+
+
+def delays(series, t, error):
+    """Delays of (n,) samples at t, s, of series numbered from 0; error(delay) -> (n,), what is left of each."""
+    block = ((t - t.min()) / BLOCK).astype(int)
+    blocks = block.max() + 1
+    group = series * blocks + block
+    size = (series.max() + 1) * blocks
+    count = np.bincount(group, minlength=size)
+    counted = count[group] >= FEWEST
+    power, scale = np.zeros((size, len(DELAYS))), None
+    for k in np.roll(np.arange(len(DELAYS)), -NONE):  # as it is first
+        left = error(DELAYS[k])
+        left = left - (np.bincount(group, left, size) / np.maximum(count, 1))[group]
+        scale = _scatter(series, np.where(counted, left, np.nan))[series] if scale is None else scale
+        left = np.where(counted, np.clip(left / scale, -LIMIT, LIMIT), 0.0)
+        power[:, k] = np.bincount(group, left**2, size)
+    return Delays(power.reshape(-1, blocks, len(DELAYS)))
+
+
+def _scatter(series, values):
+    """(series,): robust standard deviation of each, of what is not NaN; 1 where there is none."""
+    known = [np.abs(values[(series == k) & np.isfinite(values)]) for k in range(series.max() + 1)]
+    return np.array([max(1.4826 * np.median(part), 1e-9) if len(part) else 1.0 for part in known])
+
+
+def of_tdoas(path):
+    """Delays of the pairs of a KnownPath, in their order; None without any."""
+    if not path.pairs:
+        return None
+    every = max(1, sum(map(len, path.pairs.values())) // MOST)
+    rows = [part[::every] for part in path.pairs.values()]
+    series, rows = np.repeat(np.arange(len(rows)), [len(part) for part in rows]), np.concatenate(rows)
+    t, samples = path.t[rows], path.samples
+    a, b = samples.position_a[rows], samples.position_b[rows]
+    return delays(series, t, lambda delay: path.d[rows] - tdoa(path.track.positions(t - delay), a, b))

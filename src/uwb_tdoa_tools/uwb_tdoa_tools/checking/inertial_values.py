@@ -1,0 +1,32 @@
+"""What the values of inertial samples tell by themselves, over a whole flight."""
+
+import numpy as np
+
+from uwb_tdoa_ekf.streams import WARNING, Finding
+from uwb_tdoa_ekf.streams.inertial_rules import AXES
+
+HITS, MORE, NEXT = 20, 5.0, 5  # samples at one end, and times as many as have each of the values next to it; healthy 1
+FAR, EVEN = 0.02, 2.6  # s, and times the least that a step can be over the change in that time; healthy 2.8 (filtered 20 ms) to 400
+FEWEST = 10  # samples within FAR, without which nothing is said
+
+
+def saturated(flight):
+    """An axis with many samples at its largest or smallest value, far more than next to it. Takes a Flight, yields Findings."""
+    for name, column in zip(AXES, np.column_stack([flight.imu.gyro, flight.imu.accel]).T):
+        values, counts = np.unique(column, return_counts=True)
+        for values, counts in ((values, counts), (values[::-1], counts[::-1])):
+            if len(values) > NEXT and counts[0] >= HITS and counts[0] > MORE * counts[1 : 1 + NEXT].mean():
+                evidence = f"{counts[0]} samples of {values[0]:.2f}, {counts[1 : 1 + NEXT].mean():.0f} of each of the next values"
+                remedy = "set the sensor to a larger range"
+                yield Finding("imu_clipped", WARNING, f"{name} is clipped", evidence, remedy, float(values[0]))
+                return
+
+
+def smooth(t, values):
+    """Whether what a sensor reads, (n, 3) at t (n,) s, changes so evenly, on all axes, as only behind a low pass: the square of a
+    step over that of the change in FAR is 1/k^2 at least, k steps being that long. False of a slow sensor, of which nobody can tell."""
+    steps = round(FAR / max(np.median(np.diff(t)), 1e-6))
+    if steps < FEWEST or len(t) <= steps:
+        return False
+    one, far = np.mean(np.diff(values, axis=0) ** 2, axis=0), np.mean((values[steps:] - values[:-steps]) ** 2, axis=0)
+    return bool((one * steps**2 < EVEN * far).all())

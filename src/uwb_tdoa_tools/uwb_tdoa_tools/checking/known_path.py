@@ -1,0 +1,34 @@
+"""TDOAs of a flight beside what the geometry of its ground truth says, pair by pair."""
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet, Track, true_samples
+from uwb_tdoa_bias.foundation.geometry import tdoa
+
+AIRBORNE = 0.3  # m
+FEWEST = 40  # TDOAs of a pair in the air, of which something is said
+
+
+class KnownPath:
+    """d, true (n,) m, t (n,) s: the usable TDOAs and what they should be; samples : Samples; ids (N,); track : Track of the truth;
+    start : s, stamp of the first TDOA; pairs {(a, b) ids: rows (k,)} of those in the air that are often heard."""
+
+    def __init__(self, flight):
+        """flight : Flight with ground truth."""
+        self._flight = flight
+        self.samples, rows = true_samples(flight)
+        self.t, self.d = self.samples.t, flight.tdoa.d[rows]
+        self.true = tdoa(self.samples.p, self.samples.position_a, self.samples.position_b)
+        self.ids, self.track, self.start = self.samples.anchors.ids, Track(flight.truth), float(flight.tdoa.t[0])
+        self.flown = np.flatnonzero(self.samples.p[:, 2] > AIRBORNE)
+        key = (self.samples.a * len(self.ids) + self.samples.b)[self.flown]
+        order = np.argsort(key, kind="stable")
+        parts = np.split(self.flown[order], np.flatnonzero(np.diff(key[order])) + 1) if len(order) else []
+        self.pairs = {self._named(part[0]): part for part in parts if len(part) >= FEWEST}
+
+    def without(self, *effects):
+        """The same without some LabelEffects."""
+        return KnownPath(EffectSet(effects).correct_streams(self._flight))
+
+    def _named(self, row):
+        return int(self.ids[self.samples.a[row]]), int(self.ids[self.samples.b[row]])

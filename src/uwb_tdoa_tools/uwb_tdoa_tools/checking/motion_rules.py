@@ -1,0 +1,200 @@
+"""Does the inertial sensor fit the turns and accelerations of the ground truth? A rule takes a TrueMotion and yields Findings.
+
+Both sensors are compared over short cells; constant biases and what changes slowly are taken out first.
+"""
+
+from itertools import permutations, product
+
+import numpy as np
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation, Slerp
+
+from uwb_tdoa_ekf.streams import ERROR, Finding
+
+from .delays import BLOCK, LONGEST, delays
+from .imu_rules import SCALES
+from .inertial_values import smooth
+from .time_rules import changing
+
+CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which one is averaged
+BEYOND = round(LONGEST / CELL)  # cells at either end that are there for what is late
+FEWEST = 200  # cells in the air
+LIMIT = 4.0  # standard deviations, robust, beyond which a difference counts no more
+GRAVITY = 9.81  # m/s^2
+# Of the power that is left with the axes of a sensor otherwise, healthy 1.22 and 0.92 at least; of that, with another attitude of the truth.
+AXES, ATTITUDE = {"gyro": 0.8, "accel": 0.75}, 1.2
+# Of the power that is left behind a low pass: healthy 0.87 at least, and where the sensor is too smooth; and the time constants, s.
+FILTERED, FILTERED_TOO, SLOWNESS = 0.8, 0.97, (0.05, 0.1, 0.2, 0.4, 0.8)  # of the power that is left with a low pass; s, its time constants
+SENSORS = {"gyro": "gyroscope", "accel": "accelerometer"}
+# What an attitude x, y, z, w may be instead: {words: places, signs}
+ATTITUDES = {
+    "of a frame that is mirrored along x": ([0, 1, 2, 3], (1, -1, -1, 1)),
+    "of a frame that is mirrored along y": ([0, 1, 2, 3], (-1, 1, -1, 1)),
+    "of a frame that is mirrored along z": ([0, 1, 2, 3], (-1, -1, 1, 1)),
+    "from the world to the body": ([0, 1, 2, 3], (-1, -1, -1, 1)),
+    "written with w first": ([1, 2, 3, 0], (1, 1, 1, 1)),
+}  # fmt: skip
+
+
+class TrueMotion:
+    """measured {"gyro", "accel": (n, 3)}, means over cells at t (n,) s in the air; block (n,), of BLOCK seconds; smooth {sensor: bool},
+    whether it changes too evenly for a sensor that vibrates."""
+
+    def __init__(self, flight):
+        """flight : Flight with inertial samples and ground truth with attitudes."""
+        imu, truth = flight.imu, flight.truth
+        known = np.isfinite(truth.q).all(axis=1)
+        self._t, first = np.unique(truth.t[known], return_index=True)
+        self._p, self._q = truth.p[known][first], truth.q[known][first]
+        flown = self._t[self._p[:, 2] > 0.3]
+        margin = LONGEST + 0.5
+        start, end = max(flown[0], imu.t[0], self._t[0]) + margin, min(flown[-1], imu.t[-1], self._t[-1]) - margin
+        self.t = start + CELL * np.arange(max(int((end - start) / CELL), 0))
+        self.block = (CELL * np.arange(len(self.t)) / BLOCK).astype(int)
+        if len(self) < FEWEST:
+            return
+        self.measured = {"gyro": _mean(imu.t, imu.gyro, self.t), "accel": _triangle(imu.t, imu.accel, self.t)}
+        self.true = self.with_attitude(None)
+        self.smooth = {"gyro": smooth(imu.t, imu.gyro), "accel": smooth(imu.t, imu.accel)}
+        self._scale = {}
+        for sensor in SENSORS:
+            left = _slowly_left(self.measured[sensor] - self.at(self.true[sensor]), self.block)
+            self._scale[sensor] = 1.4826 * np.median(np.abs(left), axis=0) + 1e-9
+
+    def __len__(self):
+        """How many cells there are."""
+        return len(self.t)
+
+    def with_attitude(self, name):
+        """{"gyro", "accel": (n + 2 BEYOND, 3)}, what the sensors should have measured at t and LONGEST before and after, with an
+        attitude of ATTITUDES, or the one that is written."""
+        order, signs = ATTITUDES[name] if name else ([0, 1, 2, 3], (1, 1, 1, 1))
+        turn = Slerp(self._t, Rotation.from_quat(self._q[:, order] * signs))
+        t = self.t[0] + CELL * np.arange(-BEYOND, len(self.t) + BEYOND)
+        gyro = (turn(t - HALF).inv() * turn(t + HALF)).as_rotvec() / (2.0 * HALF)
+        before, here, after = (_at(self._t, self._p, t + shift) for shift in (-HALF, 0.0, HALF))
+        force = (after - 2.0 * here + before) / HALF**2
+        return {"gyro": gyro, "accel": turn(t).inv().apply(force + (0.0, 0.0, GRAVITY))}
+
+    def at(self, true, late=0):
+        """(n, 3): the values of `true` so many cells before."""
+        return true[BEYOND - late : len(true) - BEYOND - late]
+
+    def power(self, sensor, true, change=None):
+        """Mean clipped square of measured, turned by `change`, minus true (n + 2 BEYOND, 3), in units of its scatter as it is."""
+        measured = self.measured[sensor] if change is None else self.measured[sensor] @ change.T
+        left = _slowly_left(measured - self.at(true), self.block) / self._scale[sensor]
+        return float(np.mean(np.clip(left, -LIMIT, LIMIT) ** 2))
+
+    def delays(self):
+        """Delays of the six axes together."""
+        series, t = np.repeat(np.arange(6), len(self.t)), np.tile(self.t, 6)
+
+        def error(late):
+            parts = (self.measured[s] - self.at(self.true[s], round(late / CELL)) for s in SENSORS)
+            return np.concatenate([part.T.reshape(-1) for part in parts])
+
+        return delays(series, t, error)
+
+
+def _slowly_left(values, block):
+    """(n, 3) without their means over blocks."""
+    count = np.maximum(np.bincount(block), 1)
+    return values - np.stack([(np.bincount(block, column) / count)[block] for column in values.T], axis=1)
+
+
+def _integral(t, values):
+    """(m, 3): integral of samples over t (m,)."""
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None]
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def _at(t, values, when):
+    return np.stack([np.interp(when, t, column) for column in values.T], axis=1)
+
+
+def _mean(t, values, when):
+    """(n, 3): means over HALF to both sides."""
+    total = _integral(t, values)
+    return (_at(t, total, when + HALF) - _at(t, total, when - HALF)) / (2.0 * HALF)
+
+
+def _triangle(t, values, when):
+    """(n, 3): means with a triangular weight, HALF to both sides, which is what a second difference of places is of."""
+    total = _integral(t, _integral(t, values - values.mean(axis=0)))
+    second = _at(t, total, when + HALF) - 2.0 * _at(t, total, when) + _at(t, total, when - HALF)
+    return second / HALF**2 + values.mean(axis=0)
+
+
+def axes(motion):
+    """Axes that are exchanged or mirrored, a gyroscope in another unit, or a truth whose attitude is another one."""
+    base = {sensor: motion.power(sensor, motion.true[sensor]) for sensor in SENSORS}
+    best = {sensor: _best_arrangement(motion, sensor) for sensor in SENSORS}
+    wrong = [sensor for sensor in SENSORS if best[sensor][0] < AXES[sensor] * base[sensor]]
+    attitude, power = min(((name, _with_attitude(motion, name)) for name in ATTITUDES), key=lambda x: x[1]["gyro"])
+    if power["gyro"] < AXES["gyro"] * base["gyro"] and power["accel"] < base["accel"] and power["gyro"] < ATTITUDE * best["gyro"][0]:
+        evidence = f"{100 * (1 - power['gyro'] / base['gyro']):.0f} % less mean square difference of the turns then, "
+        evidence += f"{100 * (1 - power['accel'] / base['accel']):.0f} % of the accelerations"
+        cause = f"the attitude of the ground truth is {attitude}"
+        yield Finding("truth_attitude", ERROR, cause, evidence, "write body to world, right-handed, x y z w", power["gyro"])
+        return
+    for sensor in wrong:
+        power, change = best[sensor]
+        evidence = f"{100 * (1 - power / base[sensor]):.0f} % less mean square difference to the ground truth"
+        yield _of_axes(sensor, change, evidence, power)
+
+
+def _best_arrangement(motion, sensor):
+    """(power that is left, (3, 3) matrix) of what explains most."""
+    return min(((motion.power(sensor, motion.true[sensor], change), change) for change in _arrangements(sensor)), key=lambda x: x[0])
+
+
+def _arrangements(sensor):
+    """[(3, 3) matrix that undoes it] of what may be wrong with the axes of a sensor."""
+    changes = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
+    changes += [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)] if sensor == "gyro" else []
+    return changes[1:]  # the first is as it is
+
+
+def _with_attitude(motion, name):
+    true = motion.with_attitude(name)
+    return {sensor: motion.power(sensor, true[sensor]) for sensor in SENSORS}
+
+
+def _of_axes(sensor, change, evidence, power):
+    scale = abs(np.linalg.det(change)) ** (1.0 / 3.0)
+    if abs(scale - 1.0) > 0.1:
+        cause = f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the turns of the ground truth"
+        return Finding("imu_rate_unit", ERROR, cause, evidence, f"angular_velocity *= {scale:.6g}", scale)
+    words = []
+    for k, row in enumerate(change):
+        place = int(np.argmax(np.abs(row)))
+        if place != k or row[place] < 0.0:
+            words.append(f"{'xyz'[k]} is {'-' if row[place] < 0.0 else ''}{'xyz'[place]}")
+    cause = f"axes of the {SENSORS[sensor]} are exchanged or mirrored: {', '.join(words)} of what it reads"
+    return Finding(f"{sensor}_axes", ERROR, cause, evidence, "put the driver right: x forward, y left, z up", power)
+
+
+def filtered(motion):
+    """A low pass of first order in a sensor: its output is late and too small. The truth is noisy, and fits better behind any low
+    pass: one that runs backwards tells by how much."""
+    for sensor in SENSORS:
+        true, limit = motion.true[sensor], FILTERED_TOO if motion.smooth[sensor] else FILTERED
+        powers = [(motion.power(sensor, _slowed(true, tau)), motion.power(sensor, _slowed(true[::-1], tau)[::-1]), tau) for tau in SLOWNESS]
+        power, backwards, slowness = min(powers)
+        backwards = min(backwards, motion.power(sensor, true))
+        if power < limit * backwards:
+            cause = f"the {SENSORS[sensor]} is filtered: what it reads is {slowness:g} s late and too small"
+            evidence = f"{100 * (1 - power / backwards):.0f} % less mean square difference to the ground truth behind a low pass of {slowness:g} s"
+            yield Finding("imu_filtered", ERROR, cause, evidence, "set the low pass of the sensor to 20 Hz or more", slowness)
+
+
+def _slowed(values, tau):
+    """Through a low pass of first order, of time constant tau, s."""
+    share = 1.0 - np.exp(-CELL / tau)
+    return lfilter([share], [1.0, share - 1.0], values - values[0], axis=0) + values[0]
+
+
+def stamps(motion):
+    """Stamps that drift or jump."""
+    yield from changing("imu", "inertial samples", motion.delays())

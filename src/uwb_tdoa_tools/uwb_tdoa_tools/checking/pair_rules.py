@@ -1,0 +1,155 @@
+"""What is wrong with the TDOAs of single pairs, or of all: values, signs, ids. A rule takes a KnownPath and yields Findings.
+
+Limits are shares, or what is left of an error. The healthy values beside them are the extremes of the pairs of 37 measured recordings.
+"""
+
+from itertools import combinations
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_ekf.streams import ERROR, Finding
+
+CONTRARY = 0.4  # of the median error that is left with the other sign, or with the ids exchanged
+MOVED = 0.3  # m by which what a pair should measure varies, at least, for its sign to be told
+GRID, ON_GRID = 0.03, 1e-4  # m: least step of what counts as rounded, and how near to it values are
+BETWEEN = 0.2  # share of TDOAs on the line between their neighbours
+REPEATED, FROZEN = 0.2, 8  # share of TDOAs that equal the one before, and how many together, with one value
+AT_END, HITS = 0.04, 5  # share of TDOAs at the largest or smallest value, and how many
+MOST = 0.5  # share of the pairs with the same fault, from which on it is one of all
+EXCHANGES = 4  # pairs of anchors that are exchanged one after the other
+
+
+def values(path):
+    """Pairs with the other sign, rounded, interpolated, repeated, clipped or frozen; all of them alike count as one finding."""
+    found = {}
+    for pair, rows in path.pairs.items():
+        for rule in OF_PAIR:
+            said = rule(path.d[rows], path.true[rows], path.t[rows] - path.start)
+            if said is not None:
+                found.setdefault(rule.__name__[1:], {})[pair] = said
+                break
+    for name, of_pairs in found.items():
+        if len(of_pairs) >= MOST * len(path.pairs):
+            _, (what, evidence, remedy, value) = next(iter(of_pairs.items()))
+            evidence = f"{len(of_pairs)} of {len(path.pairs)} pairs; of the first: {evidence}"
+            yield Finding(f"tdoa_{name}", ERROR, f"the TDOAs of all pairs are wrong: each {what}", evidence, remedy, value)
+            continue
+        for pair, (what, evidence, remedy, value) in of_pairs.items():
+            yield Finding(f"pair_{name}", ERROR, f"the TDOA of the pair ({pair[0]}, {pair[1]}) {what}", evidence, remedy, value)
+
+
+def contrary(path):
+    """[(a, b)] of the pairs whose sign is the other one."""
+    return [pair for pair, rows in path.pairs.items() if _sign(path.d[rows], path.true[rows], None) is not None]
+
+
+def _sign(d, true, t):
+    same, other = (float(np.median(np.abs(sign * d - true))) for sign in (1.0, -1.0))
+    if np.std(true) > MOVED and other < CONTRARY * same:
+        return "has the wrong sign", f"median error {same:.2f} m, with the other sign {other:.2f} m", "distance_difference *= -1.0", other
+
+
+def _rounded(d, true, t):
+    values = np.unique(d)
+    if len(values) < 2 or len(values) > 0.5 * len(d):
+        return None
+    grid = float(np.diff(values).min())
+    if grid > GRID and (np.abs(d / grid - np.round(d / grid)) < ON_GRID / grid).all():
+        return f"is rounded to {grid:.3g} m", f"{len(values)} values, all multiples of it", "publish it as measured", grid
+
+
+def _interpolated(d, true, t):
+    """On the line between its neighbours, over packets or over time."""
+    step = np.median(np.abs(np.diff(d)))
+    moving = (d[1:-1] != d[:-2]) | (d[2:] != d[1:-1])
+    share = 0.0
+    for place in (np.arange(len(d)), t):
+        weight = (place[1:-1] - place[:-2]) / np.maximum(place[2:] - place[:-2], 1e-9)
+        off = np.abs(d[1:-1] - (1.0 - weight) * d[:-2] - weight * d[2:])
+        share = max(share, float(np.mean(moving & (off < 1e-3 * max(step, 1e-6)))))
+    if share > BETWEEN:
+        evidence = f"{100 * share:.0f} % are on the line between their neighbours"
+        return "is interpolated", evidence, "publish only what was measured", share
+
+
+def _repeated(d, true, t):
+    """Beside the longest run, which may stand still, and the ends, which may be clipped."""
+    first, length = _runs(d)
+    length = length[(d[first] > d.min()) & (d[first] < d.max())]
+    if not len(length):
+        return None
+    share = float((length.sum() - len(length) - (length.max() - 1)) / max(length.sum() - length.max(), 1))
+    if share > REPEATED:
+        return "is published more than once", f"{100 * share:.0f} % equal the one before", "publish a TDOA when there is a new one", share
+
+
+def _clipped(d, true, t):
+    """Many at one end; if they are all together, there where the geometry is beyond it, or it stands still."""
+    for end, outward in ((d.max(), 1.0), (d.min(), -1.0)):
+        at = d == end
+        together = np.sum(np.diff(np.flatnonzero(at)) > 1) == 0
+        if at.sum() > AT_END * len(d) and at.sum() >= HITS and not (together and np.median(outward * (true[at] - end)) < 0.0):
+            evidence = f"{100 * at.mean():.0f} % have this value"
+            return f"is clipped at {end:.2f} m", evidence, "widen the limit of the driver", float(end)
+
+
+def _frozen(d, true, t):
+    first, length = _runs(d)
+    k = int(np.argmax(length))
+    rows = slice(first[k], first[k] + length[k])
+    if length[k] >= FROZEN and np.ptp(true[rows]) > 0.02:
+        evidence = f"{length[k]} times {d[first[k]]:.3f} m while it changes by {np.ptp(true[rows]):.2f} m"
+        what = f"stands still from {t[rows][0]:.1f} to {t[rows][-1]:.1f} s"
+        return what, evidence, "publish a TDOA when there is a new one", float(t[rows][0])
+
+
+def _runs(d):
+    """(first, length) of the runs of equal values: (k,) each."""
+    edges = np.flatnonzero(np.concatenate([[True], np.diff(d) != 0.0, [True]]))
+    return edges[:-1], np.diff(edges)
+
+
+OF_PAIR = _sign, _rounded, _interpolated, _repeated, _clipped, _frozen
+
+
+def ids(path):
+    """Anchors that are called by the names of others."""
+    table, before, after = renamed(path)
+    if table:
+        names = ", ".join(f"{wrong} is {right}" for wrong, right in table.items())
+        evidence = f"median error of their TDOAs {before:.2f} m, exchanged {after:.2f} m"
+        line = f"id = {{{', '.join(f'{wrong}: {right}' for wrong, right in table.items())}}}.get(id, id)"
+        yield Finding("ids_exchanged", ERROR, f"the ids of anchors are exchanged: what is called {names}", evidence, line, after)
+
+
+def renamed(path):
+    """({id as received: id of that anchor}, median error m of the TDOAs of these anchors as they are, and then)."""
+    rows, table, errors = np.arange(len(path.ids)), {}, None
+    for _ in range(EXCHANGES):
+        best = None
+        for one, two in combinations(range(len(rows)), 2):
+            trial = rows.copy()
+            trial[[one, two]] = trial[[two, one]]
+            before, after = _median_errors(path, (one, two), rows, trial)
+            if after < CONTRARY * before and (best is None or after / before < best[0]):
+                best = after / before, trial
+        if best is None:
+            break
+        rows = best[1]
+        changed = np.flatnonzero(rows != np.arange(len(rows)))
+        table = {int(path.ids[row]): int(path.ids[rows[row]]) for row in changed}
+        errors = _median_errors(path, changed, np.arange(len(rows)), rows)
+    return table, *(errors or (0.0, 0.0))
+
+
+def _median_errors(path, anchors, *tables):
+    """Median |error| m of the TDOAs in the air with some anchors (rows), under each table of the rows of the anchors."""
+    samples, flown = path.samples, path.flown
+    a, b = samples.a[flown], samples.b[flown]
+    with_them = np.isin(a, anchors) | np.isin(b, anchors)
+    if with_them.sum() < 40:
+        return tuple(np.inf for _ in tables)
+    a, b, d, p = a[with_them], b[with_them], path.d[flown][with_them], samples.p[flown][with_them]
+    at = samples.anchors.positions
+    return tuple(float(np.median(np.abs(d - tdoa(p, at[table[a]], at[table[b]])))) for table in tables)

@@ -1,0 +1,26 @@
+"""Faults of the numbers that can be undone: as effects, for effects.yaml."""
+
+from uwb_tdoa_bias.effects.anchor_ids import AnchorIds
+from uwb_tdoa_bias.effects.pair_sign import PairSign
+
+from . import pair_rules
+from .known_path import KnownPath
+
+SOURCE = "numbers"
+
+
+def repairs(flight):
+    """(LabelEffect, ...) that undo wrong ids and signs of a Flight, in the order in which they are undone; () without ground truth."""
+    return () if flight.truth is None or len(flight.truth) < 2 else repairs_of(KnownPath(flight))
+
+
+def repairs_of(path):
+    """The same of a KnownPath. Where most signs are wrong, nothing is said of ids."""
+    out, signs = [], pair_rules.contrary(path)
+    table = {} if len(signs) >= pair_rules.MOST * max(len(path.pairs), 1) else pair_rules.renamed(path)[0]
+    if table:
+        out.append(AnchorIds({str(wrong): right for wrong, right in table.items()}, source=SOURCE))
+        signs = pair_rules.contrary(path.without(out[0]))
+    if signs:
+        out.append(PairSign({f"{a}-{b}": -1.0 for a, b in signs}, source=SOURCE))
+    return tuple(out)
