@@ -70,11 +70,15 @@ UNITS = {
     **dict.fromkeys((name for name in OF_IMU if name.startswith("rate_")), "rad/s"),
     **dict.fromkeys((name for name in OF_IMU if name.startswith("accel")), "m/s^2"),
 }  # fmt: skip
+EXTRA = "extra."  # before the name of what else a log holds: "extra.STREAM.COLUMN"
 OF_ACCEL = ("accel", "accel_x", "accel_y", "accel_z")  # specific force, m/s^2
 
 
 def sensor_covariate(name, samples):
-    """Covariate `name`, of a pose in OF_TDOA, of ImuSamples also of OF_IMU: (n,). samples : ImuSamples or AidSamples."""
+    """Covariate `name`, of a pose in OF_TDOA, of ImuSamples also of OF_IMU and "extra.NAME": (n,). samples : ImuSamples or
+    AidSamples."""
+    if name.startswith(EXTRA):
+        return samples.extra[name.removeprefix(EXTRA)]
     if samples.channel == "accel" and name in OF_ACCEL:  # the measured one shares its noise with the residual
         return _norm(samples.reading) if name == "accel" else samples.reading[:, "xyz".index(name[-1])]
     if name in OF_IMU and isinstance(samples, ImuSamples):

@@ -80,7 +80,8 @@ class ImuSamples:
     reading (n, 3): what it should have read, body axes: of the gyroscope what it did read, which is less noisy there.
     Noise in a regressor shrinks what is fitted.
     change (n, 3): how fast the reading changes, per s, None if nobody knows; up (n, 3): the world's vertical, body axes.
-    features (n, len(OF_IMU)): covariates; motion : Motion.
+    features (n, len(OF_IMU)): covariates; motion : Motion; extra : {name: (n,)}, anything else that a recording holds, None if nobody
+    asked.
     """
 
     channel: str
@@ -92,6 +93,7 @@ class ImuSamples:
     up: np.ndarray
     features: np.ndarray
     motion: Motion
+    extra: dict | None = None
 
     def __len__(self):
         return len(self.t)

@@ -10,7 +10,7 @@ import numpy as np
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
 from .base import Effect, known_anchors, once_per_anchors, tile
-from .covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_TDOA, sensor_covariate
+from .covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_TDOA, sensor_covariate
 from .shapes import SHAPES, functions
 from .smooth_words import sentences
 
@@ -66,7 +66,7 @@ class SmoothTerm(Effect):
             raise InputError(f"effects: smooth_term: knots: {self.knots!r} are not two or more rising numbers.")
         known = {**dict.fromkeys(IMU_CHANNELS, (*OF_IMU, *OF_TDOA)), **dict.fromkeys(AID_CHANNELS, OF_TDOA)}
         known["tdoa"] = (*OF_TDOA, *OF_ARRIVAL)
-        extra = self.covariate.startswith("extra.")
+        extra = self.covariate.startswith(EXTRA)
         if self.form not in FORMS or self.channel not in known or not (extra or self.covariate in known[self.channel]):
             raise InputError(
                 f"effects: smooth_term: no {self.form!r} function of {self.covariate!r} acts on {self.channel!r}."
@@ -183,7 +183,7 @@ class SmoothTerm(Effect):
         if self.covariate in OF_TDOA:
             values = OF_TDOA[self.covariate](samples)
         else:
-            values = (samples.extra or {}).get(self.covariate.removeprefix("extra."))
+            values = (samples.extra or {}).get(self.covariate.removeprefix(EXTRA))
         return values, None if values is None else tile(samples, values)
 
     def bias(self, samples):
@@ -219,7 +219,7 @@ class SmoothTerm(Effect):
         return "xyz".index(self.channel.partition(".")[2] or "x")
 
     def uncorrected(self, samples):
-        if self.channel not in AID_CHANNELS:
+        if self.channel not in AID_CHANNELS and self.usable:
             return 0.0
         keys = self.keys()
         return self.regressors(samples, keys) @ np.array([self.values.get(key, 0.0) for key in keys])

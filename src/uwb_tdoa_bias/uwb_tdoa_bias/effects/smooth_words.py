@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .covariates import UNITS
+from .covariates import EXTRA, UNITS
 from .wording import listed, measured, rounded
 
 AXES = {"gyro": "the gyroscope reads {} about {}", "accel": "the accelerometer reads {} along {}"}
@@ -46,7 +46,7 @@ _SENSOR_CAUSES = {
 def described(term, part=""):
     """The function of an anchor "3", a pair "0-1" or of all, "", as a sentence without its end."""
     prefix = f"{part}." if part else ""
-    name, unit = term.covariate.replace("_", " "), UNITS.get(term.covariate, "")
+    name, unit = _named(term.covariate), UNITS.get(term.covariate, "")
     level, *more = (term.values.get(f"{prefix}c{k}", 0.0) for k in range(term.count))
     std = term.std.get(f"{prefix}c1")
     knots = [f"{rounded(knot)} {unit}".strip() for knot in term.knots]
@@ -75,6 +75,8 @@ def described(term, part=""):
 def causes(term):
     """(what could do such a thing, which trial tells)."""
     sensor = term.channel.partition(".")[0]
+    if term.covariate.startswith(EXTRA):
+        return "what warms, loads or supplies it", f"keep the vehicle at rest and change {_named(term.covariate)} alone"
     if sensor in SENSOR_UNITS:
         return _SENSOR_CAUSES[_kind(term.covariate)]
     for forms, covariates, cause, trial in _CAUSES:
@@ -91,6 +93,10 @@ def sentences(term):
     cause, trial = causes(term)
     said = listed(described(term, part) for part in parts)
     return (f"Look for why {said}: {cause}. To tell: {trial}.",)
+
+
+def _named(covariate):
+    return covariate.removeprefix(EXTRA).replace("_", " ").replace(".", " ")
 
 
 def _where(name, over, during):

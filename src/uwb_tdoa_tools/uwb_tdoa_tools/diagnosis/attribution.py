@@ -16,7 +16,7 @@ from .regression.confounding import alternatives
 from .regression.fit import fit
 from .regression.held_out import held_out
 from .regression.scan import Scan
-from .regression.select import LARGE, Selection, select, with_rivals, worth
+from .regression.select import Selection, select, with_rivals, worth
 from .regression.table import table_of
 from .regression.terms import Candidate, Term, candidates_of, columns_of
 
@@ -241,7 +241,7 @@ def _with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress
     progress()
     inflation = selection.fit.inflation
     after = select(table, everything, inflation, search, scan_of(table), selection.chosen, progress)
-    if selection.chosen and any(not candidate.declared or len(candidate.columns) > LARGE for candidate in after.chosen):
+    if selection.chosen:
         anew = select(unmoved.with_terms(terms), everything, inflation, search, scan_of(unmoved), progress=progress)
         after = max(after, anew, key=lambda each: worth(each, len(everything)))
     return after

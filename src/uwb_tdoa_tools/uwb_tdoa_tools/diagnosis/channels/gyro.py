@@ -37,7 +37,8 @@ class Gyro(Inertial):
         before, after = (means(imu.t, imu.gyro, edges + shift) for shift in (-SHIFT, SHIFT))
         middles = 0.5 * (edges[:-1] + edges[1:])
         features, change = means(imu.t, features_of(imu), edges), (after - before) / (2.0 * SHIFT)
-        return ImuResidual(self._samples(comparison, middles, measured, features, change), measured - true, self.unit)
+        samples = self._samples(comparison, middles, measured, features, change)
+        return ImuResidual(samples, measured - true - comparison.effects.uncorrected(samples), self.unit)
 
     def _at_rest(self, comparison, imu):
         edges = np.arange(imu.t[0], imu.t[-1], CELL)
@@ -52,7 +53,7 @@ class Gyro(Inertial):
         features[:, TURNING] = 0.0  # it does not turn: what it measures is the residual, which would be a function of itself
         nothing = np.zeros_like(measured)
         samples = self._samples(comparison, middles, nothing, features, nothing)
-        return ImuResidual(samples, measured, self.unit)
+        return ImuResidual(samples, measured - comparison.effects.uncorrected(samples), self.unit)
 
 
 def _true_rates(truth, edges):

@@ -10,6 +10,7 @@ from uwb_tdoa_bias.effects import ImuSamples, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, sensor_covariate
 
 from .base import Channel, ChannelResidual, Rows
+from .extra import extra_at, extra_names
 from .figures import figures
 from .knots import knots_of
 from .pairs import APART
@@ -48,17 +49,21 @@ class Inertial(Channel):
 
     def smooth_terms(self, residuals):
         out = []
-        for name in (*OF_IMU, *OF_POSE):
+        for name in self._covariates(residuals):
             knots = knots_of(np.concatenate([sensor_covariate(name, part.samples) for part in residuals]), name)
             if knots is not None:
                 out += [SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots) for axis in self.axes]
         return out
 
     def views(self, residuals):
-        channels, names = [f"{self.name}.{axis}" for axis in self.axes], (*OF_IMU, *OF_POSE)
+        channels, names = [f"{self.name}.{axis}" for axis in self.axes], self._covariates(residuals)
         parts = [part.samples for part in residuals]
         values = {name: np.concatenate([np.tile(sensor_covariate(name, one), 3) for one in parts]) for name in names}
         return views_of_axes(channels, values, np.concatenate([np.repeat(np.arange(3), len(one)) for one in parts]))
+
+    @staticmethod
+    def _covariates(residuals):
+        return (*OF_IMU, *OF_POSE, *extra_names([part.samples for part in residuals]))
 
     def health(self, residuals):
         t = np.concatenate([part.samples.t + APART * number for number, part in enumerate(residuals)])
@@ -74,7 +79,8 @@ class Inertial(Channel):
         if known.any():
             up[known] = Rotation.from_quat(q[known]).inv().apply([0.0, 0.0, 1.0])
         place, motion = track.positions(t), track.motion(t)
-        return ImuSamples(self.name, t, place, comparison.start, reading, change, up, features, motion)
+        extra = extra_at(comparison.flight, t)
+        return ImuSamples(self.name, t, place, comparison.start, reading, change, up, features, motion, extra)
 
 
 def features_of(imu):

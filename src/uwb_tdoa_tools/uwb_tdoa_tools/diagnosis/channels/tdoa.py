@@ -10,13 +10,14 @@ from functools import cached_property
 import numpy as np
 
 from uwb_tdoa_bias.effects import Samples, SmoothTerm, samples_at
-from uwb_tdoa_bias.effects.covariates import CATEGORIES, OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
+from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
 from uwb_tdoa_ekf.sensitivity import Innovations
 
 from . import pairs
 from .base import Channel, ChannelResidual, Rows
+from .extra import extra_at, extra_names
 from .knots import knots_of
 from .views import views_of_pairs
 
@@ -116,7 +117,7 @@ class Tdoa(Channel):
             interval=np.diff(t, prepend=t[:1]),
             previous=np.concatenate([[-1], anchors.ids[b[:-1]]]),
             vibration=_vibration(flight.imu, t),
-            extra=_extra(flight, t),
+            extra=extra_at(flight, t),
         )
         at_a, at_b = samples.position_a, samples.position_b
         if innovations is None:
@@ -128,15 +129,14 @@ class Tdoa(Channel):
 
     def smooth_terms(self, residuals):
         out, chosen = [], [part.airborne for part in residuals]
-        extra = sorted(set.intersection(*(set(part.samples.extra) for part in residuals)))
-        for name in (*OF_TDOA, *(f"extra.{key}" for key in extra)):
+        for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
             values = [_covariate(name, part.samples) for part in residuals]
             knots = None
             if all(v is not None for v in values):
                 knots = knots_of(np.concatenate([v[rows] for v, rows in zip(values, chosen)]), name)
             if knots is not None:
                 out.append(SmoothTerm(covariate=name, form="common", knots=knots))
-                if name not in CATEGORIES and not name.startswith("extra."):
+                if name not in CATEGORIES and not name.startswith(EXTRA):
                     out.append(SmoothTerm(covariate=name, form="anchor", knots=knots))
         for name, function in OF_ARRIVAL.items():
             values = [_of_arrivals(function, part.samples)[:, rows] for part, rows in zip(residuals, chosen)]
@@ -151,8 +151,8 @@ class Tdoa(Channel):
         cells = [part.cells for part in residuals]
         ends = [np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)]) for part in residuals]
         of_tdoa, of_arrival, quick = {}, {}, {}
-        for name in OF_TDOA:
-            values = [OF_TDOA[name](part.samples) for part in residuals]
+        for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
+            values = [_covariate(name, part.samples) for part in residuals]
             if all(v is not None for v in values) and name in QUICK:
                 quick[name] = np.concatenate([v[cell.chosen] for cell, v in zip(cells, values)])
             elif all(v is not None for v in values):
@@ -171,7 +171,7 @@ class Tdoa(Channel):
 
 
 def _covariate(name, samples):
-    return OF_TDOA[name](samples) if name in OF_TDOA else samples.extra[name.removeprefix("extra.")]
+    return OF_TDOA[name](samples) if name in OF_TDOA else samples.extra[name.removeprefix(EXTRA)]
 
 
 def _of_arrivals(function, samples):
@@ -184,18 +184,3 @@ def _vibration(imu, t):
         return None
     features = ImuFeatures()(imu.t, imu.gyro, imu.accel)
     return np.interp(t, imu.t, features[:, OF_IMU.index("vibration")])
-
-
-def _extra(flight, t):
-    """Whatever else the log holds, at the stamps t: {"stream.column": (n,)}. What a simulation tells of itself is no
-    log."""
-    out = {}
-    for name, columns in flight.extra.items():
-        stamps = np.asarray(columns.get("t", ()), dtype=float)
-        if name.endswith("_truth") or len(stamps) < 10:
-            continue
-        for column, values in columns.items():
-            values = np.asarray(values)
-            if column != "t" and values.dtype.kind in "fiu" and np.ptp(values) > 0:
-                out[f"{name}.{column}"] = np.interp(t, stamps, values.astype(float))
-    return out
