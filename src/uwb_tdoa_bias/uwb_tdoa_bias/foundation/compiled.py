@@ -4,12 +4,31 @@ numba's own cache notices a change in the file of a compiled function, but not i
 Here every state of the sources has a cache folder of its own.
 """
 
+from contextlib import contextmanager
 from functools import lru_cache
 import hashlib
 import os
 from pathlib import Path
+import sys
 
-from numba import config, njit
+
+@contextmanager
+def _hidden(*names):
+    """Packages that are not imported yet seem not to be installed."""
+    hidden = [name for name in names if name not in sys.modules]
+    sys.modules.update(dict.fromkeys(hidden))
+    try:
+        yield
+    finally:
+        for name in hidden:
+            del sys.modules[name]
+
+
+# numba imports these only to see whether they are there, which takes a fifth of a second of a node's start: for products of matrices
+# in compiled code, of which there are none here, and for coverage of it.
+with _hidden("scipy", "coverage"):
+    from numba import config, njit
+    import numba.np.arraymath  # noqa: F401
 
 
 def compiled(function):

@@ -271,6 +271,7 @@ def run(node_class, description, argv=None):
             executor.add_node(each)
         gc.collect()
         gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
+        gc.enable()
         interruptible = False
         if stop.done():
             raise KeyboardInterrupt
