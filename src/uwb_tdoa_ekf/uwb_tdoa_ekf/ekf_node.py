@@ -38,7 +38,9 @@ from .core.config import RENAMED
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import STREAMS, VERDICTS, Estimator, invalid
 from .imu_mount import ImuMount
+from .monitoring.change import YOUNGEST, ChangeDetector
 from .monitoring.health import OK, WARN, Health
+from .monitoring.slices import LENGTH, Slice
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, pose_and_twist
 from .streams import most_severe_first
@@ -334,6 +336,10 @@ def warm_up():
         odometry, _ = estimator.advance()
     pose_and_twist(odometry, estimator.rates_at(odometry.t), 0.0)
     watch.findings()
+    detector = ChangeDetector(1)
+    for k in range(YOUNGEST + 2):
+        detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1), np.eye(1), np.ones(1)))
+    detector.find(0.0)
     estimator.tell_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
     estimator.finish()
 

@@ -63,23 +63,20 @@ class Anchors:
         for name, value in (("ids", ids), ("positions", positions), ("orientations", orientations)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "_rows", {i: row for row, i in enumerate(ids.tolist())})
+        rows = np.full(ids.max() + 3, -1)  # of the ids from -1 on, and of those beyond
+        rows[ids + 1] = np.arange(n)
+        object.__setattr__(self, "_rows", rows)
 
     def __len__(self):
         return len(self.ids)
 
     def row(self, anchor):
         """Row of one id, -1 if it is unknown."""
-        return self._rows.get(anchor, -1)
+        return int(self.index(anchor))
 
     def index(self, ids):
         """Rows of the given ids: int array of the shape of `ids`, -1 where an id is unknown."""
-        ids = np.asarray(ids)
-        if ids.size < 100:  # few are looked up faster than sorted
-            return np.array([self.row(i) for i in ids.ravel().tolist()], dtype=np.intp).reshape(ids.shape)
-        order = np.argsort(self.ids)
-        at = np.clip(np.searchsorted(self.ids[order], ids), 0, len(self.ids) - 1)
-        return np.where(self.ids[order][at] == ids, order[at], -1)
+        return self._rows.take(np.asarray(ids, dtype=np.int64) + 1, mode="clip")
 
     def at(self, positions):
         """The same Anchors at other positions, (N, 3) m."""

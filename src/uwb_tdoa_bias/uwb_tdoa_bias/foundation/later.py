@@ -21,14 +21,6 @@ def interpolate():
 
 
 @Later
-def linalg():
-    """scipy.linalg"""
-    from scipy import linalg as module
-
-    return module
-
-
-@Later
 def rotations():
     """scipy.spatial.transform"""
     from scipy.spatial import transform as module

@@ -9,10 +9,11 @@ the kernel expects needs a larger change.
 """
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.later import linalg
+from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .slices import LENGTH
 
@@ -117,7 +118,7 @@ class ChangeDetector:
         """Steps (m), then ramps (m/s), that began with each slice from `first` on but the youngest: their most likely
         values and their ratios, (2 k, N)."""
         n, window = self._count - first, slice(first, self._count)
-        inverse = linalg.solve_triangular(self._factor[window, window], np.eye(n), lower=True)
+        inverse = _inverse(self._factor, first, n)
         response = self._response[window]
         scores = np.einsum("snk,sn->sk", response, inverse.T @ self._white[window])
         information = np.einsum("snk,tnk->stk", response, response) * (inverse.T @ inverse)[:, :, None]
@@ -132,18 +133,7 @@ class ChangeDetector:
 
     def _whiten(self, k):
         """Row k of the factor, and its whitened error."""
-        apart = ((self._p[:k] - self._p[k]) ** 2).sum(axis=1)
-        ago = np.abs(self._t[k] - self._t[:k])
-        local = np.exp(-0.5 * apart / LOCAL_LENGTH**2 - ago / LOCAL_TIME)
-        kernel = MEAN_STD**2 + PLACE_STD**2 * np.exp(-0.5 * apart / PLACE_LENGTH**2) + LOCAL_STD**2 * local
-        row = linalg.solve_triangular(self._factor[:k, :k], kernel, lower=True) if k else kernel
-        error = self._delays[k] - row @ self._white[:k]
-        variance = MEAN_STD**2 + PLACE_STD**2 + LOCAL_STD**2 + NOISE_STD**2 - row @ row
-        freedom = max(np.trace(self._response[k]), 1e-3)  # combinations of delays that are measured
-        self._squares[k] = error @ error / (variance * freedom)
-        variance *= max(1.0, self._squares[k] / OUTLIER)
-        self._factor[k, :k], self._factor[k, k] = row, np.sqrt(variance)
-        self._white[k] = error / self._factor[k, k]
+        _whiten(k, self._t, self._p, self._delays, self._response, self._factor, self._white, self._squares)
 
     def _forget_oldest(self, n):
         for array in (self._t, self._p, self._delays, self._response):
@@ -151,3 +141,36 @@ class ChangeDetector:
         self._count = CAPACITY - n
         for k in range(self._count):
             self._whiten(k)
+
+
+@compiled
+def _whiten(k, t, p, delays, response, factor, white, squares):
+    row, error = factor[k], delays[k].copy()
+    variance = MEAN_STD**2 + PLACE_STD**2 + LOCAL_STD**2 + NOISE_STD**2
+    for i in range(k):
+        apart = (p[i, 0] - p[k, 0]) ** 2 + (p[i, 1] - p[k, 1]) ** 2 + (p[i, 2] - p[k, 2]) ** 2
+        local = math.exp(-0.5 * apart / LOCAL_LENGTH**2 - abs(t[k] - t[i]) / LOCAL_TIME)
+        kernel = MEAN_STD**2 + PLACE_STD**2 * math.exp(-0.5 * apart / PLACE_LENGTH**2) + LOCAL_STD**2 * local
+        for j in range(i):
+            kernel -= factor[i, j] * row[j]
+        row[i] = kernel / factor[i, i]
+        error -= row[i] * white[i]
+        variance -= row[i] ** 2
+    freedom = 0.0  # combinations of delays that are measured
+    for anchor in range(len(error)):
+        freedom += response[k, anchor, anchor]
+    squares[k] = np.sum(error**2) / (variance * max(freedom, 1e-3))
+    row[k] = math.sqrt(variance * max(1.0, squares[k] / OUTLIER))
+    white[k] = error / row[k]
+
+
+@compiled
+def _inverse(factor, first, n):
+    """(n, n): inverse of the part of a lower triangular matrix that begins with row and column `first`."""
+    out = np.zeros((n, n))
+    for i in range(n):
+        out[i, i] = 1.0
+        for j in range(i):
+            out[i] -= factor[first + i, first + j] * out[j]
+        out[i] /= factor[first + i, first + i]
+    return out
