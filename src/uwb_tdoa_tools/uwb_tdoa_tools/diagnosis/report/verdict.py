@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from uwb_tdoa_bias.effects.wording import listed
 
 from ..calibration import LEFT
+from .left_over import left_over
 
 CM = 100.0  # in a metre
 ERROR = "The position error (3D RMSE)"
@@ -69,7 +70,7 @@ def _judged(diagnosis):
     gain, interval = 1.0 - after["rmse_3d"] / before["rmse_3d"], after.get("rmse_3d_gain_ci")
     change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
     more = [_intervals(before, after, interval), f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}."]
-    more += [*_shared(diagnosis), *_caveats(diagnosis), *_worse(diagnosis), *_diverged(diagnosis)]
+    more += [*_shared(diagnosis), *_caveats(diagnosis), *_worse(diagnosis), *_diverged(diagnosis), *left_over(diagnosis)]
     if interval and interval[0] > 0.0:
         return Verdict(f"{ERROR} falls {change}: {_share(gain)} of it is gone.", tuple(more), "better")
     more.append(
@@ -92,7 +93,7 @@ def _nothing_added(diagnosis):
     pooled, found = diagnosis.before["pooled"], len({finding.key for finding in diagnosis.findings})
     interval = f"95 % interval {_bounds(pooled['rmse_3d_ci'])} cm"
     error = f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {_flights(diagnosis)}."
-    more = (error, *_shared(diagnosis), *_diverged(diagnosis))
+    more = (error, *_shared(diagnosis), *_diverged(diagnosis), *left_over(diagnosis))
     if not found:
         return Verdict(
             "Nothing was found: what the model leaves of the measurements looks like noise.", more, "nothing"
