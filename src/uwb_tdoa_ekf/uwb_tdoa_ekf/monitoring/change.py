@@ -125,7 +125,8 @@ class ChangeDetector:
         age = np.arange(n) - np.arange(n - YOUNGEST)[:, None]  # of slices (columns) since each onset (rows)
         shapes = np.concatenate([(age >= 0).astype(float), LENGTH * np.maximum(age + 0.5, 0.0)])
         score = shapes @ scores
-        value = score / (np.einsum("js,stk,jt->jk", shapes, information, shapes, optimize=True) + 1e-9)
+        power = np.sum(np.tensordot(shapes, information, axes=1) * shapes[:, :, None], axis=1)
+        value = score / (power + 1e-9)
         squares = np.minimum(self._squares[: self._count], LARGEST_ERROR)
         before = first + np.tile(np.arange(n - YOUNGEST), 2)  # slices before each onset
         scale = SCALE_SLICES * SCALE + np.concatenate([[0.0], np.cumsum(squares)])[before]
