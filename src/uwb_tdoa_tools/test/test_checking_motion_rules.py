@@ -8,7 +8,8 @@ from scipy.signal import lfilter
 
 from uwb_tdoa_tools.checking import motion_rules
 from uwb_tdoa_tools.checking.motion_rules import TrueMotion
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.studies.diagnosis.bank import CLEAN, clean_flight
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,11 @@ def test_axes_of_either_sensor(flight, order, signs):
 @pytest.mark.parametrize("scale", [180.0 / np.pi, np.pi / 180.0])
 def test_unit_of_the_gyroscope(flight, scale):
     assert said(with_imu(flight, gyro=flight.imu.gyro * scale))["imu_rate_unit"].value == pytest.approx(1.0 / scale)
+
+
+def test_a_sensor_that_has_nothing_to_measure_is_in_no_other_unit():
+    hover = simulate(SimulationConfig(seed=6, duration=30.0, trajectory="hover", **CLEAN))
+    assert "imu_rate_unit" not in said(hover)
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ class AnchorIds(LabelEffect):
     physics = "modules were configured with, or put up by, the number of another anchor, or the survey lists them in another order"
     confounded_with = ("anchor_position",)
     reference = "Bitcraze documentation of the loco positioning system: every anchor is given its id by hand"
+    separable = False
     expected = "the id of an anchor, a whole number"
 
     @classmethod

@@ -12,6 +12,7 @@ class LabelEffect(Effect):
 
     fitted = False
     portable = False
+    separable = True  # each value means something without the others
 
     def __post_init__(self):
         super().__post_init__()

@@ -21,7 +21,8 @@ BEYOND = round(LONGEST / CELL)  # cells at either end that are there for what is
 FEWEST = 200  # cells in the air
 LIMIT = 4.0  # standard deviations, robust, beyond which a difference counts no more
 GRAVITY = 9.81  # m/s^2
-# Of the power that is left with the axes of a sensor otherwise, healthy 1.22 and 0.92 at least; of that, with another attitude of the truth.
+# Of the power that is left with the axes of a sensor otherwise: healthy 1.22 and 0.92 at least; of that, with another attitude of
+# the truth.
 AXES, ATTITUDE = {"gyro": 0.8, "accel": 0.75}, 1.2
 # Of the power that is left behind a low pass: healthy 0.87 at least, and where the sensor is too smooth; and the time constants, s.
 FILTERED, FILTERED_TOO, SLOWNESS = 0.8, 0.97, (0.05, 0.1, 0.2, 0.4, 0.8)  # of the power that is left with a low pass; s, its time constants
@@ -130,7 +131,7 @@ def axes(motion):
     """Axes that are exchanged or mirrored, a gyroscope in another unit, or a truth whose attitude is another one."""
     base = {sensor: motion.power(sensor, motion.true[sensor]) for sensor in SENSORS}
     best = {sensor: _best_arrangement(motion, sensor) for sensor in SENSORS}
-    wrong = [sensor for sensor in SENSORS if best[sensor][0] < AXES[sensor] * base[sensor]]
+    wrong = [sensor for sensor in SENSORS if _explains(motion, sensor, base[sensor], *best[sensor])]
     attitude, power = min(((name, _with_attitude(motion, name)) for name in ATTITUDES), key=lambda x: x[1]["gyro"])
     if power["gyro"] < AXES["gyro"] * base["gyro"] and power["accel"] < base["accel"] and power["gyro"] < ATTITUDE * best["gyro"][0]:
         evidence = f"{100 * (1 - power['gyro'] / base['gyro']):.0f} % less mean square difference of the turns then, "
@@ -142,6 +143,17 @@ def axes(motion):
         power, change = best[sensor]
         evidence = f"{100 * (1 - power / base[sensor]):.0f} % less mean square difference to the ground truth"
         yield _of_axes(sensor, change, evidence, power)
+
+
+def _explains(motion, sensor, base, power, change):
+    """Whether a change of the axes explains much of what is left without; one that makes values small, more than no values would."""
+    if _scale(change) < 0.9:
+        base = min(base, motion.power(sensor, motion.true[sensor], np.zeros((3, 3))))
+    return power < AXES[sensor] * base
+
+
+def _scale(change):
+    return abs(np.linalg.det(change)) ** (1.0 / 3.0)
 
 
 def _best_arrangement(motion, sensor):
@@ -162,7 +174,7 @@ def _with_attitude(motion, name):
 
 
 def _of_axes(sensor, change, evidence, power):
-    scale = abs(np.linalg.det(change)) ** (1.0 / 3.0)
+    scale = _scale(change)
     if abs(scale - 1.0) > 0.1:
         cause = f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the turns of the ground truth"
         return Finding("imu_rate_unit", ERROR, cause, evidence, f"angular_velocity *= {scale:.6g}", scale)
@@ -185,7 +197,8 @@ def filtered(motion):
         backwards = min(backwards, motion.power(sensor, true))
         if power < limit * backwards:
             cause = f"the {SENSORS[sensor]} is filtered: what it reads is {slowness:g} s late and too small"
-            evidence = f"{100 * (1 - power / backwards):.0f} % less mean square difference to the ground truth behind a low pass of {slowness:g} s"
+            less = f"{100 * (1 - power / backwards):.0f} % less mean square difference to the ground truth"
+            evidence = f"{less} behind a low pass of {slowness:g} s"
             yield Finding("imu_filtered", ERROR, cause, evidence, "set the low pass of the sensor to 20 Hz or more", slowness)
 
 

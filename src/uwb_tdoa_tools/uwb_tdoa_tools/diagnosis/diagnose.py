@@ -10,7 +10,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..checking.numbers import numbers
 from ..parallel import in_one_thread
 from ..scoring.metrics import Score
-from . import judging, output
+from . import judging, output, repairing
 from .attribution import Attribution, attribute
 from .calibration import merged
 from .channels import residuals
@@ -77,14 +77,17 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     def saying(what):
         return lambda: progress(what)
 
-    attribution = attribute(flights, reference, base, progress=saying("tracing residuals to effects"))
+    repairs = repairing.repaired(flights, base, config, saying("looking at ids and signs")) if reference.judges else {}
+    sound, rest = repairing.sound(flights, base, repairs)
+    attribution = attribute(sound, reference, rest, progress=saying("tracing residuals to effects"))
     # A finding stays one even if the filter does without it; it is only not added.
     trying = saying("running the filter without each")
     baseline = judging.Baseline(base, config)
     if reference.judges:
-        kept = judging.useful(attribution, flights, baseline, trying)
+        kept = judging.useful(attribution, sound, judging.Baseline(rest, config), trying)
     else:
-        kept = judging.borne_out(attribution, flights, base, config, reference.constraints, trying)
+        kept = judging.borne_out(attribution, sound, rest, config, reference.constraints, trying)
+    attribution, kept = repairing.before_others(attribution, kept, repairs)
     model = attribution.of(kept)
     effects = merged(base, usable(model.effects).effects, kept.selection)
     judged = judging.judge(model, flights, holdout, baseline, effects, reference, saying("judging"))

@@ -127,7 +127,8 @@ def _blind(args):
 
 def _faults(args):
     results = list(tqdm(faults.cases(args.data, args.seeds, args.first), unit="draw", disable=None))
-    return {"figures": faults.figures(results), "cases": results}
+    named = {"named in the flights as they are": faults.as_they_are(args.data)}
+    return {"figures": {**faults.figures(results), **named}, "cases": results}
 
 
 def _injected(args):

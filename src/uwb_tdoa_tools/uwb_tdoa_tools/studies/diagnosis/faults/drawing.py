@@ -63,8 +63,7 @@ FAULTS = dict(_all_faults())
 def cases(data, number, first):
     """Yields dict of each draw, of every fault until `number` of it cost the filter LEAST_COST, or spoil the truth. data : Path of
     the measured flights; first : seed of the first draw."""
-    paths = list(dict.fromkeys(path for sides in measured.SPLITS.values() for side in sides for path in side))
-    known = {}
+    paths, known = _paths(), {}
     for place, (name, fault) in enumerate(FAULTS.items()):
         fit = [path for path in paths if path.startswith("flights") or not fault.inertial]
         costly = 0
@@ -79,6 +78,20 @@ def cases(data, number, first):
             yield {**result, "seed": seed}
             if costly == number:
                 break
+
+
+def as_they_are(data):
+    """{rule: [names of the flights]} of what is named in the measured flights without any fault put in."""
+    said = {}
+    for path in _paths():
+        flight = measured.load(data, [path])[0]
+        for finding in numbers(flight):
+            said.setdefault(finding.rule, []).append(flight.name)
+    return said
+
+
+def _paths():
+    return list(dict.fromkeys(path for sides in measured.SPLITS.values() for side in sides for path in side))
 
 
 def draw(name, fault, flight, before, rng):
