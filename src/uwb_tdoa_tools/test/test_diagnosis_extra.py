@@ -51,7 +51,9 @@ def test_one_anchor_that_changes_with_the_log_is_found(flight):
     d = flight.tdoa.d + late * (1.0 * (flight.tdoa.b == 2) - (flight.tdoa.a == 2))
     (finding,) = attribute([replace(flight, tdoa=replace(flight.tdoa, d=d))], GroundTruth()).findings()
     assert finding.effect.covariate == "extra.baro.temperature" and finding.effect.form == "anchor"
-    assert "for each unit more of baro temperature" in finding.effect.advice()[0]
+    assert "baro temperature" in finding.effect.advice()[0]
+    ends = finding.effect.curve(np.array(finding.effect.knots)[[0, -1]], "2.")
+    assert np.diff(ends) / np.ptp(finding.effect.knots) == pytest.approx(0.1, rel=0.1)
     assert all(key.startswith("2.") for key in finding.effect.values)
 
 

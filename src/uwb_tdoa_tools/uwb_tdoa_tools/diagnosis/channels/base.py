@@ -76,6 +76,10 @@ class ChannelResidual:
         """Regressors of an Effect for the parameters `keys`, averaged as the rows are: (m, len(keys))."""
         raise NotImplementedError
 
+    def place_in_room(self, series):
+        """What a series number of Rows is of in the room, such as a pair of anchors; "" if it is of the vehicle."""
+        return ""
+
     def series(self):
         """{label with unit: (t (k,) s, residual (k,))}, to be plotted and judged."""
         raise NotImplementedError

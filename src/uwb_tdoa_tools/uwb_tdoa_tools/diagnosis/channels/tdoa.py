@@ -57,6 +57,9 @@ class TdoaResidual(ChannelResidual):
     def series(self):
         return {"TDOA [m]": (self.samples.t[self.airborne], self.residual[self.airborne])}
 
+    def place_in_room(self, series):
+        return "-".join(str(self.samples.anchors.ids[row]) for row in self.arrivals(series))
+
     def arrivals(self, series):
         """Anchor rows (a, b) of series numbers (m,) in Rows."""
         return np.divmod(series, len(self.samples.anchors))

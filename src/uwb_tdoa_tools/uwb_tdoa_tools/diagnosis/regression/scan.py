@@ -25,6 +25,7 @@ NOISY = 1.5  # times the noise of most series that any may have
 FINER = 9  # places between two bins where a knot is tried again
 FEWEST = 12  # values of a subset
 PROPOSED = 16  # functions
+SHAPES_FIRST = 3  # of one View
 HUBER = 3.0  # scales; a larger residual counts as that of a heavy tail, but more than in Student's t
 LEAST_GAIN = 20.0  # twice a log-likelihood
 _ENDS = np.array([(first, last) for first in range(3) for last in (-1, -2, -3)])  # edges between which a line rises
@@ -72,7 +73,7 @@ class Scan:
         model = refit(table, columns_of(chosen), replace(model, weight=weight), everywhere)
         found = self.gains(table, model, chosen)[:PROPOSED]
         found = _best_first(table, [self._refined(table, model, chosen, item) for item in found])
-        return [self._candidate(*item[1:]) for item in found]
+        return [self._candidate(*item[1:]) for item in _various(found)]
 
     def _refined(self, table, model, chosen, item):
         """An item of `gains` with its inner knots moved by parts of a bin, if that gains more."""
@@ -115,6 +116,16 @@ def _noise_of_series(table):
         rows = table.channel == channel
         out[rows] /= max(float(NOISY * np.median(out[rows])), 1e-12)
     return np.maximum(out, 1.0)
+
+
+def _various(found):
+    """Items of `gains` in their order, but of one View no more than SHAPES_FIRST before those of others: a dozen shapes of one
+    function are one idea."""
+    early, late, count = [], [], {}
+    for item in found:
+        count[id(item[1].view)] = count.get(id(item[1].view), 0) + 1
+        (early if count[id(item[1].view)] <= SHAPES_FIRST else late).append(item)
+    return early + late
 
 
 def _best_first(table, found):

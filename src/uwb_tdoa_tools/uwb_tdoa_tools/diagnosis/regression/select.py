@@ -73,12 +73,6 @@ def select(table, candidates, inflation, search=None, scan=None, start=(), progr
         ranked = rank(wider, candidates + found, chosen, model)
         ranked += [(_fitted(table, chosen, model, one, len(candidates), scan.even), one) for one in scanned[:FITTED]]
         ranked.sort(key=lambda item: -item[0])
-        unfitted = scanned[FITTED:]
-        while ranked and ranked[0][1] in unfitted:  # what comes first by the present weights has to hold with its own
-            best = ranked.pop(0)[1]
-            unfitted.remove(best)
-            ranked.append((_fitted(table, chosen, model, best, len(candidates), scan.even), best))
-            ranked.sort(key=lambda item: -item[0])
         progress()
         if not ranked or ranked[0][0] <= 0.0:
             break

@@ -1,4 +1,4 @@
-"""Where a model leaves most of the TDOAs unexplained: of which pairs, when and where."""
+"""Where a model leaves most of the measurements unexplained: of which pairs, when and where."""
 
 import numpy as np
 
@@ -12,22 +12,22 @@ def left_over(diagnosis):
     """(sentence, ...), the largest first; () where nothing stands out."""
     found = []
     for flight, residuals in zip(diagnosis.flights, diagnosis.remaining):
-        if "tdoa" in residuals:
-            found += _of_flight(flight, residuals["tdoa"], f" of {flight.name}" if len(diagnosis.flights) > 1 else "")
+        for part in residuals.values():
+            found += _of_part(part, f" of {flight.name}" if len(diagnosis.flights) > 1 else "")
     places = [f"{said} ({100 * size:.0f} cm)" for size, said in sorted(found, reverse=True)[:NAMED]]
     return (f"What is left is largest for {'; '.join(places)}.",) if places else ()
 
 
-def _of_flight(flight, part, of):
-    rows, ids = part.rows(), flight.anchors.ids
+def _of_part(part, of):
+    rows = part.rows()
     block = (rows.t / BLOCK).astype(int)
     usual = np.sqrt(np.median(rows.y**2) / 0.455)  # the median of squares is 0.455 of their mean, for Gaussian noise
     label = rows.series * (block.max() + 1) + block
     for number in np.unique(label):
         mine = label == number
         size = float(np.sqrt(np.mean(rows.y[mine] ** 2)))
-        if mine.sum() >= 3 and size > max(LARGE, ABOVE * usual):
-            a, b = (int(ids[row]) for row in part.arrivals(rows.series[mine][0]))
+        name = part.place_in_room(rows.series[mine][0])
+        if name and mine.sum() >= 3 and size > max(LARGE, ABOVE * usual):
             first = block[mine][0] * BLOCK
             x, y, z = rows.place[mine].mean(axis=0)
-            yield size, f"{a}-{b} from {first:.0f} to {first + BLOCK:.0f} s{of}, around ({x:.1f}, {y:.1f}, {z:.1f}) m"
+            yield size, f"{name} from {first:.0f} to {first + BLOCK:.0f} s{of}, around ({x:.1f}, {y:.1f}, {z:.1f}) m"
