@@ -110,7 +110,7 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
     detections = (detector.detect(remaining) for detector in detectors)
     found = tuple(detection for detection in detections if detection is not None)
     alone, names = [], tuple(flight.name for flight in flights)
-    if undeclared and len(flights) > 1:
+    if undeclared and len(flights) > 1 and all(reference.positions_known):
         alone = [(names[k], own) for k, own in of_one(remaining, inflation, _views, search)]
     return Attribution(under_base, remaining, selection, found, declared, tuple(refused), names, tuple(alone))
 
