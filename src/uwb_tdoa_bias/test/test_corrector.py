@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
-from uwb_tdoa_bias.correction.poses import known_yaw_std, rotated_in_yaw
+from uwb_tdoa_bias.correction.poses import known_yaw_std, parts_of, rotated_in_yaw
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
 DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))
@@ -172,7 +172,7 @@ def test_effects_are_those_of_the_mean_heading_while_the_yaw_is_unknown():
     told = {}
     for yaw_std in (0.1, 2.0):
         corrector = Corrector(ANCHORS, arm, lag=0.0)
-        corrector.add_pose(0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), yaw_std)
+        corrector.add_pose(0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), yaw_std=yaw_std)
         told[yaw_std] = correct(corrector, [0.0])
     upright = Corrector(ANCHORS, EffectSet((TagLeverArm({"z": 0.2}),)), lag=0.0)
     upright.add_pose(0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]))
@@ -196,3 +196,15 @@ def test_rotated_in_yaw_turns_about_the_vertical(quarters, seed):
 def test_empty_batch():
     found = correct(climbing(Corrector(ANCHORS, DELAYS, Height()), [0.0]), [])
     assert len(found.bias) == len(found.std) == len(found.corrected) == len(found.status) == 0
+
+
+@given(seed=st.integers(0, 1000))
+def test_parts_of_odometry_hold_the_velocity_in_the_world(seed):
+    rng = np.random.default_rng(seed)
+    poses, twists = rng.normal(size=(3, 43)), rng.normal(size=(3, 42))
+    poses[:, 3:7] /= np.linalg.norm(poses[:, 3:7], axis=1)[:, None]
+    poses[2, 3:7] = 0.0  # not known
+    p, q, v, _ = parts_of(poses, twists)
+    np.testing.assert_array_equal(p, poses[:, :3])
+    np.testing.assert_allclose(v[:2], Rotation.from_quat(q[:2]).apply(twists[:2, :3]), atol=1e-12)
+    assert np.isnan(v[2]).all() and np.isnan(q[2]).all()

@@ -51,8 +51,8 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
         "base_link", "frame of the odometry's body; TDOAs in another frame are of an antenna that /tf_static places in it"
     ),
 }
-POSE = ("pose",)  # what is read of an Odometry, its numbers,
-POSE_NUMBERS = 3 + 4 + 36
+POSE = "pose", "twist"  # what is read of an Odometry, its numbers,
+POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36
 MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a Tdoa
 CORRECTED = (  # what is written of a TdoaCorrected
     "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status",
@@ -186,7 +186,7 @@ class BiasNode(ros.StreamNode):
             self._add_poses(np.array([stamp]), row)
 
     def _add_poses(self, t, rows):
-        self._corrector.add_pose(t, *parts_of(np.array(rows["pose"])))
+        self._corrector.add_pose(t, *parts_of(*(np.array(rows[name]) for name in POSE)))
 
     def _on_tdoa(self, frame, t, rows, arrival):
         self._counts["received"] += len(t)
@@ -321,7 +321,7 @@ class BiasNode(ros.StreamNode):
 def warm_up(effects, network, lag=0.05):
     """A Corrector, after compiling, or loading from numba's cache, whatever its first correction needs."""
     corrector = Corrector(Anchors.from_positions(np.eye(3)), effects, network, lag)
-    corrector.add_pose(np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6)))
+    corrector.add_pose(np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6), np.zeros((1, TWIST_NUMBERS))))
     corrector.correct(np.array([1.0]), np.array([0]), np.array([1]), np.array([0.0]))
     return corrector
 

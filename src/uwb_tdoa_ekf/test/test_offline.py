@@ -30,7 +30,7 @@ def live(flight, corrector, config=None):
         odometry, residuals = estimator.advance()
         told = to_odometry(odometry.q, odometry.v, odometry.covariance)[1] if len(odometry) else np.empty((0, 9, 9))
         yaw_std = known_yaw_std(np.sqrt(told[:, [3, 4, 5], [3, 4, 5]]))
-        for pose in zip(odometry.t, odometry.p, odometry.q, yaw_std):
+        for pose in zip(odometry.t, odometry.p, odometry.q, odometry.v, yaw_std):
             corrector.add_pose(*pose)
         parts.append((odometry, residuals))
 

@@ -128,5 +128,6 @@ def _batches(t, a, b, d, corrector, longest, period):
 
 
 def poses_of(odometry):
-    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4), yaw_std (n,) rad)."""
-    return odometry.t, odometry.p, odometry.q, known_yaw_std(rotation_std(odometry.q, odometry.covariance))
+    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4), v (n, 3) m/s, yaw_std
+    (n,) rad)."""
+    return odometry.t, odometry.p, odometry.q, odometry.v, known_yaw_std(rotation_std(odometry.q, odometry.covariance))

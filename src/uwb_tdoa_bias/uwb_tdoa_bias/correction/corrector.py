@@ -56,10 +56,11 @@ class Corrector:
         """True if there is nothing to correct with."""
         return not len(self.effects) and self.network is None
 
-    def add_pose(self, t, p, q, yaw_std=0.0):
-        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, yaw_std rad: deviation of its rotation about
-        the vertical; or several: (k,), (k, 3), (k, 4), (k,). Stamps must rise; others are ignored."""
-        self._poses.add(t, p, q, yaw_std if np.shape(yaw_std) == np.shape(t) else np.broadcast_to(yaw_std, np.shape(t)))
+    def add_pose(self, t, p, q, v=np.nan, yaw_std=0.0):
+        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, v (3,) m/s, world, NaN for an unknown one, yaw_std
+        rad: deviation of its rotation about the vertical; or several: (k,), (k, 3), (k, 4), (k, 3), (k,). Stamps must rise;
+        others are ignored."""
+        self._poses.add(t, p, q, np.broadcast_to(v, np.shape(p)), np.broadcast_to(yaw_std, np.shape(t)))
 
     def ready(self, before):
         """True if no pose that is still to come can change the correction of a measurement that follows one stamped so."""
@@ -110,7 +111,7 @@ class Corrector:
         self._last = (t[-1], self.anchors.ids[b[-1]])
         return replace(
             samples,
-            motion=motion_at(self._poses.t, self._poses.p, self._poses.q, places),
+            motion=motion_at(self._poses.t, self._poses.v, self._poses.q, places),
             interval=t - np.concatenate([[last_t], t[:-1]]),
             previous=np.concatenate([[last_b], self.anchors.ids[b[:-1]]]),
         )

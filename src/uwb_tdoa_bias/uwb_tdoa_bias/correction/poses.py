@@ -1,4 +1,4 @@
-"""The poses of the last seconds."""
+"""The poses of the last seconds, and how fast they change."""
 
 import math
 
@@ -15,7 +15,7 @@ class Poses:
 
     def __init__(self, history):
         self._history, self._count = history, 0
-        self._columns = [np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), ())]
+        self._columns = [np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), (3,), ())]
 
     @property
     def t(self):
@@ -33,16 +33,21 @@ class Poses:
         return self._columns[2][: self._count]
 
     @property
+    def v(self):
+        """Velocities, (m, 3) m/s, world, NaN where not known."""
+        return self._columns[3][: self._count]
+
+    @property
     def newest(self):
         """Stamp of the last pose, s; -inf if there is none."""
         return self.t[-1] if self._count else -np.inf
 
-    def add(self, t, p, q, yaw_std):
-        """Append one pose, or several: t (k,), p (k, 3), q (k, 4), yaw_std (k,) rad. Those not later than all before them
-        are ignored."""
+    def add(self, t, p, q, v, yaw_std):
+        """Append one pose, or several: t (k,), p (k, 3), q (k, 4), v (k, 3), yaw_std (k,) rad. Those not later than all before
+        them are ignored."""
         if not np.ndim(t):
-            t, p, q, yaw_std = [t], [p], [q], [yaw_std]
-        new = [np.ascontiguousarray(part, dtype=float) for part in (t, p, q, yaw_std)]
+            t, p, q, v, yaw_std = [t], [p], [q], [v], [yaw_std]
+        new = [np.ascontiguousarray(part, dtype=float) for part in (t, p, q, v, yaw_std)]
         self._count = _append(self._count, *self._columns, *new)
 
     def before(self, t, newest, lag):
@@ -55,7 +60,7 @@ class Poses:
 
 
 @compiled
-def _append(count, stamps, p, q, yaw_std, new_stamps, new_p, new_q, new_yaw_std):
+def _append(count, stamps, p, q, v, yaw_std, new_stamps, new_p, new_q, new_v, new_yaw_std):
     """Append what is later than all before it, and returns how many there are. Once there is no room, only the last half is kept."""
     history = len(stamps) // 2
     for i in range(len(new_stamps)):
@@ -63,15 +68,15 @@ def _append(count, stamps, p, q, yaw_std, new_stamps, new_p, new_q, new_yaw_std)
             continue
         if count == 2 * history:
             stamps[:history], yaw_std[:history] = stamps[history:], yaw_std[history:]
-            p[:history], q[:history] = p[history:], q[history:]
+            p[:history], q[:history], v[:history] = p[history:], q[history:], v[history:]
             count = history
-        stamps[count], p[count], q[count], yaw_std[count] = new_stamps[i], new_p[i], new_q[i], new_yaw_std[i]
+        stamps[count], p[count], q[count], v[count], yaw_std[count] = new_stamps[i], new_p[i], new_q[i], new_v[i], new_yaw_std[i]
         count += 1
     return count
 
 
 @compiled
-def _look_up(t, newest, lag, count, stamps, p, q, yaw_std, places, p_out, q_out, yaw_std_out):
+def _look_up(t, newest, lag, count, stamps, p, q, v, yaw_std, places, p_out, q_out, yaw_std_out):
     precede(t, newest, yaw_std_out)
     for i in range(len(t)):
         place = np.searchsorted(stamps[:count], yaw_std_out[i] - lag, side="right") - 1
@@ -90,20 +95,27 @@ def known_yaw_std(std):
     return np.where(np.maximum(std[:, 0], std[:, 1]) < TILT, std[:, 2], 0.0)
 
 
-def parts_of(poses):
-    """(p (n, 3) m, q (n, 4) x y z w, yaw_std (n,) rad) of geometry_msgs/PoseWithCovariance: (n, 43), its numbers in their
-    order. An orientation of (0, 0, 0, 0) says that it is not known: NaN."""
-    p, q, std = np.empty((len(poses), 3)), np.empty((len(poses), 4)), np.empty((len(poses), 3))
-    _part(poses, p, q, std)
-    return p, q, known_yaw_std(std)
+def parts_of(poses, twists):
+    """What a Corrector takes of nav_msgs/Odometry: (p (n, 3) m, q (n, 4) x y z w, v (n, 3) m/s, world, yaw_std (n,) rad).
+
+    poses, twists : PoseWithCovariance (n, 43) and TwistWithCovariance (n, 42), body frame, their numbers in their order. An orientation of
+    (0, 0, 0, 0) says that it is not known: NaN.
+    """
+    p, q, v, std = (np.empty((len(poses), k)) for k in (3, 4, 3, 3))
+    _part(poses, twists, p, q, v, std)
+    return p, q, v, known_yaw_std(std)
 
 
 @compiled
-def _part(poses, p, q, std):
+def _part(poses, twists, p, q, v, std):
     for n in range(len(poses)):
         p[n], q[n] = poses[n, :3], poses[n, 3:7]
         if not q[n].any():
             q[n] = np.nan
+        x, y, z, w = q[n]
+        a, b, c = twists[n, :3]
+        d, e, f = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)  # v + w d + (x, y, z) x d
+        v[n, 0], v[n, 1], v[n, 2] = a + w * d + y * f - z * e, b + w * e + z * d - x * f, c + w * f + x * e - y * d
         for axis in range(3):
             std[n, axis] = math.sqrt(max(poses[n, 7 + 7 * (3 + axis)], 0.0))
 

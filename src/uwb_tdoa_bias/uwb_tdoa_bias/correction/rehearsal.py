@@ -12,7 +12,7 @@ class RehearsedCorrector(Corrector):
     idle = True  # nothing of this run is waited for
 
     def __init__(self, anchors, effects, poses):
-        """poses : (t (k,) s, p (k, 3) m, q (k, 4), yaw_std (k,) rad) of the other run, as `add_pose` takes them."""
+        """poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad) of the other run, as `add_pose` takes them."""
         self._known = poses
         super().__init__(anchors, effects, history=max(len(poses[0]), 1))
 

@@ -1,4 +1,4 @@
-"""Velocity, acceleration and turning rate out of a history of poses: what a node can know when it corrects a TDOA."""
+"""Velocity, acceleration and turning rate out of a history of the filter's states: what a node can know when it corrects a TDOA."""
 
 from dataclasses import dataclass
 import math
@@ -20,13 +20,13 @@ class Motion:
     rate: np.ndarray
 
 
-def motion_at(t, p, q, places):
-    """Motion at some of the poses, from those before them alone: backward differences over SPAN.
+def motion_at(t, v, q, places):
+    """Motion at some of the states, from those before them alone: acceleration and rate are backward differences over SPAN.
 
-    t (m,) rising stamps, s; p (m, 3) m; q (m, 4) x y z w; places (n,) numbers of poses, -1 for none.
+    t (m,) rising stamps, s; v (m, 3) m/s, world; q (m, 4) x y z w; places (n,) numbers of states, -1 for none.
     """
     out = np.full((3, len(places), 3), np.nan)
-    _differences(t, p, q, places, out)
+    _differences(t, v, q, places, out)
     return Motion(*out)
 
 
@@ -47,21 +47,18 @@ def precede(t, newest, out):
 
 
 @compiled
-def _differences(t, p, q, places, out):
+def _differences(t, v, q, places, out):
     for i in range(len(places)):
         k = places[i]
-        if k <= 0:
+        if k < 0:
             continue
+        out[0, i] = v[k]
         near = np.searchsorted(t, t[k] - SPAN, side="right") - 1
-        far = np.searchsorted(t, t[k] - 2.0 * SPAN, side="right") - 1
         if near < 0:
             continue
         dt = t[k] - t[near]
         for axis in range(3):
-            velocity = (p[k, axis] - p[near, axis]) / dt
-            out[0, i, axis] = velocity
-            if far >= 0:
-                out[1, i, axis] = (velocity - (p[near, axis] - p[far, axis]) / (t[near] - t[far])) / dt
+            out[1, i, axis] = (v[k, axis] - v[near, axis]) / dt
         # the turn from the earlier attitude to the later one, in the body frame, as a rotation vector
         ax, ay, az, aw = -q[near, 0], -q[near, 1], -q[near, 2], q[near, 3]
         bx, by, bz, bw = q[k, 0], q[k, 1], q[k, 2], q[k, 3]

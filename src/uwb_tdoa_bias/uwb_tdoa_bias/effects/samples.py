@@ -1,6 +1,7 @@
 """A batch of measurements with the motion of the tag, as effects see it."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -150,7 +151,11 @@ class Track:
 
     def motion(self, t):
         """Motion up to the last pose no later than t (n,), s."""
-        return motion_at(self.t, self.p, self.q, np.searchsorted(self.t, t, side="right") - 1)
+        return motion_at(self.t, self._own_velocities, self.q, np.searchsorted(self.t, t, side="right") - 1)
+
+    @cached_property
+    def _own_velocities(self):
+        return self.velocities(self.t)
 
 
 def samples_at(t, a, b, poses, anchors, start=0.0, motion=True, lag=POSE_LAG):
