@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.offline import poses_of, run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.detectors import Detection
-from uwb_tdoa_tools.diagnosis.judging import Baseline, Case, _gain_interval, borne_out, compare, cross_fitted, useful, why_not
+from uwb_tdoa_tools.diagnosis.judging import Baseline, Case, _gain_interval, borne_out, compare, cross_fitted, score, useful, why_not
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
 
@@ -46,6 +46,15 @@ def test_halves_of_a_single_flight_judge_each_other(flights):
     assert together[::2] == list(first.spans) and together[1::2] == list(second.spans)
     assert all(one[1] == other[0] for one, other in zip(together, together[1:]))
     assert first.effects.effects[0].values != second.effects.effects[0].values
+
+
+def test_parts_of_a_flight_are_judged_by_the_errors_within_them(flights):
+    single = attribute(flights[:1], TRUTH, undeclared=False)
+    cases, run = cross_fitted(single, flights[:1], NONE, (), ()), Baseline(NONE).run(flights[0])
+    parts, whole = [score(case, run) for case in cases], score(replace(cases[0], spans=None), run)
+    assert 0.9 * len(whole.t) < sum(len(part.t) for part in parts) <= len(whole.t) + 1
+    assert set(np.concatenate([part.error for part in parts])[:, 0]) <= set(whole.error[:, 0])
+    assert not any(part.row()["diverged"] for part in parts)
 
 
 def test_what_helps_is_kept_and_said_what_it_is_worth(flights, attribution):
@@ -142,6 +151,6 @@ def test_a_gain_that_a_shift_of_the_reference_can_feign_is_none():
     sides[1]["pooled"]["rmse_3d_gain_ci"] = [0.02, 0.28]  # above zero by 2.3 standard deviations alone
     assert "may be 10 cm from where" in why_not(*sides, 0.1)
     sides[1]["pooled"]["rmse_3d_gain_ci"] = unsure
-    assert why_not(*sides, 0.0) is None and "may be 10 cm from where" in why_not(*sides, 0.1)
+    assert "may be chance" in why_not(*sides, 0.0) and "may be 10 cm from where" in why_not(*sides, 0.1)
     sides[1]["pooled"]["rmse_3d"] = 0.16
     assert "do not make the error smaller" in why_not(*sides, 0.0)

@@ -55,6 +55,15 @@ def test_errors_are_against_the_truth_interpolated_to_the_estimate():
     assert covariance.shape == (801, 3, 3)
 
 
+def test_what_lies_in_a_hole_of_the_truth_has_no_error():
+    truth = straight()
+    odometry = estimate(truth, constant(0.1, -0.2, 0.3))
+    known = (truth.t < 4.0) | (truth.t > 6.0)
+    truth = Truth(truth.t[known], truth.p[known] ** 2, truth.q[known])  # nothing to be interpolated
+    t, _, _ = position_errors(odometry, truth)
+    assert np.sum(t <= 4.0) > 100 and np.sum(t >= 6.0) > 100 and not np.any((t > 4.02) & (t < 5.98))
+
+
 def test_figures_of_a_constant_error():
     truth = straight()
     row = Score("flight", estimate(truth, constant(0.299, -0.4, 1.2)), truth).row()

@@ -9,7 +9,6 @@ from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.estimator import VERDICTS
 from uwb_tdoa_ekf.offline import poses_of, run_offline
 
@@ -222,6 +221,12 @@ def why_not(before, after, shift_std):
             f"all of a flight may be {100 * shift_std:.0f} cm from where the reference says, on each axis, and the gain is less than that "
             "can feign; measure more marks, or better ones"
         )
+    if interval is not None and interval[0] <= 0.0:
+        share = 1.0 - after["pooled"]["rmse_3d"] / before["pooled"]["rmse_3d"]
+        return (
+            f"together they make the error {share:.0%} smaller on held-out data, which may be chance: the 95 % interval is {interval[0]:.0%} to "
+            f"{interval[1]:.0%}; fly more"
+        )
     return None
 
 
@@ -251,13 +256,19 @@ def compare(cases, baseline, progress=lambda: None, shift_std=lambda name: np.ze
 def score(case, run):
     """Score of a Run on a Case. Raises InputError where there is no estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
-    if case.spans is not None:
-        inside = np.any([(truth.t >= first) & (truth.t <= last) for first, last in case.spans], axis=0)
-        truth = Truth(truth.t[inside], truth.p[inside], truth.q[inside])
-    out = Score(case.flight.name, run.odometry, truth, run.residuals)
+    odometry = run.odometry
+    if case.spans is not None:  # both, as the truth would be interpolated over what lies between spans
+        truth, odometry = (_inside(part, case.spans) for part in (truth, odometry))
+    out = Score(case.flight.name, odometry, truth, run.residuals)
     if not len(out.t):
         raise InputError(f"{case.flight.name}: the filter gives no estimate in the part to judge on; see what evaluate says.")
     return out
+
+
+def _inside(part, spans):
+    """What of a Truth or an Odometry is stamped within spans ((first, last), ...), s."""
+    inside = np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0)
+    return replace(part, **{name: values[inside] for name, values in vars(part).items()})
 
 
 def _run(case, baseline, after):

@@ -14,6 +14,8 @@ from .distribution import Distribution
 AIRBORNE = 0.3  # m; errors count from the first to the last instant above this height
 LOST = 1.0  # m; a larger error is no estimate
 LOST_SHARE = 0.25  # of the airborne time; more is a diverged run
+HOLE = 0.5  # s without a true pose, and SPARSE times their usual interval, over which none is interpolated
+SPARSE = 4.0
 START_GRACE = 1.0  # s into the airborne part by which the first estimate must have come
 
 
@@ -31,15 +33,22 @@ def position_at(t, truth):
 
 
 def position_errors(odometry, truth):
-    """Errors over the airborne part, the truth interpolated to the stamps of the estimate.
+    """Errors over the airborne part, the truth interpolated to the stamps of the estimate, except in holes of it.
 
     Returns (t (n,) s, error (n, 3) m, covariance (n, 3, 3) m^2 of the position).
     """
     first, last = airborne(truth)
-    chosen = (odometry.t >= first) & (odometry.t <= last)
+    chosen = (odometry.t >= first) & (odometry.t <= last) & ~_in_holes(odometry.t, truth.t)
     t = odometry.t[chosen]
     covariance = getattr(odometry, "covariance", getattr(odometry, "pose_covariance", None))
     return t, odometry.p[chosen] - position_at(t, truth), covariance[chosen, :3, :3]
+
+
+def _in_holes(t, known):
+    """Which stamps t (n,) s lie in holes between the stamps `known` (m,), s, of the truth: (n,) bool."""
+    apart = np.diff(known)
+    holes = np.flatnonzero(apart > max(HOLE, SPARSE * np.median(apart))) if len(apart) else ()
+    return np.any([(t > known[k]) & (t < known[k + 1]) for k in holes], axis=0) if len(holes) else np.zeros(len(t), bool)
 
 
 def nees(error, covariance):
