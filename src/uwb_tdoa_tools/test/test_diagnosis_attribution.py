@@ -57,7 +57,7 @@ def test_an_anchor_that_is_far_off_is_fitted_where_it_is(flight):
 
     candidates = candidates_of(far, flight.anchors, [])
     table = table_of(at(())).with_terms([term for candidate in candidates for term in candidate.terms])
-    selection = select(table, candidates, np.ones(len(table.channels)))
+    selection = select(table, candidates, np.ones(3 * len(table.channels)))
     before = np.std(table_of(at(effects_of(selection))).y - selection.fit.residual)
     after = _straightened(selection, at, candidates)
     assert before > 0.02

@@ -39,7 +39,7 @@ def test_nothing_is_detected_in_a_clean_flight(clean, name):
 
 def searched(*flights):
     table = table_of(seen(*flights))
-    return DETECTORS["nlos"].search(table, fit(table, [], np.ones(len(CHANNELS))), [])
+    return DETECTORS["nlos"].search(table, fit(table, [], np.ones(3 * len(CHANNELS))), [])
 
 
 def test_an_interval_without_sight_is_searched_in_a_single_flight(clean):
@@ -62,7 +62,7 @@ def test_time_is_no_limit_where_there_are_several_flights(clean):
 def test_an_anchor_that_is_blocked_already_is_not_searched_again(clean):
     flight = effect_of("nlos", True, 2).inject(clean)
     table = table_of(seen(flight))
-    model = fit(table, [], np.ones(len(CHANNELS)))
+    model = fit(table, [], np.ones(3 * len(CHANNELS)))
     first = DETECTORS["nlos"].search(table, model, [])
     keys = {c.terms[0].keys for c in first}
     again = DETECTORS["nlos"].search(table, model, first)

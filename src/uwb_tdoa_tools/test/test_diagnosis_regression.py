@@ -84,7 +84,7 @@ def test_the_scorer_gives_what_the_whole_equations_would(data):
     table, candidates = short()
     base = columns_of(data.draw(st.lists(st.sampled_from(candidates), max_size=2)))
     candidate = data.draw(st.sampled_from(candidates))
-    model = fit(table, base, np.ones(len(CHANNELS)))
+    model = fit(table, base, np.ones(3 * len(CHANNELS)))
     model = type(model)(**{**vars(model), "weight": rng.uniform(0.5, 1.5, len(table.y))})
     judged = Scorer(table, base, model, candidate.columns).judge(candidate.columns)
     both = list(dict.fromkeys([*base, *candidate.columns]))
@@ -102,7 +102,7 @@ def test_the_scorer_gives_what_the_whole_equations_would(data):
 
 def test_a_delay_is_ranked_first_and_a_clean_flight_has_nothing(clean, late):
     table, candidates = clean
-    model = fit(table, [], np.ones(len(CHANNELS)))
+    model = fit(table, [], np.ones(3 * len(CHANNELS)))
     assert all(criterion < 0.0 for criterion, _ in rank(table, candidates, [], model))
     table, candidates = late
     inflation = fit(table, columns_of(candidates)).inflation
@@ -112,7 +112,7 @@ def test_a_delay_is_ranked_first_and_a_clean_flight_has_nothing(clean, late):
 
 def test_what_is_implausible_is_not_chosen(late):
     table, candidates = late
-    model = fit(table, [], np.ones(len(CHANNELS)))
+    model = fit(table, [], np.ones(3 * len(CHANNELS)))
     nlos = EFFECTS["nlos"]
     early = Candidate((Term(nlos({"1.start": 0.0, "1.end": 60.0}), ("1.delay",)),))
     assert not early.plausible(np.array([-0.3])) and early.plausible(np.array([0.3]))

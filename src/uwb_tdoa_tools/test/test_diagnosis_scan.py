@@ -26,7 +26,7 @@ def scanned(flight):
     found = [residuals(flight, TRUTH, EffectSet())]
     table = table_of(found)
     views = {name: channel.views([found[0][name]]) for name, channel in CHANNELS.items() if name in found[0]}
-    return table, fit(table, [], np.ones(len(table.channels))), Scan(table, views)
+    return table, fit(table, [], np.ones(3 * len(table.channels))), Scan(table, views)
 
 
 def put_in(form, key, covariate, knots, shape, size):
@@ -54,7 +54,7 @@ def test_the_gain_is_that_of_normal_equations_with_the_same_weights(flight):
     table, _, scan = scanned(TERMS[2].inject(effect.inject(flight)))
     chosen = (Candidate((Term(effect, tuple(effect.values)),)),)
     table = table.with_terms(chosen[0].terms)
-    model = fit(table, chosen[0].columns, np.ones(len(table.channels)))
+    model = fit(table, chosen[0].columns, np.ones(3 * len(table.channels)))
     gain, shapes, shape, knots, _ = scan.gains(table, model, chosen)[0]
     term = SmoothTerm(covariate=shapes.view.covariate, form=shapes.view.form, knots=knots, shape=shape)
     candidate = Candidate((Term(term, term.keys_of((shapes.view.key,))),))

@@ -104,7 +104,7 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
         selection = _straightened(selection, at, declared + smooth)
         selection = _that_hold_on_other_data(selection, refused)
     selection = with_rivals(selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress)
-    if undeclared:
+    if undeclared and len(flights) > 1:  # maps of one flight are of its path, and mislead others
         selection = _with_maps(selection, smooth, refused)
     remaining = at(effects_of(selection))
     detections = (detector.detect(remaining) for detector in detectors)
@@ -116,7 +116,8 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
 
 
 def effects_of(selection):
-    """The chosen Candidates with the values of the fit, parameters of one effect together: tuple of Effects."""
+    """The chosen Candidates with the values of the fit, parameters of one effect together, within the bounds of the effect:
+    tuple of Effects."""
     values, std = {}, {}
     error = np.sqrt(np.diag(selection.fit.cov)) if len(selection.fit.beta) else ()
     fitted = dict(zip(selection.fit.columns, zip(selection.fit.beta.tolist(), map(float, error))))
@@ -127,7 +128,10 @@ def effects_of(selection):
         effects.setdefault(identity, effect)
         values.setdefault(identity, {}).update(effect.values)
         for column in term.columns:
-            values[identity][column.key], std.setdefault(identity, {})[column.key] = fitted[column]
+            bound = effect.bound_of(column.key)
+            value, deviation = fitted[column]
+            values[identity][column.key] = min(max(value, -bound), bound)
+            std.setdefault(identity, {})[column.key] = min(deviation, bound)
     return tuple(
         replace(effect, values=values[identity], std=std[identity], source="diagnose")
         for identity, effect in effects.items()
@@ -204,7 +208,7 @@ def _linearised(found, candidates, model):
 
 
 def _inflation(table, declared, detectors):
-    """(channels,) loss of independence, on the residual of a fit with all that is declared, and with what `detectors` find."""
+    """(groups,) loss of independence, on the residual of a fit with all that is declared, and with what `detectors` find."""
     known, model = list(declared), fit(table, columns_of(declared))
     for _ in range(DISGUISED):
         alike = replace(model, inflation=np.ones_like(model.inflation))
@@ -223,7 +227,7 @@ def _straightened(selection, at, candidates):
     for _ in range(ROUNDS):
         model = effects_of(selection)
         current, table = at(model), selection.table
-        y, limit = _linearised(current, (), model).y, STRAIGHT * selection.fit.scale[table.channel]
+        y, limit = _linearised(current, (), model).y, STRAIGHT * selection.fit.scale[table.group]
         if len(y) == len(table.y) and np.mean(((y - table.y) / limit) ** 2) <= 1.0:
             break
         table = _linearised(current, [*candidates, *selection.chosen], model)

@@ -111,6 +111,6 @@ def merged(base, found, selection):
 
 def _rows(table, chosen):
     """Table of some rows, (n,) bool, with the columns that it has."""
-    each = ("y", "channel", "series", "block", "flight", "t", "count", "place")
+    each = ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
     arrays = {name: getattr(table, name)[chosen] for name in each}
     return replace(table, **arrays, columns={column: values[chosen] for column, values in table.columns.items()})

@@ -106,7 +106,7 @@ def _elsewhere(selection, candidate, remaining, number):
     for other in remaining[:number] + remaining[number + 1 :]:
         table = table_of([other]).with_terms(candidate.terms)
         part = table.matrix(candidate.columns) @ fit.values(candidate.columns)
-        information = 1.0 / (fit.scale**2 * fit.inflation)[table.channel]
+        information = 1.0 / (fit.scale**2 * fit.inflation)[table.group]
         (share,) = _shares(part, table.y, information, table.flight, ("",))
         if share.told and share.share > ALIKE:
             return True

@@ -38,7 +38,8 @@ class AidResidual(ChannelResidual):
         samples, (n, k), known = self.samples, self.residual.shape, self._known
         y, t = self.residual.T.ravel()[known], np.tile(samples.t - samples.start, k)[known]
         place = np.tile(samples.p, (k, 1))[known]
-        return Rows(self._free(y), np.repeat(np.arange(k), n)[known], t, np.ones(len(y)), place)
+        axis = np.repeat(np.arange(k), n)[known]
+        return Rows(self._free(y), axis, axis, t, np.ones(len(y)), place)
 
     def columns(self, effect, keys):
         values = effect.regressors(self.samples, list(keys))

@@ -49,10 +49,11 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Rows:
-    """m rows of a linear fit: y (m,); series (m,) int, what is one series in time; t (m,) s since the start; count (m,)
-    samples averaged; place (m, 3) m, world."""
+    """m rows of a linear fit: y (m,); axis (m,) int, 0 to 2, of the sensor; series (m,) int, what is one series in time; t (m,) s since
+    the start; count (m,) samples averaged; place (m, 3) m, world."""
 
     y: np.ndarray
+    axis: np.ndarray
     series: np.ndarray
     t: np.ndarray
     count: np.ndarray

@@ -31,7 +31,8 @@ class ImuResidual(ChannelResidual):
     def rows(self):
         samples, n = self.samples, len(self.samples)
         t, place = np.tile(samples.t - samples.start, 3), np.tile(samples.p, (3, 1))
-        return Rows(self.residual.T.ravel(), np.repeat(np.arange(3), n), t, np.ones(3 * n), place)
+        axis = np.repeat(np.arange(3), n)
+        return Rows(self.residual.T.ravel(), axis, axis, t, np.ones(3 * n), place)
 
     def columns(self, effect, keys):
         values = effect.regressors(self.samples, list(keys))

@@ -46,7 +46,7 @@ class TdoaResidual(ChannelResidual):
     def rows(self):
         cells, samples = self.cells, self.samples
         place = np.stack([cells.mean(column) for column in samples.p.T], axis=1)
-        return Rows(cells.mean(self.residual), cells.pair, cells.t - samples.start, cells.size, place)
+        return Rows(cells.mean(self.residual), np.zeros_like(cells.pair), cells.pair, cells.t - samples.start, cells.size, place)
 
     def columns(self, effect, keys):
         values = np.nan_to_num(effect.regressors(self.samples, list(keys)))

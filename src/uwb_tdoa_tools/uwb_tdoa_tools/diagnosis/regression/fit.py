@@ -1,13 +1,15 @@
 """Robust linear fits of a Table, and what one is worth.
 
 Noise is Student's t with NU degrees of freedom, fitted by iteratively re-weighted least squares (Lange, Little and
-Taylor, JASA 1989). Rows are not independent: every channel's information is divided by an inflation that is measured
-on the residuals of blocks.
+Taylor, JASA 1989). Rows are not independent: each axis of a channel has a scale, and the information of every
+channel is divided by an inflation that is measured on the residuals of blocks.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+
+from .table import AXES
 
 NU = 4.0
 ITERATIONS = 12
@@ -18,7 +20,7 @@ LONGEST_MEMORY = 3.0  # s over which rows of a series may be alike
 @dataclass(frozen=True, eq=False)
 class Fit:
     """columns, beta (k,), cov (k, k): block sandwich, not below the model's; residual (n,), weight (n,) 0 to 1.25;
-    scale, inflation, size (channels,): spread of a row, loss of independence, effective number of rows."""
+    scale, inflation, size (groups,): spread of a row, loss of independence, effective number of rows."""
 
     columns: tuple
     beta: np.ndarray
@@ -31,13 +33,13 @@ class Fit:
 
     def information(self, table):
         """What each row of the Table counts for, (n,), in independent rows per squared unit."""
-        return self.weight / (self.scale**2 * self.inflation)[table.channel]
+        return self.weight / (self.scale**2 * self.inflation)[table.group]
 
     def likelihood(self, table):
         """Twice the log-likelihood of Student's t, in independent rows, less what the prior says of beta."""
-        scale = self.scale[table.channel]
+        scale = self.scale[table.group]
         rows = 2.0 * np.log(scale) + (NU + 1.0) * np.log1p((self.residual / scale) ** 2 / NU)
-        return -float(np.sum(rows / self.inflation[table.channel]) + np.sum((self.beta / prior_sizes(self.columns)) ** 2))
+        return -float(np.sum(rows / self.inflation[table.group]) + np.sum((self.beta / prior_sizes(self.columns)) ** 2))
 
     def values(self, columns):
         """beta of some Columns, (k,)."""
@@ -63,30 +65,30 @@ def prior_sizes(columns):
 
 
 def fit(table, columns, inflation=None):
-    """Fit of some Columns of a Table. inflation : (channels,), measured on this very fit if None."""
-    x, channel, sizes = table.matrix(columns), table.channel, prior_sizes(columns)
-    size = np.maximum(np.bincount(channel, minlength=len(table.channels)), 1).astype(float)
+    """Fit of some Columns of a Table. inflation : (groups,), measured on this very fit if None."""
+    x, group, sizes = table.matrix(columns), table.group, prior_sizes(columns)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
-    residual, scale = table.y.copy(), np.ones(len(table.channels))
+    residual = table.y.copy()
     for step in range(ITERATIONS):
         scale = _scales(table, residual)
-        weight = (NU + 1.0) / (NU + (residual / scale[channel]) ** 2)
+        weight = (NU + 1.0) / (NU + (residual / scale[group]) ** 2)
         if not columns:
             if step:
                 break
             continue
-        root = weight / scale[channel] ** 2
-        root /= 1.0 if inflation is None else inflation[channel]
+        root = weight / scale[group] ** 2
+        root /= 1.0 if inflation is None else inflation[group]
         beta, _, _ = solve((x * root[:, None]).T @ x, x.T @ (root * table.y), sizes)
         change = residual - (table.y - x @ beta)
         residual = residual - change
-        if np.all(np.abs(change) < 0.01 * scale[channel]):
+        if np.all(np.abs(change) < 0.01 * scale[group]):
             break
     if inflation is None:
         inflation = measure_inflation(table, residual, weight, scale, columns)
-    root = weight / (scale[channel] ** 2 * inflation[channel])
+    root = weight / (scale[group] ** 2 * inflation[group])
     cov = _covariance(table, x, residual, root, sizes) if columns else np.zeros((0, 0))
-    return Fit(tuple(columns), beta, cov, residual, weight, scale, inflation, size / inflation)
+    size = np.bincount(group, minlength=len(scale)) / inflation
+    return Fit(tuple(columns), beta, cov, residual, weight, scale, inflation, np.maximum(size, 1.0))
 
 
 def refit(table, columns, model, rows):
@@ -98,11 +100,16 @@ def refit(table, columns, model, rows):
 
 
 def _scales(table, residual):
-    """Scale of Student's t per channel, by the fixed point of its likelihood."""
-    out = np.ones(len(table.channels))
-    for k in np.unique(table.channel):
-        out[k] = student_scale(residual[table.channel == k])
+    """Scale of Student's t per group, by the fixed point of its likelihood."""
+    out = _one_each(table)
+    for k, rows in table.groups:
+        out[k] = student_scale(residual[rows])
     return out
+
+
+def _one_each(table):
+    """(groups,) of 1, of all channels whether they have rows or not."""
+    return np.ones(AXES * len(table.channels))
 
 
 def student_scale(r):
@@ -129,20 +136,21 @@ def _covariance(table, x, residual, root, sizes):
 
 
 def measure_inflation(table, residual, weight, scale, columns):
-    """By how much fewer the independent rows of each channel are: (channels,), at least 1.
+    """By how much fewer the independent rows of each channel are: (groups,), at least 1, alike in all groups of a channel: what one
+    axis has that the others have not is an effect.
 
     The larger of two: 1 + 2 sum(rho) over the autocorrelation of each series up to 3 s, and how much larger sums of
     scores over blocks are than those of independent rows would be, averaged over the columns. The second sees
     what series have in common. The residual should be that of a fit with all columns, or effects count as noise.
     """
-    out = np.ones(len(table.channels))
+    out = _one_each(table)
     x = table.matrix(columns)
-    for k in np.unique(table.channel):
-        rows = table.rows_of(table.channels[k])
-        r = weight[rows] * residual[rows] / scale[k]
+    for name in table.present:
+        rows = table.rows_of(name)
+        r = weight[rows] * residual[rows] / scale[table.group[rows]]
         raw = max(1.0, _temporal(table, rows, r), _clustered(table.block[rows], x[rows], r))
         spent = np.sum(np.any(x[rows] != 0.0, axis=0)) * raw / len(r)
-        out[k] = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw  # the fit has followed some of the noise
+        out[np.unique(table.group[rows])] = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw  # the fit has followed some of the noise
     return out
 
 

@@ -14,7 +14,7 @@ CLIP = 5.0  # spreads that an outlier counts as
 @dataclass(frozen=True, order=True)
 class HeldOut:
     """gain : twice the log-likelihood, in independent rows, that a Candidate brings on rows that it was not fitted to; t :
-    its t value over blocks; explained : share of the variance of the channel that gains most."""
+    its t value over blocks; explained : share of the variance of the axis or channel that gains most."""
 
     gain: float
     t: float
@@ -31,7 +31,7 @@ def held_out(selection, by_flight=False):
     for k, candidate in enumerate(chosen):
         rest = folds.residual(columns_of(chosen[:k] + chosen[k + 1 :]))
         touched = np.any(table.matrix(candidate.columns) != 0.0, axis=1)
-        gain = (_loss(table, model, rest) - _loss(table, model, whole)) / model.inflation[table.channel]
+        gain = (_loss(table, model, rest) - _loss(table, model, whole)) / model.inflation[table.group]
         sums = np.bincount(table.block[touched], gain[touched])
         sums = sums[np.unique(table.block[touched])] if touched.any() else np.zeros(1)
         t = sums.sum() / max(np.sqrt(len(sums)) * sums.std(), 1e-9)
@@ -68,17 +68,15 @@ class _Folds:
 
 def _loss(table, model, residual):
     """Minus twice the log-likelihood of Student's t, row by row."""
-    return (NU + 1.0) * np.log1p((residual / model.scale[table.channel]) ** 2 / NU)
+    return (NU + 1.0) * np.log1p((residual / model.scale[table.group]) ** 2 / NU)
 
 
 def _explained(table, model, before, after, touched):
-    """Share of the variance, with outliers at CLIP spreads, that goes from `before` to `after` in the channel that gains
-    most, over the rows (n,) bool that are touched."""
+    """Share of the variance, with outliers at CLIP spreads, that goes from `before` to `after` in the group that gains most, over the
+    rows (n,) bool that are touched."""
     best = 0.0
-    for k in np.unique(table.channel):
-        mine = (table.channel == k) & touched
-        if not mine.any():
-            continue
+    for k in np.unique(table.group[touched]):
+        mine = (table.group == k) & touched
         limit = CLIP * max(np.median(np.abs(before[mine])) * 1.4826, model.scale[k])
         power = [np.mean(np.clip(r[mine], -limit, limit) ** 2) for r in (before, after)]
         best = max(best, 1.0 - power[1] / max(power[0], 1e-300))

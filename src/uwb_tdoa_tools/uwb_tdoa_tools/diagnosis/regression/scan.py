@@ -67,7 +67,7 @@ class Scan:
     def __call__(self, table, model, chosen):
         """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows. What looks like outliers to
         the fit counts for more: it may be what acts on a few rows alone. Series that are noisier than others count for less."""
-        scale = HUBER * model.scale[table.channel] / np.sqrt(self.even)
+        scale = HUBER * model.scale[table.group] / np.sqrt(self.even)
         weight = np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12)) * self.even
         everywhere = np.ones(len(table.y), dtype=bool)
         model = refit(table, columns_of(chosen), replace(model, weight=weight), everywhere)
@@ -103,7 +103,7 @@ class Scan:
 
 
 def _noise_of_series(table):
-    """How much noisier the series of each row is than most of its channel, (n,), at least 1: by differences of successive rows, of
+    """How much noisier the series of each row is than most of its group, (n,), at least 1: by differences of successive rows, of
     which steps and trends are a small part."""
     order = np.lexsort((table.t, table.series, table.flight, table.channel))
     label = np.unique(np.stack([table.channel, table.flight, table.series]), axis=1, return_inverse=True)[1].reshape(-1)
@@ -112,8 +112,7 @@ def _noise_of_series(table):
     parts = (step[same & (label[order][1:] == k)] for k in range(label.max() + 1))
     scatter = np.array([np.median(part) if len(part) else 0.0 for part in parts])
     out = scatter[label]
-    for channel in np.unique(table.channel):
-        rows = table.channel == channel
+    for _, rows in table.groups:
         out[rows] /= max(float(NOISY * np.median(out[rows])), 1e-12)
     return np.maximum(out, 1.0)
 

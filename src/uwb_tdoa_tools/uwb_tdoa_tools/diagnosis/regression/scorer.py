@@ -1,7 +1,7 @@
 """What sets of columns would gain, in closed form.
 
-All that candidates need of the rows is computed for all of them at once: products with the base of the model, channel by
-channel. A candidate is then a small system of equations on top of that of the base (Schur complement).
+All that candidates need of the rows is computed for all of them at once: products with the base of the model, group by group
+(an axis of a channel). A candidate is then a small system of equations on top of that of the base (Schur complement).
 """
 
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .fit import prior_sizes, solve
+from .table import AXES
 
 AT_ONCE = 128  # columns whose products with the base are made together, so that a copy of all of them is never held
 
@@ -30,10 +31,11 @@ class Scorer:
         """base : Columns that are in the model already; model : Fit, whose weights count; others : Columns that may be
         judged."""
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
-        self._size, self._base = dict(zip(table.channels, model.size)), np.arange(len(base))
+        self._base = np.arange(len(base))
         columns, root = list(self._place), model.information(table)
-        self._channels = table.present
-        self._parts = [self._part(table, columns, root, table.rows_of(name)) for name in self._channels]
+        self._parts = [self._part(table, columns, root, rows) for _, rows in table.groups]
+        self._group_sizes = [model.size[group] for group, _ in table.groups]
+        self._channels = [table.channels[group // AXES] for group, _ in table.groups]
         self._sizes = prior_sizes(list(self._place))
         sizes = self._sizes[self._base]
         gram = sum(part.cross[:, self._base] for part in self._parts)
@@ -70,25 +72,25 @@ class Scorer:
         z = np.concatenate([self._inverse @ (vector[: len(base)] - cross @ z_new), z_new])
         determined = len(both) - np.trace(self._inverse) - np.trace(schur) - np.sum((half @ schur) * half)
         beta, gain = z * sizes[both], self._penalty - float(z @ z)
-        for name, part, gram, before in zip(self._channels, self._parts, own, self._squares):
-            gain += self._size[name] * np.log(before / part.squares(beta, both, gram))
+        for size, part, gram, before in zip(self._group_sizes, self._parts, own, self._squares):
+            gain += size * np.log(before / part.squares(beta, both, gram))
         values = dict(zip(both.tolist(), beta.tolist()))
         return Gain(np.array([values[place] for place in all_places.tolist()]), float(determined - self._determined), float(gain))
 
     def price(self, candidate, determined, choices):
         """What the parameters of a Candidate, `determined` of them by the data, must at least gain, if it is one of `choices`."""
-        rows = sum(self._size[name] for name in self._channels if name in candidate.channels)
+        rows = sum(size for size, name in zip(self._group_sizes, self._channels) if name in candidate.channels)
         return determined * np.log(max(rows, 10.0)) + 2.0 * np.log(max(choices, 2)) + candidate.price
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One channel: its rows in a Table of some columns, with weights root (n,); cross (base, k) and vector (k,): X' W X and X' W y;
+    """One group: its rows in a Table of some columns, with weights root (n,); cross (base, k) and vector (k,): X' W X and X' W y;
     power : y' W y."""
 
     table: object
     columns: list
-    rows: slice
+    rows: object
     root: np.ndarray
     cross: np.ndarray
     vector: np.ndarray

@@ -7,13 +7,15 @@ import numpy as np
 from ..channels import CHANNELS
 
 BLOCK = 5.0  # s, taken as independent of each other
+AXES = 3  # of a channel at most
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
     """n rows of a linear model y = X beta + noise, those of one channel after the other.
 
-    channels : names; y (n,); channel (n,) place in `channels`; series (n,) int, different in every flight; block (n,) number of an independent
+    channels : names; y (n,); channel (n,) place in `channels`; group (n,) number of an axis of a channel, AXES of each, what is alike
+    in noise; series (n,) int, different in every flight; block (n,) number of an independent
     block; flight (n,); t (n,) s since the start; count (n,) samples averaged; place (n, 3) m.
     parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column: (n,)}, X, whose columns tables share.
     """
@@ -21,6 +23,7 @@ class Table:
     channels: tuple
     y: np.ndarray
     channel: np.ndarray
+    group: np.ndarray
     series: np.ndarray
     block: np.ndarray
     flight: np.ndarray
@@ -34,6 +37,17 @@ class Table:
     def present(self):
         """Names of the channels that have rows."""
         return tuple(self.channels[place] for place in np.unique(self.channel))
+
+    @property
+    def groups(self):
+        """[(number, rows)] of the groups that have rows: a slice, where they lie together, or bool (n,)."""
+        return [(k, self._rows_of_group(k)) for k in np.unique(self.group).tolist()]
+
+    def _rows_of_group(self, group):
+        inside = self.group == group
+        first, count = int(np.argmax(inside)), int(inside.sum())
+        together = slice(first, first + count)
+        return together if inside[together].all() else inside
 
     @property
     def flights(self):
@@ -82,7 +96,7 @@ class Table:
 
 def table_of(residuals):
     """Table without columns of [{name of a channel: ChannelResidual}], one dict for each flight."""
-    parts, pieces = [], {key: [] for key in ("y", "channel", "series", "block", "flight", "t", "count", "place")}
+    parts, pieces = [], {key: [] for key in ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")}
     rows = [{name: part.rows() for name, part in flight.items()} for flight in residuals]
     start = [min(part.t.min() for part in flight.values()) for flight in rows]
     blocks = [1 + max(int((part.t.max() - t) / BLOCK) for part in flight.values()) for flight, t in zip(rows, start)]
@@ -98,6 +112,7 @@ def table_of(residuals):
             first += n
             pieces["block"].append(offset[number] + ((part.t - start[number]) / BLOCK).astype(int))
             pieces["channel"].append(np.full(n, place))
+            pieces["group"].append(AXES * place + part.axis)
             pieces["flight"].append(np.full(n, number))
             for key in ("y", "series", "t", "count", "place"):
                 pieces[key].append(getattr(part, key))
