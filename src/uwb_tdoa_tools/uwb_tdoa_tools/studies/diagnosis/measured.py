@@ -113,7 +113,7 @@ def run(data, name, out, aids=()):
 
 
 def injected(data, each):
-    """Put large effects into measured flights whose own effects were diagnosed before: [dict], with "hit"."""
+    """Put large effects into measured flights whose own effects were diagnosed before: [dict], as of the bank, with "hit"."""
     cases = [(path, name) for path in INTO for name in SIZES if name not in (*PRESENT, *ON_AIDS)]
     known = {}
 
@@ -129,6 +129,6 @@ def injected(data, each):
         same = next((f.effect for f in findings if f.effect.name == name), None)
         hit = same is not None and bool(set(same.values) & set(effect.values))
         rivals = sorted({other.effect for f in findings for other in f.alternatives if other.gap is not None})
-        return {"flight": flight.name, "put_in": name, "found": names, "ambiguous": rivals, "hit": hit}
+        return {"kind": "large", "flight": flight.name, "put_in": [name], "found": names, "ambiguous": rivals, "hit": hit}
 
     return each(cases, one)
