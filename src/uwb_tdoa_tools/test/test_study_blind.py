@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import EFFECTS, SmoothTerm
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_tools.diagnosis.findings import Finding
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative
 from uwb_tdoa_tools.studies.diagnosis import blind, grammar
@@ -77,3 +77,14 @@ def test_cases_cost_what_they_must():
     drawn = (blind.case(blind.Simulated(), seed) for seed in range(20))
     effect, flown, plain, base, where = next(one for one in drawn if one is not None)
     assert all(blind.rmse(one, base) - blind.rmse(none, base) >= blind.LEAST_COST for one, none in zip(flown, plain))
+
+
+@pytest.mark.parametrize("covariate", ["speed", "x", "previous_anchor", "interval"])
+def test_what_is_told_is_removed(flight, covariate):
+    limits = (2, 2) if covariate == "previous_anchor" else (0.01, 0.05) if covariate == "interval" else (0.0, 1.0)
+    subset, who = ("all", ()) if covariate == "previous_anchor" else ("anchor", (3,))
+    effect = grammar.Undeclared("tdoa", subset, who, covariate, "trend", 1.0, limits, (0.5, 0.2, 0.5))
+    flown = effect.inject(flight)
+    plain, before = (blind.rmse(one, EffectSet()) for one in (flight, flown))
+    assert before > 1.5 * plain
+    assert blind.told(effect, flown, plain, EffectSet()) < plain + 0.25 * (before - plain)

@@ -3,7 +3,7 @@
 Some effects of the grammar have a name in the catalogue: an anchor that is late from one time to another is nlos.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,7 +36,7 @@ STREAM = {"imu_gravity": "accel", "imu_misalignment": "gyro"}
 @dataclass(frozen=True)
 class Claim:
     """stream; subset : kind of it; who : frozenset of the anchors, or of the axis; covariates : those that it names, the first
-    and what is the same in that flight; shape; text; usable : nodes can take it out."""
+    and what is the same in that flight; shape; text."""
 
     stream: str
     subset: str
@@ -44,7 +44,6 @@ class Claim:
     covariates: tuple
     shape: str
     text: str
-    usable: bool = True
 
     def names(self, true):
         """Whether stream and subset are those of another Claim."""
@@ -71,8 +70,7 @@ def claims(findings):
     ranked = sorted(findings, key=lambda finding: (bool(finding.together_with), -finding.prominence))
     out = []
     for finding in ranked:
-        several = _undeclared(finding) if finding.effect.settings else _declared(finding.effect)
-        out += [replace(claim, usable=finding.effect.usable) for claim in several]
+        out += _undeclared(finding) if finding.effect.settings else _declared(finding.effect)
     return out
 
 

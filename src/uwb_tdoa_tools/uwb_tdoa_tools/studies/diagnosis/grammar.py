@@ -79,10 +79,11 @@ class Undeclared:
             return replace(flight, imu=replace(imu, **{self.stream: getattr(imu, self.stream) + change}))
         samples, rows = true_samples(flight)
         d = flight.tdoa.d.copy()
-        d[rows] += np.nan_to_num(self._tdoa(samples))
+        d[rows] += np.nan_to_num(self.bias(samples))
         return replace(flight, tdoa=replace(flight.tdoa, d=d))
 
-    def _tdoa(self, samples):
+    def bias(self, samples):
+        """What it adds to the TDOAs of Samples, (n,) m; NaN where the pose does not tell."""
         ids = samples.anchors.ids
         a, b = ids[samples.a], ids[samples.b]
         if self.covariate in ON_ARRIVAL:
@@ -148,7 +149,9 @@ def _of_arrival(samples, name):
 
 def _of_tdoa(samples, name):
     if name == "interval":
-        return np.diff(samples.t, prepend=samples.t[:1])
+        return np.diff(samples.t, prepend=samples.t[:1]) if samples.interval is None else samples.interval
+    if name == NAMES and samples.previous is not None:
+        return samples.previous
     if name == NAMES:
         return np.concatenate([[-1], samples.anchors.ids[samples.b[:-1]]])
     return OF_TDOA[name](samples)
