@@ -136,8 +136,8 @@ def _covariance(table, x, residual, root, sizes):
 
 
 def measure_inflation(table, residual, weight, scale, columns):
-    """By how much fewer the independent rows of each channel are: (groups,), at least 1, alike in all groups of a channel: what one
-    axis has that the others have not is an effect.
+    """By how much fewer the independent rows of each channel are: (groups,), at least 1. Of its axes the median: what one has that the
+    others have not is an effect.
 
     The larger of two: 1 + 2 sum(rho) over the autocorrelation of each series up to 3 s, and how much larger sums of
     scores over blocks are than those of independent rows would be, averaged over the columns. The second sees
@@ -145,12 +145,14 @@ def measure_inflation(table, residual, weight, scale, columns):
     """
     out = _one_each(table)
     x = table.matrix(columns)
-    for name in table.present:
-        rows = table.rows_of(name)
-        r = weight[rows] * residual[rows] / scale[table.group[rows]]
+    for k, rows in table.groups:
+        r = weight[rows] * residual[rows] / scale[k]
         raw = max(1.0, _temporal(table, rows, r), _clustered(table.block[rows], x[rows], r))
         spent = np.sum(np.any(x[rows] != 0.0, axis=0)) * raw / len(r)
-        out[np.unique(table.group[rows])] = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw  # the fit has followed some of the noise
+        out[k] = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw  # the fit has followed some of the noise
+    for name in table.present:
+        axes = np.unique(table.group[table.rows_of(name)])
+        out[axes] = np.median(out[axes])
     return out
 
 
