@@ -47,8 +47,10 @@ def position_errors(odometry, truth):
 def _in_holes(t, known):
     """Which stamps t (n,) s lie in holes between the stamps `known` (m,), s, of the truth: (n,) bool."""
     apart = np.diff(known)
-    holes = np.flatnonzero(apart > max(HOLE, SPARSE * np.median(apart))) if len(apart) else ()
-    return np.any([(t > known[k]) & (t < known[k + 1]) for k in holes], axis=0) if len(holes) else np.zeros(len(t), bool)
+    if not len(apart):
+        return np.zeros(len(t), bool)
+    k = np.clip(np.searchsorted(known, t, side="right") - 1, 0, len(apart) - 1)
+    return (apart > max(HOLE, SPARSE * np.median(apart)))[k] & (t > known[k]) & (t < known[k + 1])
 
 
 def nees(error, covariance):

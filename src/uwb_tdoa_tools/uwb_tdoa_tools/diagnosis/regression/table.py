@@ -1,6 +1,7 @@
 """Residuals of several flights and channels, and regressors, as one immutable table of a linear fit."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -38,7 +39,7 @@ class Table:
         """Names of the channels that have rows."""
         return tuple(self.channels[place] for place in np.unique(self.channel))
 
-    @property
+    @cached_property
     def groups(self):
         """[(number, rows)] of the groups that have rows: a slice, where they lie together, or bool (n,)."""
         return [(k, self._rows_of_group(k)) for k in np.unique(self.group).tolist()]
