@@ -5,7 +5,7 @@ import pytest
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
-from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import poses_of, run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
@@ -67,6 +67,21 @@ def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
     clean = [clean_flight(seed, 30.0) for seed in (100, 101)]
     kept = useful(attribution, clean, Baseline(NONE))
     assert kept.candidates == () and "the filter does better without it" in kept.refused[0].why
+
+
+@pytest.mark.parametrize("effect, recurs", [
+    (EFFECTS["nlos"]({"1.delay": 0.8, "1.start": 8.0, "1.end": 14.0}), False),
+    (SmoothTerm({"3.c0": 0.0, "3.c1": 0.7}, covariate="time", form="anchor", knots=(0.0, 17.0, 32.0), shape="step"), False),
+    (SmoothTerm({"3.c0": 0.0, "3.c1": 0.9}, covariate="time", form="anchor", knots=(0.0, 32.0), shape="line"), True),
+])  # fmt: skip
+def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recurs):
+    flight = effect.inject(clean_flight(100, 30.0))
+    found = attribute([flight], TRUTH)
+    kept = useful(found, [flight], Baseline(NONE))
+    assert found.selection.chosen and bool(kept.candidates) == recurs
+    assert all(kept.worth[candidate] > 0.02 for candidate in found.selection.chosen[:1])
+    if not recurs:
+        assert any("it happened at a time of this flight" in refused.why for refused in kept.refused)
 
 
 def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_not_is_not(flights, attribution):

@@ -27,6 +27,7 @@ JUDGES = 3  # flights, or halves of one, on which trials are judged
 # Standard deviations by which a gain must be above zero where the reference itself may be off. What is fitted follows what the
 # references have in common, in whatever direction that is: chi with three degrees of freedom, 99.9 %.
 SURE = 4.0
+DRIFTS = ("line", "beyond", "below", "parabola")  # shapes of a function of the time that may come again, as a clock warms up
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
@@ -92,6 +93,7 @@ def useful(attribution, flights, baseline, progress=lambda: None):
     Candidates go, one by one, if the error is smaller without; detections stay only if it is smaller with them. At most
     JUDGES flights are judged. Trials run the filter with the corrections that it would get at the poses of a run with all.
     After one has gone, those that seemed to do harm too are tried again first; in the end all are tried beside what is kept.
+    What happened at a time of a single flight is tried, so that its worth is known, and not kept.
     """
     candidates, detections, refused = list(attribution.selection.chosen), [], []
     trials = _Trials(attribution, flights, baseline, progress)
@@ -120,7 +122,19 @@ def useful(attribution, flights, baseline, progress=lambda: None):
         else:
             why = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
             refused.append(Refused(detection.effect.label, why))
+    for momentary in (one for one in candidates if len(flights) == 1 and _momentary(one)):
+        refused.append(Refused(momentary.label, "it happened at a time of this flight; of another one that tells nothing"))
+        candidates = [one for one in candidates if one is not momentary]
     return Kept(attribution.selection.only(candidates), tuple(detections), tuple(refused), worth)
+
+
+def _momentary(candidate):
+    """Whether it is what happened at a time of one flight: a delay for a while, or a function of the time that is no drift."""
+    effects = [term.effect for term in candidate.terms]
+    functions = (effect for effect in effects if effect.settings)
+    return any(key.endswith((".start", ".end")) for effect in effects for key in effect.values) or any(
+        effect.covariate == "time" and effect.shape not in DRIFTS for effect in functions
+    )
 
 
 _NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
