@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,6 +67,19 @@ def test_a_claim_is_what_was_put_in(flight):
     assert said.names(true) and said.shape == true.shape and not said.depends_as(true)
     (said,) = claims([finding(found, (Alternative("tdoa of anchor 3 over x", 0.95, 4.0, ""),))])
     assert said.depends_as(true)
+
+
+def test_what_follows_an_anchor_is_said_as_its_pair_where_no_other_pair_follows(flight):
+    def true(first, a, b):
+        effect = grammar.Undeclared("tdoa", "all", (), grammar.NAMES, "step", 0.4, (first, first), (0.5, 0.2, 0.5))
+        return truth_of(effect, replace(flight, tdoa=replace(flight.tdoa, a=a, b=b)))
+
+    a = np.arange(len(flight.tdoa)) % 8
+    b = (a + 1) % 8
+    (said,) = claims([finding(EFFECTS["pair_offset"]({"4-5": 0.4}))])
+    assert said.names(true(4, a, b)) and said.depends_as(true(4, a, b))
+    assert not said.names(true(3, a, b))
+    assert true(4, *np.random.default_rng(0).permutation(np.stack([a, b]), axis=1)).subset == "all"
 
 
 def test_what_has_a_name_in_the_catalogue_is_said_by_that(flight):

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import true_samples
+
 from .grammar import NAMES
 
+CONSTANT = "nothing"  # that a function depends on
 # {declared effect: (subset, covariates, shapes)}; "key": an anchor, a pair or an axis for each parameter.
 CATALOGUE = {
     "anchor_delay": ("anchor", (), ()),
-    "pair_offset": ("pair", (), ()),
+    "pair_offset": ("pair", (CONSTANT,), ("step",)),
     "anchor_position": ("anchor", ("bearing", "elevation"), ("periodic",)),
     "anchor_clock_drift": ("anchor", ("time",), ("trend",)),
     "range_scale": ("arrivals", ("range",), ("trend",)),
@@ -30,6 +33,7 @@ SHAPES = {
     "line": "trend", "beyond": "ramp", "below": "ramp", "step": "step", "interval": "transient", "wave": "periodic",
     "parabola": "bend",
 }  # fmt: skip
+NEARLY_ALL = 0.9  # of the TDOAs of a pair, as packets get lost
 STREAM = {"imu_gravity": "accel", "imu_misalignment": "gyro"}
 
 
@@ -55,14 +59,29 @@ class Claim:
 
 
 def truth_of(effect, flight):
-    """Claim of an Undeclared in a Flight. A direction is a pair where nobody hears the other one."""
+    """Claim of an Undeclared in a Flight. A direction is a pair where nobody hears the other one, and so is what follows an anchor
+    where only one pair does."""
     subset = effect.subset
+    if effect.covariate == NAMES and (pair := _only_pair(effect, flight)):
+        return Claim(effect.stream, "pair", frozenset(map(str, pair)), (effect.covariate, CONSTANT), effect.shape, effect.name)
     if subset == "direction":
         a, b = effect.who
         back = np.sum((flight.tdoa.a == b) & (flight.tdoa.b == a))
         subset = "direction" if back > 0.1 * np.sum((flight.tdoa.a == a) & (flight.tdoa.b == b)) else "pair"
     who = frozenset(("xyz"[effect.who[0]],) if subset == "axis" else map(str, effect.who))
     return Claim(effect.stream, subset, who, (effect.covariate,), effect.shape, effect.name)
+
+
+def _only_pair(effect, flight):
+    """Ids of the pair whose TDOAs are those that it changes; None if there is no such pair."""
+    samples, _ = true_samples(flight)
+    pairs, changed = np.sort(samples.anchors.ids[np.column_stack([samples.a, samples.b])], axis=1), effect.bias(samples) != 0.0
+    several, count = np.unique(pairs[changed], axis=0, return_counts=True)
+    if not len(several):
+        return None
+    pair = several[np.argmax(count)]
+    of_it = (pairs == pair).all(axis=1)
+    return pair.tolist() if min(of_it[changed].mean(), changed[of_it].mean()) > NEARLY_ALL else None
 
 
 def claims(findings):
