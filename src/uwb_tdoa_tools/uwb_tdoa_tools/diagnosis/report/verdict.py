@@ -155,7 +155,7 @@ def _caveats(diagnosis):
         out.append(f"Before is with the {base} effect{'s' if base > 1 else ''} that the model held already.")
     if set(_names(diagnosis)) & {flight.name for flight in diagnosis.flights}:
         out.append("Which effects to add was decided on these same flights; flights given as --holdout judge that too.")
-    elif len(_names(diagnosis)) == 1:
+    if len(_names(diagnosis)) == 1:
         out.append("One flight does not tell how much flights differ.")
     return out
 
