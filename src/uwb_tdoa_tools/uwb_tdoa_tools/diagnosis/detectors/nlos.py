@@ -1,6 +1,7 @@
 """An anchor that was blocked for a while, or from a region."""
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from uwb_tdoa_bias.effects import EFFECTS
 
@@ -24,14 +25,14 @@ class NlosDetector(Detector):
         a, b = part.arrivals(table.series[rows])
         information, residual = model.information(table)[rows], model.residual[rows]
         keys = {key for candidate in chosen if candidate.name == self.effect.name for key in candidate.terms[0].keys}
-        out = []
+        spheres, out = _Spheres(table.place[rows]), []
         for row, anchor in enumerate(part.samples.anchors.ids.tolist()):
             key = f"{anchor}.delay"
             if key in keys:
                 continue
             x = 1.0 * (b == row) - 1.0 * (a == row)
             score, power = x * information * residual, x * x * information
-            searches = [_region(table.place[rows], score, power)]
+            searches = [spheres.best(score, power)]
             if table.flights == 1:  # only a flight alone has a time of its own
                 searches.append(best_interval(table.t[rows], score, power, PRIOR))
             for gain, limits, price in searches:
@@ -41,16 +42,20 @@ class NlosDetector(Detector):
         return out
 
 
-def _region(place, score, power):
-    """Best (gain, {limit: value}, price of the search) over spheres."""
-    centres = place[:: max(1, len(place) // CENTRES)]
-    away = np.linalg.norm(place[None] - centres[:, None], axis=2)
-    best, limits = 0.0, {}
-    for radius in RADII:
-        inside = away <= radius
-        gain = np.maximum(inside @ score, 0.0) ** 2 / (inside @ power + PRIOR)
-        gain[inside.mean(axis=1) > LONGEST] = 0.0
-        k = int(np.argmax(gain))
-        if gain[k] > best:
-            best, limits = gain[k], {**dict(zip("xyz", centres[k].tolist())), "radius": radius}
-    return best, limits, 2.0 * np.log(len(centres) * len(RADII))
+class _Spheres:
+    """Spheres about some of the places (n, 3) m that were flown; the same for every anchor, so found once."""
+
+    def __init__(self, place):
+        self._centres = place[:: max(1, len(place) // CENTRES)]
+        away = cdist(self._centres, place)
+        self._inside = np.concatenate([away <= radius for radius in RADII]).astype(float)  # all of a radius after the other
+        self._constant = self._inside.mean(axis=1) > LONGEST
+
+    def best(self, score, power):
+        """Best (gain, {limit: value}, price of the search), as `best_interval`."""
+        score, power = (self._inside @ np.stack([score, power], axis=1)).T
+        gain = np.where(self._constant, 0.0, np.maximum(score, 0.0) ** 2 / (power + PRIOR))
+        best = int(np.argmax(gain))
+        radius, centre = divmod(best, len(self._centres))
+        limits = {**dict(zip("xyz", self._centres[centre].tolist())), "radius": RADII[radius]}
+        return gain[best], limits, 2.0 * np.log(len(gain))
