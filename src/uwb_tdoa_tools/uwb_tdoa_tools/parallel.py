@@ -2,6 +2,8 @@
 
     parallel.add_options(parser)                                         # --jobs, --dask
     for row in parallel.over(judge, found, args.jobs, args.dask):        # in the order of `found`
+
+Processes are kept from one call to the next, if each ends of itself: whoever stops before the last result ends them too.
 """
 
 import argparse
@@ -37,12 +39,12 @@ def over(function, items, jobs=None, dask=None, unit="flight"):
     """Generator of function(item) for every item, in order, with a progress bar on a terminal.
 
     To be called in the main thread. function, items, results : what pickle takes; jobs : processes, default one per
-    core; dask : address of a scheduler.
+    core, and no more than items; dask : address of a scheduler; unit : of the progress bar, None for no bar.
     The first item runs in this process, so that what has to be compiled is compiled once, and is in numba's cache when
     the others start. What the function raises is raised here. Raises InputError where there is no Dask.
     """
     items = list(items)
-    with tqdm(total=len(items), unit=unit, disable=None, leave=False) as progress:
+    with tqdm(total=len(items), unit=unit or "", disable=None if unit else True, leave=False) as progress:
         for result in _results(function, items, jobs, dask):
             progress.update()
             yield result
@@ -50,8 +52,8 @@ def over(function, items, jobs=None, dask=None, unit="flight"):
 
 def _results(function, items, jobs, dask):
     first, rest = items[:1], items[1:]
-    count = min(jobs or cpu_count(), len(rest))
-    if not rest or (count == 1 and dask is None):
+    count = jobs or min(cpu_count(), len(rest))  # of `jobs` as many as asked for: with another number, all are started anew
+    if not rest or (min(count, len(rest)) == 1 and dask is None):
         yield from map(function, items)
         return
     with _cluster(dask) as backend:
@@ -88,6 +90,7 @@ def _closing(outcomes):
             outcomes.close()
 
 
+@in_one_thread
 def _attempt(function, item):
     """(result, None), or (None, what cli tells in one sentence): else joblib would raise it before earlier results."""
     try:

@@ -1,11 +1,14 @@
 """diagnose: from a residual to the missing effect to a smaller error."""
 
+from functools import partial
 import sys
+
+from joblib import cpu_count
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli, options
+from .. import cli, options, parallel
 from ..checking.check import different_surveys
 from ..checking.remarks import survey_remarks
 from ..diagnosis import diagnose
@@ -23,6 +26,7 @@ Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_
 assume with them; --config of evaluate) and report.html."""
 
 MOST = 300_000  # TDOAs; what they take: docs/speed.md
+FEW = 5  # flights; what fewer gain by other processes, these take to start
 
 
 def main(argv=None):
@@ -63,6 +67,7 @@ def parser():
     )  # fmt: skip
     add("--drift", type=float, default=DRIFT, metavar="M", help="of that, m per square root of a second (default %(default)s)")
     options.add_most(made, MOST)
+    parallel.add_options(made)
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
 
@@ -71,7 +76,8 @@ def _diagnose(args):
     out = cli.output_folder(args.out)
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
-    flights, holdout = (reading.flights(paths, args.most) for paths in (args.flights, args.holdout))
+    several = _several(args, reading)
+    flights, holdout = (reading.flights(paths, args.most, *several) for paths in (args.flights, args.holdout))
     shared = {f.name for f in flights} & {f.name for f in holdout}
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
@@ -87,10 +93,11 @@ def _diagnose(args):
     if args.odometry is not None:
         known = (*known, *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace))
     reference = REFERENCES[args.reference](config, known)
+    over = partial(parallel.over, jobs=several[0], dask=several[1], unit=None)  # no bar beside the line of Progress
     with Progress("diagnose") as progress:
-        result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress)
+        result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress, over)
         progress("measuring the noise")
-        tdoa_std = _noise(result, config)
+        tdoa_std = _noise(result, config, over)
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(out / "diagnosis.json", result.as_json())
     result.effects.to_yaml(out / "effects.yaml")
@@ -101,10 +108,19 @@ def _diagnose(args):
     print(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
 
 
-def _noise(result, config):
+def _several(args, reading):
+    """(jobs, dask) for parallel.over: as asked for; else as many jobs as there are cores and flights, one for few flights, which are
+    done before other processes have started."""
+    if args.jobs or args.dask:
+        return args.jobs, args.dask
+    count = len(reading.find(args.flights))
+    return (min(cpu_count(), count) if count >= FEW else 1), None
+
+
+def _noise(result, config, over):
     """tdoa_std, m, of the flights of a Diagnosis beside its effects; None where they are too short to tell."""
     try:
-        return tdoa_std_of(result.flights, result.effects, config)
+        return tdoa_std_of(result.flights, result.effects, config, over)
     except InputError as error:
         cli.say("diagnose", f"no ekf_node.yaml: {error}")
         return None

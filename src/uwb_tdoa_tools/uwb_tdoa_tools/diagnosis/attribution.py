@@ -1,6 +1,7 @@
 """From flights to a model: which effects are there, how large, how sure, and what else it could be."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -61,20 +62,18 @@ class Attribution:
 
 
 @in_one_thread
-def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True, progress=lambda: None):
+def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True, progress=lambda: None, over=map):
     """Attribution of the residuals of Flights, which the Reference has prepared, to effects beyond `base`.
 
     kinds : names of the declared effects to look for, None for all; undeclared : look for functions without a name too;
-    progress() is called now and then.
+    progress() is called now and then; over(function, items) : as map, but for the time and the process in which each is done.
     """
     detectors = [detector for name, detector in DETECTORS.items() if kinds is None or name in kinds]
 
     def at(model):
-        return _residuals(flights, reference, EffectSet((*base.effects, *model)), progress)
+        return residuals_of(flights, reference, EffectSet((*base.effects, *model)), progress, over)
 
-    def search(table, model, chosen):
-        return [candidate for detector in detectors for candidate in detector.search(table, model, chosen)]
-
+    search = partial(_search, detectors)
     under_base = at(())
     installation = _installation(flights)
     declared = _declared(under_base, reference, kinds, installation)
@@ -111,7 +110,7 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
     found = tuple(detection for detection in detections if detection is not None)
     alone, names = [], tuple(flight.name for flight in flights)
     if undeclared and len(flights) > 1 and all(reference.positions_known):
-        alone = [(names[k], own) for k, own in of_one(remaining, inflation, _views, search)]
+        alone = [(names[k], own) for k, own in of_one(remaining, inflation, _views, search, over)]
     return Attribution(under_base, remaining, selection, found, declared, tuple(refused), names, tuple(alone))
 
 
@@ -143,12 +142,19 @@ def _merged_as(effect):
     return effect.identity if effect.settings else effect.name
 
 
-def _residuals(flights, reference, effects, progress):
+def residuals_of(flights, reference, effects, progress=lambda: None, over=map):
+    """[`channels.residuals`] of Flights. progress, over : as of `attribute`."""
+    if not all(reference.positions_known):
+        over = map  # with all that the filter knows of the path, they take as long to send as to find
     out = []
-    for flight in flights:
-        out.append(residuals(flight, reference, effects))
+    for of_flight in over(partial(residuals, reference=reference, effects=effects), flights):
+        out.append(of_flight)
         progress()
     return out
+
+
+def _search(detectors, table, model, chosen):
+    return [candidate for detector in detectors for candidate in detector.search(table, model, chosen)]
 
 
 def _installation(flights):

@@ -56,16 +56,17 @@ class Calibration:
         return None
 
 
-def calibrate(flights, attribution, base, config=None, constraints=(), progress=lambda: None):
+def calibrate(flights, attribution, base, config=None, constraints=(), progress=lambda: None, over=map):
     """Calibration from the innovations of prepared Flights. attribution : Attribution of them; base : EffectSet that is in the
-    model, its covariance the prior; config : FilterConfig; constraints : what else is known."""
+    model, its covariance the prior; config : FilterConfig; constraints : what else is known; over : as of
+    `attribution.attribute`."""
     candidates = attribution.candidates
     whole = {candidate.name: candidate for candidate in reversed(candidates)}  # the first of an effect is all of it
     chosen = tuple(whole[name] for name in CALIBRATED)
     table = table_of(attribution.residuals).with_terms([term for candidate in candidates for term in candidate.terms])
     table = _rows(table, (table.channel == table.channels.index("tdoa")) & (table.count >= FEWEST))
     anchors = flights[0].anchors
-    found = survey(flights, np.full((len(anchors), 3), POSITION_STD), base, config, constraints, progress)
+    found = survey(flights, np.full((len(anchors), 3), POSITION_STD), base, config, constraints, progress, over)
     columns = columns_of(chosen)
     keys = [*(f"{i}.{axis}" for i in anchors.ids for axis in "xyz"), *map(str, anchors.ids)]
     places = [keys.index(column.key) for column in columns]

@@ -11,9 +11,8 @@ from ..checking.numbers import numbers
 from ..parallel import in_one_thread
 from ..scoring.metrics import Score
 from . import judging, output, repairing
-from .attribution import Attribution, attribute
+from .attribution import Attribution, attribute, residuals_of
 from .calibration import merged
-from .channels import residuals
 from .findings import Refused, usable
 from .health import health
 from .references import GroundTruth, Reference
@@ -63,11 +62,12 @@ class Diagnosis:
 
 
 @in_one_thread
-def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None, progress=lambda what: None):
+def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None, progress=lambda what: None, over=map):
     """Diagnosis of Flights.
 
     holdout : Flights to judge on; base : EffectSet that is in the model already; config : FilterConfig; reference :
-    Reference, by default the recorded ground truth; progress(what) is called every few seconds at least.
+    Reference, by default the recorded ground truth; progress(what) is called every few seconds at least;
+    over : as of `attribute`, of work on single flights.
     Raises InputError where a flight cannot be used: flights of different anchors, or without the reference.
     """
     reference = reference or GroundTruth()
@@ -79,18 +79,18 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
 
     repairs = repairing.repaired(flights, base, config, saying("looking at ids and signs")) if reference.judges else {}
     sound, rest = repairing.sound(flights, base, repairs)
-    attribution = attribute(sound, reference, rest, progress=saying("tracing residuals to effects"))
+    attribution = attribute(sound, reference, rest, progress=saying("tracing residuals to effects"), over=over)
     # A finding stays one even if the filter does without it; it is only not added.
     trying = saying("running the filter without each")
     baseline = judging.Baseline(base, config)
     if reference.judges:
-        kept = judging.useful(attribution, sound, judging.Baseline(rest, config), trying)
+        kept = judging.useful(attribution, sound, judging.Baseline(rest, config), trying, over)
     else:
-        kept = judging.borne_out(attribution, sound, rest, config, reference.constraints, trying)
+        kept = judging.borne_out(attribution, sound, rest, config, reference.constraints, trying, over)
     attribution, kept = repairing.before_others(attribution, kept, repairs)
     model = attribution.of(kept)
     effects = merged(base, usable(model.effects).effects, kept.selection)
-    judged = judging.judge(model, flights, holdout, baseline, effects, reference, saying("judging"))
+    judged = judging.judge(model, flights, holdout, baseline, effects, reference, saying("judging"), over)
     before, after, judged_on = judged
     refused = [*attribution.refused, *kept.refused]
     why_not = judging.why_not(before, after, max(reference.shift_std(flight.name).max() for flight in flights)) if reference.judges else None
@@ -98,8 +98,8 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         refused.append(Refused("all", why_not))
         effects, after, kept = base, before, judging.nothing(attribution)
         model = attribution.of(kept)
-    remaining = [residuals(flight, reference, effects) for flight in flights]
-    progress("judging")
+    remaining = residuals_of(flights, reference, effects, saying("judging"), over)
+    baseline.prepare(flights, saying("judging"), over)
     runs = [baseline.run(flight) for flight in flights]
     scores = [
         Score(flight.name, run.odometry, flight.truth, run.residuals)
@@ -119,7 +119,7 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         health(attribution.residuals, runs, scores),
         attribution,
         remaining,
-        {flight.name: found for flight in flights if (found := numbers(flight))},
+        {flight.name: found for found, flight in zip(over(numbers, flights), flights) if found},
         kept.changes,
     )
 

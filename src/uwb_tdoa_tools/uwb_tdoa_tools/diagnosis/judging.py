@@ -1,6 +1,8 @@
 """The loop closed: the filter with and without the effects, on data that they were not fitted to."""
 
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import cycle
 
 import numpy as np
 
@@ -87,20 +89,22 @@ def cross_fitted(attribution, flights, base, candidates, detections, most=None):
     return out
 
 
-def useful(attribution, flights, baseline, progress=lambda: None):
+def useful(attribution, flights, baseline, progress=lambda: None, over=map):
     """Kept: what makes the filter no worse where it was not fitted.
 
     Candidates go, one by one, if the error is smaller without; detections stay only if it is smaller with them. At most
     JUDGES flights are judged. Trials run the filter with the corrections that it would get at the poses of a run with all.
     After one has gone, those that seemed to do harm too are tried again first; in the end all are tried beside what is kept.
     What happened at a time of a single flight is tried, so that its worth is known, and not kept.
+    over : as of `attribute`.
     """
     candidates, detections, refused = list(attribution.selection.chosen), [], []
-    trials = _Trials(attribution, flights, baseline, progress)
+    trials = _Trials(attribution, flights, baseline, progress, over)
     error = trials.start(candidates, detections)
     without, suspects = {}, candidates
     while candidates:
-        without = {one: trials.error([c for c in candidates if c is not one], detections) for one in suspects}
+        less = [([c for c in candidates if c is not one], detections) for one in suspects]
+        without = dict(zip(suspects, trials.errors(less)))
         harmful = sorted((one for one in suspects if without[one] <= error * (1.0 - WORSE)), key=without.get)
         if harmful:
             why = f"the filter does better without it: {error:.3f} m with, {without[harmful[0]]:.3f} m without"
@@ -114,7 +118,7 @@ def useful(attribution, flights, baseline, progress=lambda: None):
     for detection in attribution.detections:
         if not detection.effect.usable:
             continue
-        trial = trials.error(candidates, [*detections, detection])
+        (trial,) = trials.errors([(candidates, [*detections, detection])])
         if trial < error * (1.0 - WORSE):
             detections.append(detection)
             worth[detection] = error - trial
@@ -140,16 +144,17 @@ def _momentary(candidate):
 _NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
 
 
-def borne_out(attribution, flights, base, config=None, constraints=(), progress=lambda: None):
+def borne_out(attribution, flights, base, config=None, constraints=(), progress=lambda: None, over=map):
     """Kept, where the reference tells no errors: positions and delays of anchors together, or nothing.
 
     A model that is wrong makes innovations smaller too, by pushing the path to where they are. On measured flights
     functions of the place, fitted to some, made innovations of others smaller and doubled the error of the position.
+    over : as of `attribute`.
     """
     selection = attribution.selection
     if not selection.chosen and base.covariance is None and not constraints:
         return nothing(attribution)
-    calibration = calibrate(flights, attribution, base, config, constraints, progress)
+    calibration = calibrate(flights, attribution, base, config, constraints, progress, over)
     changes = tuple(change.as_text() for change in calibration.changes)
     if calibration.why_not is None:
         applied = {candidate.name for candidate in calibration.selection.chosen}
@@ -169,45 +174,62 @@ class Baseline:
 
     def run(self, flight):
         """Run of a Flight, the same one whenever it is asked for."""
-        if id(flight) not in self._runs:
-            corrector = Corrector(flight.anchors, self.base)
-            self._runs[id(flight)] = flight, run_offline(flight, self.config, corrector)  # the flight, so that its id stays
+        self.prepare([flight])
         return self._runs[id(flight)][1]
+
+    def prepare(self, flights, progress=lambda: None, over=map):
+        """Make the runs of Flights that there are none of yet. over : as of `attribute`."""
+        missing = [flight for flight in flights if id(flight) not in self._runs]
+        missing = list({id(flight): flight for flight in missing}.values())
+        for run, flight in zip(over(partial(_run, self.config), [Case(flight, self.base) for flight in missing]), missing):
+            self._runs[id(flight)] = flight, run  # the flight, so that its id stays
+            progress()
 
 
 class _Trials:
     """Mean 3D RMSE, m, of cross-fitted models. The first is run as the nodes would; then each at the poses of a run with nearly
     the same model, which takes a tenth of the time."""
 
-    def __init__(self, attribution, flights, baseline, progress):
+    def __init__(self, attribution, flights, baseline, progress, over):
         self._attribution, self._flights, self._baseline, self._progress = attribution, flights, baseline, progress
-        self._poses = None
+        self._poses, self._over = [None], over
 
     def start(self, candidates, detections):
         """The error of a model; later trials take the poses of its runs."""
-        error, runs = self._judged(candidates, detections)
-        self._poses = [poses_of(run.odometry) for run in runs]
-        return error
+        (told,) = self._tried(_error_and_poses, [(candidates, detections)])
+        errors, self._poses = zip(*told)
+        return float(np.mean(errors))
 
-    def error(self, candidates, detections):
-        """The error of another model."""
-        return self._judged(candidates, detections)[0]
+    def errors(self, models):
+        """The errors of other models, [(candidates, detections)]: [m]."""
+        return [float(np.mean(errors)) for errors in self._tried(_error, models)]
 
-    def _judged(self, candidates, detections):
-        cases = cross_fitted(self._attribution, self._flights, self._baseline.base, candidates, detections, JUDGES)
-        runs = [self._run(case, poses) for case, poses in zip(cases, self._poses or [None] * len(cases))]
-        return float(np.mean([score(case, run).row()["rmse_3d"] for case, run in zip(cases, runs)])), runs
-
-    def _run(self, case, poses):
-        self._progress()
-        anchors, effects = case.flight.anchors, case.effects
-        corrector = Corrector(anchors, effects) if poses is None else RehearsedCorrector(anchors, effects, poses)
-        return run_offline(case.flight, self._baseline.config, corrector)
+    def _tried(self, function, models):
+        """[[function of each trial] of each model], all at once."""
+        fitted = [cross_fitted(self._attribution, self._flights, self._baseline.base, *model, JUDGES) for model in models]
+        told = []
+        for of_case in self._over(partial(function, self._baseline.config), zip(sum(fitted, []), cycle(self._poses))):
+            told.append(of_case)
+            self._progress()
+        return [told[k : k + len(fitted[0])] for k in range(0, len(told), len(fitted[0]))]
 
 
-def judge(attribution, flights, holdout, baseline, effects, reference, progress=lambda: None):
+def _error(config, trial):
+    return _error_and_poses(config, trial)[0]
+
+
+def _error_and_poses(config, trial):
+    """(3D RMSE, m, poses of the run) of a trial: a Case, and the poses that it is corrected at, None for those of the run itself."""
+    case, poses = trial
+    anchors, effects = case.flight.anchors, case.effects
+    corrector = Corrector(anchors, effects) if poses is None else RehearsedCorrector(anchors, effects, poses)
+    run = run_offline(case.flight, config, corrector)
+    return score(case, run).row()["rmse_3d"], poses_of(run.odometry)
+
+
+def judge(attribution, flights, holdout, baseline, effects, reference, progress=lambda: None, over=map):
     """(before, after, on what): the errors on the hold-out flights if there are any, or cross-fitted, or, where the
-    reference tells no errors, what the filter's own innovations say. As `compare` gives them."""
+    reference tells no errors, what the filter's own innovations say. As `compare` gives them. over : as of `attribute`."""
     progress()
     if holdout:
         cases, on = [Case(flight, effects) for flight in holdout], "flights that took no part in the fit"
@@ -220,8 +242,8 @@ def judge(attribution, flights, holdout, baseline, effects, reference, progress=
         cases = [Case(flight, effects) for flight in flights]
         on = "the flights that were fitted, by their innovations alone"
     if reference.judges:
-        return *compare(cases, baseline, progress, reference.shift_std), on
-    return *_innovations(cases, baseline, progress), on
+        return *compare(cases, baseline, progress, reference.shift_std, over), on
+    return *_innovations(cases, baseline, progress, over), on
 
 
 def why_not(before, after, shift_std):
@@ -244,17 +266,15 @@ def why_not(before, after, shift_std):
     return None
 
 
-def compare(cases, baseline, progress=lambda: None, shift_std=lambda name: np.zeros(3)):
+def compare(cases, baseline, progress=lambda: None, shift_std=lambda name: np.zeros(3), over=map):
     """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, besides
     residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts
-    what the references of whole flights may be off by too. shift_std : of a Reference."""
+    what the references of whole flights may be off by too. shift_std : of a Reference; over : as of `attribute`."""
     sides, draws = [], []
     for after in (False, True):
         scores, rows, blocks = [], [], []
-        for case in cases:
+        for run, case in zip(_runs(cases, baseline, after, progress, over), cases):
             case = case if after else replace(case, effects=baseline.base)
-            run = _run(case, baseline, after)
-            progress()
             scores.append(score(case, run))
             blocks.append(_blocks(scores[-1]))
             row = as_json(scores[-1].row())
@@ -285,19 +305,26 @@ def _inside(part, spans):
     return replace(part, **{name: values[inside] for name, values in vars(part).items()})
 
 
-def _run(case, baseline, after):
+def _runs(cases, baseline, after, progress, over):
+    """Runs of Cases in turn, before or after."""
     if not after:
-        return baseline.run(case.flight)
-    return run_offline(case.flight, baseline.config, Corrector(case.flight.anchors, case.effects))
+        baseline.prepare([case.flight for case in cases], progress, over)
+        yield from (baseline.run(case.flight) for case in cases)
+        return
+    for run in over(partial(_run, baseline.config), cases):
+        progress()
+        yield run
 
 
-def _innovations(cases, baseline, progress):
+def _run(config, case):
+    return run_offline(case.flight, config, Corrector(case.flight.anchors, case.effects))
+
+
+def _innovations(cases, baseline, progress, over):
     sides = []
     for after in (False, True):
         rows = []
-        for case in cases:
-            run = _run(case, baseline, after)
-            progress()
+        for run, case in zip(_runs(cases, baseline, after, progress, over), cases):
             used = run.residuals.verdict == USED
             nis = run.residuals.innovation[used] ** 2 / run.residuals.variance[used]
             figures = {"nis_mean": float(np.mean(nis)), "residual_spread": _spread(run)}

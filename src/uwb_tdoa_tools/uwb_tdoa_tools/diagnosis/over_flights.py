@@ -1,6 +1,7 @@
 """Several flights: whether a finding is the same in all, differs, grows from one to the next, or belongs to one alone."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -85,19 +86,26 @@ def in_words(several):
     return f"{'Grows' if kind == GROWS else 'Differs'} from flight to flight: {listed} of it."
 
 
-def of_one(remaining, inflation, views, search):
+def of_one(remaining, inflation, views, search, over=map):
     """[(flight, Selection)] of what each flight alone shows of its own, of [{channel: ChannelResidual}] that a model of all leaves.
 
-    inflation : of the fit of all; views(table) -> {channel: [View]}; search : as `select` takes it. What another flight
-    shows too is not of one alone."""
+    inflation : of the fit of all; views(table) -> {channel: [View]}; search : as `select` takes it; over : as of `attribute`. What
+    another flight shows too is not of one alone."""
     out = []
-    for number, residuals in enumerate(remaining):
-        table = table_of([residuals])
-        selection = select(table, [], inflation, search, Scan(table, views(table)))
+    for number, selection in enumerate(over(partial(_selection, inflation, views, search), remaining)):
+        if selection is None:
+            continue
         own = [candidate for candidate in selection.chosen if not _elsewhere(selection, candidate, remaining, number)]
         if own:
             out.append((number, selection.only(own)))
     return out
+
+
+def _selection(inflation, views, search, residuals):
+    """Selection of what the residuals of a flight show; None if that is nothing."""
+    table = table_of([residuals])
+    selection = select(table, [], inflation, search, Scan(table, views(table)))
+    return selection if selection.chosen else None
 
 
 def _elsewhere(selection, candidate, remaining, number):

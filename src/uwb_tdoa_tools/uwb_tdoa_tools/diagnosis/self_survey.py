@@ -8,6 +8,7 @@ functions explain what shifts would, shifts stay where the prior is.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
+from ..parallel import in_one_thread
 from ..scoring.metrics import AIRBORNE
 from .channels import CHANNELS, Comparison
 from .prior import DELAY, MOVED, POSITION, Prior, keys_of, solve
@@ -79,12 +81,12 @@ class Change:
         return f"anchor {self.anchor} is later than it was by {by} cm" + ", or has moved" * bool(self.rivals)
 
 
-def survey(flights, position_std, base=EffectSet(), config=None, constraints=(), progress=lambda: None):
+def survey(flights, position_std, base=EffectSet(), config=None, constraints=(), progress=lambda: None, over=map):
     """Surveyed of Flights of the same anchors, which are where they say within position_std, (N, 3) m, or as the covariance of
     `base` says.
 
-    base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known. The frame is that of the
-    coordinates with the smallest std. Raises InputError for a flight that is too short.
+    base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known; over : as of
+    `attribution.attribute`. The frame is that of the coordinates with the smallest std. Raises InputError for a flight that is too short.
     """
     config = config or FilterConfig()
     given, runs = flights[0].anchors, _Runs(flights, base, config, constraints)
@@ -92,7 +94,7 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     start = np.concatenate([given.positions.ravel(), np.zeros(n)])
     best, rounds, found = start, [], None
     for _ in range(ROUNDS):
-        rounds.append(runs.equations(given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :], prior.loose, progress))
+        rounds.append(runs.equations(given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :], prior.loose, progress, over))
         found = solve(rounds[-1].gram, rounds[-1].vector, prior, best - start)
         best = best + found.step
     first, last = rounds[0], rounds[-1]
@@ -105,11 +107,13 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     )  # fmt: skip
 
 
-def tdoa_std_of(flights, effects, config=None):
-    """m, the tdoa_std that the innovations of Flights call for beside the EffectSet `effects`; their ground truth is not used."""
+@in_one_thread
+def tdoa_std_of(flights, effects, config=None, over=map):
+    """m, the tdoa_std that the innovations of Flights call for beside the EffectSet `effects`; their ground truth is not used. over : as
+    of `attribution.attribute`."""
     config, anchors = config or FilterConfig(), flights[0].anchors
     loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
-    return _Runs(flights, effects, config).equations(anchors, np.zeros(len(anchors)), loose).tdoa_std(config)
+    return _Runs(flights, effects, config).equations(anchors, np.zeros(len(anchors)), loose, over=over).tdoa_std(config)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,32 +147,47 @@ class _Runs:
 
     def residual(self, flight, anchors, delays):
         """TdoaResidual of one of `flights` with Anchors that are late by delays (N,) m: the innovations of a run."""
-        effects = EffectSet((*self._base.effects, delay_effect(anchors, delays))) if delays.any() else self._base
-        comparison = Comparison.of(replace(flight, anchors=anchors), self._reference, effects, self.spans.get(flight.name))
-        self.spans[flight.name] = comparison.span
-        part = CHANNELS["tdoa"].residual(comparison)
-        if part is None:
-            raise InputError(f"{flight.name}: has no TDOAs in the air to survey with; fly for half a minute at least.")
-        return part
+        return _residual(self._base, self._reference, anchors, delays, flight, self.spans.get(flight.name))[0]
 
-    def equations(self, anchors, delays, loose, progress=lambda: None):
+    def equations(self, anchors, delays, loose, progress=lambda: None, over=map):
         """_Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may be."""
-        n, gram, vector, marks, slow, alike, seconds = len(loose), 0.0, 0.0, [], [], [], 0.0
-        for flight in self.flights:
-            part = self.residual(flight, anchors, delays)
-            slow.append(_slow(part))
-            here = [one for one in self._marks if one.flight == flight.name]
-            grams, vectors, known = _equations(part, flight, here)
-            marks += known
-            seconds += BLOCK * len(grams)
-            alike.append(_inflation(grams[:, :n, :n], vectors[:, :n], loose))
-            gram = gram + grams.sum(axis=0) / (SYSTEMATIC * alike[-1])
-            vector = vector + vectors.sum(axis=0) / (SYSTEMATIC * alike[-1])
+        gram, vector, marks, slow, alike, seconds = 0.0, 0.0, [], [], [], 0.0
+        here = [[one for one in self._marks if one.flight == flight.name] for flight in self.flights]
+        items = [(flight, self.spans.get(flight.name), some) for flight, some in zip(self.flights, here)]
+        told = over(partial(_of_flight, self._base, self._reference, anchors, delays, loose), items)
+        for (one, span), flight in zip(told, self.flights):
+            self.spans[flight.name] = span
+            marks += one.marks
+            slow.append(one.slow)
+            alike.append(one.alike)
+            seconds += one.seconds
+            gram = gram + one.gram / (SYSTEMATIC * one.alike)
+            vector = vector + one.vector / (SYSTEMATIC * one.alike)
             progress()
         of_anchors = [one.equations(anchors, len(vector)) for one in self._of_anchors]
         for more, right in [*((mark.gram, mark.vector) for mark in marks), *of_anchors]:
             gram, vector = gram + more, vector + right
         return _Equations(gram, vector, marks, student_scale(np.concatenate(slow)), float(np.mean(alike)), seconds)
+
+
+def _residual(base, reference, anchors, delays, flight, span):
+    """(TdoaResidual, span) of a Flight: the innovations of a run with Anchors that are late by delays (N,) m."""
+    effects = EffectSet((*base.effects, delay_effect(anchors, delays))) if delays.any() else base
+    comparison = Comparison.of(replace(flight, anchors=anchors), reference, effects, span)
+    part = CHANNELS["tdoa"].residual(comparison)
+    if part is None:
+        raise InputError(f"{flight.name}: has no TDOAs in the air to survey with; fly for half a minute at least.")
+    return part, comparison.span
+
+
+def _of_flight(base, reference, anchors, delays, loose, item):
+    """(_Equations, span) of (Flight, span or None, marks of it), before they are divided by what their errors are alike; slow : (n,) m."""
+    flight, span, marks = item
+    part, span = _residual(base, reference, anchors, delays, flight, span)
+    grams, vectors, known = _equations(part, flight, marks)
+    n = len(loose)
+    alike = _inflation(grams[:, :n, :n], vectors[:, :n], loose)
+    return _Equations(grams.sum(axis=0), vectors.sum(axis=0), known, _slow(part), alike, BLOCK * len(grams)), span
 
 
 def _left_out(equations, prior):

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+from .. import parallel
 from . import read_flight
 
 HELP = "recordings: raw logs, UTIL CSV files, bags, or folders that hold them"
@@ -81,16 +82,15 @@ class Reading:
         """Flight of one recording."""
         return self.read((path, survey_for(path, self.survey)))
 
-    def flights(self, paths, most=None):
-        """Flights of recordings and folders, with a progress bar: list.
+    def flights(self, paths, most=None, jobs=1, dask=None):
+        """Flights of recordings and folders, with a progress bar: list. jobs, dask : as of `parallel.over`.
 
         most : TDOAs that they may hold together, the first excepted; of more, as many whole flights as that are drawn at random, alike
         at every call, and the others not held, so that memory and time are bounded.
         """
-        found, read, count = self.find(paths), {}, 0
+        found, read, count = self.find(paths, bool(dask)), {}, 0
         order = range(len(found)) if most is None else np.random.default_rng(0).permutation(len(found)).tolist()
-        for number in tqdm(order, desc="reading", unit="flight", disable=None, leave=False):
-            flight = self.read(found[number])
+        for flight, number in zip(parallel.over(self.read, [found[number] for number in order], jobs, dask), order):
             count += len(flight.tdoa)
             if most is not None and read and count > most:
                 tqdm.write(
