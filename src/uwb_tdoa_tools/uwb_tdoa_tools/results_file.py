@@ -13,6 +13,9 @@ import hashlib
 import json
 import os
 from pathlib import Path
+import sys
+
+from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.version import written_by
@@ -98,6 +101,26 @@ class ResultsFile:
 
     def _foreign(self):
         return InputError(f"{self._path}: holds something else than results of this tool; name another file.")
+
+
+def resumed(over, path, done):
+    """over(function, items), as of `parallel.over`, that takes from a ResultsFile what is there, by the name of the function and the
+    place of the item, and keeps there what is not. path : of the file; done : ResultsFile."""
+
+    def over_missing(function, items):
+        name, items = getattr(function, "func", function).__name__, list(items)
+        keys = [f"{name} {place}" for place in range(len(items))]
+        missing = [item for key, item in zip(keys, items) if key not in done]
+        if len(missing) < len(items):
+            tqdm.write(f"{path} holds {len(items) - len(missing)} of {len(items)} parts; going on with the others", sys.stderr)
+        made = over(function, missing)
+        for key in keys:
+            if key not in done:
+                done[key] = next(made)
+            yield done[key]
+        next(made, None)  # to its end, so that its processes are kept
+
+    return over_missing
 
 
 def state_of(path):

@@ -1,5 +1,6 @@
 """train: learn the systematic error of TDOAs from flights with ground truth."""
 
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 import sys
@@ -7,9 +8,11 @@ import sys
 from tqdm import tqdm
 
 from .. import cli, options, parallel
+from ..results_file import ResultsFile, asked_of, resumed, state_of
 from ..training import labels as labelling, models, shrinking
 from ..training.plots import plot_curve
 
+NO_MATTER = ("flights", "survey", "name", "out", "resume", "jobs", "dask")  # to what is kept of a training, beside states of recordings
 MOST = 1_500_000  # TDOAs; what they take: docs/speed.md
 
 
@@ -36,6 +39,7 @@ def parser():
         "train flights/0425 --survey surveys/ --model physics+structured --out model/",
         "train flights/ util/ --survey surveys/ --model structured --out model/ --seed 1",
         "train a.bag b.bag c.bag --validation c --model paper --out model/",
+        "train flights/ --model physics+structured --resume parts.jsonl --out model/",
     )
     add = made.add_argument
     options.add_recordings(made)
@@ -45,18 +49,37 @@ def parser():
     add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
     add("--name", help="of the model, goes into every corrected message (default: the kind)")
     add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
+    add(
+        "--resume", metavar="FILE",
+        help="keep there, a line of JSON each, what is found of flights left out; what is there is not done again",
+    )  # fmt: skip
     parallel.add_options(made)
     return made
 
 
 def _train(args):
-    flights = {flight.name: flight for flight in options.reading_of(args).flights(args.flights, args.most)}
+    reading = options.reading_of(args)
+    with _kept(args, reading) as done:
+        over = partial(parallel.over, jobs=args.jobs, dask=args.dask, unit="part")
+        _write(args, reading, resumed(over, args.resume, done) if done else over)
+
+
+def _kept(args, reading):
+    """The ResultsFile of --resume, or a context of None."""
+    if args.resume is None:
+        return nullcontext()
+    recordings = [" ".join(map(state_of, recording)) for recording in reading.find(args.flights)]
+    return ResultsFile(args.resume, {**asked_of(args, NO_MATTER), "flights": recordings})
+
+
+def _write(args, reading, over):
+    """Train, and write all of it. over : as of `shrinking.train`."""
+    flights = {flight.name: flight for flight in reading.flights(args.flights, args.most, args.jobs, args.dask)}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):
         print(f"{what:13s} {', '.join(some)}")
     training, validation = ([flights[name] for name in some] for some in names)
     name = args.name or args.model
-    over = partial(parallel.over, jobs=args.jobs, dask=args.dask, unit="part")
     result, borne_out = shrinking.train(args.model, training, validation, args.seed, name, progress=tqdm.write, over=over)
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)

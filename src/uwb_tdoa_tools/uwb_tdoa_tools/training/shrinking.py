@@ -34,7 +34,8 @@ def bear_out(kind, flights, plain, seed, options=structured.Options(), found=Non
     folds = [order[k :: min(FOLDS, len(flights))].tolist() for k in range(min(FOLDS, len(flights)))]
     rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
     known = [found and physics.Physics(found.fitted_to(others)) for others in rest]
-    for of_fold in over(partial(_left_out, kind, flights, plain, seed, options), list(zip(folds, rest, known))):
+    for told in over(partial(_left_out, kind, flights, plain, seed, options), list(zip(folds, rest, known))):
+        of_fold = {name: dict(pairs) for name, pairs in told.items()}
         for name, of in of_fold.items():
             progress("{} left out: {:.3f} m without, {:.3f} m with all".format(name, of[None], of[1.0]))
         errors |= of_fold
@@ -43,7 +44,7 @@ def bear_out(kind, flights, plain, seed, options=structured.Options(), found=Non
 
 def uncorrected(flights, over=map):
     """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction. over : as of `bear_out`."""
-    return dict(zip((flight.name for flight in flights), over(_error, flights)))
+    return {flight.name: error for error, flight in zip(over(_error, flights), flights)}
 
 
 def judged(flight, plain, effects, network, shares=SHARES):
@@ -72,14 +73,15 @@ def train(kind, training, validation, seed, name, options=structured.Options(), 
 
 @in_one_thread
 def _left_out(kind, flights, plain, seed, options, fold):
-    """{flight: {share: 3D RMSE}} of a fold: (numbers of the flights left out, of the others, Physics fitted to those or None)."""
+    """{flight: [(share, 3D RMSE), ...]}, JSON, of a fold: (numbers of the flights left out, of the others, Physics fitted to those or
+    None)."""
     left_out, others, known = fold
     with TemporaryDirectory() as folder:
         some = [flights[k] for k in others]
         trained = models.train(kind, some[:-1] or some, some[-1:], seed, kind, options, found=known, curve=False)
         model, _ = models.save(trained, Path(folder))
         network = Network(model) if model else None
-    return {flights[k].name: judged(flights[k], plain, trained.effects, network) for k in left_out}
+    return {flights[k].name: list(judged(flights[k], plain, trained.effects, network).items()) for k in left_out}
 
 
 @in_one_thread
