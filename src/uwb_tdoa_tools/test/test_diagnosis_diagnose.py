@@ -3,7 +3,7 @@ import json
 
 import pytest
 
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
@@ -52,3 +52,19 @@ def test_without_truth(flight):
     assert {finding.effect.name for finding in result.findings if finding.added} == {"anchor_position", "anchor_delay"}
     hidden = {item.effect for item in result.unobservable}
     assert {"truth_frame", "accel_bias", "truth_time_offset"} <= hidden
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [(), ("--no-truth",)])
+def test_two_processes_give_the_same_to_the_bit(tmp_path, more):
+    flights = [effect_of("anchor_delay", True, 4).inject(clean_flight(seed, 20.0)) for seed in (100, 101, 102)]
+    flights[1] = EFFECTS["pair_offset"]({"0-1": 0.3}).inject(flights[1])  # of one flight alone
+    paths = [str(tmp_path / flight.name) for flight in flights]
+    for flight, path in zip(flights, paths):
+        write_bag(flight, path)
+    for jobs in ("1", "2"):
+        assert main([*paths, *more, "--jobs", jobs, "--out", str(tmp_path / jobs)]) == 0
+    for name in ("diagnosis.json", "effects.yaml", "ekf_node.yaml"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+    found = json.loads((tmp_path / "1" / "diagnosis.json").read_text())["findings"]
+    assert found[0]["added"] and (more or any(finding["flight"] for finding in found))

@@ -26,7 +26,7 @@ Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_
 assume with them; --config of evaluate) and report.html."""
 
 MOST = 300_000  # TDOAs; what they take: docs/speed.md
-FEW = 5  # flights; what fewer gain by other processes, these take to start
+FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/speed.md)
 
 
 def main(argv=None):

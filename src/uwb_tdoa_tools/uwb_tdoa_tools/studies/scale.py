@@ -22,7 +22,7 @@ ANCHORS, AMONG = (8, 16, 32, 64), 3  # flights
 ADDED = 1, 3, 5  # effects
 TOOLS = {
     "evaluate": ("--no-bias", "--jobs", "1"),
-    "diagnose": ("--out", "diagnosis"),
+    "diagnose": ("--jobs", "1", "--out", "diagnosis"),
     "train": ("--model", "structured", "--jobs", "1", "--out", "model"),
 }
 FEWEST = {"evaluate": 1, "diagnose": 1, "train": 2}
