@@ -66,5 +66,5 @@ def test_two_processes_give_the_same_to_the_bit(tmp_path, more):
         assert main([*paths, *more, "--jobs", jobs, "--out", str(tmp_path / jobs)]) == 0
     for name in ("diagnosis.json", "effects.yaml", "ekf_node.yaml"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
-    found = json.loads((tmp_path / "1" / "diagnosis.json").read_text())["findings"]
-    assert found[0]["added"] and (more or any(finding["flight"] for finding in found))
+    told = json.loads((tmp_path / "1" / "diagnosis.json").read_text())
+    assert told["findings"][0]["added"] and (more or told["unattributed"][0]["flight"] == flights[1].name)
