@@ -35,6 +35,14 @@ def add_options(parser):
     )  # fmt: skip
 
 
+def asked(args, count, few):
+    """(jobs, dask) for several calls of `over`, about `count` items: as args ask for; else as many jobs as there are cores and items, one
+    for fewer items than `few`."""
+    if args.jobs or args.dask:
+        return args.jobs, args.dask
+    return (min(cpu_count(), count) if count >= few else 1), None
+
+
 def over(function, items, jobs=None, dask=None, unit="flight"):
     """Generator of function(item) for every item, in order, with a progress bar on a terminal.
 

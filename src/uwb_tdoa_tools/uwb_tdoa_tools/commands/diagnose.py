@@ -3,8 +3,6 @@
 from functools import partial
 import sys
 
-from joblib import cpu_count
-
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
@@ -76,8 +74,8 @@ def _diagnose(args):
     out = cli.output_folder(args.out)
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
-    several = _several(args, reading)
-    flights, holdout = (reading.flights(paths, args.most, *several) for paths in (args.flights, args.holdout))
+    jobs, dask = parallel.asked(args, len(reading.find(args.flights)), FEW)
+    flights, holdout = (reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout))
     shared = {f.name for f in flights} & {f.name for f in holdout}
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
@@ -93,7 +91,7 @@ def _diagnose(args):
     if args.odometry is not None:
         known = (*known, *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace))
     reference = REFERENCES[args.reference](config, known)
-    over = partial(parallel.over, jobs=several[0], dask=several[1], unit=None)  # no bar beside the line of Progress
+    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # no bar beside the line of Progress
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress, over)
         progress("measuring the noise")
@@ -106,15 +104,6 @@ def _diagnose(args):
         write_parameters(out / "ekf_node.yaml", tdoa_std)
     print(result.as_text())
     print(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
-
-
-def _several(args, reading):
-    """(jobs, dask) for parallel.over: as asked for; else as many jobs as there are cores and flights, one for few flights, which are
-    done before other processes have started."""
-    if args.jobs or args.dask:
-        return args.jobs, args.dask
-    count = len(reading.find(args.flights))
-    return (min(cpu_count(), count) if count >= FEW else 1), None
 
 
 def _noise(result, config, over):
