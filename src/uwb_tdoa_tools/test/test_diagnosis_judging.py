@@ -84,6 +84,14 @@ def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recu
         assert any("it happened at a time of this flight" in refused.why for refused in kept.refused)
 
 
+def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights):
+    two = [EFFECTS["gyro_bias"]({"z": 0.006}).inject(flight) for flight in flights]
+    several, alone = (useful(attribute(some, TRUTH, undeclared=False), some, Baseline(NONE)) for some in (two, two[:1]))
+    assert {candidate.name for candidate in several.candidates} == {"anchor_delay", "gyro_bias"}
+    assert {candidate.name for candidate in alone.candidates} == {"anchor_delay"}
+    assert "of one flight, worth less than 5% of the error" in alone.refused[-1].why
+
+
 def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_not_is_not(flights, attribution):
     def judged(std):
         noise = Detection(EFFECTS["noise_level"]({"0-1": std, "1-2": std}), "tdoa", {})

@@ -31,6 +31,7 @@ JUDGES = 3  # flights, or halves of one, on which trials are judged
 SURE = 4.0
 DRIFTS = ("line", "beyond", "below", "parabola")  # shapes of a function of the time that may come again, as a clock warms up
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
+WORTH_OF_ONE = 0.05  # share of the error by which it must grow, for the effect to stay, if a single flight shows it: others differ
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
 
@@ -92,22 +93,23 @@ def cross_fitted(attribution, flights, base, candidates, detections, most=None):
 def useful(attribution, flights, baseline, progress=lambda: None, over=map):
     """Kept: what makes the filter no worse where it was not fitted.
 
-    Candidates go, one by one, if the error is smaller without; detections stay only if it is smaller with them. At most
-    JUDGES flights are judged. Trials run the filter with the corrections that it would get at the poses of a run with all.
+    Candidates go, one by one, if the error is smaller without, or of a single flight hardly larger; detections stay only if it is
+    smaller with them. At most JUDGES flights are judged. Trials run the filter with the corrections that it would get at the poses of a run with all.
     After one has gone, those that seemed to do harm too are tried again first; in the end all are tried beside what is kept.
     What happened at a time of a single flight is tried, so that its worth is known, and not kept.
     over : as of `attribute`.
     """
     candidates, detections, refused = list(attribution.selection.chosen), [], []
+    least = WORTH_OF_ONE if len(flights) == 1 else -WORSE
     trials = _Trials(attribution, flights, baseline, progress, over)
     error = trials.start(candidates, detections)
     without, suspects = {}, candidates
     while candidates:
         less = [([c for c in candidates if c is not one], detections) for one in suspects]
         without = dict(zip(suspects, trials.errors(less)))
-        harmful = sorted((one for one in suspects if without[one] <= error * (1.0 - WORSE)), key=without.get)
+        harmful = sorted((one for one in suspects if without[one] <= error * (1.0 + least)), key=without.get)
         if harmful:
-            why = f"the filter does better without it: {error:.3f} m with, {without[harmful[0]]:.3f} m without"
+            why = _why_without(error, without[harmful[0]])
             refused.append(Refused(harmful[0].label, why))
             candidates = [one for one in candidates if one is not harmful[0]]
             error, without = trials.start(candidates, detections), {}
@@ -119,7 +121,7 @@ def useful(attribution, flights, baseline, progress=lambda: None, over=map):
         if not detection.effect.usable:
             continue
         (trial,) = trials.errors([(candidates, [*detections, detection])])
-        if trial < error * (1.0 - WORSE):
+        if trial < error * (1.0 - max(least, WORSE)):
             detections.append(detection)
             worth[detection] = error - trial
             error = trial
@@ -130,6 +132,14 @@ def useful(attribution, flights, baseline, progress=lambda: None, over=map):
         refused.append(Refused(momentary.label, "it happened at a time of this flight; of another one that tells nothing"))
         candidates = [one for one in candidates if one is not momentary]
     return Kept(attribution.selection.only(candidates), tuple(detections), tuple(refused), worth)
+
+
+def _why_without(error, without):
+    """Why an effect is not applied, by the errors with and without it, m."""
+    figures = f"{error:.3f} m with, {without:.3f} m without"
+    if without <= error * (1.0 - WORSE):
+        return f"the filter does better without it: {figures}"
+    return f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error ({figures}), it may as well do harm to another"
 
 
 def _momentary(candidate):
