@@ -96,7 +96,7 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     why_not = judging.why_not(before, after, max(reference.shift_std(flight.name).max() for flight in flights)) if reference.judges else None
     if why_not and len(effects) > len(base):
         refused.append(Refused("all", why_not))
-        effects, after, kept = base, before, judging.nothing(attribution)
+        effects, after, kept = base, before, replace(judging.nothing(attribution), worth=kept.worth)
         model = attribution.of(kept)
     remaining = residuals_of(flights, reference, effects, saying("judging"), over)
     baseline.prepare(flights, saying("judging"), over)
@@ -127,13 +127,15 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
 def _findings(attribution, model, kept):
     """[Finding]: those that are added, with the values that are written, then the others."""
     detected = {detection.effect.name: detection for detection in attribution.detections}
-    out = []
-    for finding in model.findings():
+
+    def judged(finding, added):
         tried = finding.candidates or (detected[finding.effect.name],)
         worth = [kept.worth[each] for each in tried if each in kept.worth]
-        out.append(replace(finding, added=finding.effect.usable, worth=float(np.sum(worth)) if worth else None))
+        return replace(finding, added=added, worth=float(np.sum(worth)) if worth else None)
+
+    out = [judged(finding, finding.effect.usable) for finding in model.findings()]
     added = {finding.key for finding in out}
-    return out + [replace(each, added=False) for each in attribution.findings() if each.key not in added]
+    return out + [judged(finding, False) for finding in attribution.findings() if finding.key not in added]
 
 
 def same_anchors(flights):

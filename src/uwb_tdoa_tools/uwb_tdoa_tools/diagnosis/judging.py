@@ -47,7 +47,7 @@ class Case:
 @dataclass(frozen=True, eq=False)
 class Kept:
     """What makes the filter no worse: selection : Selection; detections; refused : (Refused, ...) of the others; worth :
-    {candidate or detection: m by which the mean 3D RMSE is larger without it}; changes : sentences, what is not as in the
+    {candidate or detection: m by which the mean 3D RMSE is larger without it, of others when they were left out}; changes : sentences, what is not as in the
     last calibration."""
 
     selection: Selection
@@ -103,20 +103,20 @@ def useful(attribution, flights, baseline, progress=lambda: None, over=map):
     least = WORTH_OF_ONE if len(flights) == 1 else -WORSE
     trials = _Trials(attribution, flights, baseline, progress, over)
     error = trials.start(candidates, detections)
-    without, suspects = {}, candidates
-    while candidates:
+    without, suspects, left_out = {}, _applicable(candidates), {}
+    while suspects:
         less = [([c for c in candidates if c is not one], detections) for one in suspects]
         without = dict(zip(suspects, trials.errors(less)))
         harmful = sorted((one for one in suspects if without[one] <= error * (1.0 + least)), key=without.get)
         if harmful:
             why = _why_without(error, without[harmful[0]])
             refused.append(Refused(harmful[0].label, why))
-            candidates = [one for one in candidates if one is not harmful[0]]
+            candidates, left_out[harmful[0]] = [one for one in candidates if one is not harmful[0]], without[harmful[0]] - error
             error, without = trials.start(candidates, detections), {}
-        elif len(suspects) == len(candidates):
+        elif len(suspects) == len(_applicable(candidates)):
             break
-        suspects = harmful[1:] or candidates
-    worth = {candidate: trial - error for candidate, trial in without.items()}
+        suspects = harmful[1:] or _applicable(candidates)
+    worth = left_out | {candidate: trial - error for candidate, trial in without.items()}
     for detection in attribution.detections:
         if not detection.effect.usable:
             continue
@@ -132,6 +132,11 @@ def useful(attribution, flights, baseline, progress=lambda: None, over=map):
         refused.append(Refused(momentary.label, "it happened at a time of this flight; of another one that tells nothing"))
         candidates = [one for one in candidates if one is not momentary]
     return Kept(attribution.selection.only(candidates), tuple(detections), tuple(refused), worth)
+
+
+def _applicable(candidates):
+    """Those of some Candidates that a node can take out, at least in part."""
+    return [one for one in candidates if any(term.effect.usable for term in one.terms)]
 
 
 def _why_without(error, without):

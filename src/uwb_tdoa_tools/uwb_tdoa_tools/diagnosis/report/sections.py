@@ -75,7 +75,7 @@ def worth(diagnosis, found):
     """What was found, and what each is worth in centimetres of position. found : [Entry]."""
     if not found:
         return ""
-    largest = max((entry.worth or 0.0 for entry in found), default=0.0)
+    largest = max((entry.worth or 0.0 for entry in found if entry.matters), default=0.0)
     head = ("effect", "worth in position", "what else it could be")
     rows = [[_name(entry), _worth(entry, largest), _else(entry)] for entry in found]
     note = [
