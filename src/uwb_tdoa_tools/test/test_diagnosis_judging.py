@@ -14,6 +14,7 @@ from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.judging import Baseline, Case, _gain_interval, borne_out, compare, cross_fitted, score, useful, why_not
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+from uwb_tdoa_tools.studies.diagnosis.grammar import Undeclared
 
 TRUTH = GroundTruth()
 NONE = EffectSet()
@@ -90,6 +91,16 @@ def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights)
     assert {candidate.name for candidate in several.candidates} == {"anchor_delay", "gyro_bias"}
     assert {candidate.name for candidate in alone.candidates} == {"anchor_delay"}
     assert "of one flight, worth less than 5% of the error" in alone.refused[-1].why
+    assert sorted(candidate.name for candidate in alone.worth) == ["anchor_delay", "gyro_bias"]
+
+
+def test_what_no_node_can_take_out_is_not_tried():
+    late = Undeclared("gyro", "axis", (0,), "height", "trend", 0.3, (0.5, 2.5), (0.5, 0.2, 0.5))
+    flight = late.inject(clean_flight(100, 30.0))
+    found = attribute([flight], TRUTH)
+    kept = useful(found, [flight], Baseline(NONE))
+    assert [candidate.label for candidate in kept.candidates] == ["gyro.x over height"]
+    assert not kept.worth and not kept.refused
 
 
 def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_not_is_not(flights, attribution):
