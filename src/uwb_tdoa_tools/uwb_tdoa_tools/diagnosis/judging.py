@@ -126,7 +126,8 @@ def useful(attribution, flights, baseline, progress=lambda: None, over=map):
             worth[detection] = error - trial
             error = trial
         else:
-            why = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
+            useless = f"does not make the filter better: {error:.3f} m without, {trial:.3f} m with"
+            why = useless if trial >= error * (1.0 - WORSE) else _why_without(trial, error)
             refused.append(Refused(detection.effect.label, why))
     for momentary in (one for one in candidates if len(flights) == 1 and _momentary(one)):
         refused.append(Refused(momentary.label, "it happened at a time of this flight; of another one that tells nothing"))
