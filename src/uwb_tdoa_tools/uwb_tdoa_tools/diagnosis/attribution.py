@@ -289,7 +289,7 @@ def _that_hold_on_other_data(selection, refused):
         if selection.table.flights >= 3:
             across = held_out(selection, by_flight=True)
             scores = [
-                min(score, other) if _recurs(candidate) else score
+                min(score, other) if recurs(candidate) else score
                 for score, other, candidate in zip(scores, across, selection.chosen)
             ]
         worst = min(range(len(scores)), key=lambda k: scores[k].gain)
@@ -302,7 +302,7 @@ def _that_hold_on_other_data(selection, refused):
     return selection
 
 
-def _recurs(candidate):
+def recurs(candidate):
     """Whether it should hold on other flights too: not what happened at a time."""
     return not any(key.endswith((".start", ".end")) for term in candidate.terms for key in term.effect.values)
 

@@ -15,7 +15,7 @@ from uwb_tdoa_ekf.estimator import VERDICTS
 from uwb_tdoa_ekf.offline import poses_of, run_offline
 
 from ..scoring.metrics import Score, as_json, pooled
-from .attribution import effects_of
+from .attribution import effects_of, recurs
 from .calibration import calibrate
 from .findings import Refused, usable
 from .regression.fit import refit
@@ -150,11 +150,8 @@ def _why_without(error, without):
 
 def _momentary(candidate):
     """Whether it is what happened at a time of one flight: a delay for a while, or a function of the time that is no drift."""
-    effects = [term.effect for term in candidate.terms]
-    functions = (effect for effect in effects if effect.settings)
-    return any(key.endswith((".start", ".end")) for effect in effects for key in effect.values) or any(
-        effect.covariate == "time" and effect.shape not in DRIFTS for effect in functions
-    )
+    functions = [term.effect for term in candidate.terms if term.effect.settings]
+    return not recurs(candidate) or any(one.covariate == "time" and one.shape not in DRIFTS for one in functions)
 
 
 _NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
