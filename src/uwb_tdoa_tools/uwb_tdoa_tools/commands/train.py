@@ -59,9 +59,10 @@ def parser():
 
 def _train(args):
     reading = options.reading_of(args)
+    jobs, dask = parallel.asked(args, len(reading.find(args.flights)), 2)  # as many for folds as for flights: else all start anew
     with _kept(args, reading) as done:
-        over = partial(parallel.over, jobs=args.jobs, dask=args.dask, unit="part")
-        _write(args, reading, resumed(over, args.resume, done) if done else over)
+        over = partial(parallel.over, jobs=jobs, dask=dask, unit="part")
+        _write(args, reading.flights(args.flights, args.most, jobs, dask), resumed(over, args.resume, done) if done else over)
 
 
 def _kept(args, reading):
@@ -72,9 +73,9 @@ def _kept(args, reading):
     return ResultsFile(args.resume, {**asked_of(args, NO_MATTER), "flights": recordings})
 
 
-def _write(args, reading, over):
-    """Train, and write all of it. over : as of `shrinking.train`."""
-    flights = {flight.name: flight for flight in reading.flights(args.flights, args.most, args.jobs, args.dask)}
+def _write(args, several, over):
+    """Train on several Flights, and write all of it. over : as of `shrinking.train`."""
+    flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):
         print(f"{what:13s} {', '.join(some)}")
