@@ -3,7 +3,7 @@ import pytest
 
 import undeclared
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, LabelEffect, SmoothTerm
-from uwb_tdoa_tools.diagnosis.attribution import _straightened, attribute, effects_of
+from uwb_tdoa_tools.diagnosis.attribution import _simpler, _straightened, attribute, effects_of, residuals_of
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.regression.select import select
@@ -120,3 +120,14 @@ def test_what_is_wrong_with_height_pressure_and_velocity_is_found_with_its_size(
 
 def test_nothing_is_found_in_sound_heights_pressures_and_velocities(aided):
     assert attribute([aided], TRUTH).effects == ()
+
+
+def test_of_two_models_that_tell_the_same_the_one_of_fewer_parameters_counts(flight):
+    """A frame that is shifted along z; the same with delays of all anchors, which are of no use beside it; and nothing."""
+    shifted = EFFECTS["truth_frame"]({"z": 0.3}).inject(flight)
+    frame, delays = (candidates_of(EFFECTS[name](), flight.anchors, None) for name in ("truth_frame", "anchor_delay"))
+    along_z = next(one for one in frame if one.terms[0].keys == ("z",))
+    table = table_of(residuals_of([shifted], TRUTH, EffectSet())).with_terms([*along_z.terms, *delays[0].terms])
+    found = select(table, [along_z], None)
+    for other in (found.plus(delays[0]), found.only(())):
+        assert _simpler(other, found, 10) is _simpler(found, other, 10) is found

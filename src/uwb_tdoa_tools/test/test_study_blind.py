@@ -88,6 +88,16 @@ def test_what_has_a_name_in_the_catalogue_is_said_by_that(flight):
     assert said.names(truth_of(late, flight)) and said.depends_as(truth_of(late, flight))
 
 
+def test_a_shifted_frame_is_a_function_of_the_direction_to_every_anchor_and_a_turned_one_is_not(flight):
+    late = grammar.Undeclared("tdoa", "arrivals", (), "elevation", "trend", 0.4, (-0.5, 0.5), (0.5, 0.2, 0.5))
+    shifted, turned = (claims([finding(EFFECTS["truth_frame"]({key: 0.1}))])[0] for key in ("z", "yaw"))
+    assert shifted.names(truth_of(late, flight)) and shifted.depends_as(truth_of(late, flight))
+    assert not turned.names(truth_of(late, flight))
+    (arm,) = claims([finding(EFFECTS["tag_lever_arm"]({"z": 0.1}))])
+    in_tag = truth_of(replace(late, covariate="bearing_in_tag"), flight)
+    assert arm.names(in_tag) and arm.depends_as(in_tag) and not arm.depends_as(truth_of(late, flight))
+
+
 def test_cases_cost_what_they_must():
     drawn = (blind.case(blind.Simulated(), seed) for seed in range(20))
     effect, flown, plain, base, where = next(one for one in drawn if one is not None)

@@ -25,6 +25,7 @@ ROUNDS = 2  # of linearising about what was found
 STRAIGHT = 0.1  # of the channel's scale: root mean square by which a linear model may be off
 MAPS_GAIN, MAPS_SURE = 20.0, 3.0  # held-out log-likelihood, twice, and its t value over blocks, that maps must bring
 DISGUISED = 4  # times that what disguises itself as noise is searched for before noise is measured
+SAME_STORY = 0.05  # share of what a model explains that a simpler one may explain less
 MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
 
 
@@ -253,8 +254,17 @@ def _with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress
     after = select(table, everything, inflation, search, scan_of(table), selection.chosen, progress)
     if selection.chosen:
         anew = select(unmoved.with_terms(terms), everything, inflation, search, scan_of(unmoved), progress=progress)
-        after = max(after, anew, key=lambda each: worth(each, len(everything)))
+        after = _simpler(after, anew, len(everything))
     return after
+
+
+def _simpler(after, anew, choices):
+    """Of two Selections the one that is worth more; or the one with fewer parameters, if it is hardly worth less: how far a function
+    is off grows with its size, and many parameters can be anything."""
+    fewer, more = sorted((after, anew), key=lambda each: len(each.fit.beta))
+    nothing = fit(after.table, [], after.fit.inflation).likelihood(after.table)
+    much = (1.0 - SAME_STORY) * (worth(more, choices) - nothing)
+    return fewer if worth(fewer, choices) - nothing >= much else more
 
 
 def _with_maps(selection, smooth, refused):

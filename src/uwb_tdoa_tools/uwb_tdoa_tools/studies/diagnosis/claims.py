@@ -22,6 +22,8 @@ CATALOGUE = {
     "range_bias": ("arrivals", ("range",), ("bend", "ramp")),
     "received_power_bias": ("arrivals", ("range",), ("bend", "trend")),
     "antenna_pattern": ("arrivals", ("elevation_in_tag",), ("bend",)),
+    "truth_frame": ("arrivals", ("elevation", "bearing"), ("periodic",)),  # a shift is a function of the direction to each anchor,
+    "tag_lever_arm": ("arrivals", ("elevation_in_tag", "bearing_in_tag"), ("periodic",)),  # and so is an arm, in the tag
     "floor_multipath": ("arrivals", ("height",), ("step", "transient")),
     "gyro_scale": ("axis", ("rate",), ("trend",)),
     "accel_scale": ("axis", ("accel",), ("trend",)),
@@ -123,7 +125,8 @@ def _declared(effect):
     stream = STREAM.get(effect.name, effect.channels[0])
     if effect.name == "nlos":
         return [_nlos(effect, who) for who in dict.fromkeys(key.partition(".")[0] for key in effect.values)]
-    subset, covariates, shapes = CATALOGUE.get(effect.name, ("all", (), ()))
+    turned = effect.name == "truth_frame" and not set("xyz") & set(effect.values)  # no function of the direction alone
+    subset, covariates, shapes = ("all", (), ()) if turned else CATALOGUE.get(effect.name, ("all", (), ()))
     if subset in ("arrivals", "all"):
         return [Claim(stream, subset, frozenset(), covariates, (*shapes, "")[0], effect.name)]
     out = {}
