@@ -18,7 +18,7 @@ from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
 from .foundation import ros
 from .foundation.anchors import Anchors
-from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Corrector
+from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
 from .effects import EffectSet, LabelCorrector
 from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
@@ -55,7 +55,7 @@ POSE = "pose", "twist"  # what is read of an Odometry, its numbers,
 POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36
 MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a Tdoa
 CORRECTED = (  # what is written of a TdoaCorrected
-    "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status",
+    "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status", "bias_slope", "bias_state",
 )  # fmt: skip
 EARLY, EARLY_POSES = 2000, 500  # TDOAs, and parts of the odometry, kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
@@ -196,7 +196,7 @@ class BiasNode(ros.StreamNode):
             rows = self._relabelled(rows)
         items = [(frame, *row) for row in rows.tolist()]
         if self._idle:
-            self._publish(items, np.zeros(len(t)), np.zeros(len(t)), np.full(len(t), PASSED))
+            self._publish(items, Correction.none(rows["distance_difference"]))
         elif self._corrector is None:
             self._early.extend(items)
             while len(self._early) > EARLY:
@@ -226,7 +226,7 @@ class BiasNode(ros.StreamNode):
         for t, item in zip(stamps, items):
             accepted, outliers, jumped_back = self._tdoas.take(t, item)
             for _, outlier in outliers:  # ekf_node says of it that its stamp is wrong
-                self._publish([outlier], np.zeros(1), np.zeros(1), np.array([PASSED]))
+                self._publish([outlier], Correction.none(np.array(outlier[5:6])))
             if jumped_back:
                 self.get_logger().info("time has gone back: starting over")
                 self._start_over()
@@ -245,23 +245,24 @@ class BiasNode(ros.StreamNode):
         t, d = np.array(stamps), np.array([item[5] for item in items])
         a, b = (self._corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
-        correction = self._corrector.correct(t[valid], a[valid], b[valid], d[valid])
-        bias, std, status = np.zeros(len(t)), np.zeros(len(t)), np.full(len(t), PASSED)
-        bias[valid], std[valid], status[valid] = correction.bias, correction.std, correction.status
+        correction, found = Correction.none(d), self._corrector.correct(t[valid], a[valid], b[valid], d[valid])
+        for name, values in vars(found).items():
+            getattr(correction, name)[valid] = values
         self._counts["invalid"] += len(t) - int(valid.sum())
         self._counts["unready"] += len(t) - sum(ready)
-        self._publish(items, bias, std, status, self._epoch.parts(t) if self._late else None)
+        self._publish(items, correction, self._epoch.parts(t) if self._late else None)
 
     def _is_ready(self, before):
         return self._poses.newest == -math.inf or self._corrector.ready(before)
 
-    def _publish(self, items, bias, std, status, stamps=None):
-        """Publish corrected TDOAs: items as in `_take`; bias, std (n,) m; status (n,); stamps : seconds and nanoseconds, (n,)
-        each, instead of their own."""
+    def _publish(self, items, correction, stamps=None):
+        """Publish corrected TDOAs: items as in `_take`; their Correction; stamps : seconds and nanoseconds, (n,) each, instead of
+        their own."""
         columns = [np.array(column) for column in list(zip(*items))[1:]]
         measured = columns if stamps is None else (*stamps, *columns[2:])  # up to the variance
-        values = *measured, bias, std, measured[4] - bias, status
-        kinds, first = [(item[0], self._model[one]) for item, one in zip(items, status.tolist())], 0
+        values = *measured, *vars(correction).values()
+        status = correction.status.tolist()
+        kinds, first = [(item[0], self._model[one]) for item, one in zip(items, status)], 0
         for kind, same in groupby(kinds):
             some = slice(first, first := first + len(list(same)))
             rows = self._template(*kind).rows(some.stop - some.start)
@@ -269,7 +270,7 @@ class BiasNode(ros.StreamNode):
                 rows[name] = column[some]
             self.output.publish(kind[0], self._template(*kind), rows)
         self._counts["published"] += len(items)
-        self._counts.update(STATUS[one] for one in status.tolist())
+        self._counts.update(STATUS[one] for one in status)
 
     def _template(self, frame, model):
         if (frame, model) not in self._templates:

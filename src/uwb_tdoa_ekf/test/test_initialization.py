@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.verdicts import REJECTED, STARTUP, USED
 from uwb_tdoa_ekf.core.initialization import remember
-from uwb_tdoa_ekf.core.memory import TDOA, WINDOW, new_memory
+from uwb_tdoa_ekf.core.memory import TDOA, WINDOW, new_memory, structured
 
 
 def test_starts_by_itself_within_its_window_and_knows_where_it_is():
@@ -78,6 +78,6 @@ def test_the_window_keeps_the_latest_tdoas_in_order():
     memory, fed = new_memory(np.zeros((4, 3))), 5 * WINDOW + 7
     ekf = memory.record
     for k in range(fed):
-        remember(ekf, np.array([(0.01 * k, k % 4, 0, 1.0 * k, 0.0)], TDOA)[0], memory.anchors)
+        remember(ekf, structured(TDOA, *np.array([[0.01 * k], [k % 4], [0], [k], [0.0]]))[0], memory.anchors)
     assert WINDOW <= ekf.kept <= 2 * WINDOW
     np.testing.assert_array_equal(ekf.window["d"][: ekf.kept], np.arange(fed - ekf.kept, fed))

@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
-from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
+from uwb_tdoa_bias.effects import EffectSet, SmoothTerm  # noqa: E402
+from uwb_tdoa_bias.effects.accel_bias import AccelBias  # noqa: E402
 from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm  # noqa: E402
 from uwb_tdoa_bias.foundation.flight import Imu  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_frames import TF_QOS, TF_STATIC_QOS  # noqa: E402
@@ -52,10 +53,13 @@ def positions(messages):
 
 
 def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_path):
-    """IMU turned, antenna on an arm, odom -> base_link from somebody else, anchors of a file: as the offline engine."""
+    """IMU turned, antenna on an arm, odom -> base_link from somebody else, anchors and effects of files: as the offline engine."""
     flight = recording(3.0)
     flight.anchors.to_yaml(tmp_path / "anchors.yaml")
-    file = ["-p", f"anchors_file:={tmp_path / 'anchors.yaml'}"]
+    straight = {"shape": "line", "covariate": "height", "knots": (0.0, 3.0), "values": {"c0": 0.1, "c1": 0.4}}
+    known = AccelBias({"x": 0.4}), SmoothTerm(channel="accel.y", **straight), SmoothTerm(form="common", **straight)
+    EffectSet(known).to_yaml(tmp_path / "effects.yaml")
+    file = ["-p", f"anchors_file:={tmp_path / 'anchors.yaml'}", "-p", f"effects_file:={tmp_path / 'effects.yaml'}"]
     rig = make_rig()
     static = rig.node.create_publisher(TFMessage, "/tf_static", TF_STATIC_QOS)
     moving = rig.node.create_publisher(TFMessage, "/tf", TF_QOS)
@@ -63,8 +67,8 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
     static.publish(TFMessage(transforms=arms))
     rig.start("bias_node", "ekf_node", bias_node=file, ekf_node=[*file, "-p", "publish_tf:=odom"])
     rig.wait(lambda: static.get_subscription_count() == 2 and moving.get_subscription_count() >= 1, "TF to be heard")
-    effects = EffectSet((TagLeverArm(values=dict(zip("xyz", ARM))),))
-    flight = effects.effects[0].inject(flight)
+    effects = EffectSet((*known, TagLeverArm(values=dict(zip("xyz", ARM)))))
+    flight = effects.effects[-1].inject(flight)
     turned = TURN.inv()
     mounted = replace(flight, imu=Imu(flight.imu.t, turned.apply(flight.imu.gyro), turned.apply(flight.imu.accel)))
 
@@ -81,7 +85,7 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
     rig.play(mounted)
     ekf = rig.counts("ekf_node", IMU_samples_received=len(flight.imu), TDOAs_received=len(flight.tdoa))
     assert ekf["late"] == ekf["imu_late"] == 0
-    assert {entry.key: entry.value for entry in rig.fresh_status("bias_node").values}["model"] == "tag_lever_arm"
+    assert {entry.key: entry.value for entry in rig.fresh_status("bias_node").values}["model"] == effects.name
     expected = run_offline(flight, None, Corrector(flight.anchors, effects)).odometry
     place = np.searchsorted(expected.t, [seconds_of(m.header.stamp) for m in rig.odometry])
     apart = np.linalg.norm(positions(rig.odometry) - expected.p[place], axis=1)

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
 from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -18,7 +18,8 @@ from uwb_tdoa_ekf.frames import to_odometry
 from uwb_tdoa_ekf.offline import run_offline
 
 IDS = corners().ids.tolist()
-EFFECTS = EffectSet((AnchorDelay({IDS[0]: 0.3, IDS[4]: -0.2}), TagLeverArm({"x": 0.05, "z": 0.2})))
+STEEP = SmoothTerm(covariate="height", form="common", knots=(0.5, 2.5), shape="parabola", values={"c0": 0.1, "c1": 0.3, "c2": 0.4})
+EFFECTS = EffectSet((AnchorDelay({IDS[0]: 0.3, IDS[4]: -0.2}), TagLeverArm({"x": 0.05, "z": 0.2}), STEEP))
 
 
 def live(flight, corrector, config=None):
@@ -42,7 +43,8 @@ def live(flight, corrector, config=None):
             rows = flight.anchors.index([a]), flight.anchors.index([b])
             correction = corrector.correct(np.array([t]), *rows, flight.tdoa.d[i : i + 1])
             corrected.append((correction.bias[0], correction.std[0]))
-            estimator.add_tdoa(t, a, b, correction.corrected[0], correction.std[0] ** 2)
+            about = correction.slope, correction.state
+            estimator.add_tdoa(t, a, b, correction.corrected[0], correction.std[0] ** 2, *about)
         advance()
     odometry, residuals = estimator.finish()
     parts.append((odometry, residuals))
@@ -90,6 +92,39 @@ def test_what_is_corrected_is_what_was_wrong():
     np.testing.assert_allclose(right.bias, delay[b] - delay[a], atol=1e-12)
     expected = run_offline(flight)
     np.testing.assert_allclose(right.odometry.p, expected.odometry.p, atol=1e-9)
+
+
+def climbing(flight, steep):
+    """The Flight, its TDOAs with an error that is proportional to the climb rate, and that effect."""
+    effect = SmoothTerm(covariate="climb_rate", knots=(-5.0, 5.0), shape="line", values={"c0": 0.0, "c1": 10.0 * steep})
+    rate = np.gradient(flight.truth.p[:, 2], flight.truth.t)
+    d = flight.tdoa.d + effect.curve(np.interp(flight.tdoa.t, flight.truth.t, rate))
+    return replace(flight, tdoa=replace(flight.tdoa, d=d)), effect
+
+
+def test_a_bias_that_changes_with_the_state_is_taken_out_at_the_state(monkeypatch):
+    """At the pose of a moment ago alone it is not: the error of the velocity comes back as one of the position."""
+    wrong, effect = climbing(fly(3, 12.0), 1.5)
+
+    def error(effects=EffectSet()):
+        odometry = run_offline(wrong, FilterConfig(use_imu=False), Corrector(wrong.anchors, effects)).odometry
+        late = odometry.t > odometry.t[0] + 3.0
+        return np.sqrt(np.mean((odometry.p[late] - position_at(wrong, odometry.t[late])) ** 2))
+
+    followed, before = error(EffectSet((effect,))), error()
+    monkeypatch.setattr(SmoothTerm, "states", ())
+    assert followed < 0.2 * before and followed < 0.2 * error(EffectSet((effect,)))
+
+
+@pytest.mark.parametrize("absurd", [np.nan, np.inf, 1e300])
+def test_an_absurd_slope_makes_a_tdoa_invalid(absurd):
+    flight = fly(7, 2.0)
+    slope, state = np.zeros((2, len(flight.tdoa), 6))
+    slope[150, 4], state[200, 2] = absurd, absurd
+    estimator = Estimator(flight.anchors, FilterConfig(use_imu=False))
+    estimator.add_tdoa(*(getattr(flight.tdoa, name) for name in ("t", "a", "b", "d")), 0.0, slope, state)
+    odometry, residuals = estimator.finish()
+    assert np.flatnonzero(residuals.verdict == INVALID).size == 2 and np.isfinite(odometry.p).all()
 
 
 def test_no_effects_and_no_corrector_are_the_same():

@@ -54,7 +54,7 @@ TOPICS = {
             "linear_acceleration_covariance",
         )
     ],
-    "tdoa": [("uwb/tdoa_corrected", TdoaCorrected, "anchor_a", "anchor_b", "raw", "corrected", "bias_std", "variance")],
+    "tdoa": [("uwb/tdoa_corrected", TdoaCorrected, "anchor_a", "anchor_b", "raw", "corrected", "bias_std", "variance", "bias_slope", "bias_state")],
     "height": [("height", Range, "range", "min_range", "max_range")],
     "pressure": [("pressure", FluidPressure, "fluid_pressure")],
     "velocity": [
@@ -132,7 +132,7 @@ class EkfNode(ros.StreamNode):
         if self._estimator is not None:
             self._publish(*self._estimator.finish())
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
-        self._estimator = Estimator(anchors, self._config, self._reorder, self._lag)
+        self._estimator = Estimator(anchors, self._config, self._reorder, self._lag, self._effects.sensor_functions)
         self._imu_corrector = ImuCorrector(self._effects.effects)
         ignored = [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else []
         self._watch, self._restarts = StreamWatch(anchors, self._lag, ignored), 0
@@ -219,17 +219,18 @@ class EkfNode(ros.StreamNode):
                 once=True,
             )
             gyro[unmeasured] = math.nan
+        if self._imu_mount is not None:  # first: effects are of axes of the body, as diagnose sees them
+            gyro, accel = self._imu_mount.in_body(t, gyro, accel)
         if not self._imu_corrector.idle:
             gyro, accel = self._imu_corrector.correct(t, gyro, accel)
-        if self._imu_mount is not None:
-            gyro, accel = self._imu_mount.in_body(t, gyro, accel)
         self._watch.add_imu(t + self._epoch.begin, self._arrived(arrival), gyro, accel)
         self._estimator.add_imu(t, gyro, accel)
 
     def _take_tdoa(self, frame, t, rows, arrival):
         a, b = rows["anchor_a"], rows["anchor_b"]
         self._watch.add_tdoa(t + self._epoch.begin, self._arrived(arrival), a, b, rows["raw"])
-        self._estimator.add_tdoa(t, a, b, rows["corrected"], rows["bias_std"] ** 2 + rows["variance"])
+        variance = rows["bias_std"] ** 2 + rows["variance"]
+        self._estimator.add_tdoa(t, a, b, rows["corrected"], variance, rows["bias_slope"], rows["bias_state"])
 
     def _take_height(self, frame, t, rows, arrival):
         distance = rows["range"].astype(float)

@@ -14,7 +14,7 @@ from .core import aids
 from .core.config import FilterConfig
 from .core.engine import feed, tell_pose
 from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, Measurements, new_memory, structured
-from .core.validity import usable_all, usable_imu
+from .core.validity import usable_all, usable_imu, usable_slopes
 from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, REPEATED, STARTUP, USED
 from .monitoring.implausible import implausible
 from .monitoring.monitor import Monitor
@@ -77,9 +77,9 @@ class Estimator:
     anew; a single stamp far from its neighbours only counts as late, or as invalid if it lies ahead.
     """
 
-    def __init__(self, anchors, config=None, reorder=0.003, lag=0.25):
-        """anchors : Anchors; config : FilterConfig; reorder, lag : s."""
-        self.anchors = anchors
+    def __init__(self, anchors, config=None, reorder=0.003, lag=0.25, functions=()):
+        """anchors : Anchors; config : FilterConfig; reorder, lag : s; functions : SensorFunctions that are known."""
+        self.anchors, self._functions = anchors, functions
         self.config = config or FilterConfig()
         self.reorder, self.lag = reorder, lag
         self._tuning = self.config.tuning()
@@ -90,7 +90,7 @@ class Estimator:
         self._clear()
 
     def _clear(self):
-        self._memory, self._monitor = new_memory(self.anchors.positions), Monitor(self.anchors)
+        self._memory, self._monitor = new_memory(self.anchors.positions, self._functions), Monitor(self.anchors)
         self._waiting = [Waiting(kind) for kind in KINDS]
         self._gates, self._orders = [StampGate() for _ in STREAMS], [Order() for _ in STREAMS]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
@@ -139,12 +139,13 @@ class Estimator:
         rows = structured(IMU_SAMPLE, np.atleast_1d(t), np.atleast_2d(gyro), np.atleast_2d(accel))
         self._add(IMU_STREAM, rows, usable_imu(rows["t"], rows["gyro"], rows["accel"]))
 
-    def add_tdoa(self, t, a, b, d, variance=0.0):
+    def add_tdoa(self, t, a, b, d, variance=0.0, slope=0.0, state=0.0):
         """Take corrected TDOAs in the order of their arrival: t (n,) s; a, b (n,) anchor ids; d (n,) m; variance (n,) m^2, of
-        what is known beyond tdoa_std. Or one: numbers."""
+        what is known beyond tdoa_std; slope, state (n, 6), as of a Correction. Or one: numbers."""
         t, a, b, d = map(np.atleast_1d, (t, a, b, d))
-        rows = structured(TDOA, t, self.anchors.index(a), self.anchors.index(b), d, variance)
+        rows = structured(TDOA, t, self.anchors.index(a), self.anchors.index(b), d, variance, slope, state)
         usable = usable_all(rows["a"], rows["b"], rows["d"], rows["variance"], self.anchors.positions) & np.isfinite(t)
+        usable &= usable_slopes(rows["slope"], rows["state"])
         refused = zip(*(column[~usable].tolist() for column in (t, a, b))) if not usable.all() else ()
         self._refused += [(*one, INVALID) for one in refused]
         self._add(TDOA_STREAM, rows, usable)

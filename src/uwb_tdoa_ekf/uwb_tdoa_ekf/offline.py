@@ -13,7 +13,7 @@ from .core.config import FilterConfig
 from .core.engine import feed
 from .core.hypotheses import yaw_offset
 from .core.memory import IMU_SAMPLE, ODOMETRY, RESIDUAL, TDOA, Measurements, joined, new_memory, structured
-from .core.validity import usable_all, usable_imu
+from .core.validity import usable_all, usable_imu, usable_slopes
 from .core.verdicts import INVALID
 from .estimator import VERDICTS, Odometry, Residuals
 from .frames import rotation_std
@@ -60,7 +60,7 @@ def run_offline(flight, config=None, corrector=None, records=None):
     imu = _imu_samples(flight.imu if config.use_imu else None)
     imu_t = imu["t"].copy()  # side by side in memory, to be searched
     (aids, places), outcome_of_aids = rows_of(flight, config), []
-    memory, tuning = new_memory(positions), config.tuning()
+    memory, tuning = new_memory(positions, corrector.effects.sensor_functions), config.tuning()
     bias, std, outcome, parts, fed, felt = np.zeros(len(tdoa)), np.zeros(len(tdoa)), _not_fed(len(tdoa)), [], 0, 0
     monitor = Monitor(flight.anchors) if config.compensate_changes else None
     at_once = RECORDED_AT_ONCE if records is not None else len(tdoa)
@@ -69,8 +69,8 @@ def run_offline(flight, config=None, corrector=None, records=None):
         correction = corrector.correct(t, a, b, d)
         bias[batch], std[batch] = correction.bias, correction.std
         variance = correction.std**2 + tdoa.variance[batch]
-        sane = usable_all(a, b, correction.corrected, variance, positions)
-        corrected = structured(TDOA, t, a, b, correction.corrected, variance)[sane]
+        sane = usable_all(a, b, correction.corrected, variance, positions) & usable_slopes(correction.slope, correction.state)
+        corrected = structured(TDOA, t, a, b, correction.corrected, variance, correction.slope, correction.state)[sane]
         last = len(imu) if until is None else int(np.searchsorted(imu_t, until))
         last_aid = len(aids) if until is None else int(np.searchsorted(aids["t"], until))
         measured = Measurements(imu[fed:last], corrected, aids[felt:last_aid])

@@ -285,6 +285,24 @@ def test_a_bag_from_before_the_variance(tmp_path, storage, file_alone):
             assert typestore().deserialize_cdr(data, msgtype).variance == 0.0 and stamp
 
 
+@pytest.mark.parametrize("lacking", [("bias_slope", "bias_state"), ("variance", "bias_slope", "bias_state")])
+def test_corrected_tdoas_of_a_bag_from_before_fields_were_added(tmp_path, lacking):
+    store, msgtype = get_typestore(Stores.ROS2_JAZZY), "uwb_tdoa_msgs/msg/TdoaCorrected"
+    constants, fields = typestore().fielddefs[msgtype]
+    store.register({msgtype: (constants, [field for field in fields if field[0] not in lacking])})
+    values = {"anchor_a": 1, "anchor_b": 2, "raw": 0.5, "bias": 0.1, "bias_std": 0.2, "corrected": 0.4, "variance": 0.3, "status": 1, "model": "x"}
+    header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](1, 0), "map")
+    with new_bag(tmp_path / "old", "mcap") as writer:
+        connection = writer.add_connection("/uwb/tdoa_corrected", msgtype, typestore=store)
+        message = store.types[msgtype](header=header, **{name: value for name, value in values.items() if name not in lacking})
+        writer.write(connection, 10**9, store.serialize_cdr(message, msgtype))
+    with open_bag(tmp_path / "old") as reader:
+        ((_, _, data),) = messages(tmp_path / "old", reader, reader.connections)
+    message = typestore().deserialize_cdr(data, msgtype)
+    assert {name: getattr(message, name) for name in values} == {**values, **({"variance": 0.0} if "variance" in lacking else {})}
+    assert message.bias_slope.tolist() == message.bias_state.tolist() == [0.0] * 6
+
+
 def test_fields_of_any_topic(tmp_path):
     store = typestore()
     Residual = store.types["uwb_tdoa_msgs/msg/TdoaResidual"]

@@ -95,11 +95,11 @@ def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights)
 
 
 def test_what_no_node_can_take_out_is_not_tried():
-    late = Undeclared("gyro", "axis", (0,), "height", "trend", 0.3, (0.5, 2.5), (0.5, 0.2, 0.5))
+    late = Undeclared("gyro", "axis", (0,), "acceleration", "trend", 0.3, (0.0, 2.0), (0.5, 0.2, 0.5))
     flight = late.inject(clean_flight(100, 30.0))
     found = attribute([flight], TRUTH)
     kept = useful(found, [flight], Baseline(NONE))
-    assert [candidate.label for candidate in kept.candidates] == ["gyro.x over height"]
+    assert [candidate.label for candidate in kept.candidates] == ["gyro.x over acceleration"]
     assert not kept.worth and not kept.refused
 
 

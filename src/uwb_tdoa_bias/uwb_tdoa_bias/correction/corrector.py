@@ -7,6 +7,7 @@ import numpy as np
 
 from ..effects import EffectSet, Samples
 from ..effects.motion import POSE_LAG, motion_at
+from ..effects.slope import STATES, slope_of, state_of
 from ..foundation.compiled import compiled
 from .poses import Poses, rotated_in_yaw
 
@@ -18,12 +19,26 @@ FADED_BELOW = 0.5  # share of what can be known that a network's prediction has 
 
 @dataclass(frozen=True)
 class Correction:
-    """bias, std : (n,) m; corrected = d - bias, (n,) m; status : (n,) one of PASSED, EFFECTS, NETWORK, FADED."""
+    """bias, std : (n,) m; corrected = d - bias, (n,) m; status : (n,) one of PASSED, EFFECTS, NETWORK, FADED; slope : (n, 6) change of
+    the bias, m, with position, m, and velocity, m/s, of the tag, world axes, about state (n, 6), where the bias is that."""
 
     bias: np.ndarray
     std: np.ndarray
     corrected: np.ndarray
     status: np.ndarray
+    slope: np.ndarray
+    state: np.ndarray
+
+    @classmethod
+    def of(cls, d, bias, std, status, slope=None, state=None):
+        """Of raw d (n,) m; without a slope by default."""
+        flat = np.zeros((len(d), STATES)) if slope is None else slope
+        return cls(bias, std, d - bias, status, flat, flat.copy() if state is None else state)
+
+    @classmethod
+    def none(cls, d):
+        """Of raw d (n,) m that nothing is known to be wrong with."""
+        return cls.of(d, np.zeros(len(d)), np.zeros(len(d)), np.full(len(d), PASSED, dtype=np.uint8))
 
 
 class Corrector:
@@ -72,23 +87,25 @@ class Corrector:
         t : (n,) s; a, b : (n,) anchor rows (of `anchors`); d : (n,) raw d_ab, m. Returns a Correction. Where no pose is
         known yet, only effects that need none contribute.
         """
-        n = len(t)
-        zeros = np.zeros(n)
-        if self.idle or n == 0:
-            return Correction(zeros, zeros, d + zeros, np.full(n, PASSED, dtype=np.uint8))
+        if self.idle or len(t) == 0:
+            return Correction.none(d)
         samples = self.samples(t, a, b)
-        bias, std = self.contribution(samples)
-        status = np.full(n, EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
+        bias, std, *about = self.contribution(samples)
+        status = np.full(len(t), EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
         if self.network is not None:
             _add_learned(*self.network.predict(samples), bias, std, status)
-        return Correction(bias, std, d - bias, status)
+        return Correction.of(d, bias, std, status, *about)
 
     def contribution(self, samples):
-        """(bias, standard deviation) of the effects in Samples, (n,) m; while the yaw is unknown their mean over four headings, and its
-        scatter."""
+        """(bias, standard deviation), (n,) m, and slope and state (n, 6), as of a Correction, of the effects in Samples; while the yaw is
+        unknown the mean over four headings, and its scatter."""
         if not len(self.effects):
-            return np.zeros(len(samples)), np.zeros(len(samples))
-        bias, noise = self.effects.bias(samples), self.effects.noise_std(samples)
+            return (np.zeros(len(samples)), np.zeros(len(samples)))
+        steep, others = self.effects.parted
+        bias, noise = others.bias(samples), self.effects.noise_std(samples)
+        if len(steep):
+            of_steep, slope, curved = slope_of(steep.effects, samples)
+            bias, noise = bias + of_steep, np.hypot(noise, curved)
         unknown = samples.yaw_std > LARGEST_YAW_STD
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
@@ -96,7 +113,10 @@ class Corrector:
             known, *each = turning.bias(replace(samples.repeated(5), q=headings)).reshape(5, -1)
             bias = np.where(unknown, bias - known + np.mean(each, axis=0), bias)
             noise = np.where(unknown, np.hypot(noise, np.std(each, axis=0)), noise)
-        return bias, noise
+        if not len(steep):
+            return bias, noise
+        slope[unknown] = 0.0
+        return bias, noise, slope, state_of(samples)
 
     def samples(self, t, a, b):
         """Samples of a batch at the poses that are known by now."""

@@ -36,7 +36,7 @@ class Effect:
     source : where the values came from, free text.
     An effect says what it does to measurements, and by that how it is undone, the same way in a node, off line and in a
     recording: `bias` and `noise_std` of TDOAs, `stamp_offset` of streams, `sensor_model` of inertial samples, heights and
-    velocities, `sensor_bias` of inertial samples. For `diagnose` it gives `regressors` on the channels where it shows.
+    velocities, `sensor_bias` of inertial samples, `sensor_functions` of what these do by the state of the filter. For `diagnose` it gives `regressors` on the channels where it shows.
     """
 
     values: dict = field(default_factory=dict)
@@ -130,6 +130,12 @@ class Effect:
         (unknown pose)."""
         return np.zeros(len(samples))
 
+    @property
+    def states(self):
+        """Which of position (0, 1, 2) and velocity (3, 4, 5) its part of a TDOA may change steeply with, so that the filter should
+        follow it: tuple."""
+        return ()
+
     def regressors(self, samples, keys):
         """Derivative of what `samples.channel` measures by the parameters `keys`: of Samples (n, len(keys)), metres per
         `unit`; of ImuSamples (n, 3, len(keys)), body axes; of AidSamples (n, k, len(keys)). Asked for the channels in `channels` only."""
@@ -176,6 +182,10 @@ class Effect:
     def sensor_bias(self, channel, features):
         """What it adds to "gyro" or "accel" besides, (n, 3), given their features (n, len(OF_IMU)); None for nothing."""
         return None
+
+    def sensor_functions(self):
+        """What it adds to inertial samples that changes with the state of the filter: tuple of SensorFunction."""
+        return ()
 
     def uncorrected(self, samples):
         """What taking it out of a stream leaves of it in ImuSamples, (n, 3), or AidSamples, (n, k), because nodes know less

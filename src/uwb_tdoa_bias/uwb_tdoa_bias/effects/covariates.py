@@ -63,6 +63,13 @@ OF_IMU = (
     "time", "vibration", "turning_rate", "rate_x", "rate_y", "rate_z", "accel", "accel_x", "accel_y", "accel_z",
 )  # fmt: skip
 
+# Which of position (0, 1, 2) and velocity (3, 4, 5) of the tag, as the filter estimates them, change a covariate of TDOAs at once. Not
+# that of the speed: its direction is anybody's guess where a tag is slow, and following it did harm.
+STATES = {**dict.fromkeys(("x", "y", "height", *OF_ARRIVAL), (0, 1, 2)), "climb_rate": (5,)}
+
+# What an inertial sensor may depend on that the filter knows when it takes a sample.
+OF_STATE = ("x", "y", "height", "speed", "climb_rate")
+
 UNITS = {
     "time": "s", "x": "m", "y": "m", "height": "m", "speed": "m/s", "climb_rate": "m/s", "acceleration": "m/s^2",
     "turning_rate": "rad/s", "tilt": "rad", "interval": "s", "previous_anchor": "id", "vibration": "m/s^2", "range": "m",

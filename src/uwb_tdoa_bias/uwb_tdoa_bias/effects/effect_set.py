@@ -49,6 +49,11 @@ class EffectSet:
             total += np.where(np.isfinite(part), part, 0.0)
         return total
 
+    @cached_property
+    def parted(self):
+        """(EffectSet of those whose part of a TDOA changes steeply with the state of the filter, EffectSet of the others)."""
+        return tuple(EffectSet(tuple(effect for effect in self.effects if bool(effect.states) == steep)) for steep in (True, False))
+
     def uncorrected(self, samples):
         """What taking the effects out of a stream leaves of them in ImuSamples, (n, 3), or AidSamples, (n, k)."""
         mine = (effect for effect in self.effects if samples.channel in effect.channels)
@@ -74,6 +79,11 @@ class EffectSet:
     def needs_motion(self):
         """True if an effect looks at more than poses."""
         return any(effect.needs_motion for effect in self.effects)
+
+    @cached_property
+    def sensor_functions(self):
+        """All SensorFunctions: what the filter itself takes out of inertial samples."""
+        return tuple(function for effect in self.effects for function in effect.sensor_functions())
 
     def stamp_offset(self, stream):
         """Seconds by which the stamps of a stream of a Flight are late, by its name."""

@@ -10,7 +10,8 @@ import numpy as np
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
 from .base import Effect, known_anchors, once_per_anchors, tile
-from .covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_TDOA, sensor_covariate
+from .covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_STATE, OF_TDOA, STATES, sensor_covariate
+from .sensor_function import SensorFunction
 from .shapes import SHAPES, functions
 from .smooth_words import sentences
 
@@ -111,6 +112,10 @@ class SmoothTerm(Effect):
         return self.covariate.endswith("_in_tag") or self.covariate == "tilt"
 
     @property
+    def states(self):
+        return STATES.get(self.covariate, ()) if self.channel == "tdoa" else ()
+
+    @property
     def needs_motion(self):
         return self.channel == "tdoa" and self.covariate in OF_MOTION
 
@@ -119,7 +124,7 @@ class SmoothTerm(Effect):
         """Whether the nodes, and the filter off line, have the covariate at hand."""
         if self.channel == "tdoa":
             return self.covariate in (*OF_TDOA, *OF_ARRIVAL) and self.covariate != "vibration"
-        return self.channel in IMU_CHANNELS and self.covariate in OF_IMU
+        return self.channel in IMU_CHANNELS and self.covariate in (*OF_IMU, *OF_STATE)
 
     def keys(self, anchors=None):
         """All coefficients: of every anchor for the form "anchor"."""
@@ -207,11 +212,17 @@ class SmoothTerm(Effect):
         return forth - ((a == second) & (b == first)) if self.form == "pair" else forth
 
     def sensor_bias(self, channel, features):
-        if channel not in self.channels or not self.usable:
+        if channel not in self.channels or self.covariate not in OF_IMU:
             return None
         out = np.zeros((len(features), 3))
         out[:, self._axis] = self.curve(features[:, OF_IMU.index(self.covariate)])
         return out
+
+    def sensor_functions(self):
+        if self.channel not in IMU_CHANNELS or self.covariate not in OF_STATE:
+            return ()
+        ends = self.knots[0], self.knots[-1]
+        return (SensorFunction.of(self.curve, self.channel, self.covariate, *ends, periodic=self.shape == "wave"),)
 
     @property
     def _axis(self):
@@ -219,7 +230,7 @@ class SmoothTerm(Effect):
         return "xyz".index(self.channel.partition(".")[2] or "x")
 
     def uncorrected(self, samples):
-        if self.channel not in AID_CHANNELS and self.usable:
+        if self.channel in IMU_CHANNELS and self.covariate in OF_IMU:
             return 0.0
         keys = self.keys()
         return self.regressors(samples, keys) @ np.array([self.values.get(key, 0.0) for key in keys])

@@ -8,7 +8,8 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
 from . import aids, barometer, height, history, hypotheses, inertial, initialization, noise, plausibility, robust, workspace
-from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, Output
+from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, STEEP, Output
+from .sensor_functions import take_out
 from .startup import INLIER
 from .state import coast, predict
 from .update import project, update_state
@@ -31,7 +32,8 @@ RECORDS_OF_AID = 3  # one per component of a velocity
 def run(memory, tuning, measurements, output):
     """Feed Measurements in stamp order, neither before what was fed earlier.
 
-    memory : Memory; tuning : (1,) of config.TUNING; output : Output, which is filled. Returns the number of odometry
+    memory : Memory, whose functions are taken out of the inertial samples where they lie; tuning : (1,) of config.TUNING; output :
+    Output, which is filled. Returns the number of odometry
     rows. Raises IndexError if a history has less room than `most_records`.
     """
     ekf, anchors, parameters = memory.ekf[0], memory.anchors, tuning[0]
@@ -43,6 +45,8 @@ def run(memory, tuning, measurements, output):
         of_aid = aid[m].t if m < len(aid) else np.inf
         t = min(of_imu, of_tdoa, of_aid)
         if of_imu == t and i < len(imu):
+            if len(memory.functions) and ekf.running:
+                take_out(memory.functions, ekf.hypotheses[ekf.best].x, imu[i])
             _on_imu(ekf, parameters, imu[i], output.history)
             i += 1
         elif of_tdoa == t and k < len(tdoa):
@@ -195,7 +199,7 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
             continue
-        _compare(hypothesis, a, b, tdoa.d - known, innovation)
+        _compare(hypothesis, a, b, tdoa, known, innovation)
         _assimilate(ekf, h, tuning, tdoa.t, residual, records)
         if h == ekf.best:
             height.judge(ekf.height, tuning, innovation, tdoa.t)
@@ -208,12 +212,19 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
 
 
 @compiled
-def _compare(hypothesis, a, b, d, innovation):
-    """Fill in what a TDOA d (m) between two of ANCHOR says to a HYPOTHESIS; its Jacobian is that of the position."""
-    innovation.value = d - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
+def _compare(hypothesis, a, b, tdoa, known, innovation):
+    """Fill in what a TDOA between two of ANCHOR, `known` (m) too long, says to a HYPOTHESIS; its Jacobian is that of the position, and
+    of what its bias changes with."""
+    innovation.value = tdoa.d - known - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
     innovation.entries = 3
-    for k in range(3):
+    for k in range(STEEP):
         innovation.states[k] = k
+        if k >= 3:
+            innovation.row[k] = 0.0
+        if tdoa.slope[k] != 0.0:
+            innovation.value -= tdoa.slope[k] * (hypothesis.x[k] - tdoa.state[k])
+            innovation.row[k] += tdoa.slope[k]
+            innovation.entries = max(innovation.entries, k + 1)
     project(hypothesis.P, innovation)
 
 

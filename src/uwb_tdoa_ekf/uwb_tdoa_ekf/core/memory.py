@@ -1,4 +1,4 @@
-"""Everything one filter remembers between two events, by name. A copy of its two arrays is a copy of the filter.
+"""Everything one filter remembers between two events, by name. A copy of its arrays is a copy of the filter.
 
 The types are rows of numpy's structured arrays: compiled code reads and writes `ekf.imu.slow_accel[k]` where it lies in
 memory, a function takes a whole record as one pointer, and Python sees the same bytes (`Memory.record`).
@@ -8,11 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .sensor_functions import rows_of
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
 from .update import INNOVATION, OFFSET_STATES
 
 HYPOTHESES = 4  # starts in as many directions while the yaw is unknown
 WINDOW = 512  # TDOAs kept for a start
+STEEP = 6  # states that a bias may change with: position and velocity
 
 
 def _record(*columns):
@@ -21,7 +23,10 @@ def _record(*columns):
 
 # What is measured. Rows of an anchor, not ids; both in the order of their stamps.
 IMU_SAMPLE = _record(("t", float), ("gyro", float, 3), ("accel", float, 3))  # s, rad/s, m/s^2 (specific force); body
-TDOA = _record(("t", float), ("a", int), ("b", int), ("d", float), ("variance", float))  # s, rows, m (corrected), m^2 (beyond tdoa_std)
+TDOA = _record(
+    ("t", float), ("a", int), ("b", int), ("d", float), ("variance", float),  # s, rows, m (corrected), m^2 (beyond tdoa_std)
+    ("slope", float, STEEP), ("state", float, STEEP),  # of the bias taken out, with position and velocity, about a state; m, m/s
+)  # fmt: skip
 AID = _record(("t", float), ("kind", int), ("value", float, 3), ("std", float, 3))  # see aids.py
 
 # One estimate of the state, for one direction that the tag may have started in.
@@ -143,10 +148,12 @@ RESIDUAL = _record(("innovation", float), ("variance", float), ("weight", float)
 
 
 class Memory(NamedTuple):
-    """State of one filter. ekf : (1,) of EKF; anchors : (N,) of ANCHOR."""
+    """State of one filter. ekf : (1,) of EKF; anchors : (N,) of ANCHOR; functions : (k,) of SENSOR_FUNCTION, errors of the inertial
+    sensor that are known."""
 
     ekf: np.ndarray
     anchors: np.ndarray
+    functions: np.ndarray
 
     @property
     def record(self):
@@ -176,9 +183,9 @@ class Output(NamedTuple):
     aids: np.ndarray = np.empty(0, RESIDUAL)
 
 
-def new_memory(positions):
-    """Memory of a filter that has seen nothing; positions : (N, 3) m, of the anchors."""
-    memory = Memory(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR))
+def new_memory(positions, functions=()):
+    """Memory of a filter that has seen nothing; positions : (N, 3) m, of the anchors; functions : SensorFunctions."""
+    memory = Memory(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
     memory.anchors["position"], memory.anchors["learned"] = positions, -np.inf
     ekf = memory.record
     for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge"):
@@ -198,8 +205,9 @@ def new_memory(positions):
 
 
 def structured(kind, *columns):
-    """(n,) array of a type of this module; columns : one array for each of its fields, in their order."""
-    out = np.empty(len(columns[0]), kind)
+    """(n,) array of a type of this module; columns : one array for each of its fields, in their order; of the last ones that are not
+    given, 0."""
+    out = np.zeros(len(columns[0]), kind)
     for name, column in zip(kind.names, columns):
         out[name] = column
     return out

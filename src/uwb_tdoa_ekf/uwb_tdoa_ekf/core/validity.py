@@ -7,6 +7,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 MAX_RATE, MAX_ACCEL = 100.0, 1000.0  # rad/s, m/s^2: beyond what any inertial sensor reads
+STEEPEST, FARTHEST = 1e3, 1e6  # m per m or m/s, and m or m/s, of what a bias changes with
 LARGEST_ERROR = 1.0  # m by which |d_ab| may exceed the distance between a and b
 
 
@@ -31,6 +32,16 @@ def usable_all(a, b, d, variance, positions):
     out = np.empty(len(d), np.bool_)
     for i in range(len(d)):
         out[i] = usable(a[i], b[i], d[i], variance[i], positions)
+    return out
+
+
+@compiled
+def usable_slopes(slope, state):
+    """(n,) bool: whether a bias can change with the state by a slope (n, 6), m per m or m/s, about a state (n, 6), m or m/s."""
+    out = np.ones(len(slope), np.bool_)
+    for i in range(len(slope)):
+        for k in range(slope.shape[1]):  # NaN is not below anything
+            out[i] = out[i] and abs(slope[i, k]) < STEEPEST and abs(state[i, k]) < FARTHEST
     return out
 
 

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..readers.streams import SALVAGE
 from .integrity import NO_SUM, SUM_KEY, check as check_whole, is_packed, metadata, seal, unpack
 from .mcap import Damaged
-from .message_types import is_earlier, typestore, upgraded
+from .message_types import earlier_types, typestore, upgraded
 from .salvage import salvage as write_sound_part
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -120,12 +120,12 @@ def messages(path, reader, connections):
     left = {(connection.topic, connection.msgtype): 0 for connection in connections}
     for connection in connections:
         left[connection.topic, connection.msgtype] += connection.msgcount
-    earlier = {connection.id for connection in connections if is_earlier(path, connection)}
+    earlier = {connection.id: earlier_types(path, connection) for connection in connections}
     while True:
         try:
             connection, stamp, data = next(found)
-            if connection.id in earlier:
-                data = upgraded(data, connection.msgtype)
+            if earlier[connection.id]:
+                data = upgraded(data, connection.msgtype, earlier[connection.id])
         except StopIteration:
             break
         except Exception as error:  # as in _opened

@@ -4,6 +4,7 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -11,9 +12,9 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 OUR_PACKAGE = "uwb_tdoa_msgs"
 OUR_TYPES = ("Tdoa", "TdoaCorrected", "TdoaResidual", "Anchor", "AnchorArray")
-OPTIONAL = {  # fields of our types that earlier recordings do not have, and what is meant there
-    f"{OUR_PACKAGE}/msg/Tdoa": {"variance": 0.0},
-    f"{OUR_PACKAGE}/msg/TdoaCorrected": {"variance": 0.0},
+ADDED = {  # fields that our types were given since they were first recorded, the latest last, and what is meant where they lack
+    f"{OUR_PACKAGE}/msg/Tdoa": ({"variance": 0.0},),
+    f"{OUR_PACKAGE}/msg/TdoaCorrected": ({"variance": 0.0}, {"bias_slope": np.zeros(6), "bias_state": np.zeros(6)}),
 }
 _SOURCE_TREE = Path(__file__).resolve().parents[3]  # where our packages lie side by side
 
@@ -46,33 +47,39 @@ def check_type(path, connection):
     store = typestore()
     add_type(store, connection.msgtype)
     recorded = _recorded_hash(path, connection)
-    if recorded and recorded != store.hash_rihs01(connection.msgtype) and not is_earlier(path, connection):
+    if recorded and recorded != store.hash_rihs01(connection.msgtype) and not earlier_types(path, connection):
         raise InputError(
             f"{path}: {connection.topic} was recorded with another version of {connection.msgtype}; use the version of "
             "this software that recorded it."
         )
 
 
-def is_earlier(path, connection):
-    """Whether a topic was recorded before its type had its OPTIONAL fields. Raises InputError."""
-    return connection.msgtype in OPTIONAL and _recorded_hash(path, connection) == _earlier().hash_rihs01(connection.msgtype)
+def earlier_types(path, connection):
+    """The types as of when a topic was recorded, if its type has been ADDED fields since; None if not. Raises InputError."""
+    versions = _earlier(connection.msgtype)
+    recorded = _recorded_hash(path, connection) if versions else None
+    return next((store for store in versions if store.hash_rihs01(connection.msgtype) == recorded), None)
 
 
-def upgraded(data, msgtype):
-    """Bytes of a message whose topic `is_earlier`, as of its type now."""
-    message = _earlier().deserialize_cdr(data, msgtype)
-    fields = {name: getattr(message, name) for name, _ in _earlier().fielddefs[msgtype][1]}
-    return typestore().serialize_cdr(typestore().types[msgtype](**fields, **OPTIONAL[msgtype]), msgtype)
+def upgraded(data, msgtype, store):
+    """Bytes of a message of `earlier_types`, as of its type now."""
+    message, defaults = store.deserialize_cdr(data, msgtype), {}
+    for fields in ADDED[msgtype]:
+        defaults |= fields
+    known = {name: getattr(message, name) for name, _ in store.fielddefs[msgtype][1]}
+    return typestore().serialize_cdr(typestore().types[msgtype](**{**defaults, **known}), msgtype)
 
 
-@lru_cache(maxsize=1)
-def _earlier():
-    """The types with OPTIONAL fields without these."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for msgtype, optional in OPTIONAL.items():
+@lru_cache(maxsize=None)
+def _earlier(msgtype):
+    """The types as before each addition of fields to one of them: tuple of stores."""
+    out, added = [], ADDED.get(msgtype, ())
+    for k in range(len(added)):
+        lacking, store = {name for fields in added[k:] for name in fields}, get_typestore(Stores.ROS2_JAZZY)
         constants, fields = typestore().fielddefs[msgtype]
-        store.register({msgtype: (constants, [field for field in fields if field[0] not in optional])})
-    return store
+        store.register({msgtype: (constants, [field for field in fields if field[0] not in lacking])})
+        out.append(store)
+    return tuple(out)
 
 
 def _recorded_hash(path, connection):

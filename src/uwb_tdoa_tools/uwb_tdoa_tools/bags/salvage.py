@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from . import integrity, mcap
 from .mcap import Damaged
-from .message_types import check_type, is_earlier, typestore, upgraded
+from .message_types import check_type, earlier_types, typestore, upgraded
 
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 
@@ -49,8 +49,8 @@ def _copy(path, file, writer, connections):
             if key not in connections:
                 connections[key] = _added(path, connection, writer)
             if connections[key] is not None:
-                if is_earlier(path, connection):
-                    data = upgraded(data, connection.msgtype)
+                if earlier := earlier_types(path, connection):
+                    data = upgraded(data, connection.msgtype, earlier)
                 writer.write(connections[key], stamp, data)
                 count += 1
     except Damaged as damage:

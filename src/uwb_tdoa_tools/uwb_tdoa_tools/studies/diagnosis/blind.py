@@ -10,6 +10,8 @@ import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import Effect, EffectSet
+from uwb_tdoa_bias.effects.covariates import OF_STATE, STATES
+from uwb_tdoa_bias.effects.sensor_function import SensorFunction
 from uwb_tdoa_ekf.offline import run_offline
 
 from ...diagnosis import diagnose
@@ -96,7 +98,7 @@ def case(source, seed):
 
 
 class Told(Effect):
-    """An Undeclared of TDOAs, known exactly, that is taken out at the poses that a node has."""
+    """An Undeclared, known exactly, that is taken out at the poses that a node has."""
 
     name = "told"
     needs_motion = True
@@ -106,14 +108,25 @@ class Told(Effect):
         super().__init__()
         self.undeclared = undeclared
 
+    @property
+    def states(self):
+        return STATES.get(self.undeclared.covariate, ()) if self.undeclared.stream == "tdoa" else ()
+
     def bias(self, samples):
-        return self.undeclared.bias(samples)
+        return self.undeclared.bias(samples) if self.undeclared.stream == "tdoa" else np.zeros(len(samples))
+
+    def sensor_functions(self):
+        effect, (low, high) = self.undeclared, self.undeclared.limits
+        if effect.stream == "tdoa" or effect.covariate not in OF_STATE:
+            return ()
+        beyond = 0.25 * (high - low)  # where the course of an Undeclared ends
+        return (SensorFunction.of(effect.course, f"{effect.stream}.{'xyz'[effect.who[0]]}", effect.covariate, low - beyond, high + beyond),)
 
 
 def told(effect, flown, plain, base):
     """3D RMSE, m, of a Flight `flown` with an Undeclared that is known exactly. plain : the error without it. Of an inertial sensor
-    nodes know what it read and when, and no pose."""
-    if effect.stream == "tdoa":
+    nodes know what it read and when, and where the filter is."""
+    if effect.stream == "tdoa" or effect.covariate in OF_STATE:
         return rmse(flown, EffectSet((*base.effects, Told(effect))))
     return rmse(flown, base) if effect.covariate in grammar.OF_POSE[1:] else plain
 

@@ -1,0 +1,27 @@
+"""What an inertial sensor reads beside the truth, as a function of where the filter is: a table that compiled code looks up."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+STEPS = 256  # of a table
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFunction:
+    """sensor : "gyro" or "accel"; axis : 0 to 2, of the body; covariate : one of OF_STATE; low, high : of it; values (STEPS + 1,) rad/s or
+    m/s^2, evenly between them, held constant beyond; periodic : it goes on beyond them instead."""
+
+    sensor: str
+    axis: int
+    covariate: str
+    low: float
+    high: float
+    values: np.ndarray
+    periodic: bool = False
+
+    @classmethod
+    def of(cls, function, channel, covariate, low, high, periodic=False):
+        """Of a function of the covariate, (n,) to (n,); channel : "gyro.x" ... "accel.z"."""
+        sensor, _, axis = channel.partition(".")
+        return cls(sensor, "xyz".index(axis), covariate, low, high, function(np.linspace(low, high, STEPS + 1)), periodic)

@@ -1,0 +1,55 @@
+"""Errors of the inertial sensor that change with the state of the filter: taken out of each sample at the best hypothesis."""
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.effects.covariates import OF_STATE
+from uwb_tdoa_bias.effects.sensor_function import STEPS
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+SENSORS = ("gyro", "accel")
+SPEED, CLIMB_RATE = OF_STATE.index("speed"), OF_STATE.index("climb_rate")  # those before them are the position
+
+# A SensorFunction, by its fields.
+SENSOR_FUNCTION = np.dtype(
+    [
+        ("sensor", np.int64), ("axis", np.int64), ("covariate", np.int64),  # the first and the last by their places
+        ("low", float), ("high", float), ("values", float, STEPS + 1), ("periodic", np.bool_),
+    ],
+    align=True,
+)  # fmt: skip
+
+
+def rows_of(functions):
+    """(k,) of SENSOR_FUNCTION, of SensorFunctions."""
+    out = np.zeros(len(functions), SENSOR_FUNCTION)
+    for row, function in zip(out, functions):
+        row["sensor"], row["covariate"] = SENSORS.index(function.sensor), OF_STATE.index(function.covariate)
+        for name in ("axis", "low", "high", "values", "periodic"):
+            row[name] = getattr(function, name)
+    return out
+
+
+@compiled
+def take_out(functions, x, sample):
+    """Take (k,) of SENSOR_FUNCTION at a nominal state x out of an IMU_SAMPLE."""
+    for k in range(len(functions)):
+        function = functions[k]
+        if function.covariate == SPEED:
+            at = math.sqrt(x[3] ** 2 + x[4] ** 2 + x[5] ** 2)
+        elif function.covariate == CLIMB_RATE:
+            at = x[5]
+        else:
+            at = x[function.covariate]
+        reading = sample.gyro if function.sensor == 0 else sample.accel
+        reading[function.axis] -= _value(function, at)
+
+
+@compiled
+def _value(function, at):
+    place = (at - function.low) / (function.high - function.low)
+    place = place - math.floor(place) if function.periodic else min(max(place, 0.0), 1.0)
+    first = min(int(place * STEPS), STEPS - 1)
+    share = place * STEPS - first
+    return (1.0 - share) * function.values[first] + share * function.values[first + 1]
