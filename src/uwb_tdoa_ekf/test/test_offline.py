@@ -116,6 +116,23 @@ def test_a_bias_that_changes_with_the_state_is_taken_out_at_the_state(monkeypatc
     assert followed < 0.2 * before and followed < 0.2 * error(EffectSet((effect,)))
 
 
+def test_a_slope_tells_nothing_of_a_place_far_away():
+    """As after the tag was lost and found elsewhere, when the bias is still that of where it was not."""
+    flight = fly(7, 2.0)
+    slope, state = np.ones((2, len(flight.tdoa), 6))
+    state[:, :3] = position_at(flight, flight.tdoa.t) + 5.0
+    slope[:, 3:] = 0.0
+
+    def positions(*about):
+        estimator = Estimator(flight.anchors, FilterConfig(use_imu=False))
+        estimator.add_tdoa(*(getattr(flight.tdoa, name) for name in ("t", "a", "b", "d")), 0.0, *about)
+        return estimator.finish()[0].p
+
+    np.testing.assert_array_equal(positions(slope, state), positions())
+    state[:, :3] -= 5.2
+    assert np.abs(positions(slope, state) - positions()).max() > 0.1
+
+
 @pytest.mark.parametrize("absurd", [np.nan, np.inf, 1e300])
 def test_an_absurd_slope_makes_a_tdoa_invalid(absurd):
     flight = fly(7, 2.0)

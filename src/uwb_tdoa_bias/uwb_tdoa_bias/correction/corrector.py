@@ -30,15 +30,14 @@ class Correction:
     state: np.ndarray
 
     @classmethod
-    def of(cls, d, bias, std, status, slope=None, state=None):
-        """Of raw d (n,) m; without a slope by default."""
-        flat = np.zeros((len(d), STATES)) if slope is None else slope
-        return cls(bias, std, d - bias, status, flat, flat.copy() if state is None else state)
+    def flat(cls, d, bias, std, status):
+        """Of raw d (n,) m with a bias that nobody knows to change with the state."""
+        return cls(bias, std, d - bias, status, *np.zeros((2, len(d), STATES)))
 
     @classmethod
     def none(cls, d):
         """Of raw d (n,) m that nothing is known to be wrong with."""
-        return cls.of(d, np.zeros(len(d)), np.zeros(len(d)), np.full(len(d), PASSED, dtype=np.uint8))
+        return cls.flat(d, *np.zeros((2, len(d))), np.full(len(d), PASSED, dtype=np.uint8))
 
 
 class Corrector:
@@ -90,33 +89,31 @@ class Corrector:
         if self.idle or len(t) == 0:
             return Correction.none(d)
         samples = self.samples(t, a, b)
-        bias, std, *about = self.contribution(samples)
+        bias, std, slope, state = self.contribution(samples)
         status = np.full(len(t), EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
         if self.network is not None:
             _add_learned(*self.network.predict(samples), bias, std, status)
-        return Correction.of(d, bias, std, status, *about)
+        return Correction(bias, std, d - bias, status, slope, state)
 
     def contribution(self, samples):
-        """(bias, standard deviation), (n,) m, and slope and state (n, 6), as of a Correction, of the effects in Samples; while the yaw is
-        unknown the mean over four headings, and its scatter."""
-        if not len(self.effects):
-            return (np.zeros(len(samples)), np.zeros(len(samples)))
+        """(bias (n,) m, its standard deviation (n,) m, slope (n, 6), state (n, 6)), as of a Correction, of the effects in Samples; while
+        the yaw is unknown the mean over four headings, and its scatter, without a slope."""
         steep, others = self.effects.parted
         bias, noise = others.bias(samples), self.effects.noise_std(samples)
+        slope = state = np.zeros((len(samples), STATES))
         if len(steep):
             of_steep, slope, curved = slope_of(steep.effects, samples)
-            bias, noise = bias + of_steep, np.hypot(noise, curved)
+            bias, noise, state = bias + of_steep, np.hypot(noise, curved), state_of(samples)
         unknown = samples.yaw_std > LARGEST_YAW_STD
+        if unknown.any():
+            slope[unknown] = 0.0
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
             headings = np.concatenate([samples.q, *(rotated_in_yaw(samples.q, k) for k in range(4))])
             known, *each = turning.bias(replace(samples.repeated(5), q=headings)).reshape(5, -1)
             bias = np.where(unknown, bias - known + np.mean(each, axis=0), bias)
             noise = np.where(unknown, np.hypot(noise, np.std(each, axis=0)), noise)
-        if not len(steep):
-            return bias, noise
-        slope[unknown] = 0.0
-        return bias, noise, slope, state_of(samples)
+        return bias, noise, slope, state
 
     def samples(self, t, a, b):
         """Samples of a batch at the poses that are known by now."""

@@ -21,5 +21,5 @@ class RehearsedCorrector(Corrector):
         self.add_pose(*self._known)
 
     def correct(self, t, a, b, d):
-        bias, noise, *about = self.contribution(self.samples(t, a, b))
-        return Correction.of(d, bias, noise, np.full(len(t), EFFECTS, dtype=np.uint8), *about)
+        bias, noise, slope, state = self.contribution(self.samples(t, a, b))
+        return Correction(bias, noise, d - bias, np.full(len(t), EFFECTS, dtype=np.uint8), slope, state)

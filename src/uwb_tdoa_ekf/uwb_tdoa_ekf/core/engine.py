@@ -23,6 +23,8 @@ STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 REST_PERIOD, REST_STD = 0.05, 0.02  # s between, and m/s of, zero-velocity updates at rest
 REST_SPEED = 0.05  # m/s; a quiet tag stands still if it is known to be slower: it might also glide
 
+STRAIGHT = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
+
 RECORDS_OF_TDOA = 1 + 3 + 1 + 1  # in a history, at most: its update, workspace, fixed height, a start or a recovery
 RECORDS_OF_REST = 3  # one per axis
 RECORDS_OF_AID = 3  # one per component of a velocity
@@ -214,15 +216,16 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
 @compiled
 def _compare(hypothesis, a, b, tdoa, known, innovation):
     """Fill in what a TDOA between two of ANCHOR, `known` (m) too long, says to a HYPOTHESIS; its Jacobian is that of the position, and
-    of what its bias changes with."""
+    of what its bias changes with, where the state is about as it was when the bias was told."""
     innovation.value = tdoa.d - known - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
     innovation.entries = 3
     for k in range(STEEP):
         innovation.states[k] = k
         if k >= 3:
             innovation.row[k] = 0.0
-        if tdoa.slope[k] != 0.0:
-            innovation.value -= tdoa.slope[k] * (hypothesis.x[k] - tdoa.state[k])
+        apart = hypothesis.x[k] - tdoa.state[k]
+        if tdoa.slope[k] != 0.0 and abs(apart) < STRAIGHT:
+            innovation.value -= tdoa.slope[k] * apart
             innovation.row[k] += tdoa.slope[k]
             innovation.entries = max(innovation.entries, k + 1)
     project(hypothesis.P, innovation)

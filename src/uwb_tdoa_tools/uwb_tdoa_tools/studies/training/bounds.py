@@ -42,7 +42,7 @@ def oracle(flight, window):
     def correct(t, a, b, d):
         keys = zip(t, anchors.ids[a], anchors.ids[b], d)
         told = np.array([table[key] for key in keys]) if len(t) else np.zeros(0)
-        return Correction.of(d, told, np.zeros(len(t)), np.full(len(t), NETWORK, dtype=np.uint8))
+        return Correction.flat(d, told, np.zeros(len(t)), np.full(len(t), NETWORK, dtype=np.uint8))
 
     def nothing(*pose):
         return None
