@@ -3,9 +3,11 @@ import pytest
 
 import undeclared
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, LabelEffect, SmoothTerm
+from uwb_tdoa_tools.diagnosis import attribution
 from uwb_tdoa_tools.diagnosis.attribution import _simpler, _straightened, attribute, effects_of, residuals_of
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.regression.select import select
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import candidates_of
@@ -131,3 +133,15 @@ def test_of_two_models_that_tell_the_same_the_one_of_fewer_parameters_counts(fli
     found = select(table, [along_z], None)
     for other in (found.plus(delays[0]), found.only(())):
         assert _simpler(other, found, 10) is _simpler(found, other, 10) is found
+
+
+def test_of_two_models_of_the_same_things_the_one_that_is_worth_more_counts(flight, monkeypatch):
+    """A frame that is shifted along z and a little along x: both are shifts of the frame, and one tells three quarters of it."""
+    shifted = EFFECTS["truth_frame"]({"z": 0.3, "x": 0.02}).inject(flight)
+    frame = candidates_of(EFFECTS["truth_frame"](), flight.anchors, None)
+    whole, along_z = (next(one for one in frame if one.terms[0].keys == keys) for keys in (("x", "y", "z"), ("z",)))
+    table = table_of(residuals_of([shifted], TRUTH, EffectSet())).with_terms(whole.terms)
+    inflation = fit(table, list(whole.columns)).inflation
+    more, fewer = (select(table, [one], inflation) for one in (whole, along_z))
+    monkeypatch.setattr(attribution, "SAME_STORY", 0.3)
+    assert _simpler(more, fewer, 10) is _simpler(fewer, more, 10) is more

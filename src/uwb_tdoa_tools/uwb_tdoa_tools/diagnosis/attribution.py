@@ -259,12 +259,13 @@ def _with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress
 
 
 def _simpler(after, anew, choices):
-    """Of two Selections the one that is worth more; or the one with fewer parameters, if it is hardly worth less: how far a function
-    is off grows with its size, and many parameters can be anything."""
+    """Of two Selections the one that is worth more; or, if they tell of other things, the one with fewer parameters where it is hardly
+    worth less: how far a function is off grows with its size, and many parameters can be anything."""
     fewer, more = sorted((after, anew), key=lambda each: len(each.fit.beta))
     nothing = fit(after.table, [], after.fit.inflation).likelihood(after.table)
-    much = (1.0 - SAME_STORY) * (worth(more, choices) - nothing)
-    return fewer if worth(fewer, choices) - nothing >= much else more
+    least, most = (worth(each, choices) - nothing for each in (fewer, more))
+    same = {candidate.label for candidate in after.chosen} == {candidate.label for candidate in anew.chosen}
+    return fewer if least >= most * (1.0 if same else 1.0 - SAME_STORY) else more
 
 
 def _with_maps(selection, smooth, refused):
