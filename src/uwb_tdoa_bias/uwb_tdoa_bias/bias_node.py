@@ -245,9 +245,11 @@ class BiasNode(ros.StreamNode):
         t, d = np.array(stamps), np.array([item[5] for item in items])
         a, b = (self._corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
-        correction, found = Correction.none(d), self._corrector.correct(t[valid], a[valid], b[valid], d[valid])
-        for name, values in vars(found).items():
-            getattr(correction, name)[valid] = values
+        correction = self._corrector.correct(t[valid], a[valid], b[valid], d[valid])
+        if not valid.all():
+            found, correction = correction, Correction.none(d)
+            for name, values in vars(found).items():
+                getattr(correction, name)[valid] = values
         self._counts["invalid"] += len(t) - int(valid.sum())
         self._counts["unready"] += len(t) - sum(ready)
         self._publish(items, correction, self._epoch.parts(t) if self._late else None)

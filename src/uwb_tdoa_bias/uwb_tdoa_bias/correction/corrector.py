@@ -7,7 +7,7 @@ import numpy as np
 
 from ..effects import EffectSet, Samples
 from ..effects.motion import POSE_LAG, motion_at
-from ..effects.slope import STATES, slope_of, state_of
+from ..effects.slope import N_STATES, slope_of, state_of
 from ..foundation.compiled import compiled
 from .poses import Poses, rotated_in_yaw
 
@@ -32,7 +32,7 @@ class Correction:
     @classmethod
     def flat(cls, d, bias, std, status):
         """Of raw d (n,) m with a bias that nobody knows to change with the state."""
-        return cls(bias, std, d - bias, status, *np.zeros((2, len(d), STATES)))
+        return cls(bias, std, d - bias, status, *np.zeros((2, len(d), N_STATES)))
 
     @classmethod
     def none(cls, d):
@@ -98,21 +98,23 @@ class Corrector:
     def contribution(self, samples):
         """(bias (n,) m, its standard deviation (n,) m, slope (n, 6), state (n, 6)), as of a Correction, of the effects in Samples; while
         the yaw is unknown the mean over four headings, and its scatter, without a slope."""
+        slope = state = np.zeros((len(samples), N_STATES))
+        if not len(self.effects):
+            return np.zeros(len(samples)), np.zeros(len(samples)), slope, state
         steep, others = self.effects.parted
         bias, noise = others.bias(samples), self.effects.noise_std(samples)
-        slope = state = np.zeros((len(samples), STATES))
         if len(steep):
             of_steep, slope, curved = slope_of(steep.effects, samples)
             bias, noise, state = bias + of_steep, np.hypot(noise, curved), state_of(samples)
         unknown = samples.yaw_std > LARGEST_YAW_STD
-        if unknown.any():
-            slope[unknown] = 0.0
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
             headings = np.concatenate([samples.q, *(rotated_in_yaw(samples.q, k) for k in range(4))])
             known, *each = turning.bias(replace(samples.repeated(5), q=headings)).reshape(5, -1)
             bias = np.where(unknown, bias - known + np.mean(each, axis=0), bias)
             noise = np.where(unknown, np.hypot(noise, np.std(each, axis=0)), noise)
+        if len(steep):
+            slope[unknown] = 0.0
         return bias, noise, slope, state
 
     def samples(self, t, a, b):

@@ -36,7 +36,8 @@ class Effect:
     source : where the values came from, free text.
     An effect says what it does to measurements, and by that how it is undone, the same way in a node, off line and in a
     recording: `bias` and `noise_std` of TDOAs, `stamp_offset` of streams, `sensor_model` of inertial samples, heights and
-    velocities, `sensor_bias` of inertial samples, `sensor_functions` of what these do by the state of the filter. For `diagnose` it gives `regressors` on the channels where it shows.
+    velocities, `sensor_bias` of inertial samples, `sensor_functions` of what these do by the state of the filter. For `diagnose`
+    it gives `regressors` on the channels where it shows.
     """
 
     values: dict = field(default_factory=dict)

@@ -12,14 +12,14 @@ import numpy as np
 from .motion import Motion
 
 REACH = 0.3  # m and m/s to either side
-STATES = 6  # position and velocity of the tag, world axes
+N_STATES = 6  # position and velocity of the tag, world axes
 
 
 def slope_of(effects, samples):
     """(bias (n,) m, slope (n, 6), m per m of position and per m/s of velocity, deviation from it (n,) m) of the sum of those Effects
     that have `states`, at Samples; 0 where it cannot be told."""
     n, groups = len(samples), {}
-    bias, slope, power = np.zeros(n), np.zeros((n, STATES)), np.zeros(n)
+    bias, slope, power = np.zeros(n), np.zeros((n, N_STATES)), np.zeros(n)
     for effect in effects:
         if effect.states:
             groups.setdefault(effect.states, []).append(effect)

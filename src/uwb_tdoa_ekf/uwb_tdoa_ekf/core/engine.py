@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 
+from uwb_tdoa_bias.effects.slope import N_STATES
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
 from . import aids, barometer, height, history, hypotheses, inertial, initialization, noise, plausibility, robust, workspace
-from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, STEEP, Output
+from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, Output
 from .sensor_functions import take_out
 from .startup import INLIER
 from .state import coast, predict
@@ -219,7 +220,7 @@ def _compare(hypothesis, a, b, tdoa, known, innovation):
     of what its bias changes with, where the state is about as it was when the bias was told."""
     innovation.value = tdoa.d - known - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
     innovation.entries = 3
-    for k in range(STEEP):
+    for k in range(N_STATES):
         innovation.states[k] = k
         if k >= 3:
             innovation.row[k] = 0.0

@@ -8,13 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from uwb_tdoa_bias.effects.slope import N_STATES
+
 from .sensor_functions import rows_of
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
 from .update import INNOVATION, OFFSET_STATES
 
 HYPOTHESES = 4  # starts in as many directions while the yaw is unknown
 WINDOW = 512  # TDOAs kept for a start
-STEEP = 6  # states that a bias may change with: position and velocity
 
 
 def _record(*columns):
@@ -25,7 +26,7 @@ def _record(*columns):
 IMU_SAMPLE = _record(("t", float), ("gyro", float, 3), ("accel", float, 3))  # s, rad/s, m/s^2 (specific force); body
 TDOA = _record(
     ("t", float), ("a", int), ("b", int), ("d", float), ("variance", float),  # s, rows, m (corrected), m^2 (beyond tdoa_std)
-    ("slope", float, STEEP), ("state", float, STEEP),  # of the bias taken out, with position and velocity, about a state; m, m/s
+    ("slope", float, N_STATES), ("state", float, N_STATES),  # of the bias taken out, with position and velocity, about a state; m, m/s
 )  # fmt: skip
 AID = _record(("t", float), ("kind", int), ("value", float, 3), ("std", float, 3))  # see aids.py
 
