@@ -15,8 +15,9 @@ from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.live.session import message_class, session, subscription_qos
 
 SETTLED = 1.5  # s without news of the graph after which it is complete
-PATIENCE = 10.0  # s for a first topic or node to be seen, and for a node to answer
+PATIENCE = 15.0  # s for a first topic, node or publisher to be seen, and for a node to answer
 WINDOW = 1000  # messages that a rate is averaged over
+OF_EVERY_NODE = {"/parameter_events", "/rosout"}
 
 DESCRIPTION = """Topics, nodes and parameters, as the command of ROS 2 shows them; for those who have no ROS.
 
@@ -70,13 +71,13 @@ def parser():
 
 
 def topic_list(node, stop, args):
-    for topic, types in _settled(node.get_topic_names_and_types, stop):
+    for topic, types in _settled(node.get_topic_names_and_types, lambda topics: {*dict(topics)} - OF_EVERY_NODE, stop):
         print(f"{topic} [{', '.join(types)}]" if args.show_types else topic)
 
 
 def topic_info(node, stop, args):
     topic = _topic(node, stop, args.topic, needs_publisher=False)
-    _settled(lambda: (node.count_publishers(topic), node.count_subscribers(topic)), stop)
+    _settled(lambda: (node.count_publishers(topic), node.count_subscribers(topic)), lambda counts: counts[0] > 0, stop)
     ends = {"Publisher": node.get_publishers_info_by_topic, "Subscription": node.get_subscriptions_info_by_topic}
     print(f"Type: {', '.join(dict(node.get_topic_names_and_types())[topic])}")
     for kind, infos in ends.items():
@@ -201,9 +202,12 @@ def _the_one(answers, args):
 
 def _nodes(node, stop):
     """Absolute names of all other nodes."""
-    pairs = _settled(node.get_node_names_and_namespaces, stop)
-    names = {f"{namespace.rstrip('/')}/{name}" for name, namespace in pairs}
-    return sorted(names - {node.get_fully_qualified_name()})
+
+    def others():
+        names = {f"{namespace.rstrip('/')}/{name}" for name, namespace in node.get_node_names_and_namespaces()}
+        return sorted(names - {node.get_fully_qualified_name()})
+
+    return _settled(others, bool, stop)
 
 
 def _client(node, stop, name, missing_ok=False):
@@ -231,14 +235,14 @@ def _answer(node, stop, future):
     return future.result()
 
 
-def _settled(look, stop):
-    """What look() gives when it has not changed for a while."""
-    seen, until = look(), time.monotonic() + PATIENCE
-    while not stop and time.monotonic() < until:
+def _settled(look, found, stop):
+    """What look() gives when it has not changed for a while; what is not found(it) yet is waited for longer."""
+    seen, changed = look(), time.monotonic()
+    while not stop and time.monotonic() < changed + (SETTLED if found(seen) else PATIENCE):
         time.sleep(0.05)
         now = look()
         if now != seen:
-            seen, until = now, time.monotonic() + SETTLED
+            seen, changed = now, time.monotonic()
     return seen
 
 
