@@ -46,7 +46,7 @@ def changing(stream, name, of):
     """Stamps of a stream, "tdoa" or "imu", that drift or jump, by its Delays."""
     (drift, by), (jump, step, _) = of.drift(), of.jump()
     jumps = jump < JUMPS and abs(step) >= LEAST
-    if drift < DRIFTS and abs(by) >= LEAST and not (jumps and jump < drift):
+    if drift < DRIFTS and abs(by) >= LEAST and not (jumps and jump / JUMPS < drift / DRIFTS):  # a jump has a parameter more
         evidence = f"{by:+.2f} s over the flight; {100 * (1 - drift):.0f} % less mean square error then"
         yield Finding(f"{stream}_drift", ERROR, f"the stamps of the {name} drift against the ground truth", evidence, CLOCK, by)
     elif jumps:
