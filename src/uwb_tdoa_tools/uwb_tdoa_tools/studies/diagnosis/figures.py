@@ -138,6 +138,8 @@ def _injected(args):
         "cases": len(results),
         "found on top": bank.share(r["hit"] for r in results),
         "found, or named as an alternative": bank.share(r["hit"] or r["put_in"][0] in r["ambiguous"] for r in results),
+        "found, or named at all": bank.share(r["hit"] or r["put_in"][0] in r["ambiguous"] + r["imitators"] for r in results),
+        "effects named at all, mean": float(np.mean([len({*r["found"], *r["ambiguous"], *r["imitators"]}) for r in results])),
     }
     return {"figures": figures, "cases": results}
 

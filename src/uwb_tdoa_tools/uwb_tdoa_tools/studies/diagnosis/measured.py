@@ -113,7 +113,8 @@ def run(data, name, out, aids=()):
 
 
 def injected(data, each):
-    """Put large effects into measured flights whose own effects were diagnosed before: [dict], as of the bank, with "hit"."""
+    """Put large effects into measured flights whose own effects were diagnosed before: [dict], as of the bank, with "hit"
+    and "imitators": what explains as much, less plausibly."""
     cases = [(path, name) for path in INTO for name in SIZES if name not in (*PRESENT, *ON_AIDS)]
     known = {}
 
@@ -128,7 +129,16 @@ def injected(data, each):
         names = [f.effect.name for f in findings]
         same = next((f.effect for f in findings if f.effect.name == name), None)
         hit = same is not None and bool(set(same.values) & set(effect.values))
-        rivals = sorted({other.effect for f in findings for other in f.alternatives if other.gap is not None})
-        return {"kind": "large", "flight": flight.name, "put_in": [name], "found": names, "ambiguous": rivals, "hit": hit}
+        others = [other for f in findings for other in f.alternatives]
+        rivals, imitators = (sorted({o.effect for o in others if (o.gap is None) == less}) for less in (False, True))
+        return {
+            "kind": "large",
+            "flight": flight.name,
+            "put_in": [name],
+            "found": names,
+            "ambiguous": rivals,
+            "imitators": imitators,
+            "hit": hit,
+        }
 
     return each(cases, one)
