@@ -195,3 +195,11 @@ def test_a_filter_that_has_gone_silent_is_not_waited_for(filtered, monkeypatch):
     follower, residuals = filtered
     residuals.say(10.0)
     assert play(follower, STAMPS) == 200
+
+
+def test_tdoas_that_wait_with_the_filter_for_a_height_are_not_waited_for(filtered):
+    follower, residuals = filtered
+    follower.note_aid("/height", 10 * SECOND)
+    assert play(follower, STAMPS) == 101  # a second later the filter waits no longer
+    residuals.say(*STAMPS[:95])
+    assert play(follower, STAMPS[101:]) == 5

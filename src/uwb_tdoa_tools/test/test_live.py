@@ -1,8 +1,12 @@
 """How the nodes are started for a live run. (test_demo.py runs the real ones.)"""
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
+from uwb_tdoa_ekf.estimator import VERDICTS  # noqa: E402
 from uwb_tdoa_tools.live import run as live  # noqa: E402
 
 
@@ -17,3 +21,10 @@ def test_what_is_replayed_is_waited_for():
     arguments = live._parameters("bias_node", None)
     assert "hold:=9.975" in arguments
     assert 'qos_overrides./uwb/tdoa.subscription.reliability:="reliable"' in arguments
+
+
+def test_tdoas_that_wait_in_either_node_are_not_lost():
+    ekf = {**dict.fromkeys((*VERDICTS.values(), "imu_late", "waiting"), "1"), "IMU samples received": "4"}
+    flight = SimpleNamespace(tdoa=np.empty(len(VERDICTS) + 5), imu=np.empty(4))
+    counts = live.accounts({"waiting": "3"}, ekf, flight)
+    assert (counts["waiting"], counts["lost"], counts["imu_lost"]) == (4, 1, 0)

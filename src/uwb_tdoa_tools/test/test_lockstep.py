@@ -1,8 +1,10 @@
 """Replays that follow the nodes, with the nodes' own parameters and best-effort links, beside a computer at work."""
 
+from dataclasses import replace
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
@@ -65,6 +67,19 @@ def assert_equal_to_offline(flight, told, recorded):
     assert live.row()["rmse_3d"] == pytest.approx(offline.row()["rmse_3d"], abs=1e-3)
     assert told["bias_node"]["released before their pose"] == told["ekf_node"]["late"] == "0"
     assert told["ekf_node"]["TDOAs received"] == str(len(flight.tdoa))
+
+
+@pytest.mark.slow
+def test_heights_with_holes_are_no_reason_to_wait(tmp_path):
+    """In a hole ekf_node waits for a height, and with it all TDOAs."""
+    flight = simulate(SimulationConfig(seed=3, duration=16.0, height_noise=0.01))
+    heard = (flight.height.t - flight.height.t[0]) % 2.0 > 0.6
+    holed = {name: column[heard] for name, column in vars(flight.height).items()}
+    write_bag(replace(flight, height=replace(flight.height, **holed)), tmp_path / "flight.bag")
+    code, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path)
+    assert code == 0, said
+    assert_equal_to_offline(read_bag(tmp_path / "flight.bag"), told, recorded)
+    assert (tmp_path / "ekf_node.log").read_text().partition("running")[2].count("no TDOAs") <= 1  # when all has been played
 
 
 @pytest.mark.slow

@@ -195,8 +195,8 @@ def _count(out, flight, namespaces, diagnostics, source):
     """Fill in what was lost between the processes, and what came too late to be used."""
     out.lost = dict.fromkeys(("TDOAs", "IMU samples", "odometry"), 0)
     for space, received in zip(namespaces, source.received):
-        ekf = diagnostics.newest(_title(space, "ekf_node"))
-        became = accounts(ekf, flight)
+        bias, ekf = (diagnostics.newest(_title(space, name)) for name in ("bias_node", "ekf_node"))
+        became = accounts(bias, ekf, flight)
         out.lost["TDOAs"] += became["lost"]
         out.lost["IMU samples"] += became["imu_lost"]
         out.lost["odometry"] += int(ekf["odometry published"]) - len(received)

@@ -22,7 +22,7 @@ def measure(progress, folder, quick=False):
     for rate in RATES[:1] if quick else RATES:
         progress(f"replay at rate {rate:g}")
         live = run_live(bag, folder, rate, say=lambda text: None)
-        became, reached = accounts(live.ekf, flight), speed(live.recorded)
+        became, reached = accounts(live.bias, live.ekf, flight), speed(live.recorded)
         lost = became["lost"] + became["imu_lost"]
         late = became["late"] + became["imu_late"]
         yield Figure.of(SECTION, f"lost at rate {rate:g}", "messages", lost, 0.0 if rate <= NEEDED else None)

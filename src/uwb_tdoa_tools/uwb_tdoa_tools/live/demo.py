@@ -78,7 +78,7 @@ def fly(case, folder, rate=1.0, say=print):
         "corrected": read_odometry(live.recorded),
         "corrected, without ROS": run_offline(flight, corrector=correction).odometry,
     }
-    return accounts(live.ekf, flight), [Score(name, one, flight.truth) for name, one in estimates.items()]
+    return accounts(live.bias, live.ekf, flight), [Score(name, one, flight.truth) for name, one in estimates.items()]
 
 
 def next_steps(recording=None, survey=None):

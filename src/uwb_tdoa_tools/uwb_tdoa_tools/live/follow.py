@@ -18,6 +18,7 @@ STEP = 100_000_000  # ns: a TDOA that is older than the newest by more has come 
 START_STEP, START = 40_000_000, 1_000_000_000
 # ns: the same for so long after the first pose: less than bias_node's `pose_lag`. Before it knows of a pose it passes TDOAs on.
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
+AID_SILENT = 1_000_000_000  # ns for which ekf_node waits for heights, pressures and velocities, and all TDOAs with it
 SILENCE = 5.0  # s after which a topic is not waited for any more, until it speaks again
 POLL_PERIOD = 0.001  # s
 RESIDUAL = "uwb/residual"
@@ -48,9 +49,13 @@ class Follower:
         """A TDOA with this stamp, ns, has been played."""
         self._tdoas.note(stamp)
 
+    def note_aid(self, topic, stamp):
+        """A height, pressure or velocity with this stamp, ns, has been played, for the filter."""
+        self._tdoas.note_aid(topic, stamp)
+
     def wait(self, stamp, stop):
         """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to be played, and
-        until every TDOA older than the newest by STEP has come out of the filter.
+        until every TDOA older than the newest by STEP has come out of the filter, or older by that than an aid that the filter waits for.
 
         Returns how long that took, s; stop : true once the wait shall end.
         """
@@ -107,6 +112,7 @@ class _Tdoas:
         self._begin = self._newest = None  # ns: none up to here is waited for; newest stamp that was played
         self._out, self._silent = -math.inf, False  # ns, newest stamp that has come out
         self._first, self._shift = deque(), 0  # stamps that were played first; by how much those that come out are less
+        self._aids = {}  # {topic: ns, newest stamp that was played}
         self._learned, self._behind = 0, False  # whether START_STEP is too little, because the recorded IMU is behind its TDOAs
 
     def note(self, stamp):
@@ -117,6 +123,9 @@ class _Tdoas:
         self._newest = max(self._newest, stamp)
         if self._learned < LEARNED:
             self._first.append(stamp)
+
+    def note_aid(self, topic, stamp):
+        self._aids[topic] = stamp
 
     def wait(self, starting, stop):
         if self._subscription is None or self._newest is None:
@@ -137,7 +146,8 @@ class _Tdoas:
         return time.monotonic() - began
 
     def _is_in_step(self, step):
-        return self._newest - step <= max(self._begin, self._out + self._shift)
+        aids = (stamp for stamp in self._aids.values() if stamp > self._newest - AID_SILENT)
+        return min((self._newest, *aids)) - step <= max(self._begin, self._out + self._shift)
 
     def _learn(self, stamps):
         """Note stamps that have come out. An effect may have shifted them: the first ones tell by how much."""

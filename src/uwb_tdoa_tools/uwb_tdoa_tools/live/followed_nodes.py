@@ -58,7 +58,8 @@ class Nodes:
             for key, what in TROUBLE[name].items():
                 wrong[what] = counts.get(key, 0)
             for key, what in RECEIVED[name].items() if len(self._names) == len(TROUBLE) else ():
-                lost = player.count(what) - counts.get(key, 0)
+                waiting = after["bias_node"].get("waiting", 0) if (name, what) == ("ekf_node", "TDOAs") else 0  # on their way
+                lost = player.count(what) - counts.get(key, 0) - waiting
                 wrong[f"{what} lost"] = max(lost, wrong.get(f"{what} lost", 0))
         return {what: count for what, count in wrong.items() if count > 0}
 

@@ -45,6 +45,11 @@ def is_tdoa(publisher):
     return publisher.msg_type.__name__ == "Tdoa"
 
 
+def is_aid(publisher):
+    """Whether it publishes heights, pressures or velocities for ekf_node."""
+    return publisher.topic_name.endswith(("/height", "/pressure", "/velocity", "/velocity/odometry"))
+
+
 class Player:
     """Publishes to {topic in the bag: publisher}, `rate` times as fast as recorded, with /clock if it has a rate, Hz.
 
@@ -58,6 +63,7 @@ class Player:
         self._clock_period = 1.0 / clock_rate if clock_rate else None
         self._stamped = {topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)}
         self._tdoas = {topic for topic, publisher in publishers.items() if is_tdoa(publisher)}
+        self._aids = {topic for topic, publisher in publishers.items() if is_aid(publisher)}
         self._latched = [publisher for publisher in publishers.values() if is_latched(publisher)]
         self._start = self._began = self._next_tick = None
 
@@ -88,6 +94,8 @@ class Player:
                 self.played.counts[topic] += 1
                 if self.follower is not None and topic in self._tdoas:
                     self.follower.note_tdoa(stamp_of(data))
+                elif self.follower is not None and topic in self._aids and publisher.get_subscription_count():
+                    self.follower.note_aid(topic, stamp_of(data))
 
     def _wait_for_latched(self):
         """Wait, before the first message of a stream, until what is latched (the anchors) has been acknowledged.

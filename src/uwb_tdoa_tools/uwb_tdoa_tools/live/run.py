@@ -77,12 +77,13 @@ def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, s
     return LiveRun(recorded, diagnostics.newest("bias_node"), diagnostics.newest("ekf_node"))
 
 
-def accounts(ekf, flight):
-    """What became of the messages of a Flight that was played, by the last diagnostics of ekf_node.
+def accounts(bias, ekf, flight):
+    """What became of the messages of a Flight that was played, by the last diagnostics of bias_node and ekf_node.
 
     {verdict: TDOAs, "waiting", "lost": TDOAs, "imu_late", "imu_lost": samples}.
     """
     counts = {name: int(ekf[name]) for name in (*VERDICTS.values(), "waiting")}
+    counts["waiting"] += int(bias["waiting"])  # for a pose, which ends with the first of the streams
     counts["lost"] = len(flight.tdoa) - sum(counts.values())
     samples = 0 if flight.imu is None else len(flight.imu)
     return counts | {"imu_late": int(ekf["imu_late"]), "imu_lost": samples - int(ekf["IMU samples received"])}
