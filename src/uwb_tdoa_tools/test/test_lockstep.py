@@ -4,7 +4,6 @@ from dataclasses import replace
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
