@@ -12,6 +12,7 @@ from rclpy.serialization import serialize_message  # noqa: E402
 from sensor_msgs.msg import Imu, TimeReference  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_ekf.estimator import SILENT  # noqa: E402
 from uwb_tdoa_tools.live import follow  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 from uwb_tdoa_tools.live.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
@@ -195,6 +196,10 @@ def test_a_filter_that_has_gone_silent_is_not_waited_for(filtered, monkeypatch):
     follower, residuals = filtered
     residuals.say(10.0)
     assert play(follower, STAMPS) == 200
+
+
+def test_the_filter_waits_for_aids_as_long_as_the_replay_takes_it_to():
+    assert follow.AID_SILENT == SILENT * SECOND
 
 
 def test_tdoas_that_wait_with_the_filter_for_a_height_are_not_waited_for(filtered):

@@ -75,8 +75,8 @@ def test_heights_with_holes_are_no_reason_to_wait(tmp_path):
     heard = (flight.height.t - flight.height.t[0]) % 2.0 > 0.6
     holed = {name: column[heard] for name, column in vars(flight.height).items()}
     write_bag(replace(flight, height=replace(flight.height, **holed)), tmp_path / "flight.bag")
-    code, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path)
-    assert code == 0, said
+    _, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path)
+    assert int(told["ekf_node"]["height_late"]) <= 1, said  # the first of all, as nobody waits for what has not come yet
     assert_equal_to_offline(read_bag(tmp_path / "flight.bag"), told, recorded)
     assert (tmp_path / "ekf_node.log").read_text().partition("running")[2].count("no TDOAs") <= 1  # when all has been played
 

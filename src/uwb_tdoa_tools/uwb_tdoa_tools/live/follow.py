@@ -18,7 +18,7 @@ STEP = 100_000_000  # ns: a TDOA that is older than the newest by more has come 
 START_STEP, START = 40_000_000, 1_000_000_000
 # ns: the same for so long after the first pose: less than bias_node's `pose_lag`. Before it knows of a pose it passes TDOAs on.
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
-AID_SILENT = 1_000_000_000  # ns for which ekf_node waits for heights, pressures and velocities, and all TDOAs with it
+AID_SILENT = 1_000_000_000  # ns for which ekf_node waits for heights, pressures and velocities, and all TDOAs with it: its SILENT
 SILENCE = 5.0  # s after which a topic is not waited for any more, until it speaks again
 POLL_PERIOD = 0.001  # s
 RESIDUAL = "uwb/residual"
@@ -55,7 +55,7 @@ class Follower:
 
     def wait(self, stamp, stop):
         """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to be played, and
-        until every TDOA older than the newest by STEP has come out of the filter, or older by that than an aid that the filter waits for.
+        until every TDOA has come out of the filter that is older by STEP than the newest, and than every aid it waits for.
 
         Returns how long that took, s; stop : true once the wait shall end.
         """

@@ -52,14 +52,16 @@ class Nodes:
         """{what went wrong since: how often}, once the diagnostics have settled or `stop` is true. player : Player, who
         knows what was played."""
         after = self._counts(lambda _: stop or self._diagnostics.is_settled())
+        since = {
+            name: {key: count - self._before[name].get(key, 0) for key, count in after[name].items()} for name in self._names
+        }
         wrong = {}
-        for name in self._names:
-            counts = {key: after[name].get(key, 0) - self._before[name].get(key, 0) for key in after[name]}
+        for name, counts in since.items():
             for key, what in TROUBLE[name].items():
                 wrong[what] = counts.get(key, 0)
             for key, what in RECEIVED[name].items() if len(self._names) == len(TROUBLE) else ():
-                waiting = after["bias_node"].get("waiting", 0) if (name, what) == ("ekf_node", "TDOAs") else 0  # on their way
-                lost = player.count(what) - counts.get(key, 0) - waiting
+                on_their_way = since["bias_node"].get("waiting", 0) if (name, what) == ("ekf_node", "TDOAs") else 0
+                lost = player.count(what) - counts.get(key, 0) - on_their_way
                 wrong[f"{what} lost"] = max(lost, wrong.get(f"{what} lost", 0))
         return {what: count for what, count in wrong.items() if count > 0}
 

@@ -83,7 +83,7 @@ def accounts(bias, ekf, flight):
     {verdict: TDOAs, "waiting", "lost": TDOAs, "imu_late", "imu_lost": samples}.
     """
     counts = {name: int(ekf[name]) for name in (*VERDICTS.values(), "waiting")}
-    counts["waiting"] += int(bias["waiting"])  # for a pose, which ends with the first of the streams
+    counts["waiting"] += int(bias["waiting"])  # for poses, which end with the first of the streams
     counts["lost"] = len(flight.tdoa) - sum(counts.values())
     samples = 0 if flight.imu is None else len(flight.imu)
     return counts | {"imu_late": int(ekf["imu_late"]), "imu_lost": samples - int(ekf["IMU samples received"])}
