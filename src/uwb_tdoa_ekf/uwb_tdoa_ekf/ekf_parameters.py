@@ -33,7 +33,10 @@ PARAMETERS = {  # in the order of config/ekf_node.yaml
         10.0,
     ),
     "lag": Parameter(
-        0.25, "s of stamps; how long a silent stream is waited for; what comes later than that is late", 0.0, 100.0
+        0.25,
+        "s of stamps; how long a silent stream is waited for (height, pressure, velocity: half of that); what comes later is late",
+        0.0,
+        100.0,
     ),
 }  # fmt: skip
 

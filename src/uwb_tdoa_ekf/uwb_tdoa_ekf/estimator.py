@@ -29,6 +29,7 @@ STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
 SILENT = 1.0  # s of stamps after which height, pressure or velocity is not waited for any more, until it is back
+OF_AIDS = 0.5  # share of `lag` for which they are waited for: bias_node's `hold` must outlast that by far
 
 
 @dataclass(frozen=True)
@@ -72,9 +73,10 @@ class Estimator:
     """Time-ordered buffer, filter and accounts.
 
     Messages wait until every stream has passed them and are used in stamp order. A stream that is silent is waited for
-    for `lag` seconds of stamps, an aid (height, pressure, velocity) only if it was there a second ago; `reorder` more for
-    late siblings, unless they have come in order so far (Order). What is older than what was used is late. A stream that falls back in time starts the filter
-    anew; a single stamp far from its neighbours only counts as late, or as invalid if it lies ahead.
+    for `lag` seconds of stamps, an aid (height, pressure, velocity) for half of that, and only if it was there a second ago;
+    `reorder` more for late siblings, unless they have come in order so far (Order). What is older than what was used is late.
+    A stream that falls back in time starts the filter anew; a single stamp far from its neighbours only counts as late, or as
+    invalid if it lies ahead.
     """
 
     def __init__(self, anchors, config=None, reorder=0.003, lag=0.25, functions=()):
@@ -205,8 +207,11 @@ class Estimator:
         newest = max(stamps[IMU_STREAM], stamps[TDOA_STREAM])
         passed = []  # by each stream that is waited for
         for stream, (t, order) in enumerate(zip(stamps, self._orders)):
-            if (newest - SILENT < t < newest) if stream >= FIRST_AID else (stream == TDOA_STREAM or self.config.use_imu):
-                passed.append(order.passed(t, self.reorder))
+            if stream < FIRST_AID:
+                if stream == TDOA_STREAM or self.config.use_imu:
+                    passed.append(order.passed(t, self.reorder))
+            elif newest - SILENT < t < newest:
+                passed.append(max(order.passed(t, self.reorder), newest - OF_AIDS * self.lag))
         return self._feed(max(min(passed), newest - self.lag))
 
     def finish(self):

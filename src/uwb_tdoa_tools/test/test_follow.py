@@ -12,7 +12,8 @@ from rclpy.serialization import serialize_message  # noqa: E402
 from sensor_msgs.msg import Imu, TimeReference  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_ekf.estimator import SILENT  # noqa: E402
+from uwb_tdoa_ekf.ekf_parameters import PARAMETERS  # noqa: E402
+from uwb_tdoa_ekf.estimator import OF_AIDS, SILENT  # noqa: E402
 from uwb_tdoa_tools.live import follow  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 from uwb_tdoa_tools.live.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
@@ -151,11 +152,11 @@ STAMPS = [10.0 + 0.01 * k for k in range(200)]
 
 def test_no_tdoa_is_played_while_those_a_step_older_are_in_the_filter(filtered):
     follower, residuals = filtered
-    assert play(follower, STAMPS) == 11  # the last of them is a step newer than the first
+    assert play(follower, STAMPS) == 9  # the last of them is a step newer than the first
     residuals.say(*STAMPS[:6])
-    assert play(follower, STAMPS[11:]) == 6
+    assert play(follower, STAMPS[9:]) == 6
     residuals.say(*STAMPS[6:100])
-    assert play(follower, STAMPS[17:]) == 94
+    assert play(follower, STAMPS[15:]) == 94
 
 
 def test_steps_are_shorter_while_bias_node_may_know_of_no_pose(starting, speaker, monkeypatch):
@@ -172,7 +173,7 @@ def test_tdoas_that_are_lost_are_not_waited_for(filtered):
     follower, residuals = filtered
     play(follower, STAMPS)
     residuals.say(*STAMPS[:3], *STAMPS[7:9])
-    assert play(follower, STAMPS[11:]) == 9
+    assert play(follower, STAMPS[9:]) == 9
 
 
 def test_shifted_stamps_are_waited_for_as_little(filtered):
@@ -180,14 +181,14 @@ def test_shifted_stamps_are_waited_for_as_little(filtered):
     follower, residuals = filtered
     play(follower, STAMPS)
     residuals.say(*(stamp - 0.4 for stamp in STAMPS[:10]))
-    assert play(follower, STAMPS[11:]) == 10
+    assert play(follower, STAMPS[9:]) == 10
 
 
 def test_a_recording_that_starts_again_is_followed_anew(filtered):
     follower, residuals = filtered
     play(follower, STAMPS)
     residuals.say(*STAMPS)
-    assert play(follower, STAMPS[11:]) == 189
+    assert play(follower, STAMPS[9:]) == 191
     assert play(follower, [stamp - 5.0 for stamp in STAMPS]) == 5  # as at a start
 
 
@@ -199,12 +200,15 @@ def test_a_filter_that_has_gone_silent_is_not_waited_for(filtered, monkeypatch):
 
 
 def test_the_filter_waits_for_aids_as_long_as_the_replay_takes_it_to():
-    assert follow.AID_SILENT == SILENT * SECOND
+    found = follow.AID_SILENT, follow.AID_SHARE, follow.LAG
+    assert found == (SILENT * SECOND, OF_AIDS, PARAMETERS["lag"].default)
 
 
 def test_tdoas_that_wait_with_the_filter_for_a_height_are_not_waited_for(filtered):
     follower, residuals = filtered
     follower.note_aid("/height", 10 * SECOND)
-    assert play(follower, STAMPS) == 101  # a second later the filter waits no longer
-    residuals.say(*STAMPS[:95])
-    assert play(follower, STAMPS[101:]) == 5
+    assert play(follower, STAMPS) == 22  # it waits for half of its lag
+    residuals.say(*STAMPS[:6])
+    assert play(follower, STAMPS[22:]) == 5
+    residuals.say(*STAMPS[6:95])
+    assert play(follower, STAMPS[27:]) == 77  # after a second without one it does not

@@ -106,7 +106,7 @@ def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
     write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
     nodes = {"bias_node": ("--ros-args", "-p", "hold:=0.08")}
     code, said, _, _ = replayed(tmp_path / "flight.bag", tmp_path, nodes=nodes)
-    assert code == 2 and "hold is 0.08 s and ekf_node's lag 0.25 s; to be followed they need 0.1 s < hold < lag" in said
+    assert code == 2 and "hold is 0.08 s and ekf_node's lag 0.25 s; to be followed they need 0.205 s < hold < lag" in said
 
 
 def delayed(bag, out, count=10, delay=1_000_000_000):

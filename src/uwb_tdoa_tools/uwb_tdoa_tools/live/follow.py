@@ -12,13 +12,15 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .session import READER_DEPTH, message_class, subscription_qos
 
 LEAD = 2_000_000_000  # ns of stamps that may be played ahead
-STEP = 100_000_000  # ns: a TDOA that is older than the newest by more has come out of the filter, or is waited for
+STEP = 80_000_000  # ns: a TDOA that is older than the newest by more has come out of the filter, or is waited for
 # (STEP is more than ekf_node's `reorder`, so that it can have come out, and less than bias_node's `hold` and ekf_node's
 # `lag`, so that neither goes on without what is still on its way.)
 START_STEP, START = 40_000_000, 1_000_000_000
 # ns: the same for so long after the first pose: less than bias_node's `pose_lag`. Before it knows of a pose it passes TDOAs on.
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
-AID_SILENT = 1_000_000_000  # ns for which ekf_node waits for heights, pressures and velocities, and all TDOAs with it: its SILENT
+AID_SILENT = 1_000_000_000  # ns after which ekf_node does without heights, pressures and velocities: its SILENT
+AID_SHARE = 0.5  # of its `lag`, for which it waits for them, and all TDOAs with it: its OF_AIDS
+LAG = 0.25  # s, its `lag` if nothing else is known
 SILENCE = 5.0  # s after which a topic is not waited for any more, until it speaks again
 POLL_PERIOD = 0.001  # s
 RESIDUAL = "uwb/residual"
@@ -31,8 +33,8 @@ class Follower:
     Where somebody also publishes uwb/residual, one message for each TDOA, TDOAs are followed too (`note_tdoa`).
     """
 
-    def __init__(self, node, topic):
-        """Raises InputError if nobody publishes the topic, or its messages have no header."""
+    def __init__(self, node, topic, lag=LAG):
+        """lag : s, of ekf_node. Raises InputError if nobody publishes the topic, or its messages have no header."""
         topic = node.resolve_topic_name(topic)
         types = dict(node.get_topic_names_and_types()).get(topic)
         if not types or not node.count_publishers(topic):
@@ -43,7 +45,7 @@ class Follower:
         self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)  # taken, never spun
         self._newest = self._looked = self._started = None
         self._silent = False
-        self._tdoas = _Tdoas(node)
+        self._tdoas = _Tdoas(node, round(1e9 * AID_SHARE * lag))
 
     def note_tdoa(self, stamp):
         """A TDOA with this stamp, ns, has been played."""
@@ -55,7 +57,8 @@ class Follower:
 
     def wait(self, stamp, stop):
         """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to be played, and
-        until every TDOA has come out of the filter that is older by STEP than the newest, and than every aid it waits for.
+        until every TDOA has come out of the filter that is older by STEP than what it goes to by now: the newest, or less while it
+        waits for an aid.
 
         Returns how long that took, s; stop : true once the wait shall end.
         """
@@ -98,8 +101,8 @@ class Follower:
 class _Tdoas:
     """How far the TDOAs that were played have come out of the filter, in the order of their stamps."""
 
-    def __init__(self, node):
-        self._subscription = None
+    def __init__(self, node, aid_wait):
+        self._subscription, self._aid_wait = None, aid_wait
         publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(RESIDUAL))
         cls = message_class(publishers[0].topic_type) if publishers else None
         if cls is not None:
@@ -146,8 +149,9 @@ class _Tdoas:
         return time.monotonic() - began
 
     def _is_in_step(self, step):
-        aids = (stamp for stamp in self._aids.values() if stamp > self._newest - AID_SILENT)
-        return min((self._newest, *aids)) - step <= max(self._begin, self._out + self._shift)
+        aids = [stamp for stamp in self._aids.values() if stamp > self._newest - AID_SILENT]
+        reach = max(min((self._newest, *aids)), self._newest - self._aid_wait)  # how far the filter goes
+        return reach - step <= max(self._begin, self._out + self._shift)
 
     def _learn(self, stamps):
         """Note stamps that have come out. An effect may have shifted them: the first ones tell by how much."""

@@ -7,7 +7,7 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .follow import STEP
+from .follow import AID_SHARE, LAG, STEP
 from .processes import Diagnostics
 
 SPIN = 0.05  # s
@@ -29,7 +29,9 @@ RECEIVED = {  # {node: {key in its diagnostics: what it counts}}
 
 
 class Nodes:
-    """bias_node and ekf_node in our namespace, as far as they are there."""
+    """bias_node and ekf_node in our namespace, as far as they are there. lag : s, ekf_node's."""
+
+    lag = LAG
 
     def __init__(self, node):
         """Raises InputError if their parameters do not allow to wait for what is on its way, or if one says nothing on
@@ -80,12 +82,13 @@ class Nodes:
         }
 
     def _check_patience(self):
-        """STEP < hold < lag, or one of the nodes goes on without what is still on its way."""
-        hold, lag = (self._parameter(name, parameter) for name, parameter in PATIENCE.items())
-        if not 1e-9 * STEP < hold < lag:
+        """What may wait in the filter, for aids too, < hold < lag, or one of the nodes goes on without what is still on its way."""
+        hold, self.lag = (self._parameter(name, parameter) for name, parameter in PATIENCE.items())
+        least = 1e-9 * STEP + AID_SHARE * self.lag
+        if not least < hold < self.lag:
             raise InputError(
-                f"--follow: bias_node's hold is {hold:g} s and ekf_node's lag {lag:g} s; to be followed they need "
-                f"{1e-9 * STEP:g} s < hold < lag."
+                f"--follow: bias_node's hold is {hold:g} s and ekf_node's lag {self.lag:g} s; to be followed they need "
+                f"{least:g} s < hold < lag."
             )
 
     def _wait_for_names(self):

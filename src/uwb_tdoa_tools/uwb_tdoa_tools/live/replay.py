@@ -63,8 +63,8 @@ def replay(bag, options=Options(), say=print):
             raise InputError(f"{bag}: has no message to replay.")
         player = Player(node, publishers, options.rate, options.clock_rate, stop)
         _wait_for_listeners(node, publishers, options, stop, say)
-        player.follower = Follower(node, options.follow) if options.follow else None
         nodes = Nodes(node) if options.follow else None
+        player.follower = Follower(node, options.follow, nodes.lag) if options.follow else None
         length = (reader.end_time - reader.start_time) / 1e9
         say(f"playing {count} messages, {length:.1f} s at rate {options.rate:g}")
         began = time.perf_counter()
