@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -102,6 +103,24 @@ def test_cases_cost_what_they_must():
     drawn = (blind.case(blind.Simulated(), seed) for seed in range(20))
     effect, flown, plain, base, where = next(one for one in drawn if one is not None)
     assert all(blind.rmse(one, base) - blind.rmse(none, base) >= blind.LEAST_COST for one, none in zip(flown, plain))
+
+
+def test_of_several_flights_all_but_the_last_are_diagnosed_and_the_last_one_judges(monkeypatch):
+    seen = []
+
+    def diagnose(flights, base):
+        seen.append(flights)
+        return SimpleNamespace(findings=[], effects=base)
+
+    monkeypatch.setattr(blind, "diagnose", diagnose)
+    source = blind.Simulated()
+    seed = next(seed for seed in range(20) if blind.case(source, seed, 3) is not None)
+    _, flown, flights, _, _ = blind.case(source, seed, 3)
+    one, two = blind.several(source, 3, seed)
+    assert [[flight.name for flight in some] for some in seen[::2]] == [[flown[0].name], [flown[0].name, flown[1].name]]
+    assert all(np.array_equal(some[0].tdoa.d, flights[0].tdoa.d) for some in seen[1::2])  # as they are
+    assert one["rmse"] == two["rmse"] and one["rmse"][:2] == [blind.rmse(flights[2], EffectSet()), blind.rmse(flown[2], EffectSet())]
+    assert one["removed"] == two["removed"] == 0.0 and one["place"] is two["place"] is None
 
 
 @pytest.mark.parametrize("covariate", ["speed", "x", "previous_anchor", "interval"])

@@ -1,6 +1,7 @@
 """The blind bank: effects of the grammar put into flights, measured ones on top of what others of the day have told.
 
-An effect is put into two flights. One is diagnosed, the other judges what was found: named rightly, and removed.
+An effect is put into two flights. One is diagnosed, the other judges what was found: named rightly, and removed. Or into more,
+of which the last one judges what was found in one of the others, in two of them, and so on.
 """
 
 from dataclasses import replace
@@ -40,7 +41,7 @@ LOOKED_AT = ("0425 a", "0426 a", "const1", "const4 trial 1")  # while this was d
 
 
 class Measured:
-    """Pairs of measured flights, each with what the other flights of its day and installation have told."""
+    """Measured flights, with what the other flights of their day and installation have told."""
 
     def __init__(self, data, out, splits=tuple(GROUPS)):
         """data, out : Paths; what `measured` has written to `out` is what is known, and it is made where it is missing."""
@@ -52,13 +53,16 @@ class Measured:
     def _known(self, split):
         return self._out / measured.folder_of(split) / "effects.yaml"
 
-    def pair(self, rng):
-        """((Flight, Flight), EffectSet, name of the split)."""
-        split = self._splits[rng.integers(len(self._splits))]
+    def flights(self, rng, number):
+        """([Flight] of that number, EffectSet, name of the split)."""
+        groups = {split: [group for group in GROUPS[split] if len(group) >= number] for split in self._splits}
+        splits = [split for split in self._splits if groups[split]]
+        split = splits[rng.integers(len(splits))]
         flights = _judged(self._data, split)
-        group = GROUPS[split][rng.integers(len(GROUPS[split]))]
+        group = groups[split][rng.integers(len(groups[split]))]
         first = int(rng.integers(len(group)))
-        return (flights[group[first]], flights[group[(first + 1) % len(group)]]), EffectSet.from_yaml(self._known(split)), split
+        chosen = [flights[group[(first + k) % len(group)]] for k in range(number)]
+        return chosen, EffectSet.from_yaml(self._known(split)), split
 
 
 @cache
@@ -67,13 +71,13 @@ def _judged(data, split):
 
 
 class Simulated:
-    """Pairs of simulated flights without any other effect."""
+    """Simulated flights without any other effect."""
 
-    def pair(self, rng):
-        """As that of Measured."""
+    def flights(self, rng, number):
+        """As those of Measured."""
         seed = int(rng.integers(1000, 100000))
-        flights = clean_flight(seed), clean_flight(seed + 20 * int(rng.integers(1, 50)))
-        return flights, EffectSet(), "simulated"
+        others = [seed + 20 * int(rng.integers(1, 50)) for _ in range(number - 1)]
+        return [clean_flight(one) for one in (seed, *others)], EffectSet(), "simulated"
 
 
 def rmse(flight, effects):
@@ -83,16 +87,16 @@ def rmse(flight, effects):
     return score.row()["rmse_3d"] if len(score.t) else np.inf
 
 
-def case(source, seed):
-    """(Undeclared, pair of flights with it, pair without, base, where) of a seed; None if the effect costs too little however it
-    is enlarged."""
-    pair, base, where = source.pair(np.random.default_rng([seed, 7]))
-    effect = grammar.draw(seed, pair[0])
-    before = [rmse(flight, base) for flight in pair]
+def case(source, seed, number=2):
+    """(Undeclared, `number` flights with it, the same without, base, where) of a seed; None if the effect costs too little however
+    it is enlarged."""
+    flights, base, where = source.flights(np.random.default_rng([seed, 7]), number)
+    effect = grammar.draw(seed, flights[0])
+    before = [rmse(flight, base) for flight in flights]
     for _ in range(1 + GROWTHS):
-        flown = [effect.inject(flight) for flight in pair]
+        flown = [effect.inject(flight) for flight in flights]
         if all(rmse(one, base) - none >= LEAST_COST for one, none in zip(flown, before)):
-            return effect, flown, pair, base, where
+            return effect, flown, flights, base, where
         effect = replace(effect, size=effect.size * GROW)
     return None
 
@@ -131,33 +135,41 @@ def told(effect, flown, plain, base):
     return rmse(flown, base) if effect.covariate in grammar.OF_POSE[1:] else plain
 
 
-_as_they_are = {}  # {(where, flight): ([Claim], m of the other flight's error)} of this process: seeds share flights
+_told_as_they_are = {}  # {(where, flights): ([Claim], m of the judging flight's error)} of this process: seeds share flights
 
 
-def _as_it_is(pair, base, where):
-    """What is said of the first flight of a pair as it is, and the error of the second with that."""
-    key = where, pair[0].name, pair[1].name
-    if key not in _as_they_are:
-        result = diagnose(pair[:1], base=base)
-        _as_they_are[key] = claims(result.findings), rmse(pair[1], result.effects)
-    return _as_they_are[key]
+def _as_they_are(flights, judge, base, where):
+    """What is said of flights as they are, and the error of the flight that judges with that."""
+    key = where, *(flight.name for flight in (*flights, judge))
+    if key not in _told_as_they_are:
+        result = diagnose(flights, base=base)
+        _told_as_they_are[key] = claims(result.findings), rmse(judge, result.effects)
+    return _told_as_they_are[key]
 
 
 def run(source, seed):
     """dict of the case of a seed; None if it costs too little."""
     drawn = case(source, seed)
-    if drawn is None:
-        return None
-    effect, flown, pair, base, where = drawn
-    result = diagnose(flown[:1], base=base)
-    plain, before, after = rmse(pair[1], base), rmse(flown[1], base), rmse(flown[1], result.effects)
-    known, plain_after = _as_it_is(pair, base, where)
+    return None if drawn is None else {"seed": seed, **_judge(1, *drawn)}
+
+
+def several(source, number, seed):
+    """[dict] of the case of a seed among so many flights, with one of them diagnosed, with two, and so on; None if it costs too
+    little."""
+    drawn = case(source, seed, number)
+    return None if drawn is None else [{"seed": seed, **_judge(count, *drawn)} for count in range(1, number)]
+
+
+def _judge(count, effect, flown, flights, base, where):
+    """dict of a case of which the first `count` flights are diagnosed. The last one judges."""
+    result = diagnose(flown[:count], base=base)
+    plain, before, after = rmse(flights[-1], base), rmse(flown[-1], base), rmse(flown[-1], result.effects)
+    known, plain_after = _as_they_are(flights[:count], flights[-1], base, where)
     said, true = claims(result.findings), truth_of(effect, flown[0])
     new = [claim for claim in said if not any(claim.names(one) and claim.depends_as(one) for one in known)]
     place, among_new = (next((k for k, claim in enumerate(some) if claim.names(true)), None) for some in (said, new))
     return as_json(
         {
-            "seed": seed,
             "where": where,
             "flight": flown[0].name,
             "effect": effect.name,
@@ -174,7 +186,7 @@ def run(source, seed):
             "shape_right": place is not None and said[place].shape == true.shape,
             "rmse": [value if np.isfinite(value) else None for value in (plain, before, after, plain_after)],
             "removed": float(1.0 - (after - plain) / (before - plain)),
-            "removed_if_told": float(1.0 - (told(effect, flown[1], plain, base) - plain) / (before - plain)),
+            "removed_if_told": float(1.0 - (told(effect, flown[-1], plain, base) - plain) / (before - plain)),
         }
     )
 

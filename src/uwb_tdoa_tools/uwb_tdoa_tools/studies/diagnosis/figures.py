@@ -23,18 +23,19 @@ from ...surveying.tape import Tape
 from . import bank, blind, faults, measured, referenced, undeclared
 
 PARTS = (
-    "bank", "aids", "no-truth", "undeclared", "blind", "faults", "injected", "measured", "measured-aids", "references", "speed",
+    "bank", "aids", "no-truth", "undeclared", "blind", "several", "faults", "injected", "measured", "measured-aids", "references", "speed",
 )  # fmt: skip
+SEVERAL_MEASURED, SEVERAL_SIMULATED = 3, 4  # flights with the same effect: no measured group of one protocol has more
 
 
 def add_options(add):
     """The options of the study."""
     add("part", choices=PARTS, help="what to run")
     add("--out", metavar="DIR", type=Path, required=True, help="where to write")
-    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, cases of blind, or costly draws of each of the faults (default: 5)")
-    add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind, faults and no-truth (default: %(default)s)")
+    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, cases of blind and several, or costly draws of each of the faults (default: 5)")
+    add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind, several, faults and no-truth (default: %(default)s)")
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
-    add("--jobs", metavar="N", type=whole_number, default=1, help="cases of blind at once (default: %(default)s)")
+    add("--jobs", metavar="N", type=whole_number, default=1, help="cases of blind and several at once (default: %(default)s)")
     add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
 
 
@@ -52,6 +53,7 @@ def run(args):
         "no-truth": _no_truth,
         "undeclared": _undeclared,
         "blind": _blind,
+        "several": _several,
         "faults": _faults,
         "injected": _injected,
         "measured": _measured,
@@ -107,22 +109,39 @@ def _undeclared(args):
 
 def _blind(args):
     """In measured flights if there are any, else in simulated ones and in those with nothing."""
-    source = blind.Simulated() if args.data is None else blind.Measured(args.data, args.out)
-    results, seed = [], args.first
-    with ResultsFile(args.out / "blind.jsonl", {"data": str(args.data)}) as done:
-        while len(results) < args.seeds:
-            seeds = range(seed, seed + args.seeds - len(results))
-            missing = [one for one in seeds if str(one) not in done]
-            for one, result in zip(missing, over(partial(blind.run, source), missing, args.jobs, unit="case")):
-                done[str(one)] = result
-            results += [done[str(one)] for one in seeds if done[str(one)] is not None]
-            seed = seeds.stop
+    results = _drawn(args, partial(blind.run, _source(args)))
     figures = blind.figures(results)
     if args.data is None:
         clean = list(blind.false_alarms(args.seeds, args.first))
         figures["false alarms"] = bank.share(bool(r["said"]) for r in clean)
     _confusions(results, args.out / "blind.png")
     return {"figures": figures, "cases": results}
+
+
+def _several(args):
+    """One, two and, where there are enough, three of the flights with the same effect, judged on one more."""
+    number = SEVERAL_SIMULATED if args.data is None else SEVERAL_MEASURED
+    results = _drawn(args, partial(blind.several, _source(args), number))
+    figures = {f"flights diagnosed: {k + 1}": blind.figures([case[k] for case in results]) for k in range(number - 1)}
+    return {"figures": figures, "cases": results}
+
+
+def _source(args):
+    return blind.Simulated() if args.data is None else blind.Measured(args.data, args.out)
+
+
+def _drawn(args, function):
+    """What a function of a seed returns, of the first seeds for which that is not None; kept as it comes."""
+    results, seed = [], args.first
+    with ResultsFile(args.out / f"{args.part}.jsonl", {"data": str(args.data)}) as done:
+        while len(results) < args.seeds:
+            seeds = range(seed, seed + args.seeds - len(results))
+            missing = [one for one in seeds if str(one) not in done]
+            for one, result in zip(missing, over(function, missing, args.jobs, unit="case")):
+                done[str(one)] = result
+            results += [done[str(one)] for one in seeds if done[str(one)] is not None]
+            seed = seeds.stop
+    return results
 
 
 def _faults(args):
