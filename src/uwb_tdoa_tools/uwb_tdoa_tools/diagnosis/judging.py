@@ -132,7 +132,7 @@ def useful(attribution, flights, baseline, progress=lambda: None, over=map):
     for momentary in (one for one in candidates if len(flights) == 1 and _momentary(one)):
         refused.append(Refused(momentary.label, "it happened at a time of this flight; of another one that tells nothing"))
         candidates = [one for one in candidates if one is not momentary]
-    return Kept(attribution.selection.only(candidates), tuple(detections), tuple(refused), worth)
+    return Kept(attribution.selection.kept(candidates), tuple(detections), tuple(refused), worth)  # fitted as in the trials
 
 
 def _applicable(candidates):

@@ -91,12 +91,17 @@ def fit(table, columns, inflation=None):
     return Fit(tuple(columns), beta, cov, residual, weight, scale, inflation, np.maximum(size, 1.0))
 
 
-def refit(table, columns, model, rows):
-    """Fit of some Columns to some rows (n,) bool alone, with the weights and scales of another Fit."""
+def refit(table, columns, model, rows=None):
+    """Fit of some Columns with the weights and scales of another Fit; rows : (n,) bool, those that it is made to alone, with the
+    covariance of the model."""
     x, sizes, root = table.matrix(columns), prior_sizes(columns), model.information(table)
-    xw = x[rows] * root[rows, None]
-    beta, cov, _ = solve(xw.T @ x[rows], xw.T @ table.y[rows], sizes)
-    return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=table.y - x @ beta)
+    some = slice(None) if rows is None else rows
+    xw = x[some] * root[some, None]
+    beta, cov, _ = solve(xw.T @ x[some], xw.T @ table.y[some], sizes)
+    residual = table.y - x @ beta
+    if rows is None and columns:
+        cov = _covariance(table, x, residual, root, sizes)
+    return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=residual)
 
 
 def _scales(table, residual):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..channels import CHANNELS
-from .fit import Fit, fit
+from .fit import Fit, fit, refit
 from .scorer import Scorer
 from .table import Table
 from .terms import columns_of
@@ -44,11 +44,18 @@ class Selection:
 
     def only(self, candidates):
         """Selection of some of the chosen Candidates, fitted anew."""
+        chosen = self._chosen_of(candidates)
+        return replace(self, **chosen, fit=fit(self.table, columns_of(chosen["chosen"]), self.fit.inflation))
+
+    def kept(self, candidates):
+        """Selection of some of the chosen Candidates, fitted with the present weights: what the others explain is not taken for
+        outliers."""
+        chosen = self._chosen_of(candidates)
+        return replace(self, **chosen, fit=refit(self.table, columns_of(chosen["chosen"]), self.fit))
+
+    def _chosen_of(self, candidates):
         places = [k for k, candidate in enumerate(self.chosen) if candidate in candidates]
-        chosen = tuple(self.chosen[k] for k in places)
-        model = fit(self.table, columns_of(chosen), self.fit.inflation)
-        loss, rivals = (tuple(each[k] for k in places) for each in (self.loss, self.rivals))
-        return replace(self, chosen=chosen, fit=model, loss=loss, rivals=rivals)
+        return {name: tuple(getattr(self, name)[k] for k in places) for name in ("chosen", "loss", "rivals")}
 
     def plus(self, candidate):
         """Selection with one more Candidate, whose columns the table has."""
