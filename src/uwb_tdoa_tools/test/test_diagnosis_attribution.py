@@ -145,3 +145,12 @@ def test_of_two_models_of_the_same_things_the_one_that_is_worth_more_counts(flig
     more, fewer = (select(table, [one], inflation) for one in (whole, along_z))
     monkeypatch.setattr(attribution, "SAME_STORY", 0.3)
     assert _simpler(more, fewer, 10) is _simpler(fewer, more, 10) is more
+
+
+def test_maps_of_the_place_are_looked_for_in_three_flights_or_more(monkeypatch):
+    looked = []
+    monkeypatch.setattr(attribution, "_with_maps", lambda selection, *_: looked.append(selection.table.flights) or selection)
+    flights = [clean_flight(seed, 17.0) for seed in (100, 101, 102)]
+    for number in (1, 2, 3):
+        attribute(flights[:number], TRUTH)
+    assert looked == [3]

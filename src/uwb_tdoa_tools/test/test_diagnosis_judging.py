@@ -87,11 +87,13 @@ def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recu
 
 def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights):
     two = [EFFECTS["gyro_bias"]({"z": 0.006}).inject(flight) for flight in flights]
-    several, alone = (useful(attribute(some, TRUTH, undeclared=False), some, Baseline(NONE)) for some in (two, two[:1]))
+    found = [attribute(some, TRUTH, undeclared=False) for some in (two, two[:1])]
+    several, alone = (useful(one, some, Baseline(NONE)) for one, some in zip(found, (two, two[:1])))
     assert {candidate.name for candidate in several.candidates} == {"anchor_delay", "gyro_bias"}
     assert {candidate.name for candidate in alone.candidates} == {"anchor_delay"}
     assert "of one flight, worth less than 5% of the error" in alone.refused[-1].why
     assert sorted(candidate.name for candidate in alone.worth) == ["anchor_delay", "gyro_bias"]
+    assert np.array_equal(alone.selection.fit.weight, found[1].selection.fit.weight)  # it is applied as it was tried
 
 
 def test_what_no_node_can_take_out_is_not_tried():

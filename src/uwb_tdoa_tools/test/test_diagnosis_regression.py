@@ -141,6 +141,19 @@ def test_a_refit_to_some_rows_does_not_look_at_the_others(late):
     np.testing.assert_allclose(refit(table, columns, model, half).beta, refit(spoilt, columns, model, half).beta)
 
 
+def test_what_is_kept_is_fitted_with_the_weights_of_all_that_was_chosen(late):
+    table, candidates = late
+    delay, idle = named(candidates, "anchor_delay"), named(candidates, "gyro_bias", ("x",))
+    selection = select(table, [delay], fit(table, columns_of(candidates)).inflation).plus(idle)
+    spoilt = replace(selection, fit=replace(selection.fit, weight=np.where(table.block % 2 == 0, selection.fit.weight, 1e-9)))
+    kept = spoilt.kept([delay])
+    assert kept.chosen == (delay,) and len(kept.loss) == len(kept.rivals) == 1
+    half = refit(table, delay.columns, selection.fit, table.block % 2 == 0)
+    np.testing.assert_allclose(kept.fit.beta, half.beta, rtol=1e-6)
+    assert (np.diag(kept.fit.cov) >= np.diag(half.cov) * (1.0 - 1e-6)).all()
+    assert np.abs(spoilt.only([delay]).fit.beta - half.beta).max() > 1e-4
+
+
 def test_an_alternative_is_named_where_the_flight_cannot_tell(late):
     table, candidates = late
     inflation = fit(table, columns_of(candidates)).inflation

@@ -26,6 +26,7 @@ STRAIGHT = 0.1  # of the channel's scale: root mean square by which a linear mod
 MAPS_GAIN, MAPS_SURE = 20.0, 3.0  # held-out log-likelihood, twice, and its t value over blocks, that maps must bring
 DISGUISED = 4  # times that what disguises itself as noise is searched for before noise is measured
 SAME_STORY = 0.05  # share of what a model explains that a simpler one may explain less
+FOR_MAPS = 3  # flights: a map of fewer is of their paths, and misleads others; two that fly alike bear each other out
 MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
 
 
@@ -104,7 +105,7 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
         selection = _straightened(selection, at, declared + smooth)
         selection = _that_hold_on_other_data(selection, refused)
     selection = with_rivals(selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress)
-    if undeclared and len(flights) > 1:  # maps of one flight are of its path, and mislead others
+    if undeclared and len(flights) >= FOR_MAPS:
         selection = _with_maps(selection, smooth, refused)
     remaining = at(effects_of(selection))
     detections = (detector.detect(remaining) for detector in detectors)

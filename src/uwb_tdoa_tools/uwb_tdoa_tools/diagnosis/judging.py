@@ -32,6 +32,7 @@ SURE = 4.0
 DRIFTS = ("line", "beyond", "below", "parabola")  # shapes of a function of the time that may come again, as a clock warms up
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
 WORTH_OF_ONE = 0.05  # share of the error by which it must grow, for the effect to stay, if a single flight shows it: others differ
+SECOND = "give a second flight with this one"
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
 
@@ -130,7 +131,7 @@ def useful(attribution, flights, baseline, progress=lambda: None, over=map):
             why = useless if trial >= error * (1.0 - WORSE) else _why_without(trial, error)
             refused.append(Refused(detection.effect.label, why))
     for momentary in (one for one in candidates if len(flights) == 1 and _momentary(one)):
-        refused.append(Refused(momentary.label, "it happened at a time of this flight; of another one that tells nothing"))
+        refused.append(Refused(momentary.label, f"it happened at a time of this flight; of another one that tells nothing: {SECOND}"))
         candidates = [one for one in candidates if one is not momentary]
     return Kept(attribution.selection.kept(candidates), tuple(detections), tuple(refused), worth)  # fitted as in the trials
 
@@ -145,7 +146,7 @@ def _why_without(error, without):
     figures = f"{error:.3f} m with, {without:.3f} m without"
     if without <= error * (1.0 - WORSE):
         return f"the filter does better without it: {figures}"
-    return f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error ({figures}), it may as well do harm to another"
+    return f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error ({figures}), it may as well do harm to another: {SECOND}"
 
 
 def _momentary(candidate):
