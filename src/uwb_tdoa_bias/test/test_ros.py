@@ -59,16 +59,21 @@ def test_simulated_time_that_stands_still_or_is_missing_is_said():
     rclpy.init(args=["--ros-args", "-p", "use_sim_time:=true"])
     node, other = rclpy.create_node("on_simulated_time"), rclpy.create_node("player", use_global_arguments=False)
     try:
-        clock, source = ros.SimulatedClock(node), other.create_publisher(Clock, "/clock", 10)
+        wall = [0.0]
+        clock, source = ros.SimulatedClock(node, lambda: wall[0]), other.create_publisher(Clock, "/clock", 10)
         level, text = clock.judge()
         assert level == DiagnosticStatus.WARN and "nobody publishes /clock" in text
-        for second, expected in ((5, None), (6, None), (6, (DiagnosticStatus.OK, "paused: /clock stands still")), (7, None)):
+        paused = DiagnosticStatus.OK, "paused: /clock stands still"
+        for wall[0], second, expected in (
+            (0.0, 5, None), (0.2, 6, None), (0.6, 6, None), (0.8, 6, paused), (9.0, 6, paused), (9.2, 7, None), (9.4, 7, None),
+            (10.2, 8, None), (11.2, 9, None), (12.2, 9, None), (13.0, 9, None), (13.3, 9, paused),  # once a second: runs, too
+        ):  # fmt: skip
             for _ in range(200):
                 source.publish(Clock(clock=ros.Time(sec=second)))
                 rclpy.spin_once(node, timeout_sec=0.05)
                 if node.get_clock().now().nanoseconds == second * 10**9:
                     break
-            assert clock.judge() == expected
+            assert clock.judge() == expected, wall
     finally:
         for each in (node, other):
             each.destroy_node()

@@ -2,10 +2,14 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
+from rclpy.exceptions import ParameterNotDeclaredException  # noqa: E402
+from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: E402
 from rclpy.impl.rcutils_logger import RcutilsLogger  # noqa: E402
+from rclpy.parameter import Parameter as Value  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_parameters import (  # noqa: E402
     Parameter,
+    ParameterNode,
     declare_all,
     files_of,
     refuse_unknown,
@@ -28,7 +32,7 @@ def node_with():
 
     def make(*arguments):
         rclpy.init(args=["--ros-args", *arguments])
-        nodes.append(rclpy.create_node("some_node", namespace="tag1"))
+        nodes.append(ParameterNode("some_node", namespace="tag1"))
         nodes[-1].NAME = "some_node"
         return nodes[-1]
 
@@ -107,3 +111,54 @@ def test_a_file_that_counts_is_not_said(node_with, said, tmp_path):
     assert files_of(["node", "--ros-args", *arguments]) == [str(file)]
     say_unused([node], files_of(arguments))
     assert not said
+
+
+ODD = [  # texts of a parameter file, and whether rcl takes it
+    "/**: {ros__parameters: {speeds: !!python/tuple [1.0, 2.0]}}",  # as launch_ros writes every list
+    "/**: {ros__parameters: {mode: !!str none}}",
+    "/**: {ros__parameters: {mode: !ours none}}",
+    "/**: {ros__parameters: {mode: none, mode: base}}",
+    "/**: {ros__parameters: {gate: .inf}}",
+    "/**: {ros__parameters: {mode: 010}}",
+    "/**: {ros__parameters: {gate: 1e400}}",
+    "/**: {ros__parameters: {count: 99999999999999999999}}",
+    "/**: {ros__parameters: {mode: &a none, other: *a}}",
+    "/**: {ros__parameters: {mode: none}}\n---\n/**: {ros__parameters: {mode: base}}",
+    "/**: {ros__parameters: {mode: }}",
+    "/**: {ros__parameters: {speeds: []}}",
+    "/**: {ros__parameters: {? [a] : 1}}",
+    "/**: [1, 2]",
+    "just a text",
+    "",
+    "\xff",
+]
+
+
+@pytest.mark.parametrize("text", ODD)
+def test_a_parameter_file_is_judged_by_rcl_alone(node_with, said, tmp_path, text):
+    file = tmp_path / "odd.yaml"
+    file.write_bytes(text.encode("latin-1"))
+    try:
+        node = node_with("--params-file", str(file))
+    except rclpy_implementation.RCLError:
+        rclpy.init()  # what it refuses, it refuses before any node is there
+        return
+    say_unused([node], [str(file)])
+    given = any(name in node._parameter_overrides for name in PARAMETERS)
+    assert given or "!!python/tuple" not in text
+    assert not (given and said)
+
+
+def test_a_read_only_parameter_may_be_set_to_what_it_is(node_with):
+    node = node_with("-p", "count:=3", "-p", "speeds:=[1.5, 2.5]")
+    declare_all(node, PARAMETERS)
+    so = [Value("count", value=3), Value("speeds", value=[1.5, 2.5]), Value("mode", value="base"), Value("use_it", value=True)]
+    for parameters in ([one] for one in so):
+        assert node.set_parameters_atomically(parameters).successful
+    assert node.set_parameters_atomically([*so, Value("gate", value=5.0)]).successful and node.get_parameter("gate").value == 5.0
+    for other in (Value("count", value=4), Value("count", value=3.0), Value("speeds", value=[1.5]), Value("mode", value="none")):
+        result = node.set_parameters_atomically([so[0], Value("gate", value=6.0), other])
+        assert not result.successful and "read-only" in result.reason
+    assert node.get_parameter("gate").value == 5.0
+    with pytest.raises(ParameterNotDeclaredException):
+        node.set_parameters_atomically([Value("unknown", value=1)])

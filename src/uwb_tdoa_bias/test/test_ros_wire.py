@@ -1,3 +1,5 @@
+import struct
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,8 @@ from nav_msgs.msg import Odometry, Path  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from sensor_msgs.msg import FluidPressure, Imu, Range  # noqa: E402
 from uwb_tdoa_bias.foundation import ros_wire  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_wire import Wire  # noqa: E402
-from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected, TdoaResidual  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_wire import LONGEST_TEXT, MOST_ELEMENTS, Unreadable, Wire, decode  # noqa: E402
+from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual  # noqa: E402
 
 POSE = "pose.pose.position", "pose.pose.orientation", "pose.covariance"
 
@@ -45,8 +47,9 @@ def test_messages_are_read_in_order_in_runs_of_one_frame(way):
     messages = [corrected(k, frame, model="x" * (k % 2)) for k, frame in enumerate(frames)]
     wire = Wire(TdoaCorrected, "corrected", "anchor_b", "status")
     parts = wire.read([serialize_message(message) for message in messages])
-    assert [frame for frame, rows in parts for _ in rows] == frames
-    rows = np.concatenate([rows[["sec", "nanosec", "corrected", "anchor_b", "status"]] for _, rows in parts])
+    assert [frame for frame, rows, _ in parts for _ in rows] == frames
+    assert [k for *_, some in parts for k in range(6)[some]] == list(range(6))
+    rows = np.concatenate([rows[["sec", "nanosec", "corrected", "anchor_b", "status"]] for _, rows, _ in parts])
     assert rows["corrected"].tolist() == [message.corrected for message in messages]
     assert rows["anchor_b"].tolist() == [message.anchor_b for message in messages]
     assert rows["sec"].tolist() == [message.header.stamp.sec for message in messages]
@@ -58,7 +61,7 @@ def test_vectors_and_arrays_are_columns(way):
     message = Odometry(child_frame_id="body")
     message.pose.pose.position.y, message.pose.pose.orientation.x = 2.0, 0.5
     message.pose.covariance = np.arange(36.0)
-    ((frame, rows),) = Wire(Odometry, *POSE).read([serialize_message(message)])
+    ((frame, rows, _),) = Wire(Odometry, *POSE).read([serialize_message(message)])
     assert rows["pose.pose.position"].tolist() == [[0.0, 2.0, 0.0]]
     assert rows["pose.pose.orientation"].tolist() == [[0.5, 0.0, 0.0, 1.0]]
     assert rows["pose.covariance"].tolist() == [list(range(36))]
@@ -84,3 +87,77 @@ def test_a_middleware_that_serializes_otherwise_is_noticed(monkeypatch):
     assert not Wire(Tdoa, "distance_difference").fits
     monkeypatch.setattr(ros_wire, "serialize_message", lambda message: serialize_message(message)[:4] + b"\0" * 90)
     assert not Wire(Tdoa, "distance_difference").fits
+
+
+def tdoa_bytes(order="<", options=0, frame=b"tag", variance=True, more=b""):
+    """A serialized Tdoa, by hand: 1 s, 2 ns, anchors 3 and 4, 0.5 m, 0.25 m^2."""
+    kind = b"\0\1" if order == "<" else b"\0\0"
+    body = struct.pack(f"{order}iII", 1, 2, len(frame) + 1) + frame + b"\0"
+    body += b"\0" * (-len(body) % 2) + struct.pack(f"{order}HH", 3, 4)
+    body += b"\0" * (-len(body) % 8) + struct.pack(f"{order}d", 0.5) + (struct.pack(f"{order}d", 0.25) if variance else b"")
+    return kind + bytes([0, options]) + body + more
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("options", [0, 1, 3])
+@pytest.mark.parametrize("more", [b"", b"\0\0\0"])
+def test_every_encoding_that_means_something_is_read(way, order, options, more):
+    wire = Wire(Tdoa, "anchor_a", "anchor_b", "distance_difference", "variance")
+    ((frame, rows, some),) = wire.read([tdoa_bytes(order, options, more=more)])
+    assert (frame, some) == ("tag", slice(0, 1)) and rows[list(wire.dtype.names)].tolist() == [(1, 2, 3, 4, 0.5, 0.25)]
+
+
+BAD = {
+    "8 too few for uwb_tdoa_msgs/Tdoa: cut off, or of another version of the type": tdoa_bytes(variance=False),
+    "8 too many for uwb_tdoa_msgs/Tdoa: of another version of the type": tdoa_bytes(more=bytes(8)),
+    "header.frame_id is no UTF-8": tdoa_bytes(frame=b"t\xff"),
+    "header.frame_id does not end where it says": tdoa_bytes(frame=b"t\0g"),
+    "header.frame_id would be 4294967295 bytes long": tdoa_bytes()[:12] + b"\xff" * 4 + tdoa_bytes()[16:],
+    "header.frame_id would be 5001 bytes long": tdoa_bytes(frame=b"x" * 5000),
+    "it ends after 14 bytes, before header.frame_id": tdoa_bytes()[:14],
+    "not plain CDR": b"\0\7\0\0" + tdoa_bytes()[4:],
+    "cannot be read as|bytes are|it has|not plain CDR": b"",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("reason", BAD)
+def test_what_cannot_be_read_is_left_out_and_said(reason):
+    wire, refused = Wire(Tdoa, "anchor_a"), []
+    parts = wire.read([tdoa_bytes(), BAD[reason], tdoa_bytes(">"), BAD[reason], tdoa_bytes()], refused.append)
+    assert [some.start for *_, some in parts] == [0, 2, 4] and [rows["anchor_a"].tolist() for _, rows, _ in parts] == [[3]] * 3
+    assert len(refused) == 2
+    with pytest.raises(Unreadable, match=reason):
+        wire.read([BAD[reason]])
+
+
+def test_a_wrong_version_in_another_encoding_is_none_either():
+    for data in (tdoa_bytes(">", variance=False), tdoa_bytes(">", more=bytes(8)), tdoa_bytes("<", 1, variance=False)):
+        with pytest.raises(Unreadable, match="another version|cannot be read as uwb_tdoa_msgs/Tdoa"):
+            Wire(Tdoa, "anchor_a").read([data])
+    with pytest.raises(Unreadable, match="no UTF-8"):
+        Wire(Tdoa, "anchor_a").read([tdoa_bytes(">", frame=b"t\xff")])
+
+
+def test_lists_are_bounded_before_anything_is_allocated():
+    array = AnchorArray()
+    array.header.frame_id = "map"
+    data = serialize_message(array)
+    assert decode(data, AnchorArray) == array
+    for count, reason in ((MOST_ELEMENTS + 1, f"at most {MOST_ELEMENTS}"), (2**32 - 1, "at most"), (1000, "1000 elements, in")):
+        with pytest.raises(Unreadable, match=reason):
+            decode(data[:-4] + struct.pack("<I", count), AnchorArray)
+    with pytest.raises(Unreadable, match="bytes are too many"):
+        decode(data + bytes(10_000_000), AnchorArray)
+    with pytest.raises(Unreadable, match="bytes are too many"):
+        decode(tdoa_bytes() + bytes(3 * LONGEST_TEXT), Tdoa)
+
+
+def test_noise_is_refused_or_read_and_nothing_else(way):
+    rng, wire, refused, read = np.random.default_rng(1), Wire(TdoaCorrected, "corrected", "bias_slope"), [], 0
+    whole = serialize_message(corrected(1))
+    for _ in range(300):
+        data = bytearray(whole[: rng.integers(len(whole) + 1)] if rng.random() < 0.3 else whole)
+        for place in rng.integers(len(data), size=rng.integers(1, 6)) if data else ():
+            data[place] ^= 1 << rng.integers(8)
+        read += sum(len(rows) for _, rows, _ in wire.read([bytes(data)], refused.append))
+    assert read + len(refused) == 300 and read > 50 and len(refused) > 50

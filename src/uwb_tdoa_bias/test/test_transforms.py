@@ -1,6 +1,9 @@
+import math
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.transforms import HELD, Frames
 
 QUARTER = Rotation.from_euler("z", 90.0, degrees=True)  # to the left
@@ -71,3 +74,24 @@ def test_a_frame_that_goes_back_in_time_starts_anew():
     frames.move("odom", "base_link", IDENTITY, (1.0, 0.0, 0.0), 3.0)
     assert frames.between("odom", "base_link", 3.0)[1].tolist() == [1.0, 0.0, 0.0]
     assert frames.between("odom", "base_link", 100.0) is None
+
+
+@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0)])
+def test_what_is_no_rotation_is_refused(q):
+    frames = Frames()
+    for take in (frames.set, lambda *transform: frames.move(*transform, 1.0)):
+        with pytest.raises(InputError, match="a -> b"):
+            take("a", "b", q, (0.0, 0.0, 0.0))
+        with pytest.raises(InputError, match="must be finite"):
+            take("a", "b", (0.0, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0))
+    assert frames.between("a", "b", 1.0) is None
+
+
+def test_frames_are_bounded(monkeypatch):
+    monkeypatch.setattr("uwb_tdoa_bias.foundation.transforms.MOST", 3)
+    frames = Frames()
+    for k in range(3):
+        frames.set("a", f"b{k}", (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="3 frames already"):
+        frames.set("a", "c", (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+    frames.set("a", "b1", (0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0))  # one that is known may move

@@ -8,7 +8,6 @@ One for all tags of a room: remap their uwb/anchors to its own. Every parameter 
 import sys
 
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
-from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -26,7 +25,7 @@ PARAMETERS = {  # in the order of config/anchors_node.yaml
 LEVEL = Quaternion(w=1.0)  # of an anchor whose orientation was not surveyed
 
 
-class AnchorsNode(Node):
+class AnchorsNode(ros.StreamNode):
     """Publishes once, and stays for who comes later."""
 
     NAME = "anchors_node"

@@ -57,6 +57,7 @@ MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a
 CORRECTED = (  # what is written of a TdoaCorrected
     "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status", "bias_slope", "bias_state",
 )  # fmt: skip
+MOST_FRAMES = 100  # that are remembered: names on a topic may be anything
 EARLY, EARLY_POSES = 2000, 500  # TDOAs, and parts of the odometry, kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
@@ -85,8 +86,8 @@ class BiasNode(ros.StreamNode):
         self._early, self._early_poses, self._hold = deque(), deque(maxlen=EARLY_POSES), PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
-        self._wire, self._templates = Wire(TdoaCorrected, *CORRECTED), {}  # by frame and model
-        self._frame, self._frame_trouble = self._body, None  # of the TDOAs
+        self._wire, self._templates = Wire(TdoaCorrected, *CORRECTED), {}  # by frame and model, the latest
+        self._frame, self._frame_trouble, self._frames_said = self._body, None, set()  # of the TDOAs
         self._declared = self._effects  # without the arm of the antenna
         self.output = StreamOutput(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
@@ -139,7 +140,9 @@ class BiasNode(ros.StreamNode):
                 self.get_logger().info(f"{TagLeverArm.name} of effects_file counts, not the transform of '{frame}'")
             elif between is None:
                 self._frame_trouble = unknown_frame("uwb/tdoa", frame, self._body)
-                self.get_logger().warning(self._frame_trouble)
+                if frame not in self._frames_said and len(self._frames_said) < MOST_FRAMES:
+                    self._frames_said.add(frame)
+                    self.get_logger().warning(self._frame_trouble)
             elif between[1].any():
                 arm = TagLeverArm(values=dict(zip("xyz", between[1].tolist())))
                 effects = EffectSet((*effects.effects, arm))
@@ -276,6 +279,8 @@ class BiasNode(ros.StreamNode):
 
     def _template(self, frame, model):
         if (frame, model) not in self._templates:
+            if len(self._templates) >= MOST_FRAMES:
+                self._templates.clear()
             message = TdoaCorrected(model=model)
             message.header.frame_id = frame
             self._templates[frame, model] = self._wire.template(message)
@@ -289,15 +294,20 @@ class BiasNode(ros.StreamNode):
         recent = {"uwb/tdoa": received, "odometry": poses}
         wiring = [end.trouble(recent[name]) for name, end in self.streams.inputs.items()]
         wiring.append(ros.several_publishers(self, "uwb/tdoa_corrected"))
+        others = [*self._anchors.refusals, *self._frames.refusals]
+        wiring += [*(refusals.trouble() for refusals in others), self._frames.trouble]
         unready, self._reported_unready = counts["unready"] - self._reported_unready, counts["unready"]
         values = {"model": self._model[NETWORK], "received": counts["received"], "published": counts["published"]}
         values |= {"waiting": len(self._hold) + len(self._tdoas) + len(self._early), "dropped": counts["dropped"]}
         values |= {name: counts[name] for name in STATUS.values()}
         values |= {"released before their pose": counts["unready"], "invalid": counts["invalid"]}
+        outside = self._corrector.outside if self._corrector is not None else []
+        values |= {"beyond where effects were seen": "; ".join(outside) or "nothing"}
         values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
         values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self.streams.inputs.items()}
         values |= {"subscribers of uwb/tdoa_corrected": self.output.publisher.get_subscription_count()}
         values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
+        values |= {f"unreadable on {end.topic}": end.count for end in (*self.streams.refusals, *others)}
         level, text = self._health(rate, unready)
         if level != DiagnosticStatus.ERROR and any(wiring):
             level, text = DiagnosticStatus.WARN, next(filter(None, wiring))

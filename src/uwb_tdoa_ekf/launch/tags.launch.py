@@ -12,9 +12,8 @@ ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml processes:=2     # takes
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-from uwb_tdoa_ekf.launching import pooled, tags, typed
-from uwb_tdoa_ekf.launching_actions import node_action, rviz_action
+from uwb_tdoa_ekf.launching import RESPAWN, pooled, tags, typed
+from uwb_tdoa_ekf.launching_actions import actions
 
 OTHERS = {
     "processes": ("", "localization_nodes that share the tags, e.g. one for each core; default: two nodes for each tag"),
@@ -29,15 +28,17 @@ def generate_launch_description():
     arguments = [
         DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()
     ]
+    arguments += [
+        DeclareLaunchArgument(name, default_value="stay" if name == "on_exit" else default, description=text, choices=choices)
+        for name, (default, text, choices) in RESPAWN.items()
+    ]  # one tag does not take the others along
     file = DeclareLaunchArgument("tags", description="YAML file of the tags")
     return LaunchDescription([file, *arguments, OpaqueFunction(function=_nodes)])
 
 
 def _nodes(context):
-    path, *given = (LaunchConfiguration(name).perform(context) for name in ("tags", *OTHERS))
-    processes, sim_time, log_level, rviz = given
-    values = typed({"use_sim_time": sim_time})
-    starts = tags(path, values, log_level)
-    starts = pooled(starts, processes) if processes else starts
-    actions = [node_action(Node, each) for each in starts]
-    return actions + ([rviz_action(Node, values.get("use_sim_time", False))] if rviz == "true" else [])
+    given = {name: LaunchConfiguration(name).perform(context) for name in ("tags", *OTHERS, *RESPAWN)}
+    values = typed({"use_sim_time": given["use_sim_time"]})
+    starts = tags(given["tags"], values, given["log_level"])
+    starts = pooled(starts, given["processes"]) if given["processes"] else starts
+    return actions(starts, *(given[name] for name in (*RESPAWN, "rviz")), values.get("use_sim_time", False))

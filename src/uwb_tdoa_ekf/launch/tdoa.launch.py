@@ -8,9 +8,8 @@ ros2 launch uwb_tdoa_ekf tdoa.launch.py --show-args
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-from uwb_tdoa_ekf.launching import start, tag, typed
-from uwb_tdoa_ekf.launching_actions import node_action, rviz_action
+from uwb_tdoa_ekf.launching import RESPAWN, start, tag, typed
+from uwb_tdoa_ekf.launching_actions import actions
 
 VALUES = {  # parameters of the nodes; one that is not given is what the files say, or the node's default
     "anchors_file": "survey of the anchors; without it they come on uwb/anchors",
@@ -38,15 +37,18 @@ def generate_launch_description():
     arguments += [
         DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()
     ]
+    arguments += [
+        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
+        for name, (default, text, choices) in RESPAWN.items()
+    ]
     return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
 
 
 def _nodes(context):
     values = typed({name: LaunchConfiguration(name).perform(context) for name in VALUES})
-    given = {name: LaunchConfiguration(name).perform(context) for name in OTHERS}
+    given = {name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *RESPAWN)}
     files = {node: [given[key]] for node, key in (("bias_node", "bias_params"), ("ekf_node", "ekf_params")) if given[key]}
     starts = tag(given["namespace"], values, files, given["log_level"])
     if "anchors_file" in values:
         starts.append(start("anchors_node", given["namespace"], values, (), given["log_level"]))
-    actions = [node_action(Node, each) for each in starts]
-    return actions + ([rviz_action(Node, values.get("use_sim_time", False))] if given["rviz"] == "true" else [])
+    return actions(starts, *(given[name] for name in (*RESPAWN, "rviz")), values.get("use_sim_time", False))

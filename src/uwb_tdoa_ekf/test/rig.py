@@ -176,6 +176,11 @@ class Rig:
             reader = threading.Thread(target=_collect, args=(process.stdout, lines), daemon=True)
             reader.start()
             self._processes[name] = Process(process, lines, reader)
+        self.meet(*names)
+        return [self._processes[name] for name in names]
+
+    def meet(self, *names):
+        """Returns when nodes, whoever starts them, hear what they need, and we hear them."""
         made = {topic for name in names for topic in OUTPUTS[name]}
         taken = {topic for name in names for topic in INPUTS[name]}
         for topic in taken - made:
@@ -197,12 +202,15 @@ class Rig:
             )
 
         self.wait(all_matched, "all to have found each other")
-        return [self._processes[name] for name in names]
 
     def add_publisher(self, topic):
         """Play a topic that a node can do without."""
         publisher = self._publishers[topic] = self.node.create_publisher(STREAMS[topic], topic, self._qos)
         self.wait(publisher.get_subscription_count, f"{topic} to be heard")
+
+    def watch(self, process):
+        """Wait for nothing any more when this Process has ended, which starts nodes itself."""
+        self._processes["launch"] = process
 
     def close(self):
         """End what was started."""

@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402
 from uwb_tdoa_ekf.streams import Finding  # noqa: E402
 
-STARTING, RUNNING = SimpleNamespace(running=False), SimpleNamespace(running=True)
+STARTING, RUNNING = SimpleNamespace(running=False, lost=None), SimpleNamespace(running=True)
 
 
 class Clock:
@@ -48,6 +48,12 @@ def test_says_what_is_missing(clock):
     level, text, _ = second(clock, judge, RUNNING, imu=0)
     assert level == ERROR and "imu/data" in text
     assert second(clock, health.Health(FilterConfig(use_imu=False), 0.25), RUNNING, imu=0)[0] == OK
+
+
+def test_a_lost_tag_is_a_warning_and_no_start(clock):
+    judge = health.Health(FilterConfig(), lag=0.25)
+    level, text, values = second(clock, judge, SimpleNamespace(running=False, lost="the tag is lost"))
+    assert (level, text, values["state"]) == (WARN, "the tag is lost", "lost")
 
 
 def test_a_start_that_takes_long_is_a_warning(clock):

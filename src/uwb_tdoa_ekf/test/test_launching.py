@@ -1,4 +1,4 @@
-"""What the launch files start. launch itself is not needed: it is played by stubs that take notes where it is missing."""
+"""What the launch files start. Where there is no launch, it is played by stubs that take notes; test_launch_files.py runs the real one."""
 
 import json
 from pathlib import Path
@@ -14,8 +14,9 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from nav_msgs.msg import Odometry  # noqa: E402
+from real_launch import WHY_NOT  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_ekf.launching import NODES, pooled, start, tag, tags, typed  # noqa: E402
+from uwb_tdoa_ekf.launching import NODES, Lives, network, pooled, start, tag, tags, typed  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,6 +39,50 @@ def test_a_value_goes_to_the_nodes_that_have_it_and_overrides_their_file():
         tag("", {"tdoa_sdt": 1.0})
 
 
+def test_what_a_node_is_told_are_arguments_which_later_ones_override():
+    told = start("ekf_node", "", {"world_frame": 'hall: 1 # "ä"', "tdoa_std": 0.3, "use_sim_time": True}, ["mine.yaml"], "debug")
+    assert told.words == [
+        "--log-level", "debug", "--params-file", "mine.yaml",
+        "-p", 'world_frame:="hall: 1 # \\"ä\\""', "-p", "tdoa_std:=0.3", "-p", "use_sim_time:=true",
+    ]  # fmt: skip
+
+
+def test_a_node_that_crashes_is_started_again_each_time_later():
+    lives = Lives("tag1/ekf_node", True, "shutdown")
+    assert [lives.ended(-9, 1.0).again for _ in range(7)] == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
+    assert lives.ended(1, 61.0).again == 1.0  # it had lived well
+    again = lives.ended(2, 1.0)  # not at its start: whoever wrote the file may not have been ready
+    assert (again.again, again.everything) == (2.0, False)
+    assert again.text == "tag1/ekf_node has ended with exit code 2: it is started again in 2 s"
+
+
+@pytest.mark.parametrize("code", [0, -2, -15, 130, 143])
+def test_a_node_that_was_asked_to_end_is_left_alone(code):
+    ended = Lives("ekf_node", True, "shutdown").ended(code, 1.0)
+    assert (ended.again, ended.text, ended.everything) == (None, None, False)
+
+
+@pytest.mark.parametrize(("on_exit", "everything"), [("shutdown", True), ("stay", False)])
+def test_what_ends_for_good_ends_all_if_it_is_to(on_exit, everything):
+    refused, crashed = Lives("ekf_node", True, on_exit).ended(2, 1.0), Lives("ekf_node", False, on_exit).ended(-11, 1.0)
+    assert refused.again is crashed.again is None and refused.everything is crashed.everything is everything
+    assert "refuses what it is given" in refused.text and "ended with exit code -11" in crashed.text
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, ROS_DOMAIN_ID=0: heard by nodes on every machine that multicast reaches, any of which"),
+        ({"ROS_DOMAIN_ID": "7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, "LOCALHOST, ROS_DOMAIN_ID=7: heard by nodes on this machine, and"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "robot"}, "this machine and of ROS_STATIC_PEERS=robot, and"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_STATIC_PEERS": "robot"}, "OFF, ROS_DOMAIN_ID=0: heard by nobody"),
+        ({"ROS_LOCALHOST_ONLY": "1", "ROS_STATIC_PEERS": "robot"}, "LOCALHOST, ROS_DOMAIN_ID=0: heard by nodes on this machine, and"),
+    ],
+)
+def test_who_hears_the_nodes_is_said(given, said):
+    assert said in network(given)
+
+
 def test_texts_become_values():
     assert typed({"use_sim_time": "true", "body_frame": "", "world_frame": "map"}) == {"use_sim_time": True, "world_frame": "map"}
 
@@ -58,13 +103,19 @@ def test_tags_of_a_file(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "named"),
-    [("{}", "expected a mapping 'tags'"), ("tags: {a: 1}", "a: 1 must be a mapping"), ("tags: {a: {gaet: 1}}", "gaet: .* write gate")],
+    [
+        ("{}", "expected a mapping 'tags'"), ("tags: {a: 1}", "a: 1 must be a mapping"), ("tags: {a: {gaet: 1}}", "gaet: .* write gate"),
+        ("tags: {a: {gate: }}", "gate: None is no value"), ("tags: {a: {gate: {b: 1}}}", "gate: .* is no value"),
+    ],
 )
 def test_a_bad_file_is_refused(tmp_path, text, named):
     file = tmp_path / "tags.yaml"
     file.write_text(text)
     with pytest.raises(InputError, match=f"{file}: .*{named}"):
         tags(file, {})
+
+
+LEVEL = ["--log-level", "info"]
 
 
 class Noted(SimpleNamespace):
@@ -76,7 +127,9 @@ class Noted(SimpleNamespace):
 
 @pytest.fixture
 def launched(monkeypatch):
-    """launched(file, **arguments): the actions of a launch file with such arguments, by stubs of launch."""
+    """launched(file, **arguments): the nodes of a launch file with such arguments, by stubs of launch."""
+    if WHY_NOT is None:
+        pytest.skip("the real launch is here: test_launch_files.py")
     given = {}
 
     class Configuration(Noted):
@@ -85,12 +138,14 @@ def launched(monkeypatch):
 
     kinds = {
         "launch": ["LaunchDescription"],
-        "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction", "ExecuteProcess", "IncludeLaunchDescription"],
+        "launch.actions": [
+            "DeclareLaunchArgument", "ExecuteProcess", "IncludeLaunchDescription", "LogInfo", "OpaqueFunction", "Shutdown", "TimerAction",
+        ],
         "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
         "launch_ros": [],
         "launch_ros.actions": ["Node"],
     }
-    for module, names in {**kinds, "launch.substitutions": []}.items():
+    for module, names in {**kinds, "launch.logging": [], "launch.substitutions": []}.items():
         stub = ModuleType(module)
         for name in names:
             setattr(stub, name, type(name, (Noted,), {}))
@@ -104,52 +159,54 @@ def launched(monkeypatch):
         given.clear()
         given.update(arguments, defaults={name: getattr(each, "default_value", None) for name, each in declared.items()})
         (function,) = (each.function for each in found if type(each).__name__ == "OpaqueFunction")
-        return function(None)
+        return [action for action in function(None) if type(action).__name__ == "Node"]
 
     return launch
 
 
 def test_one_tag(launched):
     bias, ekf = launched("tdoa.launch.py")
-    assert (bias.executable, ekf.executable, ekf.parameters) == ("bias_node", "ekf_node", [])  # nothing set: can be overridden
+    assert (bias.executable, ekf.executable, ekf.ros_arguments) == ("bias_node", "ekf_node", LEVEL)  # nothing set: can be overridden
     told = dict(anchors_file="a.yaml", publish_tf="odom", ekf_params="e.yaml", use_sim_time="true", rviz="true", namespace="t")
     bias, ekf, anchors, rviz = launched("tdoa.launch.py", **told)
-    assert ekf.parameters == ["e.yaml", {"anchors_file": "a.yaml", "publish_tf": "odom", "use_sim_time": True}]
-    assert bias.parameters == [{"anchors_file": "a.yaml", "use_sim_time": True}] and bias.namespace == "t"
+    values = ["-p", 'anchors_file:="a.yaml"', "-p", 'publish_tf:="odom"', "-p", "use_sim_time:=true"]
+    assert ekf.ros_arguments == [*LEVEL, "--params-file", "e.yaml", *values]
+    assert bias.ros_arguments == [*LEVEL, *values[:2], *values[4:]] and bias.namespace == "t"
     assert (anchors.executable, rviz.executable) == ("anchors_node", "rviz2")
-    assert Path(rviz.arguments[1]).is_file() and rviz.parameters == [{"use_sim_time": True}]
-    assert ekf.arguments == ["--ros-args", "--log-level", "info"]
+    assert Path(rviz.arguments[1]).is_file() and rviz.ros_arguments == values[4:]
 
 
 def test_several_tags(launched, tmp_path):
     (tmp_path / "tags.yaml").write_text("tags: {a: {}, b: {}, c: {publish_tf: odom, odom_frame: c/odom}, d: {body_frame: drone}}")
     nodes = launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"))
     assert [node.namespace for node in nodes] == list("aabbccdd")
-    frames = [node.parameters[-1] for node in nodes if node.executable == "ekf_node"]
-    assert [frame["body_frame"] for frame in frames] == ["a/base_link", "b/base_link", "c/base_link", "drone"]  # no two alike
-    assert frames[2]["odom_frame"] == "c/odom"
+    told = [node.ros_arguments for node in nodes if node.executable == "ekf_node"]
+    for words, frame in zip(told, ["a/base_link", "b/base_link", "c/base_link", "drone"]):  # no two alike
+        assert f'body_frame:="{frame}"' in words
+    assert 'odom_frame:="c/odom"' in told[2]
 
 
-def test_several_tags_in_a_pool_of_processes(launched, tmp_path):
-    (tmp_path / "tags.yaml").write_text("anchors_file: a.yaml\ntags: {a: {}, b: {tdoa_std: 0.3}, c: {map: map.npz}}")
-    nodes = launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"), processes="2")
+def test_several_tags_in_a_pool_of_processes(tmp_path):
+    file = tmp_path / "tags.yaml"
+    file.write_text("anchors_file: a.yaml\ntags: {a: {}, b: {tdoa_std: 0.3}, c: {map: map.npz}}")
+    nodes = pooled(tags(file, {}), "2")
     assert [node.executable for node in nodes] == ["debias_node", "anchors_node", "localization_node", "localization_node"]
     one, other = nodes[2:]
     assert (one.name, other.name, one.namespace) == ("localization_node_1", "localization_node_2", "")
     assert [node.parameters[1] for node in (one, other)] == [{"tags": ["a", "c"]}, {"tags": ["b"]}]
     told = yaml.safe_load(Path(one.parameters[0]).read_text())
-    assert told.keys() == {f"/{tag}/{node}_node" for tag in "abc" for node in ("bias", "ekf")}
+    assert told.keys() == {f"/**/{tag}/{node}_node" for tag in "abc" for node in ("bias", "ekf")}
     shared = {"anchors_file": str(tmp_path / "a.yaml")}
-    assert told["/b/ekf_node"] == {"ros__parameters": {"body_frame": "b/base_link", "tdoa_std": 0.3} | shared}
+    assert told["/**/b/ekf_node"] == {"ros__parameters": {"body_frame": "b/base_link", "tdoa_std": 0.3} | shared}
     with pytest.raises(InputError, match="params_file: does not go with processes"):
         pooled([start("ekf_node", "a", {}, ["mine.yaml"])], 2)
     with pytest.raises(InputError, match="processes: 'two' must be a whole number"):
-        launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"), processes="two")
+        pooled(tags(file, {}), "two")
 
 
-def test_a_bag_is_played_on_its_time(launched):
+def test_a_bag_is_played_on_its_time(launched):  # the fixture puts the stubs in their places
     found = runpy.run_path(str(ROOT / "launch" / "bag.launch.py"))["generate_launch_description"]().args[0]
-    include, play = found[2:]
+    include, play = found[-2:]
     assert dict(include.launch_arguments) == {"use_sim_time": "true"}
     assert play.cmd[:3] == ["ros2", "bag", "play"] and "--clock" in play.cmd and "--delay" in play.cmd
 

@@ -102,12 +102,34 @@ def test_what_happens_on_the_floor_is_not_judged():
     assert not any(alarms for _, alarms in said)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_makes_several_late_at_once_names_none(seed):
+    """As on a floor: half of the anchors by metres, each pair by its own."""
+    late = np.random.default_rng(seed).uniform(2.5, 4.0, 6) * (np.arange(6) % 2)
+    said = watch(lambda t, p: late * (t > 40.0), seed=seed, seconds=50)
+    assert [alarms for _, alarms in said if alarms] == []
+
+
 def test_what_did_not_reach_the_filter_does_not_count():
     monitor, one = Monitor(ANCHORS), np.ones(1)
     nothing = Odometry(*(np.empty((0, *shape)) for shape in ((), (3,), (3,), (4,), (3,), (3,), (9, 9))))
     monitor.add(nothing, Residuals(one, 3 * one, 99 * one, np.nan * one, np.nan * one, 0 * one, np.full(1, INVALID)))
     monitor.judge(np.inf)
     assert monitor.alarms == []
+
+
+def test_remembers_no_more_of_odometry_without_tdoas_than_of_one_slice():
+    monitor, none = Monitor(ANCHORS), Residuals(*np.empty((7, 0)))
+    held = []
+    for second in range(100):
+        t = second + np.arange(RATE) / RATE
+        still = np.zeros((RATE, 3))
+        odometry = Odometry(t, still, still, np.zeros((RATE, 4)), still, still, np.zeros((RATE, 9, 9)))
+        some = Residuals(t, IDS[[0] * RATE], IDS[[1] * RATE], 0 * t, 1 + 0 * t, 1 + 0 * t, np.full(RATE, USED))
+        monitor.add(odometry, some if second == 10 else none)
+        monitor.judge(second + 1.0)
+        held.append(sum(len(part[0]) for part in monitor._odometry))
+    assert max(held[:10] + held[45:]) <= RATE
 
 
 def test_does_not_depend_on_when_it_is_asked():

@@ -3,7 +3,6 @@
 from contextlib import contextmanager
 from dataclasses import replace
 import itertools
-import json
 from pathlib import Path
 import signal
 import threading
@@ -193,7 +192,7 @@ def test_two_tags_of_a_launch_file(make_rig, tmp_path):
     starts = [each for each in tags(tmp_path / "tags.yaml", {"use_sim_time": True}) if each.executable in OUTPUTS]
     with ticking(clock, epoch) as running:
         for rig in (one, other):
-            arguments = {each.executable: words_of(each) for each in starts if each.namespace == rig.namespace}
+            arguments = {each.executable: each.words for each in starts if each.namespace == rig.namespace}
             rig.start(*arguments, **arguments)
         one.play(flight, epoch)
         assert one.counts("ekf_node")["used"] > 0
@@ -215,15 +214,6 @@ def test_two_tags_of_a_launch_file(make_rig, tmp_path):
     assert {(m.header.frame_id, m.child_frame_id) for m in other.odometry} == {("hall", "drone")}
     frames = {(t.header.frame_id, t.child_frame_id) for m in one.received["/tf"] for t in m.transforms}
     assert frames == {("hall", "tag0/base_link")}  # of both, on the one /tf that there is
-
-
-def words_of(start):
-    """The arguments that launch_ros gives a node."""
-    words = []
-    for part in start.parameters:
-        values = part.items() if isinstance(part, dict) else ()
-        words += [word for name, value in values for word in ("-p", f"{name}:={json.dumps(value)}")]
-    return words
 
 
 @contextmanager

@@ -7,13 +7,13 @@ Every parameter is documented in config/debias_node.yaml.
 """
 
 from collections import Counter
+from copy import copy
 import math
 import sys
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
-from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -38,7 +38,7 @@ PARAMETERS = {  # in the order of config/debias_node.yaml; the layers are those 
 }
 
 
-class DebiasNode(Node):
+class DebiasNode(ros.StreamNode):
     """Converts messages for a BiasMap and keeps the accounts: received = corrected + faded + outside + invalid."""
 
     NAME = "debias_node"
@@ -56,7 +56,9 @@ class DebiasNode(Node):
         self._newest = -math.inf
         self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
         self._publisher = ros.publish_stream(self, Odometry, "odometry/debiased")
-        self._input = ros.StreamInput(self, Odometry, "odometry", self._on_odometry)
+        self._input = ros.Input(
+            self, Odometry, "odometry", self._on_odometry, copy(ros.STREAM_QOS), qos_overriding_options=ros.OVERRIDES
+        )
         say_unused([self], files_of(arguments))
         self._diagnostics = ros.Diagnostics(self, self._report)
         self.get_logger().info(f"ready; {len(self._map.at)} markers, {self._map.interpolator}")
@@ -98,9 +100,14 @@ class DebiasNode(Node):
         rate = self._rate.of(self._counts["received"])
         values = {name: self._counts[name] for name in ("received", *kinds)}
         values |= {"odometry rate": f"{rate:.1f} Hz", "map": self._map.source, "markers": len(self._map.at)}
-        values |= {"publishers of odometry": self._input.get_publisher_count()}
+        values |= {"publishers of odometry": self._input.subscription.get_publisher_count()}
         values |= {"subscribers of odometry/debiased": self._publisher.get_subscription_count()}
-        return *self._judge(recent, sum(recent.values())), values
+        values |= {"unreadable on odometry": self._input.refusals.count}
+        level, text = self._judge(recent, sum(recent.values()))
+        unreadable = self._input.refusals.trouble()
+        if unreadable and level != DiagnosticStatus.ERROR:
+            level, text = DiagnosticStatus.WARN, unreadable
+        return level, text, values
 
     def _judge(self, recent, total):
         if not total:

@@ -4,7 +4,7 @@ imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (Anc
 (sensor_msgs/Range, REP 117), pressure (sensor_msgs/FluidPressure), velocity (geometry_msgs/TwistWithCovarianceStamped, in the
 body frame), velocity/odometry (the twist of another nav_msgs/Odometry), initialpose (geometry_msgs/PoseWithCovarianceStamped)
   -> odometry (nav_msgs/Odometry), /tf (tf2_msgs/TFMessage), uwb/residual (TdoaResidual: one for each TdoaCorrected),
-     /diagnostics (diagnostic_msgs/DiagnosticArray).
+     status (EstimatorStatus: whether the odometry may be flown by), /diagnostics (diagnostic_msgs/DiagnosticArray).
 Service ~/reset (std_srvs/Trigger): start anew.
 Every parameter is documented in config/ekf_node.yaml.
 """
@@ -37,12 +37,14 @@ from .core import aids
 from .core.config import RENAMED
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import STREAMS, VERDICTS, Estimator, invalid
+from .frames import rotation_std
 from .imu_mount import ImuMount
 from .monitoring.change import YOUNGEST, ChangeDetector
 from .monitoring.health import OK, WARN, Health
 from .monitoring.slices import LENGTH, Slice
+from .monitoring.status import status_of, yaw_in_words
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
-from .outputs import Outputs, pose_and_twist
+from .outputs import Outputs, StatusOutput, pose_and_twist
 from .streams import most_severe_first
 from .told_pose import told_pose
 
@@ -62,6 +64,8 @@ TOPICS = {
         ("velocity/odometry", Odometry, "twist.twist.linear", "twist.covariance"),
     ],
 }  # fmt: skip
+MOST_FRAMES = 100  # of the IMU that are remembered: names on a topic may be anything
+MOST_NAMED = 3  # of them in a sentence
 EARLY = 5000  # messages kept while there are no anchors
 UNKNOWN_VARIANCE = 1e6  # (m/s)^2, at which and above a velocity is not measured
 
@@ -86,10 +90,12 @@ class EkfNode(ros.StreamNode):
         self._aid_corrector = AidCorrector(self._effects.effects)
         self._estimator = None
         self._epoch, self._clock = ros.Epoch(), self.get_clock()
+        self._attitude, self._last_tdoa = None, -math.inf  # quaternion and covariance of the newest odometry; time.monotonic(), s
         self._received_before = {}  # messages by topic, by the last report
         self._early = deque()  # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one message each
         self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
-        self._imu_frame, self._imu_mount, self._frame_trouble = own["body_frame"], None, None
+        self._lately = []  # frames of the IMU since the last report, and the last one before it
+        self._placed = {}  # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of coming
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
         refuse_unknown(self, {*RENAMED, *(member or ())})
         self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute, unless compile_nodes has done so")
@@ -99,10 +105,11 @@ class EkfNode(ros.StreamNode):
         self.outputs = Outputs(self, self._epoch, self._frames.frames, self._body, own["publish_tf"], own["odom_frame"])
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.streams = self._subscribe({"uwb/tdoa_corrected"} if member is not None else ())
-        self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
+        self._told = ros.Input(self, PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
         self._reset = self.create_service(Trigger, "~/reset", self._on_reset)
         follow_changes(self, lambda: self._config, self._on_config)
-        self._diagnostics = ros.Diagnostics(self, self._report)
+        self._status = StatusOutput(self)
+        self._diagnostics = ros.Diagnostics(self, self._report, self._tell_status)
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
@@ -111,7 +118,7 @@ class EkfNode(ros.StreamNode):
 
     def _subscribe(self, handed):
         """Streams of everything that the filter takes. handed : topics that a node of this process hands over."""
-        streams = Streams(self, self._epoch, self._advance, self._frames.catch_up)
+        streams = Streams(self, self._epoch, self._advance)
         self._takers = {
             "imu": self._take_imu, "tdoa": self._take_tdoa, "height": self._take_height,
             "pressure": self._take_pressure, "velocity": self._take_velocity,
@@ -168,30 +175,47 @@ class EkfNode(ros.StreamNode):
 
     def _on_frames(self):
         """A constant transform is new, or another."""
-        if self._imu_frame == self._body:
-            return
-        before = self._frame_trouble, self._imu_mount
-        self._place_imu(self._imu_frame)
-        if before != (self._frame_trouble, self._imu_mount) and self._estimator is not None:
-            self.get_logger().warning(f"the transform of '{self._imu_frame}' is new: starting over")
+        before, self._placed = self._placed, {}
+        for frame in before:
+            self._place_imu(frame, say=False)
+        moved = [frame for frame in before if before[frame] != self._placed[frame]]
+        self._placed |= {frame: before[frame] for frame in before if frame not in moved}  # it goes on where it was
+        if moved and self._estimator is not None:
+            self.get_logger().warning(f"the transform of '{moved[0]}' is new: starting over")
             self._start_over()
 
-    def _place_imu(self, frame):
-        """Find out how an IMU of this frame sits on the body."""
-        self._imu_frame, self._imu_mount, self._frame_trouble = frame, None, None
-        if frame in ("", self._body):
-            return
-        between = self._frames.frames.between(self._body, frame)
-        if between is None:
-            self._frame_trouble = unknown_frame("imu/data", frame, self._body)
-            self.get_logger().warning(self._frame_trouble)
-        else:
-            self._imu_mount = ImuMount(*between)
+    def _place_imu(self, frame, say=True):
+        """ImuMount of an IMU of this frame, None for one that is taken as the body's; say : log what is wrong, once for each."""
+        if frame in self._placed:
+            return self._placed[frame][0]
+        mount = trouble = None
+        if frame not in ("", self._body):
+            between = self._frames.frames.between(self._body, frame)
+            if between is None:
+                trouble = unknown_frame("imu/data", frame, self._body)
+                if say:
+                    self.get_logger().warning(trouble)
+            else:
+                mount = ImuMount(*between)
+        if len(self._placed) < MOST_FRAMES:
+            self._placed[frame] = mount, trouble
+        return mount
+
+    def _frame_troubles(self):
+        """What is wrong with the frames of the IMU, a list of sentences."""
+        lately, self._lately = self._lately, self._lately[-1:]
+        troubles = [*filter(None, (self._placed[frame][1] for frame in lately if frame in self._placed))]
+        if len(lately) > 1:
+            names = ", ".join(f"'{frame}'" for frame in lately[:MOST_NAMED])
+            troubles.insert(0, f"imu/data comes in {len(lately)} frames ({names}): stop all but one of the drivers")
+        return troubles
 
     def _receive(self, stream, *part):
         """Messages of a stream, see Streams."""
         n = len(part[1])
         self._health.received[stream] += n
+        if stream == "tdoa":
+            self._last_tdoa = time.monotonic()
         if self._estimator is not None:
             self._takers[stream](*part)
             return
@@ -208,8 +232,9 @@ class EkfNode(ros.StreamNode):
             self._publish(*self._estimator.advance())
 
     def _take_imu(self, frame, t, rows, arrival):
-        if frame != self._imu_frame:
-            self._place_imu(frame)
+        mount = self._place_imu(frame)
+        if frame not in self._lately and len(self._lately) < MOST_FRAMES:
+            self._lately.append(frame)
         gyro, accel = rows["angular_velocity"].copy(), rows["linear_acceleration"].copy()  # the specific force, says REP 145
         unmeasured = (rows["angular_velocity_covariance"][:, 0] == -1.0) | (rows["linear_acceleration_covariance"][:, 0] == -1.0)
         if unmeasured.any():
@@ -219,8 +244,8 @@ class EkfNode(ros.StreamNode):
                 once=True,
             )
             gyro[unmeasured] = math.nan
-        if self._imu_mount is not None:  # first: effects are of axes of the body, as diagnose sees them
-            gyro, accel = self._imu_mount.in_body(t, gyro, accel)
+        if mount is not None:  # first: effects are of axes of the body, as diagnose sees them
+            gyro, accel = mount.in_body(t, gyro, accel)
         if not self._imu_corrector.idle:
             gyro, accel = self._imu_corrector.correct(t, gyro, accel)
         self._watch.add_imu(t + self._epoch.begin, self._arrived(arrival), gyro, accel)
@@ -252,11 +277,11 @@ class EkfNode(ros.StreamNode):
 
     def _publish(self, odometry, residuals):
         if len(odometry.t):
-            # the variance is that of the mean over one odometry interval
-            variance = self._config.gyro_noise**2 * self._config.odometry_rate
-            self.outputs.publish_odometry(odometry, self._estimator.rates_at(odometry.t) - odometry.gyro_bias, variance)
+            rates, variances = self._estimator.rates_at(odometry.t)
+            self.outputs.publish_odometry(odometry, rates - odometry.gyro_bias, variances)
             self._health.last_odometry = time.monotonic()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
+            self._attitude = odometry.q[-1:], odometry.covariance[-1:]
         if len(residuals.t):
             self.outputs.publish_residuals(residuals)
 
@@ -283,13 +308,33 @@ class EkfNode(ros.StreamNode):
             total = received.get(topic, 0)
             troubles.append(end.trouble(total - self._received_before.get(topic, 0)))
         self._received_before = received
+        troubles += [refusals.trouble() for refusals in self._single]
         return [*filter(None, [*troubles, ros.several_publishers(self, "odometry")])]
+
+    @property
+    def _single(self):
+        """ros.Refusals of what comes one at a time."""
+        return [self._told.refusals, *self._anchors.refusals, *self._frames.refusals]
 
     def _behind(self):
         """s from the stamp of the newest odometry to now, by the clock of the node; None without odometry."""
         if not self.outputs.published:
             return None
         return 1e-9 * (self.get_clock().now().nanoseconds - Time.from_msg(self.outputs.stamp).nanoseconds)
+
+    def _tell_status(self):
+        """Say on `status` whether the odometry may be flown by; not while simulated time stands still: then nothing can come."""
+        if self._diagnostics.paused:
+            return
+        yaw_std, age = self._yaw_std(), time.monotonic() - self._last_tdoa
+        stamp = self.outputs.stamp if self.outputs.published else self.get_clock().now().to_msg()
+        self._status.publish(status_of(self._estimator, yaw_std, age), yaw_std, age, stamp, self.outputs.world)
+
+    def _yaw_std(self):
+        """Standard deviation of the rotation about the world's z axis, rad; NaN unless there is odometry."""
+        if self._estimator is None or not self._estimator.running or self._attitude is None:
+            return math.nan
+        return rotation_std(*self._attitude)[0, 2]
 
     def _report(self):
         counts, estimator = Counter(self._past), self._estimator
@@ -301,10 +346,16 @@ class EkfNode(ros.StreamNode):
         troubles = self._wiring(), self._stream_findings()
         level, text, values = self._health.report(self._anchors.refused, estimator, counts, *troubles)
         alarms = estimator.alarms if estimator is not None else []
-        others = [*filter(None, [self._frame_trouble, self.outputs.trouble, *alarms])]
+        refused = estimator.refused_pose if estimator is not None else None
+        heard = ", ".join(self._lately[:MOST_NAMED])
+        frames = [*self._frame_troubles(), self._frames.trouble]
+        others = [*filter(None, [*frames, self.outputs.trouble, refused, *alarms])]
         if level == OK and others:
             level, text = WARN, others[0]
+        values |= {"yaw": yaw_in_words(self._yaw_std()), "frames of imu/data": heard or "none yet"}
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
+        outside = self._imu_corrector.outside if estimator is not None else []
+        values |= {"beyond where effects were seen": "; ".join(outside) or "nothing"}
         values |= {"TDOAs received": self._health.received["tdoa"]} | {name: counts[name] for name in VERDICTS.values()}
         values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.received["imu"]}
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
@@ -314,6 +365,7 @@ class EkfNode(ros.StreamNode):
             values |= {f"{aid}_received": self._health.received[aid], f"{aid}_waiting": waiting[aid]}
             values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}
         values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
+        values |= {f"unreadable on {refusals.topic}": refusals.count for refusals in (*self.streams.refusals, *self._single)}
         values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self.streams.inputs.items()}
         values |= {"subscribers of odometry": self.outputs.odometry.publisher.get_subscription_count()}
         values |= {"subscribers of uwb/residual": self.outputs.residual.publisher.get_subscription_count()}
@@ -335,11 +387,12 @@ def warm_up():
         estimator.add_pressure(t, np.full(len(some), 1e5))
         estimator.add_velocity(t, none, none + 0.1)
         odometry, _ = estimator.advance()
-    pose_and_twist(odometry, estimator.rates_at(odometry.t), 0.0)
+    pose_and_twist(odometry, *estimator.rates_at(odometry.t))
+    rotation_std(odometry.q[-1:], odometry.covariance[-1:])
     watch.findings()
     detector = ChangeDetector(1)
     for k in range(YOUNGEST + 2):
-        detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1), np.eye(1), np.ones(1)))
+        detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1, int), np.zeros(1), np.eye(1)))
     detector.find(0.0)
     estimator.tell_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
     estimator.finish()

@@ -18,6 +18,10 @@ class ImuMount:
         self._centred = not self._arm.any()
         self._t, self._slow = None, np.zeros(3)  # s, stamp of the last sample, and slow part of its rate, rad/s
 
+    def __eq__(self, other):
+        """Whether it sits in the same place."""
+        return isinstance(other, ImuMount) and (self._matrix == other._matrix).all() and (self._arm == other._arm).all()
+
     def in_body(self, t, gyro, accel):
         """gyro (n, 3) rad/s and accel (n, 3) m/s^2 in the body frame, of samples at t (n,) s. Stamps rise, but for outliers."""
         gyro, accel = gyro @ self._matrix.T, accel @ self._matrix.T

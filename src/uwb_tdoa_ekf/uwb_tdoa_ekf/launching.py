@@ -1,8 +1,12 @@
 """What the launch files start: which node, in which namespace, with which of the values. Without launch itself."""
 
+import atexit
 from dataclasses import dataclass
 from difflib import get_close_matches
+import json
 from pathlib import Path
+import shutil
+import signal
 import tempfile
 
 import yaml
@@ -20,7 +24,29 @@ NODES = {  # {executable: (package, names of its parameters)}
     "debias_node": ("uwb_tdoa_ekf", {*debias_node.PARAMETERS} | EVERYWHERE),
     "anchors_node": ("uwb_tdoa_bias", {*anchors_node.PARAMETERS} | EVERYWHERE),
 }
+PATHS = "anchors_file", "effects_file", "map", "flyable_volume"  # parameters that are paths
 OF_FILES = {"params_file"}  # a parameter file for both nodes of a tag, which the values override
+RESPAWN = {  # arguments of the launch files: (default, text, choices)
+    "respawn": ("true", "start a node again that has crashed, after 1 s, 2 s, 4 s ... 30 s", ["true", "false"]),
+    "on_exit": (
+        "shutdown",
+        "when a node refuses at the start what it is given, or has crashed with respawn:=false: shutdown ends all, with code 1; "
+        "stay lets the others go on",
+        ["shutdown", "stay"],
+    ),
+}
+RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+WHO = {
+    "OFF": "nobody, not even on this machine",
+    "LOCALHOST": "nodes on this machine{}, and whoever names it in ROS_STATIC_PEERS; with SUBNET by those of other machines, too",
+    "SUBNET": "nodes on every machine that multicast reaches{}, any of which can command these; with LOCALHOST by those of this machine",
+    "SYSTEM_DEFAULT": "whom the settings of the middleware let through",
+}
+FIRST, LONGEST = 1.0, 30.0  # s, until a node that has crashed is started again: twice as long each time
+SOUND = 60.0  # s; a node that lived for so long has crashed for the first time again
+ENDING = signal.SIGINT, signal.SIGTERM
+REFUSED = 2  # exit code of a node that cannot use what it is given
+IN_ORDER = 0, *(-number for number in ENDING), *(128 + number for number in ENDING)  # exit codes of a node that was asked to end
 
 
 @dataclass(frozen=True)
@@ -34,6 +60,66 @@ class Start:
     parameters: list
     log_level: str = "info"
     name: str | None = None
+
+    @property
+    def label(self):
+        """What it is called in messages."""
+        return f"{self.namespace.strip('/')}/{self.name or self.executable}".lstrip("/")
+
+    @property
+    def words(self):
+        """What it is told, as arguments after --ros-args."""
+        words = ["--log-level", self.log_level]
+        for part in self.parameters:
+            if isinstance(part, dict):
+                words += [word for name, value in part.items() for word in ("-p", f"{name}:={json.dumps(value, ensure_ascii=False)}")]
+            else:
+                words += ["--params-file", str(part)]
+        return words
+
+
+@dataclass(frozen=True)
+class Ended:
+    """What is done when a node has ended. again : s after which it is started again, or None; text : what is said, or None;
+    everything : whether the others end, too."""
+
+    again: float | None = None
+    text: str | None = None
+    everything: bool = False
+
+
+class Lives:
+    """Those of one node: whether it is started again."""
+
+    def __init__(self, label, respawn, on_exit):
+        """respawn : bool; on_exit : "shutdown" or "stay"."""
+        self._label, self._respawn, self._on_exit = label, respawn, on_exit
+        self._crashes = 0  # in a row
+
+    def ended(self, code, alive):
+        """Ended, of a node that has ended by itself with this exit code, or by minus this signal, after so many seconds."""
+        if code in IN_ORDER:
+            return Ended()
+        if code == REFUSED and not self._crashes and alive < SOUND:  # later its files may just be being written: again, then
+            what = f"{self._label} refuses what it is given (see its message above), and is not started again"
+        elif not self._respawn:
+            what = f"{self._label} has ended with exit code {code}"
+        else:
+            self._crashes = 1 if alive > SOUND else self._crashes + 1
+            again = min(LONGEST, FIRST * 2.0 ** (self._crashes - 1))
+            return Ended(again, f"{self._label} has ended with exit code {code}: it is started again in {again:g} s")
+        return Ended(text=what, everything=self._on_exit == "shutdown")
+
+
+def network(environment):
+    """Who can hear the nodes, and command them, in a sentence. environment : variables."""
+    found, peers = environment.get(RANGE) or "SUBNET", environment.get("ROS_STATIC_PEERS")
+    if environment.get("ROS_LOCALHOST_ONLY") == "1":  # old, and counts
+        found, peers = "LOCALHOST", None
+    elif found not in WHO:  # rcl says so
+        found = "LOCALHOST"
+    also = f" and of ROS_STATIC_PEERS={peers}" if peers else ""
+    return f"{RANGE}={found}, ROS_DOMAIN_ID={environment.get('ROS_DOMAIN_ID') or 0}: heard by {WHO[found].format(also)}"
 
 
 def start(executable, namespace, values, files=(), log_level="info"):
@@ -71,7 +157,7 @@ def tags(path, values, log_level="info"):
             merged = {"body_frame": f"{namespace}/base_link", **content, **(own or {}), **values}
             file = merged.pop("params_file", None)
             files = {name: [_beside(path, file)] for name in ("bias_node", "ekf_node")} if file else {}
-            merged |= {name: _beside(path, merged[name]) for name in ("anchors_file", "effects_file") if merged.get(name)}
+            merged |= {name: _beside(path, merged[name]) for name in PATHS if merged.get(name)}
             starts += tag(str(namespace), merged, files, log_level)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -90,23 +176,27 @@ def pooled(starts, processes):
     members = [each for each in starts if each.executable in ("bias_node", "ekf_node")]
     if any(isinstance(part, str) for each in members for part in each.parameters):
         raise InputError("params_file: does not go with processes; write its values into the file of the tags.")
-    told = {f"/{each.namespace}/{each.executable}": {"ros__parameters": each.parameters[-1]} for each in members if each.parameters}
-    with tempfile.NamedTemporaryFile("w", prefix="uwb_tdoa_tags_", suffix=".yaml", delete=False) as file:
-        yaml.safe_dump(told, file)
+    told = {f"/**/{each.label}": {"ros__parameters": each.parameters[-1]} for each in members if each.parameters}  # in any namespace
+    folder = Path(tempfile.mkdtemp(prefix="uwb_tdoa_tags_"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)  # a node that is started again reads it again
+    file = folder / "tags.yaml"
+    file.write_text(yaml.safe_dump(told, allow_unicode=True), encoding="utf-8")
     namespaces, out = list(dict.fromkeys(each.namespace for each in members)), [each for each in starts if each not in members]
     for k in range(min(int(processes), len(namespaces))):
-        parameters, name = [file.name, {"tags": namespaces[k :: int(processes)]}], f"localization_node_{k + 1}"
+        parameters, name = [str(file), {"tags": namespaces[k :: int(processes)]}], f"localization_node_{k + 1}"
         out.append(Start("uwb_tdoa_ekf", "localization_node", "", parameters, members[0].log_level, name))
     return out
 
 
 def refuse_unknown(values, *executables):
-    """Raise InputError for a value that none of the executables has."""
+    """Raise InputError for a value that none of the executables has, or that is none."""
     known = set().union(*(NODES[name][1] for name in executables))
-    for name in values:
+    for name, value in values.items():
         if name not in known:
             near = get_close_matches(str(name), known | OF_FILES, n=1, cutoff=0.5)
             raise InputError(f"{name}: is no parameter of {', '.join(executables)}; " + (f"write {near[0]}." if near else "leave it out."))
+        if value is None or isinstance(value, dict):
+            raise InputError(f"{name}: {value!r} is no value; give a number, a text, true or false, or leave it out.")
 
 
 def typed(texts):

@@ -63,12 +63,12 @@ class Pair:
         bias.streams.wait_for("uwb/tdoa", ekf.due)
 
     def take(self):
-        """Give everything that has arrived to those that take it."""
-        self.bias.streams.take()
-        self.ekf.streams.take()
+        """Give everything that has arrived to those that take it. Returns whether there was anything, or is."""
+        busy = [self.bias.streams.take(), self.ekf.streams.take()]
         while self.bias.holds and len(self._odometry):  # poses that TDOAs wait for
             self.bias.streams.take(at_once=True)
             self.ekf.streams.take(at_once=True)
+        return any(busy)
 
 
 def _for_all(arguments):

@@ -1,6 +1,7 @@
 """What ekf_node publishes: odometry, transforms, residuals."""
 
 import math
+import time
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
@@ -9,19 +10,40 @@ import numpy as np
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.later import rotations
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.foundation.ros_frames import TF_QOS
 from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
 from uwb_tdoa_bias.foundation.ros_wire import Wire
-from uwb_tdoa_msgs.msg import TdoaResidual
+from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM
 from .frames import to_odometry
 
+STATUS_PERIOD = 0.95  # s; it is looked at five times a second
 UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
 ODOMETRY = "pose", "twist"
 RESIDUAL = "anchor_a", "anchor_b", "innovation", "innovation_variance", "weight", "verdict"
 POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a TwistWithCovariance
 UNPLACED = 100  # odometries in a row without odom -> body on /tf, before it is a trouble
+
+
+class StatusOutput:
+    """Publishes EstimatorStatus on `status`: each second, and at once when it changes."""
+
+    def __init__(self, node):
+        self._publisher = node.create_publisher(EstimatorStatus, "status", STATUS_QOS)
+        self._said, self._due = None, -math.inf
+
+    def publish(self, status, yaw_std, tdoa_age, stamp, frame):
+        """Publish if it is due. status : monitoring.status.Status; yaw_std : rad; tdoa_age : s; stamp : builtin_interfaces/Time."""
+        now = time.monotonic()
+        if status == self._said and now < self._due:
+            return
+        self._said, self._due = status, now + STATUS_PERIOD
+        message = EstimatorStatus(status=status.status, lost=status.lost, yaw_known=status.yaw_known, why=status.why)
+        message.header.stamp, message.header.frame_id = stamp, frame
+        message.yaw_std, message.tdoa_age = float(yaw_std), float(tdoa_age)
+        self._publisher.publish(message)
 
 
 class Outputs:
@@ -73,12 +95,12 @@ class Outputs:
             rows[name] = column
         self.residual.publish(self.world, self._residual, rows)
 
-    def publish_odometry(self, odometry, rates, rate_variance):
-        """Publish Odometry. rates (n, 3) rad/s, NaN where not known, and their variance, rad^2/s^2."""
+    def publish_odometry(self, odometry, rates, rate_variances):
+        """Publish Odometry. rates (n, 3) rad/s and their variances (n,) rad^2/s^2, NaN where not known."""
         n = len(odometry)
         rows = self._odometry.rows(n)
         rows["sec"], rows["nanosec"] = self._epoch.parts(odometry.t)
-        rows["pose"], rows["twist"] = pose_and_twist(odometry, rates, rate_variance)
+        rows["pose"], rows["twist"] = pose_and_twist(odometry, rates, rate_variances)
         transformed = self._tf_publisher is not None and (self._odom or self._tf_publisher.get_subscription_count())
         self.odometry.publish(self.world, self._odometry, rows)
         for k in range(n) if transformed else ():
@@ -104,25 +126,25 @@ class Outputs:
         self._tf_publisher.publish(self._tf)
 
 
-def pose_and_twist(odometry, rates, rate_variance):
+def pose_and_twist(odometry, rates, rate_variances):
     """The numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST), see `publish_odometry`."""
     velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
     pose, twist = np.empty((len(odometry), POSE)), np.zeros((len(odometry), TWIST))
     p, q = np.ascontiguousarray(odometry.p), np.ascontiguousarray(odometry.q)
-    _fill(p, q, velocity, covariance, rates, rate_variance, pose, twist)
+    _fill(p, q, velocity, covariance, rates, rate_variances, pose, twist)
     return pose, twist
 
 
 @compiled
-def _fill(p, q, velocity, covariance, rates, rate_variance, pose, twist):
+def _fill(p, q, velocity, covariance, rates, rate_variances, pose, twist):
     for n in range(len(p)):
         pose[n, :3], pose[n, 3:7], twist[n, :3] = p[n], q[n], velocity[n]
-        known = math.isfinite(rates[n, 0])
+        known = math.isfinite(rates[n, 0]) and math.isfinite(rate_variances[n])
         for i in range(6):
             for j in range(6):
                 pose[n, 7 + 6 * i + j] = covariance[n, i, j]
         for i in range(3):
             twist[n, 3 + i] = rates[n, i] if known else 0.0
-            twist[n, 6 + 7 * (3 + i)] = rate_variance if known else UNKNOWN_RATE
+            twist[n, 6 + 7 * (3 + i)] = rate_variances[n] if known else UNKNOWN_RATE
             for j in range(3):
                 twist[n, 6 + 6 * i + j] = covariance[n, 6 + i, 6 + j]

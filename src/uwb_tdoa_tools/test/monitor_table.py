@@ -1,5 +1,5 @@
 """What the monitor of ekf_node names on measured flights, and what it names on flights that nothing was put into: the
-figures of docs/reliability.md. Same code as in the node, without ROS.
+figures of docs/reliability.md. The same filter and monitor as in the node, off line.
 
 python src/uwb_tdoa_tools/test/monitor_table.py DATA --days 0426 0607
 """
@@ -11,14 +11,18 @@ from pathlib import Path
 import numpy as np
 from time_offset_table import cut, measured
 
+from uwb_tdoa_bias.foundation import geometry
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.monitoring.monitor import Monitor
+from uwb_tdoa_ekf.monitoring.slices import LENGTH, reduced
+from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.scoring.metrics import position_at
 
 STEP = 0.5  # s between two looks at what the monitor says
 SIZES = {0.6: 5.0, 0.3: 10.0}  # m: s within which it is to be named
 MIDDLE = 0.4, 0.6  # of the time in the air, between which a fault begins
+SPAN = 6.0  # s over which delays at the ground truth are averaged
 JUDGED = 5.0  # s after the beginning of a fault from which errors count
 
 
@@ -68,25 +72,27 @@ EVENT_LIMIT = 5.0  # s
 
 
 def run(flight, config):
-    """Live, without ROS: [(s, sentences)] and (t (n,) s, p (n, 3) m) of a Flight."""
-    estimator, said, odometry = Estimator(flight.anchors, config), [], []
-    imu, tdoa = flight.imu, flight.tdoa
-    i = k = 0
-    for until in np.arange(tdoa.t[0] + STEP, airborne(flight)[1] + STEP, STEP):
-        last, first = np.searchsorted(tdoa.t, until), k
-        rows = zip(*(column[first:last].tolist() for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d)))
-        if imu is not None:
-            end = np.searchsorted(imu.t, until)
-            for sample in zip(*(column[i:end].tolist() for column in (imu.t, imu.gyro, imu.accel))):
-                estimator.add_imu(*sample)
-            i = end
-        for row in rows:
-            estimator.add_tdoa(*row)
-        k = last
-        out, _ = estimator.advance()
-        odometry.append(out)
-        said.append((until, estimator.alarms))
-    return said, (np.concatenate([o.t for o in odometry]), np.concatenate([o.p for o in odometry]))
+    """[(s, sentences)], every STEP, and (t (n,) s, p (n, 3) m) of a Flight: off line, which is what live gives."""
+    result, monitor, said = run_offline(flight, config), Monitor(flight.anchors), []
+    odometry, residuals = (_by_stamp(part) for part in (result.odometry, result.residuals))
+    low = -np.inf
+    for until in np.arange((np.floor(flight.tdoa.t[0] / STEP) + 1.0) * STEP, flight.tdoa.t[-1] + STEP, STEP):
+        monitor.add(*(_between(part, low, until) for part in (odometry, residuals)))
+        monitor.judge(until)
+        said.append((until, monitor.alarms))
+        low = until
+    return said, (odometry.t, odometry.p)
+
+
+def _by_stamp(part):
+    order = np.argsort(part.t, kind="stable")
+    return type(part)(*(column[order] for column in vars(part).values()))
+
+
+def _between(part, low, high):
+    """What of an Odometry, or of Residuals, is stamped from `low` on, and before `high`, s."""
+    inside = slice(*np.searchsorted(part.t, [low, high]))
+    return type(part)(*(column[inside] for column in vars(part).values()))
 
 
 def error_of(flight, track, low, high):
@@ -96,17 +102,47 @@ def error_of(flight, track, low, high):
     return float(np.sqrt(np.nanmean(np.sum((p[inside] - position_at(t[inside], flight.truth)) ** 2, axis=1))))
 
 
+def delays_at_truth(flight):
+    """(t (n,) s, delays (n, N) m): as the monitor reduces them, by half seconds in the air, but at the ground truth."""
+    tdoa, (begin, end), positions = flight.tdoa, airborne(flight), flight.anchors.positions
+    a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
+    p = position_at(tdoa.t, flight.truth)
+    error = tdoa.d - geometry.tdoa(p, positions[a], positions[b])
+    known, t, out = np.isfinite(error), np.arange(begin, end, LENGTH), []
+    for low in t:
+        now = known & (tdoa.t >= low) & (tdoa.t < low + LENGTH)
+        piece = reduced(low, p[now].mean(axis=0), positions, a[now], b[now], error[now]) if now.any() else None
+        out.append(np.full(len(positions), np.nan))
+        if piece is not None:
+            out[-1][piece.rows] = piece.delays
+    return t, np.array(out)
+
+
+def borne_out(flight, t, sentence):
+    """By how much the anchor that a sentence names, first said at t, s, is later at the ground truth in the SPAN seconds around t than
+    from 2 SPAN to SPAN before t: m, as the monitor would have it, which shrinks delays; NaN for other sentences."""
+    if not sentence.startswith("anchor "):
+        return np.nan
+    row = int(flight.anchors.index(np.array([int(sentence.split()[1].rstrip(":"))]))[0])
+    at, delays = delays_at_truth(flight)
+    now, before = (at > t - 0.5 * SPAN) & (at < t + 0.5 * SPAN), (at > t - 2.0 * SPAN) & (at < t - SPAN)
+    return float(np.nanmean(delays[now, row]) - np.nanmean(delays[before, row]))
+
+
 def clean(flights, config):
-    """Prints what is said of flights that nothing was put into."""
-    seconds = alarmed = 0
+    """Prints what is said of flights that nothing was put into, and what the ground truth says to it."""
+    seconds = alarmed = grounded = 0
     for flight in flights:
         said, _ = run(flight, config)
-        seconds += airborne(flight)[1] - airborne(flight)[0]
+        begin, end = airborne(flight)
+        seconds += end - begin
         first = next(((t, sentences[0]) for t, sentences in said if sentences), None)
         alarmed += first is not None
+        grounded += any(sentences for t, sentences in said if t < begin or (t > end and not (first and first[0] <= end)))
         if first:
-            print(f"  {flight.name}: {first[0] - airborne(flight)[0]:.1f} s in the air: {first[1]}")
-    print(f"{alarmed} of {len(flights)} unharmed flights with an alarm, {seconds:.0f} s in the air")
+            truth = borne_out(flight, *first)
+            print(f"  {flight.name}: {first[0] - begin:.1f} s in the air: {first[1]} (at the ground truth by {truth:+.2f} m)", flush=True)
+    print(f"{alarmed} of {len(flights)} unharmed flights with an alarm, {grounded} on the floor, {seconds:.0f} s in the air")
 
 
 def faults(flights, config, draws, seed):

@@ -25,7 +25,7 @@ def soak(minutes, starts, folder):
     flight = make_flight(LAPS * 2.0 * math.pi * LAP["radius"] / LAP["speed"], **LAP)
     rounds = math.ceil(60.0 * minutes / (flight.imu.t[-1] - flight.imu.t[0]))
     nodes.start(folder)  # whoever compiles the filter keeps the memory that took
-    with nodes._surroundings(folder) as (node, processes):
+    with nodes.surroundings(folder) as (node, processes):
         diagnostics, source, began = Diagnostics(node), Source(node, [""]), time.monotonic()
         for title, (name, arguments) in starts.items():
             nodes._start(processes, node, title, name, arguments)

@@ -117,7 +117,7 @@ def test_ready_is_read_from_the_log():
 
 def test_bad_usage(tmp_path, capsys):
     assert bench.main(["--only", "cpu"]) == 2
-    assert "core, offline, nodes, tags, replay" in capsys.readouterr().err.replace("'", "")
+    assert "core, offline, nodes, tags, replay, graph" in capsys.readouterr().err.replace("'", "")
     assert bench.main(["--json", str(tmp_path / "no" / "bench.json"), "--out", str(tmp_path)]) == 2
     assert "its directory does not exist" in capsys.readouterr().err
     assert bench.main(["--only", "offline", "--model", str(tmp_path / "no.onnx"), "--out", str(tmp_path)]) == 2

@@ -11,26 +11,22 @@ import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock as SteadyClock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
-from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
+from rosgraph_msgs.msg import Clock
 
 from .errors import InputError
 from .executable import interrupt
-
-try:  # not in rclpy before 7.1.4; takes a third of the CPU time
-    from rclpy.experimental import EventsExecutor
-
-    SERVED = 0.02  # s, from one time that an executor does everything that is to do to the next, beside turns
-except ImportError:
-    EventsExecutor, SERVED = SingleThreadedExecutor, 0.0  # does one thing at a time
+from .ros_parameters import ParameterNode
+from .ros_spinning import Spinner
+from .ros_wire import Unreadable, decode, name_of
 
 # What comes in is sensor data: best effort, which hears every publisher. Deep, because a node that was not scheduled for a
 # moment must find all of it: 10 s of a 1 kHz IMU, or 2.5 s of it replayed four times as fast. Takes memory only where it
@@ -38,7 +34,10 @@ except ImportError:
 STREAM_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 OUTPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LARGEST_LOSS = 0.01  # share of the messages of a second
-LONGEST_WAIT = 0.2  # s, until a node that receives nothing sees a signal
+BEHIND = 0.5  # s that something may wait until this process serves it
+REPORT_PERIOD, LOOKS = 1.0, 5  # s from one report to the next, and looks in between at what is to be told at once
+PAUSED, SLOWEST_CLOCK = 0.5, 2.0  # s without a new time on /clock; s from one time to the next of a clock that runs
+SAY_AGAIN = 10.0  # s from one warning to the next of the same kind
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])  # written into the given profile
 
@@ -48,58 +47,120 @@ def publish_stream(node, kind, topic):
     return node.create_publisher(kind, topic, copy(OUTPUT_QOS), qos_overriding_options=OVERRIDES)
 
 
-class StreamNode(Node):
-    """A node that may have subscriptions which no executor serves. members : nodes that live and end with it."""
+class StreamNode(ParameterNode):
+    """A node whose /clock is not served by an executor (see Spinner). members : nodes that live and end with it; spinner : the
+    Spinner that serves it, once there is one."""
 
-    members = ()
-
-    def __init__(self, *arguments, **options):
-        self._unserved = []
-        super().__init__(*arguments, **options)
+    members, spinner = (), None
 
     @property
     def subscriptions(self):
         """Those that an executor serves."""
-        yield from (one for one in super().subscriptions if one not in self._unserved)
+        yield from (one for one in super().subscriptions if one.msg_type is not Clock)
 
-    def leave_to_itself(self, subscription):
-        """Have no executor serve a subscription."""
-        self._unserved.append(subscription)
+    def take_clock(self):
+        """Set the clock of the node to the newest of /clock."""
+        for clock in [one for one in super().subscriptions if one.msg_type is Clock]:
+            newest = None
+            with clock.handle:
+                while (taken := clock.handle.take_message(Clock, True)) is not None:
+                    newest = taken[0]
+            if newest is None:
+                continue
+            try:
+                clock.callback(decode(newest, Clock))
+            except (ValueError, OverflowError) as error:  # no time at all, or before 1970
+                self.get_logger().warning(f"/clock: passed over: {error}", throttle_duration_sec=SAY_AGAIN)
+
+
+class Refusals:
+    """Messages of a topic that could not be read. count : of them; reason : of the last; topic : its name."""
+
+    def __init__(self, node, topic, kind):
+        self.count, self.reason = 0, ""
+        self.topic, self._node, self._kind, self._before = topic, node, kind, 0
+
+    def add(self, error):
+        """Count one. error : Unreadable."""
+        self.count, self.reason = self.count + 1, str(error)
+        self._node.get_logger().warning(
+            f"{self.topic}: a message cannot be read and is not used: {error}", throttle_duration_sec=SAY_AGAIN
+        )
+
+    def trouble(self):
+        """The sentence for those since this was asked last, or None."""
+        new, self._before = self.count - self._before, self.count
+        if not new:
+            return None
+        others = self._others()
+        remedy = f"{others} publishes another version of {name_of(self._kind)}: build it anew" if others else "check who publishes it"
+        return f"{new} messages on {self.topic} cannot be read ({self.reason}): {remedy}"
+
+    def _others(self):
+        """Who publishes another definition of the type than ours, as text."""
+        name = self._node.resolve_topic_name(self.topic)
+        own = {_hash(end) for end in self._node.get_subscriptions_info_by_topic(name) if end.node_name == self._node.get_name()}
+        ends = [end for end in self._node.get_publishers_info_by_topic(name) if _hash(end) not in own]
+        return ", ".join(sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}))
+
+
+def _hash(end):
+    return str(end.topic_type_hash)
+
+
+class Input:
+    """Subscription of messages that come one at a time, not in streams: callback(message). What cannot be read is refused.
+
+    refusals : Refusals; options : of Node.create_subscription.
+    """
+
+    def __init__(self, node, kind, topic, callback, qos, read=None, **options):
+        """read(bytes) : what is given to the callback; default the message; raises Unreadable."""
+        self.refusals = Refusals(node, topic, kind)
+        self._read, self._callback = read or (lambda data: decode(data, kind)), callback
+        self.subscription = node.create_subscription(kind, topic, self._take, qos, raw=True, **options)
+
+    def _take(self, data):
+        try:
+            message = self._read(data)
+        except Unreadable as error:
+            self.refusals.add(error)
+        else:
+            self._callback(message)
 
 
 class StreamInput:
-    """Subscription of a stream. QoS by parameter: qos_overrides.<topic>.subscription.reliability and .depth.
+    """Subscription of a stream, of which what arrives is kept until it is fetched. QoS by parameter:
+    qos_overrides.<topic>.subscription.reliability and .depth.
 
-    lost : messages that were sent and that DDS did not deliver, as far as it knows.
+    lost : messages that were sent and that DDS did not deliver, as far as it knows; refusals : Refusals.
     """
 
-    def __init__(self, node, kind, topic, callback=None):
-        """callback(message); None: the node, a StreamNode, fetches them as bytes."""
+    def __init__(self, node, kind, topic):
         self.lost, self._before = 0, 0
-        self._node, self._topic = node, topic
+        self.refusals = Refusals(node, topic, kind)
+        self._node, self._topic, self._messages, self._arrivals = node, topic, [], []
         events = SubscriptionEventCallbacks(message_lost=self._on_lost)
         self._subscription = node.create_subscription(
-            kind, topic, callback or _unused, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES,
-            raw=callback is None,
+            kind, topic, self._keep, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES, raw=True
         )  # fmt: skip
-        if callback is None:
-            node.leave_to_itself(self._subscription)
+
+    def _keep(self, data):
+        self._messages.append(data)
+        self._arrivals.append(time.time_ns())
+
+    def __len__(self):
+        """Messages that wait."""
+        return len(self._messages)
 
     def fetch(self, wire):
         """What has arrived, by a Wire: [(frame, rows (n,), arrivals (n,) s since 1970)], each of successive messages of one
         frame."""
-        kind, handle, messages, arrivals = self._subscription.msg_type, self._subscription.handle, [], []
-        with handle:
-            while (taken := handle.take_message(kind, True)) is not None:
-                messages.append(taken[0])
-                arrivals.append(taken[1]["received_timestamp"] or time.time_ns())
-        if not messages:
+        if not self._messages:
             return []
-        arrivals, first, out = 1e-9 * np.array(arrivals), 0, []
-        for frame, rows in wire.read(messages):
-            out.append((frame, rows, arrivals[first : first + len(rows)]))
-            first += len(rows)
-        return out
+        messages, arrivals = self._messages, 1e-9 * np.array(self._arrivals)
+        self._messages, self._arrivals = [], []
+        return [(frame, rows, arrivals[some]) for frame, rows, some in wire.read(messages, self.refusals.add)]
 
     def _on_lost(self, status):
         self.lost += status.total_count_change
@@ -111,6 +172,9 @@ class StreamInput:
     def trouble(self, received):
         """What is wrong with the stream as ROS sees it, or None. received : messages since this was asked last."""
         lost, self._before = self.lost - self._before, self.lost
+        refused = self.refusals.trouble()
+        if refused:
+            return refused
         if self.get_publisher_count() > 1:
             return several_publishers(self._node, self._topic)
         if lost > LARGEST_LOSS * (received + lost):
@@ -119,10 +183,6 @@ class StreamInput:
                 f"of machine and network, or set qos_overrides.{self._subscription.topic_name}.subscription.reliability"
             )
         return None
-
-
-def _unused(_):
-    """Callback of a subscription that no executor serves."""
 
 
 def several_publishers(node, topic):
@@ -178,21 +238,42 @@ def orientation_of(q):
 
 
 class Diagnostics:
-    """Publishes one status on /diagnostics each second of the wall clock, and logs it whenever its text changes.
+    """Publishes one status on /diagnostics each second of the wall clock, and at once when simulated time stops or goes on; logs it
+    whenever its text changes.
 
-    report() -> (level, text, {key: value}), with level one of DiagnosticStatus.OK, WARN, ERROR.
+    report() -> (level, text, {key: value}), with level one of DiagnosticStatus.OK, WARN, ERROR; look() : called LOOKS times a
+    second.
     """
 
-    def __init__(self, node, report):
-        self._node, self._report, self._said = node, report, None
-        self._clock = SimulatedClock(node)
+    def __init__(self, node, report, look=lambda: None):
+        self._node, self._report, self._look, self._said = node, report, look, None
+        self._clock, self._judgement, self._looks = SimulatedClock(node), None, 0
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS_QOS)
-        node.create_timer(1.0, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node.create_timer(REPORT_PERIOD / LOOKS, self._on_timer, clock=SteadyClock(clock_type=ClockType.STEADY_TIME))
+
+    def _on_timer(self):
+        before, self._judgement = self._judgement, self._clock.judge()
+        self._looks += 1
+        if self._looks % LOOKS == 0 or before != self._judgement:
+            self.publish()
+        self._look()
+
+    @property
+    def paused(self):
+        """Whether simulated time stands still."""
+        return self._judgement is not None
 
     def publish(self):
         """Publish now."""
         level, text, values = self._report()
-        level, text = self._clock.judge() or (level, text)
+        spinner = self._node.spinner
+        if spinner is not None:
+            late = spinner.longest_wait
+            spinner.longest_wait = 0.0  # of the process: the first of its nodes that asks says it
+            values |= {"longest wait of a request": f"{late:.3f} s"}
+            if late > BEHIND and level == DiagnosticStatus.OK:
+                level, text = DiagnosticStatus.WARN, f"this node answers up to {late:.1f} s late: check the load of this machine"
+        level, text = self._judgement or (level, text)
         if text != self._said:
             logger = self._node.get_logger()
             if level == DiagnosticStatus.OK:
@@ -209,21 +290,29 @@ class Diagnostics:
 
 
 class SimulatedClock:
-    """Whether simulated time goes on; of the clock of a node, asked once a second."""
+    """Whether simulated time goes on; of the clock of a node, asked a few times a second."""
 
-    def __init__(self, node):
-        self._node, self._before = node, None
+    def __init__(self, node, now=time.monotonic):
+        self._node, self._now = node, now
+        self._time, self._since, self._period = None, now(), 0.0  # the last time, since when, s from one to the next lately
 
     def judge(self):
         """(level, text) while nothing else can be said, because time stands still; None otherwise."""
-        clock = self._node.get_clock()
+        clock, now = self._node.get_clock(), self._now()
         if not clock.ros_time_is_active:
+            self._time = None
             return None
-        before, self._before = self._before, clock.now().nanoseconds
-        if self._before == 0:
+        time_of_it = clock.now().nanoseconds
+        if time_of_it == 0:
             remedy = "play the bag with --clock, or set use_sim_time to false"
             return DiagnosticStatus.WARN, f"use_sim_time is set, and nobody publishes /clock: {remedy}"
-        return (DiagnosticStatus.OK, "paused: /clock stands still") if self._before == before else None
+        if time_of_it != self._time:
+            took = now - self._since
+            if self._time is not None and took < SLOWEST_CLOCK:
+                self._period = max(took, 0.5 * self._period)
+            self._time, self._since = time_of_it, now
+        stands = now - self._since > max(PAUSED, 2.0 * self._period)
+        return (DiagnosticStatus.OK, "paused: /clock stands still") if stands else None
 
 
 class Rate:
@@ -244,7 +333,7 @@ def run(node_class, description, argv=None):
     """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an InputError, or 128 and the
     number of a signal that came before the node was ready.
 
-    node_class(arguments) makes the node, in an initialised rclpy, of the arguments of the process; it has the executable's
+    node_class(arguments) makes the StreamNode, in an initialised rclpy, of the arguments of the process; it has the executable's
     NAME, and may have `members` and `turns`, ros_streams.Turns. description : for --help.
     """
     name = node_class.NAME
@@ -262,20 +351,21 @@ def run(node_class, description, argv=None):
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
-    nodes, executor = [], None
+    nodes, spinner = [], None
     try:
         _init(parser, arguments)
         node = node_class(arguments)
-        executor, nodes = EventsExecutor(), [node, *getattr(node, "members", ())]
+        nodes = [node, *node.members]
+        spinner = Spinner(nodes, getattr(node, "turns", None))
         for each in nodes:
-            executor.add_node(each)
+            each.spinner = spinner
         gc.collect()
         gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
         gc.enable()
         interruptible = False
         if stop.done():
             raise KeyboardInterrupt
-        _spin(executor, getattr(node, "turns", None), stop)
+        spinner.spin(stop)
     except SystemExit as ended:  # argparse has said it already
         return ended.code or 0
     except InputError as error:
@@ -287,27 +377,12 @@ def run(node_class, description, argv=None):
         pass
     finally:
         interruptible = False
-        if executor is not None:
-            for each in nodes:
-                executor.remove_node(each)
-            executor.shutdown()
+        if spinner is not None:
+            spinner.close()
         for each in nodes:
             each.destroy_node()
         rclpy.try_shutdown()
     return 0
-
-
-def _spin(executor, turns, stop):
-    """Live until the future `stop` is done. Turns are taken beside the executor: a timer of it costs four times as much."""
-    served = -np.inf
-    while not stop.done() and rclpy.ok():
-        if turns is None:  # a signal is seen after a callback, or after the time
-            executor.spin_until_future_complete(stop, timeout_sec=LONGEST_WAIT)
-            continue
-        if time.monotonic() >= served + SERVED:
-            executor.spin_once(timeout_sec=0.0)
-            served = time.monotonic()
-        time.sleep(turns.take())
 
 
 def _init(parser, arguments):

@@ -6,6 +6,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
+from . import ros
 from .anchors import Anchors
 from .errors import InputError
 from .ros_parameters import Parameter
@@ -55,9 +56,7 @@ class AnchorsInput:
         self._of_file = read_survey(file) if file else None
         self._repeated = None  # the subscription to volatile ones
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
-        self._latched = node.create_subscription(
-            AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events
-        )
+        self._latched = ros.Input(node, AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events)
 
     def start(self):
         """Give the anchors of the file, if there is one."""
@@ -65,12 +64,17 @@ class AnchorsInput:
             self.anchors = self._of_file
             self._on_change(self.anchors)
 
+    @property
+    def refusals(self):
+        """ros.Refusals of each subscription."""
+        return [end.refusals for end in (self._latched, self._repeated) if end is not None]
+
     def _on_incompatible(self, _):
         if self._repeated is None:
             self._node.get_logger().warning(
                 "uwb/anchors is not published reliable and transient local: taken when it is repeated"
             )
-            self._repeated = self._node.create_subscription(AnchorArray, "uwb/anchors", self._on_message, ANY_QOS)
+            self._repeated = ros.Input(self._node, AnchorArray, "uwb/anchors", self._on_message, ANY_QOS)
 
     def _on_message(self, message):
         try:

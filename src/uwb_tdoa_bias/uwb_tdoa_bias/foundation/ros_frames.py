@@ -1,50 +1,87 @@
 """What TF says, as far as a node needs it: constant transforms, and on request those that move."""
 
+import struct
+
+from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
+from . import ros
+from .errors import InputError
+from .ros_wire import ENCAPSULATION, LENGTH, MOST_ELEMENTS, Unreadable, aligned, check_length, decode, read_text
 from .transforms import Frames
 
 TF_QOS = QoSProfile(depth=100)  # what tf2 uses
+MOVING_QOS = QoSProfile(depth=1000)  # 2 s of a robot that publishes it at 500 Hz
+STAMP, NUMBERS = struct.Struct("<iI"), struct.Struct("<7d")  # of a TransformStamped: p, then q
 TF_STATIC_QOS = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 
 
 class FramesInput:
-    """Frames of /tf_static, and of /tf if they may move."""
+    """Frames of /tf_static, and of /tf if they may move. trouble : a transform that is none, or None; refusals : ros.Refusals."""
 
     def __init__(self, node, seconds, on_new, moving=False):
         """seconds(stamp) : s of a builtin_interfaces/Time; on_new() is called when a constant transform is new."""
-        self.frames = Frames()
-        self._seconds, self._on_new = seconds, on_new
-        node.create_subscription(TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS)
-        self._moving = node.create_subscription(TFMessage, "/tf", self._on_moving, TF_QOS) if moving else None
+        self.frames, self.trouble = Frames(), None
+        self._node, self._seconds, self._on_new = node, seconds, on_new
+        ends = [ros.Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms)]
+        if moving:
+            ends.append(ros.Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, read_transforms))
+        self.refusals = [end.refusals for end in ends]
 
-    def catch_up(self):
-        """Take what has arrived of frames that move, before what was measured among them."""
-        if self._moving is not None:
-            with self._moving.handle:
-                while (taken := self._moving.handle.take_message(TFMessage, False)) is not None:
-                    self._on_moving(taken[0])
-
-    def _on_static(self, message):
-        new = [self.frames.set(*_of(transform)) for transform in message.transforms]
+    def _on_static(self, transforms):
+        new = [self._take("/tf_static", self.frames.set, *transform[2:]) for transform in transforms]
         if any(new):
             self._on_new()
 
-    def _on_moving(self, message):
-        for transform in message.transforms:
-            stamp = transform.header.stamp
-            if not (stamp.sec or stamp.nanosec):
-                continue
-            self.frames.move(*_of(transform), self._seconds(stamp))
+    def _on_moving(self, transforms):
+        for sec, nanosec, *transform in transforms:
+            if sec or nanosec:
+                self._take("/tf", self.frames.move, *transform, self._seconds(Time(sec=sec, nanosec=nanosec)))
+
+    def _take(self, topic, take, *transform):
+        try:
+            return take(*transform)
+        except InputError as error:
+            self.trouble = f"{topic}: not taken: {error}"
+            self._node.get_logger().warning(self.trouble, throttle_duration_sec=ros.SAY_AGAIN)
+            return False
+
+
+def read_transforms(data):
+    """[(sec, nanosec, parent, child, q, p)] of a serialized tf2_msgs/TFMessage: q x y z w, p m. Raises Unreadable.
+
+    A robot publishes hundreds a second, and a message object takes ten times as long as this.
+    """
+    if data[:4] != ENCAPSULATION:
+        return [_of(transform) for transform in decode(data, TFMessage).transforms]
+    if len(data) < 8:
+        raise Unreadable(f"it has {len(data)} bytes")
+    (count,), place, out = LENGTH.unpack_from(data, 4), 8, []
+    if count > MOST_ELEMENTS:
+        raise Unreadable(f"it would hold {count} transforms; at most {MOST_ELEMENTS} are read")
+    for _ in range(count):
+        place = aligned(place, 4)
+        check_length(data, place + STAMP.size, TFMessage, exactly=False)
+        stamp = STAMP.unpack_from(data, place)
+        parent, place = read_text(data, place + STAMP.size, "frame_id")
+        child, place = read_text(data, aligned(place, 4), "child_frame_id")
+        place = aligned(place, 8)
+        check_length(data, place + NUMBERS.size, TFMessage, exactly=False)
+        numbers = NUMBERS.unpack_from(data, place)
+        place += NUMBERS.size
+        out.append((*stamp, parent.lstrip("/"), child.lstrip("/"), numbers[3:], numbers[:3]))
+    check_length(data, place, TFMessage)
+    return out
 
 
 def _of(message):
-    """(parent, child, q, p) of a TransformStamped."""
-    q, p = message.transform.rotation, message.transform.translation
-    return message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/"), (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
+    """The same of a TransformStamped."""
+    q, p, stamp = message.transform.rotation, message.transform.translation, message.header.stamp
+    names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
+    return stamp.sec, stamp.nanosec, *names, (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
 
 
 def unknown_frame(topic, frame, body):

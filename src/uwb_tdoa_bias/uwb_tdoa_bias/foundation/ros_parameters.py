@@ -2,16 +2,18 @@
 
 from dataclasses import dataclass
 from difflib import get_close_matches
+from pathlib import Path
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import (
     InvalidParameterTypeException,
     InvalidParameterValueException,
     ParameterUninitializedException,
 )
+from rclpy.node import Node
+import yaml
 
 from .errors import InputError
-from .safe_yaml import read_yaml
 
 KINDS = {float: "a number with a decimal point, e.g. 1.0", int: "a whole number", bool: "true or false", list: "a list"}
 QOS = "qos_overrides."
@@ -41,6 +43,23 @@ class Parameter:
         elif isinstance(self.default, int) and not isinstance(self.default, bool):
             out.integer_range = [IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)]
         return out
+
+
+class ParameterNode(Node):
+    """A Node that takes a read-only parameter which is set to what it is: `ros2 param load` sets all that `ros2 param dump` wrote."""
+
+    def set_parameters_atomically(self, parameter_list):
+        """Of rclpy; what the parameter services of the node call."""
+        others = [each for each in parameter_list if not self._is_so_for_good(each)]
+        return super().set_parameters_atomically(others) if others or not parameter_list else SetParametersResult(successful=True)
+
+    def _is_so_for_good(self, parameter):
+        name = parameter.name
+        return (
+            self.has_parameter(name)
+            and self.describe_parameter(name).read_only
+            and self.get_parameter(name).get_parameter_value() == parameter.get_parameter_value()
+        )
 
 
 def declare(node, name, parameter):
@@ -81,7 +100,7 @@ def say_unused(nodes, files):
     process have all of their topics. files : their paths."""
     given, logger = {name for node in nodes for name in node._parameter_overrides}, nodes[0].get_logger()
     for file in files:
-        names = _names(read_yaml(file))
+        names = _names(file)
         if names and not names & given:
             logger.warning(
                 f"{file}: none of its parameters is for {nodes[0].get_fully_qualified_name()}: they are not used; begin it "
@@ -97,17 +116,29 @@ def files_of(arguments):
     return [file for word, file in zip(arguments, arguments[1:]) if word == "--params-file"]
 
 
-def _names(content):
-    """Names of all parameters in a parameter file, of whatever node."""
-    if not isinstance(content, dict):
+def _names(file):
+    """Names of all parameters in a parameter file, of whatever node. rcl has read it before and judges it: here no value is looked
+    at, nor the tag of one (launch_ros gives lists the tag !!python/tuple)."""
+    if not Path(file).is_file():  # a pipe, which rcl has emptied
         return set()
-    found = set()
-    for key, value in content.items():
-        found |= _flat(value) if key == "ros__parameters" else _names(value)
-    return found
+    try:
+        with open(file, "rb") as opened:
+            return set(_below_nodes(yaml.compose(opened, Loader=yaml.SafeLoader)))
+    except (OSError, yaml.YAMLError):
+        return set()
 
 
-def _flat(parameters, prefix=""):
-    if not isinstance(parameters, dict):
-        return {prefix.rstrip(".")}
-    return set().union(*(_flat(value, f"{prefix}{name}.") for name, value in parameters.items()), set())
+def _below_nodes(part):
+    """Yields the names below each ros__parameters in a part of a file, as yaml.compose gives it."""
+    for key, value in part.value if isinstance(part, yaml.MappingNode) else ():
+        yield from _flat(value) if key.value == "ros__parameters" else _below_nodes(value)
+
+
+def _flat(part, prefix=""):
+    """Yields the names in a mapping of parameters, whose mappings are prefixes."""
+    for key, value in part.value if isinstance(part, yaml.MappingNode) else ():
+        name = f"{prefix}{key.value}"
+        if isinstance(value, yaml.MappingNode):
+            yield from _flat(value, f"{name}.")
+        else:
+            yield name

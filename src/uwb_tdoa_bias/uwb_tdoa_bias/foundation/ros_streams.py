@@ -1,4 +1,4 @@
-"""The streams of a node: all that has arrived is taken together, in turns; an executor's wake-up costs more than a message."""
+"""The streams of a node: all that has arrived is taken together, in turns; a call of the filter costs more than a message."""
 
 import time
 
@@ -7,7 +7,7 @@ import numpy as np
 from . import ros
 from .stamps import LARGEST_STEP_BACK
 
-PERIOD = 0.001  # s, at least, from one turn to the next
+PERIOD = 0.001  # s, at least, of rest after a turn
 LONGEST_WAIT = 0.02  # s without a turn in which anything is taken, whatever it waits for
 ROUNDING = 1e-6  # s by which two ways to compute a stamp since 1970 may differ
 LONGEST_REST = 0.01  # s; after a turn there is a rest as long as it took, at most so long: more is then taken at a time
@@ -16,27 +16,34 @@ LONGEST_REST = 0.01  # s; after a turn there is a rest as long as it took, at mo
 class Turns:
     """Has nodes take what has arrived for them, one after the other. A node that has `turns` is given them by ros.run."""
 
+    PERIOD = PERIOD
+
     def __init__(self, streams):
         """streams : list of Streams, or of what else has take()."""
         self._streams = streams
 
     def take(self):
-        """One turn; returns the s until the next."""
+        """One turn; returns the s of rest after it; None if nothing has arrived."""
         began = time.monotonic()
-        for streams in self._streams:
-            streams.take()
+        if not any([streams.take() for streams in self._streams]):
+            return None
         return min(max(time.monotonic() - began, PERIOD), LONGEST_REST)
 
 
 class Streams:
-    """Subscriptions of a ros.StreamNode, which no executor serves: they hold what arrives until it is taken."""
+    """Streams of a ros.StreamNode: they hold what arrives until it is taken."""
 
-    def __init__(self, node, epoch, on_taken, catch_up=lambda: None):
-        """epoch : ros.Epoch; catch_up() is called before anything is given to those that take it, on_taken() afterwards."""
+    def __init__(self, node, epoch, on_taken):
+        """epoch : ros.Epoch; on_taken() is called after anything was given to those that take it."""
         self.inputs = {}  # ros.StreamInput or Handed by topic, in the order in which they are taken
-        self._node, self._epoch, self._on_taken, self._catch_up = node, epoch, on_taken, catch_up
-        self._streams, self._unheard, self._by_topic = [], [], {}
+        self._node, self._epoch, self._on_taken = node, epoch, on_taken
+        self._streams, self._by_topic = [], {}
         self._awaited, self._due, self._until = None, None, -np.inf
+
+    @property
+    def refusals(self):
+        """ros.Refusals of each."""
+        return [end.refusals for end in self.inputs.values()]
 
     def wait_for(self, topic, due):
         """Take nothing before a message of this topic is stamped due(), s since 1970, or later, for LONGEST_WAIT: less could not
@@ -50,31 +57,28 @@ class Streams:
         self.inputs[topic] = kind(self._node, wire.kind, topic)
         stream = self._by_topic[topic] = _Stream(wire, take, self.inputs[topic])
         self._streams.append(stream)
-        self._unheard.append(stream)
 
     def take(self, at_once=False):
-        """Give everything that has arrived to those that take it; at_once : whatever they wait for."""
+        """Give everything that has arrived to those that take it; at_once : whatever they wait for. Returns whether there was
+        anything, or is."""
+        if not any(len(end) for end in self.inputs.values()) and not (self._awaited and self._awaited.waiting):
+            return False
         if self._awaited is not None and not at_once:
             arrived, now = self._awaited.fetch(), time.monotonic()
             if now < self._until and not (arrived and self._awaited.newest_waiting > self._due() - ROUNDING):
-                return
+                return True
             self._until = now + LONGEST_WAIT
-        if self._unheard:  # of what has never come, one is asked for at a time
-            self._unheard = [*self._unheard[1:], self._unheard[0]]
-            self._unheard[-1].fetch()
-            self._unheard = [stream for stream in self._unheard if not stream.heard]
         for stream in self._streams:
-            if stream.heard:
-                stream.fetch()
-        if not any(stream.waiting for stream in self._streams):
-            return
-        self._catch_up()
+            stream.fetch()
         parts = [part for stream in self._streams if stream.waiting for part in stream.parts(self._epoch)]
+        if not parts:
+            return True
         if any(stream.fell for stream in self._streams):  # then it matters which stream was first
             parts = sorted((piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0])
         for take, *part in parts:
             take(*part)
         self._on_taken()
+        return True
 
 
 class StreamOutput:
@@ -102,6 +106,7 @@ class Handed:
     lost = 0
 
     def __init__(self, node, kind, topic):
+        self.refusals = ros.Refusals(node, topic, kind)  # of none
         self._node, self._topic, self._parts = node, topic, []
 
     def hand(self, frame, rows):
@@ -127,11 +132,10 @@ class Handed:
 
 
 class _Stream:
-    """What has arrived on one of them. heard : anything at all; waiting : parts; fell : the stamps of what was taken last have
-    fallen back."""
+    """What has arrived on one of them. waiting : parts; fell : the stamps of what was taken last have fallen back."""
 
     def __init__(self, wire, take, source):
-        self.heard, self.waiting, self.fell = False, [], False
+        self.waiting, self.fell = [], False
         self._wire, self._take, self._source, self._newest = wire, take, source, -np.inf
 
     def fetch(self):
@@ -140,7 +144,6 @@ class _Stream:
         if not parts:
             return False
         self.waiting += parts
-        self.heard = True
         return True
 
     @property

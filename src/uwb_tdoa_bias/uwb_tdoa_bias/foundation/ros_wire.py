@@ -4,6 +4,10 @@ A message object costs tens of microseconds to make and to read, most of it for 
 a place in the bytes: everything behind the strings of a message lies where the definition says, and strings (frame ids)
 hardly ever change. The layout is that of OMG Data Distribution Service Interoperability (DDSI-RTPS), CDR with 4 bytes of
 encapsulation and every number aligned to its size. Whether that is so is tried on a message with known numbers.
+
+What comes over a topic may be anything: a driver that was built with another version of a type, another encoding, noise. So
+lengths, texts and numbers of elements are checked before anything is made of them, and what cannot be read is Unreadable,
+with the reason.
 """
 
 from functools import lru_cache, reduce
@@ -11,16 +15,28 @@ from importlib import import_module
 import struct
 
 import numpy as np
+from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from rclpy.serialization import deserialize_message, serialize_message
 from rosidl_parser.definition import AbstractString, Array, BasicType, NamespacedType
 
 STAMP, FRAME = ("sec", "nanosec"), "header.frame_id"
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
+KNOWN_ENCAPSULATIONS = b"\x00\x00\x00", b"\x00\x01\x00"  # plain CDR in big and little endian; options are in the last byte
+LONGEST_TEXT = 4096  # bytes of a frame_id, or of another text
+MOST_ELEMENTS = 10_000  # in a message that is a list: anchors, transforms
+LARGEST_ELEMENT = 512  # bytes, on the average
+ANOTHER = "another version of the type"
+LENGTH = struct.Struct("<I")
+PADDING = 3  # bytes that some middlewares add at the end
 TEXT = "text"
 CODES = {
     "double": "f8", "float": "f4", "boolean": "?", "octet": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2",
     "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8",
 }  # fmt: skip
+
+
+class Unreadable(ValueError):
+    """A message cannot be read; the text says why."""
 
 
 class Wire:
@@ -34,7 +50,7 @@ class Wire:
         """kind : class of the messages; fields : their names, of numbers or of what holds only numbers of one type."""
         self.kind = kind
         paths = {name: f"header.stamp.{name}" for name in STAMP} | {field: field for field in fields}
-        self._leaves, _ = _leaves(kind)
+        self._leaves, self._whole = _leaves(kind)
         self._paths = {name: [leaf for leaf, *_ in self._leaves if _is_in(leaf, path)] for name, path in paths.items()}
         spaces = {leaf: (code, count) for leaf, code, count in self._leaves}
         columns = []
@@ -45,18 +61,24 @@ class Wire:
         self._known = None  # _Layout of the messages of late
         self.fits = self._agrees()
 
-    def read(self, messages):
-        """Serialized messages in their order, a list of bytes: a list of (frame_id, rows), each of successive messages of
-        one frame."""
-        if not self.fits:
-            return [self._convert(data) for data in messages]
+    def read(self, messages, refuse=None):
+        """Serialized messages in their order, a list of bytes: a list of (frame_id, rows, slice), each of successive messages of
+        one frame, and which they are. What cannot be read is left out: refuse(Unreadable), without which it is raised."""
         out, first = [], 0
         while first < len(messages):
-            layout = self._layout(messages[first])
             end = first + 1
-            while end < len(messages) and layout.holds(messages[end]):
-                end += 1
-            out.append((layout.frame, np.frombuffer(b"".join(messages[first:end]), layout.dtype)))
+            try:
+                frame, rows = self._convert(messages[first]) if self._is_foreign(messages[first]) else (None, None)
+                if rows is None:
+                    layout = self._layout(messages[first])
+                    while end < len(messages) and layout.holds(messages[end]):
+                        end += 1
+                    frame, rows = layout.frame, np.frombuffer(b"".join(messages[first:end]), layout.dtype)
+                out.append((frame, rows, slice(first, end)))
+            except Unreadable as error:
+                if refuse is None:
+                    raise
+                refuse(error)
             first = end
         return out
 
@@ -65,29 +87,23 @@ class Wire:
         return Template(self, message)
 
     def layout(self, data):
-        """Where the fields are in this serialized message, and in those that have strings of the same length before them.
-        Raises ValueError if it is none."""
+        """Where the fields are in this serialized message, and in those that have the same texts. Raises Unreadable."""
         if data[:4] != ENCAPSULATION:
-            raise ValueError("not plain CDR in little endian")
-        place, places, texts = 4, {}, []
-        wanted = {FRAME, *(leaf for leaves in self._paths.values() for leaf in leaves)}
-        last = max(k for k, (leaf, *_) in enumerate(self._leaves) if leaf in wanted)
-        frame = ""
-        for leaf, code, count in self._leaves[: last + 1]:
+            raise Unreadable("it is not plain CDR in little endian")
+        place, places, texts, frame = 4, {}, [], ""
+        for leaf, code, count in self._leaves:
             if code == TEXT:
-                place = _aligned(place, 4)
-                end = place + 4 + struct.unpack_from("<I", data, place)[0]
-                texts.append((place, end, data[place:end]))
+                begin = aligned(place, 4)
+                text, place = read_text(data, begin, leaf)
+                texts.append((begin, place, data[begin:place]))
                 if leaf == FRAME:
-                    frame = data[place + 4 : end - 1].decode()
-                place = end
+                    frame = text
             else:
                 size = np.dtype(code).itemsize
-                place = _aligned(place, size)
+                place = aligned(place, size)
                 places[leaf] = place
                 place += size * count
-        if place > len(data):
-            raise ValueError(f"{len(data)} bytes are too few")
+        check_length(data, place, self.kind, exactly=self._whole)
         formats = [self.dtype[name] for name in self._paths]
         offsets = [places[leaves[0]] for leaves in self._paths.values()]
         dtype = np.dtype(
@@ -100,12 +116,19 @@ class Wire:
             self._known = self.layout(data)
         return self._known
 
+    def _is_foreign(self, data):
+        """Whether only the type support of the middleware can read it: another byte order, or options."""
+        return not self.fits or (data[:4] != ENCAPSULATION and data[:3] in KNOWN_ENCAPSULATIONS)
+
     def _convert(self, data):
         """The same of one message by way of a message object."""
-        message, row = deserialize_message(data, self.kind), np.empty(1, self.dtype)
+        message, row = decode(data, self.kind), np.empty(1, self.dtype)
         for name, leaves in self._paths.items():
             row[name] = np.concatenate([np.atleast_1d(_get(message, leaf)) for leaf in leaves])
-        return message.header.frame_id, row
+        frame = message.header.frame_id
+        if "\ufffd" in frame:  # what the type support puts where it is no UTF-8
+            raise Unreadable(f"{FRAME} is no UTF-8")
+        return frame, row
 
     def _agrees(self):
         """Whether messages are laid out as their definition says."""
@@ -117,7 +140,7 @@ class Wire:
         data = serialize_message(message)
         try:
             layout = self.layout(data)
-        except (ValueError, KeyError, struct.error):
+        except (Unreadable, KeyError):
             return False
         return layout.frame == "a frame" and np.array_equal(
             np.frombuffer(data, layout.dtype).astype(self.dtype), self._convert(data)[1]
@@ -174,6 +197,78 @@ class _Layout:
         return True
 
 
+def decode(data, kind):
+    """Message of a serialized one, of any type, by the type support of the middleware. Raises Unreadable."""
+    if data[:3] not in KNOWN_ENCAPSULATIONS:
+        raise Unreadable("it is not plain CDR" if len(data) >= 4 else f"it has {len(data)} bytes")
+    _check_size(data, kind)
+    try:
+        message = deserialize_message(data, kind)
+        length = len(serialize_message(message))
+    except (implementation.RMWError, UnicodeError, ValueError) as error:
+        raise Unreadable(f"{len(data)} bytes cannot be read as {name_of(kind)}") from error
+    check_length(data, length, kind)
+    return message
+
+
+def read_text(data, place, what):
+    """(text, place behind it) of a text in plain little-endian CDR, whose length is at `place`. Raises Unreadable."""
+    if place + 4 > len(data):
+        raise Unreadable(f"it ends after {len(data)} bytes, before {what}")
+    (length,), begin = LENGTH.unpack_from(data, place), place + 4
+    end = begin + length
+    if length > LONGEST_TEXT or end > len(data):
+        raise Unreadable(f"{what} would be {length} bytes long, in a message of {len(data)}")
+    content = data[begin : end - 1] if length else b""
+    if length and (data[end - 1] or b"\0" in content):
+        raise Unreadable(f"{what} does not end where it says")
+    try:
+        return content.decode(), end
+    except UnicodeDecodeError as error:
+        raise Unreadable(f"{what} is no UTF-8") from error
+
+
+def check_length(data, length, kind, exactly=True):
+    """Raise Unreadable for a message that is shorter than so many bytes, or, if told, longer."""
+    if length > len(data):
+        raise Unreadable(f"{len(data)} bytes are {length - len(data)} too few for {name_of(kind)}: cut off, or of {ANOTHER}")
+    if exactly and length < len(data) - PADDING:
+        raise Unreadable(f"{len(data)} bytes are {len(data) - length} too many for {name_of(kind)}: of {ANOTHER}")
+
+
+def _check_size(data, kind):
+    """Raise Unreadable for more than may be allocated: long messages, lists that say that they are longer than they are."""
+    leaves, whole = _leaves(kind)
+    texts = sum(code == TEXT for _, code, _ in leaves)
+    fixed = sum(np.dtype(code).itemsize * count + 8 for _, code, count in leaves if code != TEXT)
+    element = 0 if whole else LARGEST_ELEMENT
+    if len(data) > 4 + fixed + texts * (LONGEST_TEXT + 8) + MOST_ELEMENTS * element:
+        limit = f"up to {MOST_ELEMENTS} elements" if element else f"any {name_of(kind)}"
+        raise Unreadable(f"{len(data)} bytes are too many for {limit}")
+    if whole or data[:4] != ENCAPSULATION:
+        return
+    place = 4
+    for leaf, code, count in leaves:
+        if code == TEXT:
+            _, place = read_text(data, aligned(place, 4), leaf)
+        else:
+            size = np.dtype(code).itemsize
+            place = aligned(place, size) + size * count
+    place = aligned(place, 4)
+    if place + 4 > len(data):
+        raise Unreadable(f"it ends after {len(data)} bytes, before its list")
+    (count,) = LENGTH.unpack_from(data, place)
+    if count > MOST_ELEMENTS:
+        raise Unreadable(f"its list would have {count} elements; at most {MOST_ELEMENTS} are read")
+    if count > len(data) - place:
+        raise Unreadable(f"its list would have {count} elements, in {len(data)} bytes")
+
+
+def name_of(kind):
+    """Like sensor_msgs/Imu."""
+    return f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
+
+
 @lru_cache(maxsize=None)
 def _leaves(kind):
     """Of a message class up to the first field that has no fixed size: ([(name of a number, an array of numbers or a string,
@@ -199,7 +294,7 @@ def _is_in(leaf, path):
     return leaf == path or leaf.startswith(path + ".")
 
 
-def _aligned(place, size):
+def aligned(place, size):
     """Numbers are aligned as counted from behind the encapsulation."""
     return place + (4 - place) % size
 

@@ -2,14 +2,18 @@
 
 from bisect import bisect_right
 from collections import deque
+import math
 
 import numpy as np
 
+from .errors import InputError
 from .later import rotations
 
 KEPT = 1000  # transforms of a frame that moves
 HELD = 0.5  # s for which the last transform of a frame that moves holds
 DEEPEST = 100  # frames between a frame and its root
+MOST = 10_000  # frames
+SHORTEST = 1e-3  # of a quaternion, which should be 1
 
 
 class Frames:
@@ -19,7 +23,9 @@ class Frames:
         self._static, self._moving = {}, {}  # {frame: (parent, Rotation, p)} and {frame: (parent, deque of (t, q, p))}
 
     def set(self, parent, child, q, p):
-        """A constant transform: x_parent = R(q) x_child + p; q (4,) x y z w, p (3,) m. Returns whether it is new."""
+        """A constant transform: x_parent = R(q) x_child + p; q (4,) x y z w, p (3,) m. Returns whether it is new. Raises
+        InputError for what is no transform."""
+        self._check(self._static, parent, child, q, p)
         before = self._static.get(child)
         entry = parent, rotations.Rotation.from_quat(q), np.array(p, dtype=float)
         self._static[child] = entry
@@ -28,7 +34,9 @@ class Frames:
         return not np.array_equal(before[2], entry[2]) or (before[1].inv() * entry[1]).magnitude() > 1e-9
 
     def move(self, parent, child, q, p, t):
-        """The transform at stamp t, s. One that is not later than the last is passed over; another parent starts anew."""
+        """The transform at stamp t, s. One that is not later than the last is passed over; another parent starts anew. Raises
+        InputError for what is no transform."""
+        self._check(self._moving, parent, child, q, p)
         known = self._moving.get(child)
         if known is None or known[0] != parent:
             known = self._moving[child] = parent, deque(maxlen=KEPT)
@@ -37,6 +45,14 @@ class Frames:
             course.clear()  # time went back
         if not course or t > course[-1][0]:
             course.append((t, tuple(q), tuple(p)))
+
+    def _check(self, known, parent, child, q, p):
+        if not all(map(math.isfinite, (*q, *p))):
+            raise InputError(f"{parent} -> {child}: q = {tuple(q)}, p = {tuple(p)} must be finite numbers.")
+        if math.hypot(*q) < SHORTEST:
+            raise InputError(f"{parent} -> {child}: {tuple(q)} is no rotation; give a quaternion x, y, z, w of length 1.")
+        if child not in known and len(known) >= MOST:
+            raise InputError(f"{parent} -> {child}: there are {MOST} frames already; publish fewer.")
 
     def between(self, target, source, t=None):
         """(Rotation, p (3,) m) with x_target = R x_source + p, at stamp t, s, for frames that move; None if not known."""

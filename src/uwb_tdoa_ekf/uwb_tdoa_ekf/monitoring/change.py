@@ -6,6 +6,9 @@ the last seconds a generalised likelihood ratio (Willsky and Jones, IEEE Trans. 
 that began then, as a step or as a ramp, with none: what a delay would make of the same errors, whitened likewise, against
 them. The ratio is counted in units of the mean square of the errors before the onset, so that a flight with worse errors than
 the kernel expects needs a larger change.
+
+Memory grows with the number of anchors, not with its square: what a delay does to a slice is kept for the anchors that were
+heard in it, and for the slices in which an onset is looked for.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +18,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from .slices import LENGTH
+from .slices import LENGTH, MOST
 
 MEAN_STD = 0.15  # m, of a delay that is the same everywhere,
 PLACE_STD, PLACE_LENGTH = 0.2, 0.9  # m, of one that depends on the place, and how far it is alike,
@@ -32,13 +35,16 @@ CAPACITY = 240  # slices that are remembered
 
 @dataclass(frozen=True)
 class Change:
-    """row : of the anchor; since : s, stamp of the onset; size : m, at the onset; slope : m/s; ratio : the test."""
+    """row : of the anchor; since : s, stamp of the onset; size : m, at the onset; slope : m/s; ratio : the test; rival : the same of the
+    best change of any other anchor; left : mean square of the errors since then that it does not explain, over that of those before."""
 
     row: int
     since: float
     size: float
     slope: float
     ratio: float
+    rival: float
+    left: float
 
     def at(self, t):
         """The delay, m, at stamps t, s."""
@@ -50,21 +56,28 @@ class ChangeDetector:
 
     def __init__(self, anchors):
         """anchors : their number."""
-        n, room = anchors, CAPACITY
+        room, heard = CAPACITY, min(anchors, MOST)
         self._t, self._p = np.zeros(room), np.zeros((room, 3))
-        self._delays, self._response = np.zeros((room, n)), np.zeros((room, n, n))  # without what was taken out
-        self._factor, self._white = np.zeros((room, room)), np.zeros((room, n))  # Cholesky factor; whitened errors
+        self._delays, self._freedom = np.zeros((room, anchors)), np.zeros(room)  # without what was taken out; combinations measured
+        self._factor, self._white = np.zeros((room, room)), np.zeros((room, anchors))  # Cholesky factor; whitened errors
         self._squares = np.zeros(room)  # normalised squares
-        self._known, self._count = [], 0
+        self._response = np.zeros((WINDOW, heard, heard))  # of the latest slices, in turn, for the anchors that were heard,
+        self._place = np.full((WINDOW, anchors), -1)  # and where an anchor is among them
+        self._known, self._count, self._added = [], 0, 0
 
     def add(self, piece):
         """Take a Slice."""
         if self._count == CAPACITY:
             self._forget_oldest(CAPACITY // 4)
-        k = self._count
-        self._t[k], self._p[k], self._response[k] = piece.t, piece.p, piece.response
-        self._delays[k] = piece.delays - piece.response @ self.delays_at(piece.t)
-        self._count += 1
+        k, n = self._count, len(piece.rows)
+        self._count, self._added = k + 1, self._added + 1
+        self._t[k], self._p[k], self._freedom[k] = piece.t, piece.p, np.trace(piece.response)
+        self._delays[k] = 0.0
+        self._delays[k, piece.rows] = piece.delays - piece.response @ self.delays_at(piece.t)[piece.rows]
+        turn = self._turn(k)
+        self._place[turn] = -1
+        self._place[turn, piece.rows] = np.arange(n)
+        self._response[turn, :n, :n] = piece.response
         self._whiten(k)
 
     def delays_at(self, t):
@@ -80,13 +93,17 @@ class ChangeDetector:
         onsets = self._count - first - YOUNGEST
         if onsets <= 0:
             return None
-        value, ratio = self._compare(first)
+        value, ratio, scale = self._compare(first)
         ratio[onsets:][np.abs(value[onsets:]) > FASTEST_DRIFT] = 0.0
         ratio[onsets:] /= CLEARLY
         shape, row = np.unravel_index(np.argmax(ratio), ratio.shape)
+        best, scale, later = float(ratio[shape, row]), scale[shape], slice(first + shape % onsets, self._count)
+        explained = best * scale * (CLEARLY if shape >= onsets else 1.0)
+        left = (np.sum(self._white[later] ** 2) - explained) / max(np.sum(self._freedom[later]) * scale, 1e-9)
+        rival = float(np.max(np.delete(ratio, row, axis=1), initial=0.0))
         since, value = self._t[first + shape % onsets] - 0.5 * LENGTH, float(value[shape, row])
         size, slope = (value, 0.0) if shape < onsets else (0.0, value)
-        return Change(int(row), float(since), size, slope, float(ratio[shape, row]))
+        return Change(int(row), float(since), size, slope, best, rival, float(left))
 
     def refined(self, change):
         """The step that was taken out last, with the size that it has by now, or None; takes that out instead."""
@@ -106,9 +123,16 @@ class ChangeDetector:
         self._subtract(change)
 
     def _subtract(self, change):
-        for k in range(int(np.searchsorted(self._t[: self._count], change.since)), self._count):
-            self._delays[k] -= self._response[k][:, change.row] * change.at(self._t[k])
+        for k in range(self._first(change.since), self._count):  # later than any onset that is found
+            place, response = self._place[self._turn(k)], self._response[self._turn(k)]
+            if place[change.row] >= 0:
+                heard = np.flatnonzero(place >= 0)
+                self._delays[k, heard] -= response[place[heard], place[change.row]] * change.at(self._t[k])
             self._whiten(k)
+
+    def _turn(self, k):
+        """Where the response of slice k is, one of the latest; or of several."""
+        return (self._added - self._count + k) % WINDOW
 
     def _first(self, after):
         """Place of the first slice of the window that is later than `after`, s."""
@@ -116,28 +140,32 @@ class ChangeDetector:
 
     def _compare(self, first):
         """Steps (m), then ramps (m/s), that began with each slice from `first` on but the youngest: their most likely
-        values and their ratios, (2 k, N)."""
-        n, window = self._count - first, slice(first, self._count)
-        inverse = _inverse(self._factor, first, n)
-        response = self._response[window]
-        scores = np.einsum("snk,sn->sk", response, inverse.T @ self._white[window])
-        information = np.einsum("snk,tnk->stk", response, response) * (inverse.T @ inverse)[:, :, None]
+        values and their ratios, (2 k, N), and the mean square of the errors before each, (2 k,)."""
+        n, turns = self._count - first, self._turn(np.arange(first, self._count))
+        some = np.flatnonzero((self._place[turns] >= 0).any(axis=0))  # anchors that were heard
+        inverse, white = _inverse(self._factor, first, n), self._white[first : self._count, some]
+        of_slices = self._place[turns][:, some], self._response[turns]
+        scores, information = _seen(*of_slices, inverse.T @ white, inverse.T @ inverse)
         age = np.arange(n) - np.arange(n - YOUNGEST)[:, None]  # of slices (columns) since each onset (rows)
         shapes = np.concatenate([(age >= 0).astype(float), LENGTH * np.maximum(age + 0.5, 0.0)])
         score = shapes @ scores
         power = np.sum(np.tensordot(shapes, information, axes=1) * shapes[:, :, None], axis=1)
-        value = score / (power + 1e-9)
+        value = np.zeros((len(shapes), self._white.shape[1]))
+        value[:, some] = score / (power + 1e-9)
         squares = np.minimum(self._squares[: self._count], LARGEST_ERROR)
         before = first + np.tile(np.arange(n - YOUNGEST), 2)  # slices before each onset
         scale = SCALE_SLICES * SCALE + np.concatenate([[0.0], np.cumsum(squares)])[before]
-        return value, score * value / np.maximum(scale / (SCALE_SLICES + before), SMALLEST_SCALE)[:, None]
+        scale = np.maximum(scale / (SCALE_SLICES + before), SMALLEST_SCALE)
+        ratio = np.zeros_like(value)
+        ratio[:, some] = score * value[:, some] / scale[:, None]
+        return value, ratio, scale
 
     def _whiten(self, k):
         """Row k of the factor, and its whitened error."""
-        _whiten(k, self._t, self._p, self._delays, self._response, self._factor, self._white, self._squares)
+        _whiten(k, self._t, self._p, self._delays, self._freedom, self._factor, self._white, self._squares)
 
     def _forget_oldest(self, n):
-        for array in (self._t, self._p, self._delays, self._response):
+        for array in (self._t, self._p, self._delays, self._freedom):
             array[: CAPACITY - n] = array[n:].copy()
         self._count = CAPACITY - n
         for k in range(self._count):
@@ -145,7 +173,7 @@ class ChangeDetector:
 
 
 @compiled
-def _whiten(k, t, p, delays, response, factor, white, squares):
+def _whiten(k, t, p, delays, freedom, factor, white, squares):
     row, error = factor[k], delays[k].copy()
     variance = MEAN_STD**2 + PLACE_STD**2 + LOCAL_STD**2 + NOISE_STD**2
     for i in range(k):
@@ -157,10 +185,7 @@ def _whiten(k, t, p, delays, response, factor, white, squares):
         row[i] = kernel / factor[i, i]
         error -= row[i] * white[i]
         variance -= row[i] ** 2
-    freedom = 0.0  # combinations of delays that are measured
-    for anchor in range(len(error)):
-        freedom += response[k, anchor, anchor]
-    squares[k] = np.sum(error**2) / (variance * max(freedom, 1e-3))
+    squares[k] = np.sum(error**2) / (variance * max(freedom[k], 1e-3))
     row[k] = math.sqrt(variance * max(1.0, squares[k] / OUTLIER))
     white[k] = error / row[k]
 
@@ -175,3 +200,27 @@ def _inverse(factor, first, n):
             out[i] -= factor[first + i, first + j] * out[j]
         out[i] /= factor[first + i, first + i]
     return out
+
+
+@compiled
+def _seen(place, response, errors, weights):
+    """Of n slices what a delay of each anchor makes of whitened errors (n, M) that are there, (n, M), and how much of it any two
+    of them would see, weighted (n, n): (n, n, M). place : (n, M), of an anchor in the response (H, H) of each slice, or -1."""
+    n, anchors = errors.shape
+    scores, information = np.zeros((n, anchors)), np.zeros((n, n, anchors))
+    for s in range(n):
+        heard = np.flatnonzero(place[s] >= 0)
+        own = place[s][heard]
+        for row, i in zip(own, heard):
+            for column, k in zip(own, heard):
+                scores[s, k] += response[s, row, column] * errors[s, i]
+        for t in range(s + 1):
+            both = heard[place[t][heard] >= 0]
+            own, other = place[s][both], place[t][both]
+            for i in range(len(both)):
+                one, two = response[s, own[i]], response[t, other[i]]
+                for k in range(len(both)):
+                    information[s, t, both[k]] += one[own[k]] * two[other[k]]
+            information[s, t] *= weights[s, t]
+            information[t, s] = information[s, t]
+    return scores, information

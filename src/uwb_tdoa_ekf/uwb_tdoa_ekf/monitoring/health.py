@@ -73,6 +73,8 @@ class Health:
             judgement = _worst(wiring, findings)
         elif running:
             judgement = self._judge_use(counts)
+        elif estimator.lost:
+            judgement = WARN, estimator.lost
         elif now - self._starting > START_TIMEOUT:
             judgement = WARN, "no start position found: check ids and positions of the anchors, and that four are heard"
         else:
@@ -90,7 +92,8 @@ class Health:
         if running and self.behind is not None and -BEHIND[1] < self.behind < -BEHIND[0] and judgement[0] == OK:
             judgement = WARN, f"the odometry is {-self.behind:.1f} s ahead of the clock: correct the stamps, or the clock"
         age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
-        values = {"state": "running" if running else "starting", "age of last odometry": age}
+        state = "running" if running else "lost" if estimator is not None and estimator.lost else "starting"
+        values = {"state": state, "age of last odometry": age}
         values |= {"odometry behind the clock": _behind(self.behind)}
         values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
         sentences = [*wiring, *(finding.sentence for finding in findings)]

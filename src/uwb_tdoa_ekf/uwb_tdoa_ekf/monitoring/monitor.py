@@ -19,7 +19,9 @@ from .swap import swapped
 MOVING = 0.3  # m/s; on the floor, residuals are not those of the air
 SETTLE = 8.0  # s in motion before an onset is looked for
 GAP = 30.0  # s without TDOAs after which a new flight begins
-LIMIT = 16.5  # ratio above which an anchor has changed: what it costs in false alarms is in docs/reliability.md
+LIMIT = 16.3  # ratio above which an anchor has changed: a tenth above the largest of sound flights of two days, see docs/reliability.md
+CLEARLY = 1.4  # how much larger it must be than that of any other anchor,
+MOST_LEFT = 1.0  # and of the errors since then, over those before, what it may leave: else something else has happened too, as on a floor
 SMALLEST_CHANGE = 0.15  # m; less does not matter, and what has come back to that has gone
 SILENT, FEWEST = 4, 40  # slices without an anchor, and the TDOAs of the others in them
 OFTEN = 0.5  # share of the slices in which it was heard before
@@ -71,7 +73,7 @@ class Monitor:
         """Take Odometry and the Residuals that came with it."""
         if len(odometry):
             self._odometry.append([odometry.t, odometry.p, odometry.v, odometry.gyro_bias, odometry.accel_bias])
-        reached = np.isfinite(residuals.innovation)  # the filter
+        began, reached = self._end is not None, np.isfinite(residuals.innovation)  # the filter
         if reached.any():
             columns = residuals.t, residuals.a, residuals.b, residuals.innovation
             self._residuals.append([column[reached] for column in columns])
@@ -79,6 +81,15 @@ class Monitor:
             self._last = float(t[-1])
             if self._end is None:
                 self._end = (math.floor(t[0] / LENGTH) + 1.0) * LENGTH
+        if not began:
+            self._keep_one_slice()
+
+    def _keep_one_slice(self):
+        """Forget the odometry before the first slice, or before the one that it would be in if it began now."""
+        odometry = [np.concatenate(columns) for columns in zip(*self._odometry)]
+        if len(odometry[0]):
+            begin = math.floor(odometry[0][-1] / LENGTH) * LENGTH if self._end is None else self._end - LENGTH
+            self._odometry = [[column[odometry[0] >= begin] for column in odometry]]
 
     def judge(self, until):
         """Everything stamped before `until`, s, was added: judge the slices that end there or earlier."""
@@ -95,6 +106,8 @@ class Monitor:
         self._residuals, self._odometry = [residuals], [odometry]
         if self._end <= until:  # nothing came for too long
             self._forget()
+            self._odometry = [odometry]
+            self._keep_one_slice()
 
     def _judge(self, end, residuals, odometry):
         """One slice that ends at `end`, s: its columns."""
@@ -115,7 +128,7 @@ class Monitor:
 
     def _look_for_change(self, end):
         change = self._detector.find(self._moving_since + SETTLE)
-        if change is not None and change.ratio > LIMIT and abs(change.at(end)) > SMALLEST_CHANGE:
+        if change is not None and _is_clear(change) and abs(change.at(end)) > SMALLEST_CHANGE:
             self._detector.take_out(change)
             self._changes[change.row] = [*self._changes.get(change.row, ()), change]
             self._latest_change = change
@@ -181,3 +194,8 @@ class Monitor:
                     unit = "rad/s" if name == "gyroscope" else "m/s^2"
                     out.append(f"{name} {axis}: bias moved by {value:+.3f} {unit} since the start of the flight")
         return out
+
+
+def _is_clear(change):
+    """Whether a Change is large, of one anchor alone, and all that has happened."""
+    return change.ratio > max(LIMIT, CLEARLY * change.rival) and change.left < MOST_LEFT

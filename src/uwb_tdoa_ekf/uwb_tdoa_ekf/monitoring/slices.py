@@ -16,32 +16,46 @@ CLIP = 1.5  # m; a larger innovation counts as this
 TDOA_VARIANCE = 0.02  # m^2, noise of one TDOA about the errors that last
 PLACE_STD = 0.5  # m, by which the filter may be off
 DELAY_STD = 0.15  # m, of a delay, before anything is measured
+MOST = 100  # anchors of a slice; where more are heard, those that are heard least are left out of it
 
 
 @dataclass(frozen=True)
 class Slice:
-    """t : s, its middle; p : (3,) m, where the filter had the tag; delays : (N,) m, their least mean square estimate;
-    response : (N, N), what a metre of delay of each anchor (column) makes of the estimate; heard : (N,) number of TDOAs."""
+    """t : s, its middle; p : (3,) m, where the filter had the tag; rows : (H,) of the anchors that were heard, MOST at most;
+    delays : (H,) m, their least mean square estimate; response : (H, H), what a metre of delay of each anchor (column) makes of
+    the estimate. An anchor that was not heard has neither."""
 
     t: float
     p: np.ndarray
+    rows: np.ndarray
     delays: np.ndarray
     response: np.ndarray
-    heard: np.ndarray
 
 
 def reduced(t, p, positions, a, b, innovation):
     """The Slice of TDOAs between the anchors (rows) a and b (n,), with innovations (n,) m; positions : (N, 3) m."""
-    n = len(positions)
     value = np.clip(innovation, -CLIP, CLIP)
+    rows, a, b, value = _heard_most(len(positions), a, b, value)
+    n = len(rows)
     heard = np.bincount(a, minlength=n) + np.bincount(b, minlength=n)
     both = np.bincount(a * n + b, minlength=n * n).reshape(n, n)
     information = (np.diag(heard) - both - both.T) / TDOA_VARIANCE
     vector = (np.bincount(b, value, n) - np.bincount(a, value, n)) / TDOA_VARIANCE
-    direction = ranges(p, positions)[1]
+    direction = ranges(p, positions[rows])[1]
     of_place = information @ direction
     gain = np.linalg.solve(direction.T @ of_place + np.eye(3) / PLACE_STD**2, of_place.T)
     information = information - of_place @ gain
     vector = vector - gain.T @ (direction.T @ vector)
     both = np.linalg.solve(information + np.eye(n) / DELAY_STD**2, np.column_stack([vector, information]))
-    return Slice(t, p, both[:, 0], both[:, 1:], heard)
+    return Slice(t, p, rows, both[:, 0], both[:, 1:])
+
+
+def _heard_most(anchors, a, b, value):
+    """(rows, a, b, value): the anchors that are heard, MOST at most, and the TDOAs between them, with places among these rows."""
+    heard = np.bincount(np.concatenate([a, b]), minlength=anchors)
+    rows = np.sort(np.argsort(-heard, kind="stable")[: min(MOST, np.count_nonzero(heard))])
+    place = np.full(anchors, -1)
+    place[rows] = np.arange(len(rows))
+    a, b = place[a], place[b]
+    kept = (a >= 0) & (b >= 0)
+    return rows, a[kept], b[kept], value[kept]

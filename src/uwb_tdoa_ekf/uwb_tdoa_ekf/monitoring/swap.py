@@ -9,6 +9,7 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 LARGE = 0.75  # m, median innovation of the TDOAs with either of the two
 GAIN = 4.0  # how much less it must be with them exchanged
 SUSPECTS = 4  # anchors with the largest innovations
+WITHIN, SHARE = 1.0, 0.9  # m, in which this share of all TDOAs must be then: on a floor much else is wrong
 FEWEST = 20  # TDOAs with either of the two
 
 
@@ -31,7 +32,8 @@ def swapped(positions, a, b, d, p):
         now = np.median(error[concerned])
         exchanged = positions.copy()
         exchanged[[i, k]] = positions[[k, i]]
-        then = np.median(np.abs(d - tdoa(p, exchanged[a], exchanged[b]))[concerned])
-        if now > LARGE and GAIN * then < now and then < best:
+        left = np.abs(d - tdoa(p, exchanged[a], exchanged[b]))
+        then = np.median(left[concerned])
+        if now > LARGE and GAIN * then < now and then < best and np.quantile(left, SHARE) < WITHIN:
             best, pair = then, (i, k)
     return pair

@@ -84,7 +84,7 @@ def measure_tags(progress, folder, quick=False):
 
 def start(folder):
     """{node: s from its start until it says that it is ready}, one after the other."""
-    with _surroundings(folder) as (node, processes):
+    with surroundings(folder) as (node, processes):
         return {name: _start(processes, node, name, name, []) for name in NODES}
 
 
@@ -106,7 +106,7 @@ def pool(namespaces, processes):
 def fly(flight, folder, namespaces, starts):
     """Measured of a flight in real time through the nodes of each namespace ("" or "/name"); starts : of `pairs` or `pool`."""
     out = Measured()
-    with _surroundings(folder) as (node, processes):
+    with surroundings(folder) as (node, processes):
         diagnostics, source = Diagnostics(node), Source(node, namespaces)
         for title, (name, arguments) in starts.items():
             out.ready[title] = _start(processes, node, title, name, arguments)
@@ -137,7 +137,7 @@ def fly(flight, folder, namespaces, starts):
 
 
 @contextmanager
-def _surroundings(folder):
+def surroundings(folder):
     """(node of ours, Processes) in a domain of their own, whose logs ready_at understands."""
     form = "[{severity}] [{time}] [{name}]: {message}"
     logs = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": form, "RCUTILS_COLORIZED_OUTPUT": "0"}

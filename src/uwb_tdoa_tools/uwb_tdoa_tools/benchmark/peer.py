@@ -9,7 +9,12 @@ It exports, in C:
     void tdoa_peer_position(double *p);
 
 An event with a < 0 is an inertial sample (s, rad/s, m/s^2), every other one a TDOA d = |p - b| - |p - a|, m, of the anchors in
-rows a and b of `anchors` (count, 3), m. The filter starts at p, m, with the attitude q, x y z w, body to world, at rest.
+rows a and b of `anchors` (count, 3), m. The filter starts at p, m, with the attitude q, x y z w, body to world, at rest. To be flown by
+(`fly --peer`) it exports one more, which gives all of its state, m, m/s in the world, and x y z w:
+
+    void tdoa_peer_state(double *p, double *v, double *q);
+
+There p is NaN at the start if nobody told it where it is, and what is told is so to 0.1 m; q is level, and its yaw so to 0.1 rad.
 """
 
 import ctypes
@@ -45,6 +50,7 @@ class Peer:
         if missing:
             raise InputError(f"--peer: {path} does not export {missing[0]}; add it as docs/speed.md shows.")
         self._version, self._start, self._run, self._position = functions.values()
+        self._state = getattr(library, "tdoa_peer_state", None)
         self._version.restype = ctypes.c_int32
         version = self._version()
         if version != VERSION:
@@ -66,6 +72,14 @@ class Peer:
         """(3,) m."""
         out = np.full(3, np.nan)
         self._position(_pointer(out))
+        return out
+
+    def state(self):
+        """(p (3,) m, v (3,) m/s, world, q (4,) x y z w). Raises InputError if the library does not tell."""
+        if self._state is None:
+            raise InputError(f"--peer: {self.name} does not export tdoa_peer_state; add it as docs/speed.md shows.")
+        out = [np.full(n, np.nan) for n in (3, 3, 4)]
+        self._state(*map(_pointer, out))
         return out
 
 

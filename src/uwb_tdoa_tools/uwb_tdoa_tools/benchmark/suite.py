@@ -7,10 +7,10 @@ import platform
 import numpy as np
 from tqdm import tqdm
 
-from . import core, nodes, peer, rates, recordings
+from . import core, graph, nodes, peer, rates, recordings
 from .usage import used_by_all, used_by_others
 
-PARTS = ("core", "offline", "nodes", "tags", "replay")
+PARTS = ("core", "offline", "nodes", "tags", "replay", "graph")
 
 
 def measure(parts, folder, quick=False, model=None, other=None):
@@ -30,6 +30,7 @@ def measure(parts, folder, quick=False, model=None, other=None):
             "peer": lambda: peer.measure(say, other, quick),
             "nodes": lambda: nodes.measure(say, folder, quick),
             "tags": lambda: nodes.measure_tags(say, folder, quick),
+            "graph": lambda: graph.measure(say, folder, quick),
             "replay": lambda: rates.measure(say, folder, quick),
         }
         for part, measurement in measurements.items():

@@ -9,13 +9,14 @@ from ..benchmark.peer import Peer
 from ..benchmark.suite import PARTS, measure
 
 DESCRIPTION = """Measure on this machine, in this run: the compiled core, whole recordings, both nodes live, several
-tags, and replays. Figures are medians with their quartiles, beside their targets.
+tags, replays, and what else nodes answer. Figures are medians with their quartiles, beside their targets.
 
   core    us per IMU prediction and per robust TDOA update, by anchors and kind of robustness
   offline seconds for a recording of 45 s, with correction, network and smoother
   nodes   time to ready, CPU, memory, latency and losses of both nodes at 1 kHz IMU + 400 Hz TDOA
   tags    the same for 1 to 8 tags, and for 30 at 100 Hz, in localization_nodes; all tags hear the same streams
   replay  how fast a bag goes through both nodes without loss
+  graph   how long parameters, a told pose and a clock that stops wait while streams, /clock and /tf flow; idle CPU
 
 With --peer, another filter, e.g. that of a firmware, runs over the same events in turn with ours, and the ratio is printed.
 

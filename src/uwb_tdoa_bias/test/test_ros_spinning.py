@@ -1,0 +1,147 @@
+import time
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
+from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: E402
+from rclpy.qos import QoSProfile  # noqa: E402
+from rclpy.task import Future  # noqa: E402
+from rcl_interfaces.srv import GetParameters  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from sensor_msgs.msg import FluidPressure  # noqa: E402
+from uwb_tdoa_bias.foundation import ros, ros_spinning  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_streams import PERIOD, Streams, Turns  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_wire import Wire  # noqa: E402
+
+MANY = 300
+DEEP = QoSProfile(depth=1000)
+
+
+@pytest.fixture(params=["events", "single"])
+def surroundings(request, monkeypatch):
+    """(node of ours, another node); once with each of the executors."""
+    if request.param == "single":
+        monkeypatch.setattr(ros_spinning, "EventsExecutor", None)
+    elif ros_spinning.EventsExecutor is None:
+        pytest.skip("this rclpy has no EventsExecutor")
+    rclpy.init()
+    node, other = ros.StreamNode("ours"), rclpy.create_node("other")
+    yield node, other
+    for each in (node, other):
+        each.destroy_node()
+    rclpy.shutdown()
+
+
+def until(condition, seconds=30.0):
+    """Wait for what needs nobody to be spun."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def spin_until(spinner, condition, seconds=30.0):
+    """Serve until condition() holds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        spinner._serve()
+        time.sleep(0.01)
+
+
+def test_nothing_waits_behind_what_comes_often(surroundings):
+    node, other = surroundings
+    flood, asked = [], []
+    node.create_subscription(DiagnosticStatus, "flood", flood.append, DEEP)
+    node.create_service(GetParameters, "ask", lambda request, response: asked.append(len(flood)) or response)
+    publisher, client = other.create_publisher(DiagnosticStatus, "flood", DEEP), other.create_client(GetParameters, "ask")
+    spinner = Spinner([node])
+    until(lambda: publisher.get_subscription_count() and client.service_is_ready())
+    spinner._serve()
+    for _ in range(MANY):
+        publisher.publish(DiagnosticStatus())
+    client.call_async(GetParameters.Request())
+    rounds = 0
+    while not asked:
+        spinner._serve()
+        rounds += 1
+        assert rounds < 50  # as many callbacks as there are rounds would be a sixth of them
+        time.sleep(0.02)
+    spin_until(spinner, lambda: len(flood) == MANY)
+    spinner.close()
+
+
+def test_what_waits_is_measured(surroundings):
+    node, other = surroundings
+    node.create_subscription(DiagnosticStatus, "slow", lambda _: time.sleep(0.3), DEEP)
+    publisher, spinner = other.create_publisher(DiagnosticStatus, "slow", DEEP), Spinner([node])
+    until(publisher.get_subscription_count)
+    spinner._serve()
+    spinner.longest_wait = 0.0
+    spinner._serve()
+    assert spinner.longest_wait < 0.2
+    publisher.publish(DiagnosticStatus())
+    spin_until(spinner, lambda: spinner.longest_wait > 0.25)
+    spinner.close()
+
+
+def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
+    node, other = surroundings
+    node.set_parameters([rclpy.Parameter("use_sim_time", value=True)])
+    taken, epoch, stop = [], ros.Epoch(), Future()
+
+    def take(frame, t, rows, arrival):
+        taken.append(len(t))
+        if sum(taken) == MANY:
+            stop.set_result(None)
+
+    streams = Streams(node, epoch, lambda: None)
+    streams.add(Wire(FluidPressure, "fluid_pressure"), "pressure", take)
+    publisher, clock = other.create_publisher(FluidPressure, "pressure", DEEP), other.create_publisher(Clock, "/clock", DEEP)
+    until(lambda: publisher.get_subscription_count() and clock.get_subscription_count())
+    assert Clock not in [each.msg_type for each in node.subscriptions]
+    spinner = Spinner([node], Turns([streams]))
+    spinner._serve()
+    for second in range(1, MANY + 1):
+        publisher.publish(FluidPressure())
+        clock.publish(Clock(clock=ros.Time(sec=second)))
+    spinner.spin(stop)
+    assert sum(taken) == MANY and len(taken) < MANY / 3
+
+    def is_newest():
+        node.take_clock()
+        return node.get_clock().now().nanoseconds == MANY * 10**9
+
+    until(is_newest)
+    spinner.close()
+
+
+def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
+    class Slow:
+        def __init__(self, seconds, busy):
+            self.seconds, self.busy = seconds, busy
+
+        def take(self):
+            time.sleep(self.seconds)
+            return self.busy
+
+    assert Turns([Slow(0.0, False)]).take() is None
+    assert Turns([Slow(0.0, True), Slow(0.0, False)]).take() == pytest.approx(PERIOD)
+    assert 0.004 <= Turns([Slow(0.005, True)]).take() <= 0.01
+    assert Turns([Slow(0.05, True)]).take() == 0.01
+
+
+def test_a_request_that_cannot_be_taken_ends_nothing(surroundings):
+    node, _ = surroundings
+    spinner = Spinner([node])
+
+    def refuse():
+        raise rclpy_implementation.RCLError("taking failed")
+
+    spinner._guarded(refuse)
+    with pytest.raises(ValueError):
+        spinner._guarded(lambda: int("a defect of ours"))
+    spinner.close()

@@ -1,0 +1,63 @@
+"""What watching the anchors in flight takes, by their number: memory, and time for each slice of half a second.
+
+python src/uwb_tdoa_ekf/test/monitor_cost.py
+"""
+
+import time
+import tracemalloc
+
+import numpy as np
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.core.verdicts import USED
+from uwb_tdoa_ekf.estimator import Odometry, Residuals
+from uwb_tdoa_ekf.monitoring.monitor import Monitor
+from uwb_tdoa_ekf.monitoring.slices import LENGTH
+
+RATE = 400  # Hz, of TDOAs
+CASES = (8, 8), (100, 30), (100, 100), (1000, 30), (1000, 200)  # anchors, and how many of them are heard at a time
+
+
+def fly(monitor, anchors, heard, slices, first=0, seed=0):
+    """Give a Monitor so many slices of a flight along a row of Anchors, of which it hears the nearest `heard`."""
+    rng, n = np.random.default_rng(seed), round(RATE * LENGTH)
+    for k in range(first, first + slices):
+        t = LENGTH * (k + (np.arange(n) + 0.5) / n)
+        p = np.stack([2.0 * np.cos(0.6 * t) + 0.2 * t, 2.0 * np.sin(0.6 * t), np.sin(t)], axis=1)
+        near = np.argsort(np.linalg.norm(anchors.positions - p[0], axis=1))[:heard]
+        one_of = rng.permutation(n) % heard
+        a, b = near[one_of], near[(one_of + 1 + rng.integers(heard - 1, size=n)) % heard]
+        one, zeros = np.ones(n), np.zeros((n, 3))
+        state = p, np.tile([1.0, 0.0, 0.0], (n, 1)), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), zeros, zeros, np.zeros((n, 9, 9))
+        rows = anchors.ids[a], anchors.ids[b], 0.1 * rng.standard_normal(n), one, one, np.full(n, USED)
+        monitor.add(Odometry(t, *state), Residuals(t, *rows))
+        monitor.judge(t[-1])
+
+
+def row_of(n):
+    """n Anchors of a hall that is as long as it needs to be."""
+    rng = np.random.default_rng(n)
+    return Anchors.from_positions(np.column_stack([np.arange(n) * 0.5 - 4.0, rng.uniform(-6.0, 6.0, (n, 2))]))
+
+
+def cost(n, heard, slices):
+    """(largest memory, bytes; processor time of a slice, s) of a Monitor of n anchors, after so many slices."""
+    anchors = row_of(n)
+    tracemalloc.start()
+    monitor = Monitor(anchors)
+    fly(monitor, anchors, heard, slices)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    took = []
+    for k in range(8):
+        begin = time.process_time()
+        fly(monitor, anchors, heard, 1, slices + k)
+        took.append(time.process_time() - begin)
+    return peak, float(np.median(took))
+
+
+if __name__ == "__main__":
+    cost(8, 8, 30)  # what is compiled, is
+    print("| anchors | heard at a time | memory, MB | ms each half second |\n|---:|---:|---:|---:|")
+    for n, heard in CASES:
+        peak, seconds = cost(n, heard, 60)
+        print(f"| {n} | {heard} | {peak / 1e6:.1f} | {1e3 * seconds:.1f} |", flush=True)

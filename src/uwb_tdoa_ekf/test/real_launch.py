@@ -1,0 +1,109 @@
+"""The real ros2 command: that of the ROS installation, or the one in ../shared/ros2cli beside the checkout, made ready once."""
+
+import fcntl
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+FOLDER, MADE = ROOT.parent / "shared" / "ros2cli", ROOT / "build" / "ros2cli"
+WITH = "psutil", "argcomplete", "packaging"  # that it imports
+PATIENCE = 120.0  # s for anything that must happen
+WHY_NOT = (
+    None if shutil.which("ros2") or FOLDER.is_dir() and all(map(find_spec, WITH))
+    else f"no ros2 command: .venv/bin/python -m pip install {' '.join(WITH)}" if FOLDER.is_dir()
+    else "no ros2 command, and no ../shared/ros2cli beside the checkout"
+)  # fmt: skip
+
+
+def ros2():
+    """The words before those of a ros2 command."""
+    if WHY_NOT:
+        pytest.skip(WHY_NOT)
+    if shutil.which("ros2"):
+        return ["ros2"]
+    setup = MADE / "install" / "local_setup.bash"
+    MADE.mkdir(parents=True, exist_ok=True)
+    with open(MADE / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not setup.exists():  # launch_ros imports composition_interfaces
+            command = [sys.executable, "-m", "colcon", "--log-base", MADE / "log", "build", "--merge-install"]
+            command += ["--base-paths", FOLDER / "src", "--build-base", MADE / "build", "--install-base", MADE / "install"]
+            command += ["--cmake-args", "-G", "Ninja", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={sys.executable}"]
+            made = subprocess.run(list(map(str, command)), capture_output=True, text=True, cwd=ROOT)
+            assert made.returncode == 0, made.stdout + made.stderr
+    return ["bash", "-c", 'source "$0" && exec "$@"', str(setup), sys.executable, str(FOLDER / "ros2")]
+
+
+class Launch:
+    """A running `ros2 launch`, in a process group of its own as under a terminal. lines : what it and its nodes wrote so
+    far; over : whether all of it has ended."""
+
+    def __init__(self, folder, *words, path=()):
+        """folder : empty, for its temporary files and logs; words : after `ros2 launch`; path : folders that come first in PATH."""
+        self.temporary = folder / "temporary"
+        self.temporary.mkdir()
+        variables = {"TMPDIR": str(self.temporary), "ROS_LOG_DIR": str(folder / "log"), "PYTHONUNBUFFERED": "1"}
+        variables["PATH"] = os.pathsep.join([*map(str, path), os.environ["PATH"]])
+        self._terminal, stdin = os.openpty()  # without one launch passes Ctrl-C on, and nodes that have it already get it twice
+        self.process = subprocess.Popen(
+            [*ros2(), "launch", *words], env={**os.environ, **variables}, stdin=stdin,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        )  # fmt: skip
+        os.close(stdin)
+        self.lines, self._news, self.over = [], threading.Condition(), False
+        self.reader = threading.Thread(target=self._collect, daemon=True)
+        self.reader.start()
+
+    def _collect(self):
+        for line in self.process.stdout:
+            with self._news:
+                self.lines.append(line)
+                self._news.notify_all()
+        with self._news:
+            self.over = True
+            self._news.notify_all()
+
+    @property
+    def said(self):
+        return "".join(self.lines)
+
+    def wait(self, text, count=1):
+        """Wait until a text was written so often."""
+        with self._news:
+            self._news.wait_for(lambda: self.over or self.said.count(text) >= count, PATIENCE)
+        assert self.said.count(text) >= count, f"waited for {text}: {self.said}"
+
+    def ended(self):
+        """The exit code, when it has ended by itself."""
+        code = self.process.wait(timeout=PATIENCE)
+        self.reader.join(timeout=PATIENCE)
+        return code
+
+    def interrupt(self):
+        """Ctrl-C; returns the exit code."""
+        os.killpg(self.process.pid, signal.SIGINT)
+        return self.ended()
+
+    def pid_of(self, node):
+        """Process id of the node that was started last by this name."""
+        line = [line for line in self.lines if f"[{node}-" in line and "process started with pid [" in line][-1]
+        return int(line.rpartition("[")[2].partition("]")[0])
+
+    def close(self):
+        """End what is left."""
+        try:
+            os.killpg(self.process.pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+        self.process.wait()
+        self.reader.join(timeout=PATIENCE)
+        self.process.stdout.close()
+        os.close(self._terminal)

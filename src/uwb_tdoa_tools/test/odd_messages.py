@@ -1,0 +1,233 @@
+"""What nodes do with messages that no driver should send: python src/uwb_tdoa_tools/test/odd_messages.py 10000
+
+Messages of every type that a node takes, so many on each topic, changed at random: cut off, longer, of a type without its last 8
+bytes, bits turned over, of another encoding, noise. In between come whole ones. No node may end; every message of a stream is
+received or counted as unreadable, every other one that cannot be read is counted; memory stays what it was.
+"""
+
+import argparse
+from dataclasses import dataclass, field
+import json
+from pathlib import Path
+import re
+import sys
+import tempfile
+import time
+
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped, TwistWithCovarianceStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+import rclpy
+from rcl_interfaces.srv import GetParameters
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import FluidPressure, Imu, Range
+from tf2_msgs.msg import TFMessage
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message
+from uwb_tdoa_bias.foundation.ros_frames import read_transforms
+from uwb_tdoa_bias.foundation.ros_wire import Unreadable, decode
+from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected
+from uwb_tdoa_tools.benchmark.nodes import PACKAGES, READY_LIMIT, ready_at, surroundings
+from uwb_tdoa_tools.benchmark.usage import memory
+from uwb_tdoa_tools.live.processes import Diagnostics, wait
+
+RCLError = rclpy_implementation.RCLError
+ALIGNED = 4  # bytes; the middleware fills up to that, so that other lengths arrive longer
+SHORTEST = 4  # bytes; after an empty message Fast DDS delivers nothing more of a reliable publisher, to whomever
+PATIENCE = 60.0  # s
+LATCHED = "uwb/anchors", "/tf_static"
+STREAMS = {  # of each node: topic, type, and what counts those that could be read
+    "ekf_node": {
+        "imu/data": (Imu, "IMU samples received"), "uwb/tdoa_corrected": (TdoaCorrected, "TDOAs received"),
+        "height": (Range, "height_received"), "pressure": (FluidPressure, "pressure_received"),
+        "velocity": (TwistWithCovarianceStamped, "velocity_received"), "velocity/odometry": (Odometry, "velocity_received"),
+    },
+    "bias_node": {"uwb/tdoa": (Tdoa, "received"), "odometry": (Odometry, "poses")},
+}  # fmt: skip
+SINGLE = {
+    "ekf_node": {
+        "uwb/anchors": AnchorArray, "/tf_static": TFMessage, "/tf": TFMessage, "initialpose": PoseWithCovarianceStamped,
+    },
+    "bias_node": {"uwb/anchors": AnchorArray, "/tf_static": TFMessage},
+}  # fmt: skip
+ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 1], [0, 8, 2], [8, 8, 0], [0, 0, 3], [8, 0, 3], [0, 8, 3], [8, 8, 3]])
+
+
+@dataclass
+class Account:
+    """sent, received, unreadable, expected : messages by topic (received: streams; expected : unreadable ones of the others);
+    memory : bytes after each tenth; log : bytes."""
+
+    sent: dict = field(default_factory=dict)
+    received: dict = field(default_factory=dict)
+    unreadable: dict = field(default_factory=dict)
+    expected: dict = field(default_factory=dict)
+    memory: list = field(default_factory=list)
+    log: int = 0
+
+
+def changed(data, rng, step=1):
+    """A message as bytes, changed at random, or as it is. step : bytes, of which its length is made a multiple."""
+    data += bytes(-len(data) % step)
+    out, kind = bytearray(data), rng.random()
+    if kind < 0.15:
+        return data
+    if kind < 0.3:
+        return bytes(out[: max(SHORTEST, step * rng.integers(len(out) // step))])
+    if kind < 0.35:
+        return bytes(out[:-8])
+    if kind < 0.45:
+        return bytes(out) + rng.bytes(step * rng.integers(1, 64 // step))
+    if kind < 0.55:
+        out[:4] = rng.bytes(4) if rng.random() < 0.3 else bytes([0, rng.integers(12), 0, rng.integers(4)])
+    elif kind < 0.6:
+        return rng.bytes(max(SHORTEST, step * rng.integers(400 // step)))
+    else:
+        for place in rng.integers(4, len(out), size=rng.integers(1, 8)):
+            out[place] ^= 1 << rng.integers(8)
+    return bytes(out)
+
+
+def whole(kind, k):
+    """A whole message, the k-th, as bytes."""
+    if kind is AnchorArray:
+        return serialize_message(anchors_to_message(ANCHORS))
+    message = kind()
+    if kind is TFMessage:
+        message.transforms = [TransformStamped(child_frame_id=child) for child in ("base_link", "imu")]
+        for transform in message.transforms:
+            transform.header.frame_id = "odom"
+            transform.header.stamp.sec = 100 + k // 100
+        return serialize_message(message)
+    message.header.frame_id = "map" if kind is PoseWithCovarianceStamped else "base_link"
+    message.header.stamp.sec, message.header.stamp.nanosec = 100 + k // 100, k % 100 * 10_000_000
+    if hasattr(message, "anchor_a"):
+        message.anchor_a, message.anchor_b = k % 8, (k + 1) % 8
+    return serialize_message(message)
+
+
+def ordeal(name, count, folder, seed=1):
+    """Account of a node that is sent `count` messages on each topic."""
+    rng, out = np.random.default_rng(seed), Account()
+    streams, single = STREAMS[name], SINGLE[name]
+    kinds = {topic: kind for topic, (kind, _) in streams.items()} | single
+    with surroundings(folder) as (node, processes):
+        diagnostics = Diagnostics(node)
+        told = [part for topic in streams for part in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")]
+        told += ["-p", "publish_tf:=odom"] if name == "ekf_node" else ["-p", "model_file:=auto"]
+        processes.start(PACKAGES[name], name, "--ros-args", *told)
+        log = processes.file(name)
+        wait(READY_LIMIT, f"{name} to be ready", processes, node, lambda: ready_at(name, log.read_text(errors="replace")))
+        publishers = {topic: node.create_publisher(kind, topic, qos(topic)) for topic, kind in kinds.items()}
+        client = node.create_client(GetParameters, f"/{name}/get_parameters")
+        wait(PATIENCE, "the node to be found", processes, node, client.service_is_ready)
+        wait(PATIENCE, "it to listen", processes, node, lambda: all(p.get_subscription_count() for p in publishers.values()))
+        found = {f"publishers of {topic}" for topic in streams}  # a reliable link begins when both ends know of each other
+        wait(PATIENCE, "the node to find us", processes, node, lambda: all(diagnostics.newest(name).get(key) == "1" for key in found))
+        out.expected = dict.fromkeys(single, 0)
+        for k in range(count):  # one on each topic until the node has answered: of anchors only the last is kept
+            for topic, kind in kinds.items():
+                data = changed(whole(kind, k), rng, ALIGNED if topic in single else 1)
+                out.sent[topic] = out.sent.get(topic, 0) + 1
+                if topic in single:
+                    out.expected[topic] += not is_readable(data, kind)
+                publishers[topic].publish(data)
+            answered = client.call_async(GetParameters.Request(names=["use_sim_time"]))
+            while not answered.done() and processes.check() is None:
+                rclpy.spin_once(node, timeout_sec=PATIENCE)
+            if k % max(1, count // 10) == 0:
+                out.memory.append(memory(processes.pid(name)))
+
+        def said(key):
+            return int(diagnostics.newest(name).get(key, -1))
+
+        def judge():
+            out.unreadable = {topic: said(f"unreadable on {topic}") for topic in kinds}
+            out.received = {topic: said(key) for topic, (_, key) in streams.items()}
+            return not wrong(out)
+
+        until = time.monotonic() + PATIENCE
+        while not judge() and time.monotonic() < until:
+            processes.check()
+            rclpy.spin_once(node, timeout_sec=0.1)
+        out.memory.append(memory(processes.pid(name)))
+        processes.stop(name)
+        out.log = log.stat().st_size
+        assert not re.search("Traceback", log.read_text(errors="replace")), log
+    return out
+
+
+def wrong(account):
+    """Topics whose messages are not all accounted for: {topic: sentence}."""
+    out = {}
+    by_counter = {}
+    for topic, received in account.received.items():  # two topics may share a counter
+        by_counter.setdefault("velocity" if topic.startswith("velocity") else topic, []).append(topic)
+    for name, topics in by_counter.items():
+        sent = sum(account.sent[topic] for topic in topics)
+        known = account.received[topics[0]] + sum(account.unreadable[topic] for topic in topics)
+        if sent != known:
+            out[name] = f"{known} of {sent} are accounted for"
+    for topic, expected in account.expected.items():
+        if account.unreadable[topic] != expected:
+            out[topic] = f"{account.unreadable[topic]} unreadable, {expected} sent"
+    return out
+
+
+def is_readable(data, kind):
+    """Whether a message that is no stream can be read."""
+    try:
+        read_transforms(data) if kind is TFMessage else decode(data, kind)
+    except Unreadable:
+        return False
+    return True
+
+
+def qos(topic):
+    """Reliable; latched where the subscription asks for it."""
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if topic in LATCHED else DurabilityPolicy.VOLATILE
+    return QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+
+
+def clock_ordeal(count, folder, seed=1):
+    """Send `count` odd messages on /clock; returns whether ekf_node still answers."""
+    rng = np.random.default_rng(seed)
+    with surroundings(folder) as (node, processes):
+        processes.start(PACKAGES["ekf_node"], "ekf_node", "--ros-args", "-p", "use_sim_time:=true")
+        log = processes.file("ekf_node")
+        wait(READY_LIMIT, "ekf_node to be ready", processes, node, lambda: ready_at("ekf_node", log.read_text(errors="replace")))
+        publisher = node.create_publisher(Clock, "/clock", 10)
+        client = node.create_client(GetParameters, "/ekf_node/get_parameters")
+        wait(PATIENCE, "it to listen", processes, node, lambda: publisher.get_subscription_count() and client.service_is_ready())
+        for _ in range(count):
+            try:
+                publisher.publish(changed(serialize_message(Clock()), rng))
+            except RCLError:  # the middleware sends none that is longer than any Clock
+                continue
+            time.sleep(0.001)  # the newest is taken 50 times a second
+        answered = client.call_async(GetParameters.Request(names=["use_sim_time"]))
+        wait(PATIENCE, "ekf_node to answer", processes, node, answered.done)
+        processes.stop("ekf_node")
+        return "Traceback" not in log.read_text(errors="replace")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("count", type=int, help="messages on each topic")
+    parser.add_argument("--seed", type=int, default=1)
+    args, bad = parser.parse_args(), False
+    with tempfile.TemporaryDirectory() as folder:
+        for name in STREAMS:
+            account = ordeal(name, args.count, Path(folder), args.seed)
+            print(name, json.dumps({k: v for k, v in vars(account).items()}), wrong(account) or "all accounted for", flush=True)
+            bad |= bool(wrong(account))
+        fine = clock_ordeal(args.count, Path(folder), args.seed)
+        print("/clock:", "goes on" if fine else "ended")
+    return int(bad or not fine)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,31 @@
+"""What a node answers while everything flows, with ten times the time that `bench --only graph` asks for."""
+
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from uwb_tdoa_tools.benchmark import graph  # noqa: E402
+
+LENIENT = 10.0  # times the target: on a loaded machine
+
+
+@pytest.mark.slow  # where others leave it less of a core than it needs, nothing can be asked of it
+def test_everything_is_served_beside_streams_a_clock_and_transforms(tmp_path):
+    found = graph.ask(tmp_path, 5.0, clock=200.0, tf=100.0, streams=True)
+    target = {name: LENIENT * limit for name, limit in graph.TARGETS.items()}
+    assert len(found.answers) > 5 and max(found.answers) < target["get_parameters p99"]
+    assert max(found.poses) < target["initialpose, the longest"]
+    assert found.pause < target["a pause told after"]
+    assert max(found.periods) < LENIENT
+
+
+def test_a_case_is_described_and_judged():
+    assert graph.describe(0.0, 0.0, False, 0) == "the rest of the graph, ekf_node: nothing flows"
+    title = graph.describe(200.0, 500.0, True, 2)
+    assert title.endswith("/clock at 200 Hz, /tf at 500 Hz, streams at 1 kHz + 400 Hz, 2 busy loops")
+    slow = graph.Answers([0.01] * 98 + [3.0] * 2, [0.3, 0.1], [1.0, 1.1], graph.SILENCE, 0.02)
+    figures = {figure.name: figure for figure in graph.figures(title, slow, False)}
+    assert figures["get_parameters p99"].median == 3.0 and not figures["get_parameters p99"].met
+    assert not figures["initialpose, the longest"].met and not figures["a pause told after"].met
+    assert not figures[f"CPU, {graph.NODE}"].met and figures["from one report to the next"].median == pytest.approx(1.05)

@@ -1,0 +1,34 @@
+"""Messages that no driver should send, over topics, to real nodes."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+import odd_messages  # noqa: E402
+from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
+from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
+
+FEW = 100
+
+
+@pytest.mark.parametrize("name", ["ekf_node", pytest.param("bias_node", marks=pytest.mark.slow)])
+def test_no_message_ends_a_node_and_each_is_accounted_for(name, tmp_path):
+    account = odd_messages.ordeal(name, FEW, tmp_path)
+    assert not odd_messages.wrong(account)
+    assert all(count > FEW // 4 for count in account.unreadable.values())  # they are odd enough
+    assert all(count > FEW // 20 for count in account.received.values())
+
+
+@pytest.mark.slow
+def test_no_time_ends_a_node(tmp_path):
+    assert odd_messages.clock_ordeal(FEW, tmp_path)
+
+
+@pytest.mark.parametrize("kind", [Tdoa, AnchorArray, PoseWithCovarianceStamped])
+def test_whole_messages_are_readable_and_changed_ones_often_are_not(kind):
+    rng = np.random.default_rng(2)
+    assert odd_messages.is_readable(odd_messages.whole(kind, 7), kind)
+    readable = [odd_messages.is_readable(odd_messages.changed(odd_messages.whole(kind, k), rng), kind) for k in range(200)]
+    assert 30 < sum(readable) < 170

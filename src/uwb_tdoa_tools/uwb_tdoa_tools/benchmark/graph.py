@@ -1,0 +1,195 @@
+"""How fast nodes answer the rest of the graph, parameters, poses that are told, a clock that stops, while messages flow."""
+
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+import re
+import subprocess
+import sys
+import time
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rcl_interfaces.srv import GetParameters
+
+from ..live.processes import LiveError
+from .figures import Figure
+from .nodes import PACKAGES, READY_LIMIT, ready_at, surroundings
+from .usage import cpu_seconds
+
+CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, busy loops beside
+    (0.0, 0.0, False, 0), (0.0, 0.0, True, 0), (40.0, 0.0, True, 0), (200.0, 0.0, True, 0), (1000.0, 0.0, True, 0),
+    (1000.0, 500.0, True, 0), (1000.0, 500.0, True, 2),
+)  # fmt: skip
+NODE = "ekf_node"
+FLIGHT = 30.0  # s, over and over
+UNASKED = 5.0  # s in which its CPU is taken
+SILENCE = 20.0  # s without an answer, or without a report, after which there will be none
+TARGETS = {"get_parameters p99": 0.2, "initialpose, the longest": 0.2, "a pause told after": 1.0}  # s
+TARGET_IDLE = 1.0  # % of a core
+
+
+@dataclass
+class Answers:
+    """answers, poses : s that each get_parameters, each initialpose took, SILENCE without an answer; periods : s between reports;
+    pause : s until a clock that stopped was told, None without one; cpu : share of one core."""
+
+    answers: list = field(default_factory=list)
+    poses: list = field(default_factory=list)
+    periods: list = field(default_factory=list)
+    pause: float = None
+    cpu: float = np.nan
+
+
+def measure(progress, folder, quick=False):
+    """Generator of Figures. progress(text); folder : for the output of the nodes."""
+    seconds = 6.0 if quick else 20.0
+    for clock, tf, streams, busy in [CASES[0], CASES[3], CASES[-1]] if quick else CASES:
+        section = describe(clock, tf, streams, busy)
+        progress(section)
+        yield from figures(section, ask(folder, seconds, clock, tf, streams, busy), streams)
+
+
+def describe(clock, tf, streams, busy):
+    """Title of a case."""
+    parts = [f"/clock at {clock:g} Hz"] if clock else []
+    parts += [f"/tf at {tf:g} Hz"] if tf else []
+    parts += ["streams at 1 kHz + 400 Hz"] if streams else []
+    parts += [f"{busy} busy loops"] if busy else []
+    return f"the rest of the graph, {NODE}: {', '.join(parts) or 'nothing flows'}"
+
+
+def figures(section, found, streams):
+    """Figures of Answers."""
+    def of(name, unit, values):
+        return Figure.of(section, name, unit, values, TARGETS.get(name))
+
+    yield of("get_parameters p50", "s", np.percentile(found.answers, 50, method="nearest"))
+    yield of("get_parameters p99", "s", np.percentile(found.answers, 99, method="nearest"))
+    yield of("initialpose, the longest", "s", max(found.poses))
+    yield Figure.of(section, "from one report to the next", "s", found.periods)
+    yield of("the longest from one report to the next", "s", max(found.periods))
+    if found.pause is not None:
+        yield of("a pause told after", "s", found.pause)
+    target = None if streams else TARGET_IDLE
+    yield Figure.of(section, f"CPU, {NODE}", "% of a core", 100.0 * found.cpu, target)
+
+
+def ask(folder, seconds, clock=0.0, tf=0.0, streams=True, busy=0, arguments=()):
+    """Answers of an ekf_node, for so long. clock, tf : Hz, 0.0 for none; streams : whether a tag flies, through a bias_node; busy :
+    loops that take all of a core; arguments : more of the ekf_node."""
+    with ExitStack() as stack:
+        node, processes = stack.enter_context(surroundings(folder))
+        told = ["--ros-args", "-p", f"publish_tf:={'odom' if tf else 'base'}", *arguments]
+        if clock:
+            told += ["-p", "use_sim_time:=true"]
+        log = processes.file(NODE)
+        processes.start(PACKAGES[NODE], NODE, *told)
+        if streams:
+            processes.start(PACKAGES["bias_node"], "bias_node", *(["--ros-args", "-p", "use_sim_time:=true"] if clock else []))
+            _wait(node, READY_LIMIT, lambda: ready_at("bias_node", processes.file("bias_node").read_text(errors="replace")))
+        _wait(node, READY_LIMIT, lambda: ready_at(NODE, log.read_text(errors="replace")))
+        loads = {"tf": tf, "streams": FLIGHT if streams else 0.0, "clock": clock}
+        running = {what: stack.enter_context(_load(what, number)) for what, number in loads.items() if number}
+        for _ in range(busy):
+            stack.enter_context(_process([sys.executable, "-c", "while True: pass"]))
+        return _Asking(node, processes, log).ask(seconds, running.get("clock"))
+
+
+class _Asking:
+    def __init__(self, node, processes, log):
+        self._node, self._processes, self._log = node, processes, log
+        self._reports = []  # (arrival, text)
+        self._client = node.create_client(GetParameters, f"/{NODE}/get_parameters")
+        self._poses = node.create_publisher(PoseWithCovarianceStamped, "/initialpose", 10)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_report, 10)
+
+    def _on_report(self, message):
+        self._reports += [(time.monotonic(), each.message) for each in message.status if each.name.strip("/") == NODE]
+
+    def ask(self, seconds, clock):
+        """clock : Popen of what publishes it, or None."""
+        out, began = Answers(), time.monotonic()
+        _wait(self._node, SILENCE, lambda: len(self._reports) > 2 or time.monotonic() > began + SILENCE - 1.0)
+        _wait(self._node, SILENCE, self._client.service_is_ready)
+        _wait(self._node, SILENCE, self._poses.get_subscription_count)
+        before, began = cpu_seconds(self._processes.pid(NODE)), time.monotonic()
+        _wait(self._node, UNASKED + 1.0, lambda: time.monotonic() > began + UNASKED)
+        out.cpu = (cpu_seconds(self._processes.pid(NODE)) - before) / (time.monotonic() - began)
+        began, self._reports = time.monotonic(), []
+        while time.monotonic() < began + seconds:
+            out.answers.append(self._call())
+            if len(out.answers) % 10 == 1:
+                out.poses.append(self._tell(len(out.poses)))
+            if out.answers[-1] == SILENCE:
+                break
+            _wait(self._node, 1.0, lambda until=time.monotonic() + 0.05: time.monotonic() > until)
+        took = time.monotonic() - began
+        arrivals = [began, *(arrival for arrival, _ in self._reports), began + took]
+        out.periods = np.diff(arrivals[1:-1]) if len(arrivals) > 3 else np.array([took])
+        if clock is not None:
+            out.pause = self._pause(clock)
+        return out
+
+    def _call(self):
+        began, future = time.monotonic(), self._client.call_async(GetParameters.Request(names=["tdoa_std"]))
+        while not future.done() and time.monotonic() < began + SILENCE:
+            rclpy.spin_once(self._node, timeout_sec=0.01)
+        return time.monotonic() - began if future.done() else SILENCE
+
+    def _tell(self, number):
+        """s until the node has said, by the time of its log, that it does not take a pose in a frame of this number."""
+        message, frame, began = PoseWithCovarianceStamped(), f"nowhere_{number}", time.time()
+        message.header.frame_id = frame
+        self._poses.publish(message)
+        found = []
+
+        def said():
+            found[:] = re.findall(r"\[([0-9.]+)\] .*initialpose: not taken: .*", self._log.read_text(errors="replace"))[number:]
+            return found or time.time() > began + SILENCE
+
+        _wait(self._node, SILENCE + 1.0, said)
+        return float(found[0]) - began if found else SILENCE
+
+    def _pause(self, clock):
+        _end(clock)
+        stopped = time.monotonic()
+
+        def told():
+            return [a for a, text in self._reports if a > stopped and "paused" in text] or time.monotonic() > stopped + SILENCE
+
+        _wait(self._node, SILENCE + 1.0, told)
+        arrivals = [a for a, text in self._reports if a > stopped and "paused" in text]
+        return arrivals[0] - stopped if arrivals else SILENCE
+
+
+@contextmanager
+def _load(what, number):
+    command = [sys.executable, "-m", "uwb_tdoa_tools.benchmark.load", what, f"{number:g}"]
+    with _process(command, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()  # it begins
+        yield process
+
+
+@contextmanager
+def _process(command, **options):
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)
+    try:
+        yield process
+    finally:
+        _end(process)
+
+
+def _end(process):
+    if process.poll() is None:
+        process.kill()
+    process.wait()
+
+
+def _wait(node, limit, condition):
+    until = time.monotonic() + limit
+    while not condition():
+        if time.monotonic() > until:
+            raise LiveError(f"waited {limit:g} s in vain")
+        rclpy.spin_once(node, timeout_sec=0.01)
