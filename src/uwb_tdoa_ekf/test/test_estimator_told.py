@@ -71,6 +71,18 @@ def test_a_pose_that_comes_late_counts_from_the_next_measurement_and_another_tim
             estimator.tell_pose(stamp, np.zeros(3), np.eye(3))
 
 
+@pytest.mark.parametrize("stamp", [1.7e9, -500.0])
+def test_a_pose_of_another_clock_that_comes_before_the_first_measurement_is_dropped_and_said_to_be(stamp):
+    flight = fly(duration=2.0)
+    estimator = Estimator(flight.anchors)
+    estimator.tell_pose(stamp, np.zeros(3), np.eye(3))
+    odometry, _ = feed(estimator, flight)
+    assert_same(odometry, run_offline(flight).odometry)
+    assert odometry.t[-1] < 2.0 and "is not used" in estimator.refused_pose
+    estimator.tell_pose(*told(flight, 2.0))
+    assert estimator.refused_pose is None
+
+
 def test_coordinates_that_are_not_told_stay():
     flight = fly(duration=3.0)
     estimator, plain = Estimator(flight.anchors), Estimator(flight.anchors)

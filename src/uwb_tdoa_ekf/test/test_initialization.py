@@ -53,6 +53,7 @@ def test_one_tdoa_long_before_the_others_does_not_use_up_the_timeout():
 
 @pytest.mark.parametrize("robust", ROBUST)
 def test_finds_a_tag_again_that_was_carried_away(robust):
+    """3.6 m, which its inertial sensor has not felt: not before it could have come so far."""
     near, far = fly(10, 12.0, hover=True), fly(10, 12.0, hover=True)
     there = np.array([1.0, 6.5, 0.8])
     p = np.where(far.tdoa.t[:, None] < 5.0, near.truth.p[0], there)
@@ -62,7 +63,7 @@ def test_finds_a_tag_again_that_was_carried_away(robust):
     memory = memory_for(far)
     odometry, _ = drive(replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), memory)
     assert memory.record.recoveries <= 2
-    assert np.linalg.norm(odometry.x[odometry.t > 7.0, :3] - there, axis=1).max() < 0.3
+    assert np.linalg.norm(odometry.x[odometry.t > 8.0, :3] - there, axis=1).max() < 0.3
     assert_sound(memory, odometry)
 
 

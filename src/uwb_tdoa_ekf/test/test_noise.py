@@ -70,6 +70,16 @@ def test_the_first_tdoa_of_an_anchor_counts_in_full_whenever_it_comes():
     assert learned == pytest.approx([0.3**2 - 0.1**2] * 2)
 
 
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_one_innovation_after_a_silence_does_not_replace_what_was_learned(value):
+    memory = new_memory(np.zeros((2, 3)))
+    memory.anchors["learned"], memory.anchors["excess_variance"] = 1.0, 0.09
+    (a, b), innovation = memory.anchors, memory.record.innovation
+    innovation.value, innovation.noise_variance = value, 0.01 + excess_variance(a, b)
+    learn(a, b, 6.0, innovation, FilterConfig(tdoa_std=0.1).tuning()[0])
+    assert memory.anchors["excess_variance"] == pytest.approx(0.09, rel=0.5)
+
+
 def test_an_anchor_that_is_late_for_a_while_disturbs_less():
     """Anchor 3 is a metre late in every pair for a second at a time, as behind an obstacle."""
     errors = {}

@@ -1,9 +1,13 @@
-from flights import corners
+from dataclasses import replace
+
+from flights import corners, fly
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.memory import new_memory
 from uwb_tdoa_ekf.core.workspace import SMALLEST, STD, constrain, contains, set_bounds
+from uwb_tdoa_ekf.offline import run_offline
 
 MARGIN = 1.0  # m
 
@@ -50,3 +54,28 @@ def test_a_tag_inside_is_left_alone():
     before = hypothesis.copy()
     assert not any(constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3))
     assert hypothesis == before
+
+
+def test_what_is_known_better_than_its_bounds_is_not_drawn_back():
+    """A tag outside whose TDOAs agree: every one of them used to tell the bound anew, and the deviation fell with their rate."""
+    bounds, ekf = bounds_of(np.array(corners().positions)), new_memory(np.array(corners().positions)).record
+    hypothesis = ekf.hypotheses[0]
+    hypothesis.x[:3] = bounds[1] + 3.0
+    hypothesis.P[:3, :3] = 0.5 * np.eye(3)
+    assert not any(constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3))
+
+
+@pytest.mark.parametrize("beyond", [1.0, 3.0])
+def test_a_tag_outside_is_right_or_says_how_wrong_it_is(beyond):
+    found = []
+    for seed in range(5):
+        flight = fly(seed, 6.0, hover=True, anchors=corners((8.0, 8.0, 3.0)), tdoa_rate=300.0)
+        p = np.array([8.0 + MARGIN + beyond, 3.0, 1.2])
+        a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
+        d = tdoa(p, flight.anchors.positions[a], flight.anchors.positions[b])
+        d += 0.1 * np.random.default_rng(seed).standard_normal(len(d))
+        odometry = run_offline(replace(flight, tdoa=replace(flight.tdoa, d=d))).odometry
+        error = (odometry.p - p)[odometry.t > 3.0]
+        P = odometry.covariance[odometry.t > 3.0, :3, :3]
+        found.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error).mean())
+    assert np.mean(found) < 6.0

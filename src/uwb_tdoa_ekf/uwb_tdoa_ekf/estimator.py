@@ -12,8 +12,8 @@ from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BAC
 from .aid_rows import ROWS
 from .core import aids
 from .core.config import FilterConfig
-from .core.engine import feed, tell_pose
-from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, Measurements, new_memory, structured
+from .core.engine import LOST_TIME, feed, tell_pose
+from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, Measurements, joined, new_memory, structured
 from .core.validity import usable_all, usable_imu, usable_slopes
 from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, REPEATED, STARTUP, USED
 from .monitoring.implausible import implausible
@@ -28,6 +28,7 @@ VERDICTS = {
 STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
+RATE_SAMPLES = 10  # inertial samples from whose stamps their rate is known
 SILENT = 1.0  # s of stamps after which height, pressure or velocity is not waited for any more, until it is back
 OF_AIDS = 0.5  # share of `lag` for which they are waited for: bias_node's `hold` must outlast that by far
 
@@ -89,6 +90,7 @@ class Estimator:
         names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_aids]
         self.counts = dict.fromkeys(names, 0)
         self._refused = []
+        self._sensed = NONE[IMU_STREAM]  # the inertial samples of the last feed, and RATE_SAMPLES before them
         self._clear()
 
     def _clear(self):
@@ -96,13 +98,25 @@ class Estimator:
         self._waiting = [Waiting(kind) for kind in KINDS]
         self._gates, self._orders = [StampGate() for _ in STREAMS], [Order() for _ in STREAMS]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with
-        self._poses = []  # (1,) of POSE, told and not reached yet
-        self._fed_imu = np.array([(-math.inf, math.nan, math.nan)], IMU_SAMPLE), NONE[IMU_STREAM]  # the last; those after it
+        self._poses, self._begun = [], False  # (1,) of POSE, told and not reached yet; whether there was a measurement
+        self.refused_pose = None  # sentence on a pose that was told before the first measurement, and is of another time
 
     @property
     def running(self):
         """True once a start position was found."""
         return bool(self._memory.record.running)
+
+    @property
+    def lost(self):
+        """Why there is no odometry any more, a sentence, until the tag is found anew; None while it is not lost, and before it was
+        found. Depends on stamps alone."""
+        ekf = self._memory.record
+        if ekf.running or ekf.t == -math.inf:
+            return None
+        return (
+            f"the tag is lost: for more than {LOST_TIME:g} s no TDOA came, and nothing else tells where it is by now; there is no odometry "
+            "until TDOAs tell that anew"
+        )
 
     @property
     def newest(self):
@@ -176,8 +190,10 @@ class Estimator:
         """Take a pose that somebody tells: t s; p (3,) m, NaN where it is not known; covariance (3, 3) m^2; yaw and yaw_std rad,
         or NaN. It holds from its stamp on; if the filter has passed that, from the next measurement on.
 
-        Raises InputError for a stamp that is not of the time of the streams.
+        Raises InputError for a stamp that is not of the time of the streams. One that is told before there is any measurement is
+        judged by the first, and dropped if it is not of its time: `refused_pose`.
         """
+        self.refused_pose = None
         newest = self.newest
         if newest > -math.inf and not newest - LARGEST_STEP_BACK <= t <= newest + LARGEST_STEP_AHEAD:
             raise InputError(
@@ -221,11 +237,12 @@ class Estimator:
         return self._feed(math.inf)
 
     def rates_at(self, t):
-        """Angular velocity as measured, (n, 3) rad/s, at stamps t (n,) of the Odometry returned last; NaN where no sample
-        is near."""
-        out = np.empty((len(t), 3))
-        _look_up(np.ascontiguousarray(t), *self._fed_imu, self.config.imu_timeout, out)
-        return out
+        """(angular velocity as measured, (n, 3) rad/s, its variance per axis, (n,) rad^2/s^2) at stamps t (n,) of the Odometry
+        returned last; NaN where no sample is near. White noise of density gyro_noise has, in samples that are dt apart, the
+        variance gyro_noise^2 / dt; dt is the mean of the last RATE_SAMPLES."""
+        rates, variances = np.empty((len(t), 3)), np.empty(len(t))
+        _look_up(np.ascontiguousarray(t), self._sensed, self.config.imu_timeout, self.config.gyro_noise, rates, variances)
+        return rates, variances
 
     def _add(self, stream, rows, usable):
         """Take rows of a stream, of which some may not be usable: those count as invalid (TDOAs are refused already)."""
@@ -294,7 +311,8 @@ class Estimator:
 
     def _feed(self, until):
         """Use what is stamped up to `until`, s, and between it what poses were told."""
-        parts = []
+        self._judge_early_poses()
+        parts, self._sensed = [], self._sensed[-RATE_SAMPLES:]
         while self._poses and self._poses[0]["t"][0] <= until and self._has_begun():
             pose = self._poses.pop(0)
             pose["t"] = max(pose["t"][0], self._fed_until)
@@ -316,6 +334,23 @@ class Estimator:
         monitor.judge(self._fed_until)
         return parts
 
+    def _judge_early_poses(self):
+        """Drop what was told before the first measurement and is of another time than that."""
+        if self._begun or not self._has_begun():
+            return
+        self._begun = True
+        first = min(waiting.rows["t"][0] for waiting in self._waiting if len(waiting))
+        early, self._poses = self._poses, []
+        for pose in early:
+            ahead = float(pose["t"][0]) - first
+            if -LOST_TIME <= ahead <= LARGEST_STEP_AHEAD:
+                self._poses.append(pose)
+            else:
+                self.refused_pose = (
+                    f"the pose that was told is not used: its stamp is {ahead:+.3f} s from that of the first measurement; give one from "
+                    f"-{LOST_TIME:g} to {LARGEST_STEP_AHEAD:g} s, on the clock of the measurements"
+                )
+
     def _has_begun(self):
         return any(map(len, self._waiting)) or self._fed_until > -math.inf
 
@@ -333,8 +368,8 @@ class Estimator:
         for part in (imu, tdoa, felt):
             if len(part):
                 self._fed_until = max(self._fed_until, part["t"][-1])
-        before, lately = self._fed_imu
-        self._fed_imu = lately[-1:] if len(lately) else before, imu
+        if len(imu):
+            self._sensed = joined(IMU_SAMPLE, [self._sensed, imu])
         self.counts["imu_used"] += len(imu)
         out = Odometry.from_rows(odometry), self._residuals(tdoa, outcome)
         self._monitor.add(*out)
@@ -356,19 +391,24 @@ class Estimator:
 
 
 @compiled
-def _look_up(t, before, lately, timeout, out):
-    """Rates of the last of IMU_SAMPLE, one `before` and those that follow in the order of their stamps, up to each of t (n,) s, NaN
-    where it is older than that."""
-    for i in range(len(t)):
-        sample = before[0]
-        for k in range(len(lately) - 1, -1, -1):
-            if lately[k].t <= t[i]:
-                sample = lately[k]
-                break
-        if 0.0 <= t[i] - sample.t <= timeout:
-            out[i] = sample.gyro
-        else:
-            out[i] = np.nan
+def _look_up(t, sensed, timeout, noise, rates, variances):
+    """Rates of the last of `sensed`, (m,) of IMU_SAMPLE, up to each of t (n,) s, and their variances; NaN where it is older than
+    timeout, s."""
+    k = len(sensed) - 1
+    for i in range(len(t) - 1, -1, -1):
+        while k >= 0 and sensed[k].t > t[i]:
+            k -= 1
+        rates[i], variances[i] = np.nan, np.nan
+        if k < 0 or t[i] - sensed[k].t > timeout:
+            continue
+        rates[i] = sensed[k].gyro
+        apart = intervals = 0.0
+        for j in range(max(1, k - RATE_SAMPLES + 1), k + 1):
+            if 0.0 < sensed[j].t - sensed[j - 1].t <= timeout:
+                apart += sensed[j].t - sensed[j - 1].t
+                intervals += 1.0
+        if intervals > 0.0:
+            variances[i] = noise**2 * intervals / apart
 
 
 NONE = [np.empty(0, kind) for kind in KINDS]

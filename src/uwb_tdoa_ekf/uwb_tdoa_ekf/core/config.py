@@ -66,10 +66,10 @@ class FilterConfig:
         4.0, "variance of a vibrating accelerometer's error over that of its vibration; 0.0: it has none", high=1000.0, with_low=True
     )
     workspace_margin: float = _parameter(
-        1.0, "m beyond the anchors' extent; a tag further out is drawn back, against weak evidence", high=10000.0, fixed=True
+        1.0, "m beyond the anchors' extent; a tag further out is drawn back while less is known of its place", high=10000.0, fixed=True
     )
-    zero_velocity: bool = _parameter(True, "a tag whose inertial sensors neither shake nor turn stands still")
-    recover: bool = _parameter(True, "find the tag anew, untold where it is, when the TDOAs agree on another place")
+    zero_velocity: bool = _parameter(True, "a tag whose TDOAs stay what they are, or whose inertial sensors neither shake nor turn, stands still")
+    recover: bool = _parameter(True, "find the tag anew, untold where it is, when the TDOAs agree on another place that it can have come to")
     compensate_changes: bool = _parameter(False, "take out the delay of an anchor that is found to have changed in flight")
 
     # The start

@@ -8,7 +8,7 @@ from uwb_tdoa_bias.effects.slope import N_STATES
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
-from . import aids, barometer, height, history, hypotheses, inertial, initialization, noise, plausibility, robust, workspace
+from . import aids, barometer, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, rest, robust, workspace
 from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, Output
 from .sensor_functions import take_out
 from .startup import INLIER
@@ -18,15 +18,12 @@ from .verdicts import COMPENSATED, REJECTED, REPEATED, STARTUP, USED
 
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged
 INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
-LOST_TIME = 60.0  # s without any message after which the filter starts anew
+LOST_TIME = 30.0  # s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter starts anew
 MAX_STEP = 0.05  # s, longest single prediction
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
-REST_PERIOD, REST_STD = 0.05, 0.02  # s between, and m/s of, zero-velocity updates at rest
-REST_SPEED = 0.05  # m/s; a quiet tag stands still if it is known to be slower: it might also glide
-
 STRAIGHT = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
-RECORDS_OF_TDOA = 1 + 3 + 1 + 1  # in a history, at most: its update, workspace, fixed height, a start or a recovery
+RECORDS_OF_TDOA = 1 + 3 + 1 + 3 + 1  # in a history, at most: its update, workspace, fixed height, a place at rest, a start or a recovery
 RECORDS_OF_REST = 3  # one per axis
 RECORDS_OF_AID = 3  # one per component of a velocity
 
@@ -82,7 +79,10 @@ def most_records(measurements):
     """Room that a history needs for Measurements that are fed at once."""
     imu, tdoa, aid = measurements
     seconds = imu["t"][-1] - imu["t"][0] if len(imu) else 0.0
-    rests, switches = (min(len(imu), 2 + int(seconds / period)) for period in (REST_PERIOD, 0.5 * plausibility.CLEARED))
+    if len(tdoa):
+        seconds = max(seconds, tdoa["t"][-1] - tdoa["t"][0])
+    most = len(imu) + len(tdoa)
+    rests, switches = (min(most, 2 + int(seconds / period)) for period in (rest.PERIOD, 0.5 * plausibility.CLEARED))
     return RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_REST * rests + switches + RECORDS_OF_AID * len(aid)
 
 
@@ -94,10 +94,10 @@ def _on_imu(ekf, tuning, sample, records):
         ekf.distrusted = distrusted
         _switch(ekf, tuning, records)
     if ekf.running and _advance(ekf, tuning, sample.t, records):
+        if fresh and not ekf.distrusted:
+            rest.feel(ekf, sample, sample.t - ekf.imu.t)
         ekf.quiet = tuning.zero_velocity and fresh and not ekf.distrusted and inertial.is_quiet(ekf.imu)
-        if ekf.quiet and sample.t >= ekf.next_rest:
-            ekf.next_rest = sample.t + REST_PERIOD
-            _rest(ekf, sample.t, records)
+        rest.hold(ekf, sample.t, records)
     inertial.hold(ekf.imu, sample)
 
 
@@ -123,16 +123,24 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
         if not was_running:
             _wait_for_start(ekf, anchors, tuning, t, records)
         return
-    _update(ekf, anchors, tuning, tdoa, residual, records)
+    if tuning.zero_velocity:
+        if t >= ekf.next_look:
+            rest.look(ekf, anchors, tuning, initialization.recent(ekf, rest.LOOK_WINDOW), t, records)
+        if not tuning.use_imu or t - ekf.imu.t > tuning.imu_timeout:
+            rest.hold(ekf, t, records)
+    late = _update(ekf, anchors, tuning, tdoa, residual, records)
     _stay_in_workspace(ekf, t, records)
     if tuning.fixed_height_std > 0.0 and t >= ekf.next_floor:
-        ekf.next_floor = t + REST_PERIOD
+        ekf.next_floor = t + rest.PERIOD
         _stay_on_floor(ekf, tuning, t, records)
     hypotheses.select(ekf, t)
     known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
     agrees = 1.0 if abs(residual.innovation - known) < INLIER else 0.0
-    ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (agrees - ekf.consistency)
+    if not late:
+        ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (agrees - ekf.consistency)
     ekf.last_tdoa = t
+    if ekf.consistency > initialization.AGREE:
+        ekf.sure = t
     if tuning.recover and ekf.consistency < INCONSISTENT and t >= ekf.next_search:
         initialization.recover(ekf, anchors, tuning, t, records)
 
@@ -161,10 +169,9 @@ def _wait_for_start(ekf, anchors, tuning, t, records):
 @compiled
 def _advance(ekf, tuning, t, records):
     """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old, without one. Returns
-    False if the filter has stopped, because nothing has come for too long."""
+    False if the filter has stopped, because nothing has told for too long where the tag is."""
     if t - ekf.t > LOST_TIME:
-        ekf.running, ekf.first_tdoa, ekf.next_search = False, t, -np.inf
-        return False
+        return _stop(ekf, t)
     sensed = tuning.use_imu and t - ekf.imu.t < tuning.imu_timeout and not ekf.distrusted
     if sensed and ekf.t < t:
         inertial.weigh(ekf.imu, ekf.quiet, tuning)
@@ -187,22 +194,42 @@ def _advance(ekf, tuning, t, records):
                 if h == ekf.best:
                     history.add_coasting(ekf, dt, records)
         ekf.t = t if t - ekf.t <= MAX_STEP else ekf.t + dt
+    if t - ekf.last_tdoa > LOST_TIME and workspace.is_filled(ekf.workspace, ekf.hypotheses[ekf.best].P):
+        return _stop(ekf, t)
     return True
 
 
 @compiled
+def _stop(ekf, t):
+    """Go on as before the start. Returns False."""
+    ekf.running, ekf.first_tdoa, ekf.next_search = False, t, -np.inf
+    return False
+
+
+@compiled
 def _update(ekf, anchors, tuning, tdoa, residual, records):
-    """Every hypothesis with one TDOA; the best one's innovation becomes the residual."""
+    """Every hypothesis with one TDOA; the best one's innovation becomes the residual. Returns whether one of its anchors is late because
+    it is near the ground: then it tells nothing."""
     a, b, innovation = anchors[tdoa.a], anchors[tdoa.b], ekf.innovation
     innovation.noise_variance = tuning.tdoa_std**2 + tdoa.variance + a.delay_variance + b.delay_variance
     known = b.delay - a.delay
     if tuning.adapt_noise:
         innovation.noise_variance += noise.excess_variance(a, b)
+    if ground.find_lateness(a, b, ekf.hypotheses[ekf.best], tdoa.t, tuning.ground_height):
+        _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
+        in_time = ground.in_time(a, b, innovation)
+        if in_time < ground.NOT_USED:
+            residual.innovation = innovation.value + known
+            residual.variance = innovation.prior_variance + innovation.noise_variance
+            residual.verdict = REJECTED
+            return True
+        innovation.noise_variance /= in_time
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
             continue
         _compare(hypothesis, a, b, tdoa, known, innovation)
+        innovation.repeated = rest.repetition(ekf, tdoa.t)
         _assimilate(ekf, h, tuning, tdoa.t, residual, records)
         if h == ekf.best:
             height.judge(ekf.height, tuning, innovation, tdoa.t)
@@ -212,6 +239,7 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
         residual.innovation += known
         if residual.verdict == USED:
             residual.verdict = COMPENSATED
+    return False
 
 
 @compiled
@@ -236,7 +264,7 @@ def _compare(hypothesis, a, b, tdoa, known, innovation):
 def _assimilate(ekf, h, tuning, t, residual, records):
     """Hypothesis h with ekf.innovation, of whatever kind; that of the best one becomes the RESIDUAL."""
     hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
-    hypotheses.add_log_likelihood(hypothesis, innovation, tuning.tdoa_correlation_length)
+    hypotheses.add_log_likelihood(hypothesis, innovation, tuning.tdoa_correlation_length * innovation.repeated)
     robust.update(hypothesis, innovation, tuning)
     if h == ekf.best:
         residual.innovation = innovation.value
@@ -256,23 +284,6 @@ def _stay_in_workspace(ekf, t, records):
         for axis in range(3):
             outside = workspace.constrain(ekf.hypotheses[h], ekf.innovation, ekf.workspace, axis)
             if outside and h == ekf.best:
-                history.add_update(ekf, t, records)
-
-
-@compiled
-def _rest(ekf, t, records):
-    """Zero velocity, one axis after the other, for a quiet tag that the TDOAs have shown to be slow."""
-    for h in range(HYPOTHESES):
-        hypothesis = ekf.hypotheses[h]
-        x, P = hypothesis.x, hypothesis.P
-        slow = hypotheses.alive(hypothesis)
-        for state in range(3, 6):
-            slow = slow and abs(x[state]) < REST_SPEED and P[state, state] < REST_SPEED**2
-        if not slow:
-            continue
-        for state in range(3, 6):
-            update_state(hypothesis, ekf.innovation, state, 0.0, REST_STD)
-            if h == ekf.best:
                 history.add_update(ekf, t, records)
 
 

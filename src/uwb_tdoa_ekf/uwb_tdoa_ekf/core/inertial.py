@@ -9,7 +9,7 @@ from .state import GRAVITY
 
 PERSISTENCE = 0.2  # s over which the error of a vibrating accelerometer stays alike
 QUIET_ACCEL, QUIET_GYRO = 0.05, 0.02  # m/s^2, rad/s, rms per axis: less is quiet; hovering has 0.1, 0.03, idling more
-RESTLESS = 0.01  # rad^2/s^2 that fades before a tag counts as quiet, about a second after the first sample
+RESTLESS = 0.002  # rad^2/s^2 that fades before a tag counts as quiet, about half a second after the first sample
 QUIET_TILT = 0.5  # m/s^2 by which the mean specific force may differ from gravity
 QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
 

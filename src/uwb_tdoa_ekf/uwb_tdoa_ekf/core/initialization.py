@@ -6,7 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from . import height, hypotheses, inertial, workspace
+from . import ground, height, hypotheses, inertial, standing, workspace
 from .history import add_reset
 from .memory import HYPOTHESES, WINDOW
 from .startup import SPEED, level, locate, share_of_inliers
@@ -20,6 +20,7 @@ SEARCH_PERIOD = 0.1  # s between two searches
 TILT_STD = 0.1  # rad, at the start
 WRONG_POSITION = 1.0  # m, that inertial samples which are wrong have made
 SMALLEST_STD = 0.03  # m, of a height that is known at the start
+REACH, REACH_SPEED, REACH_ACCELERATION = 0.5, 0.5, 0.5  # m, m/s, m/s^2: how far from where it was right a filter may be found, by time
 
 
 @compiled
@@ -50,7 +51,7 @@ def is_repeat(ekf, tdoa, anchors):
 @compiled
 def start(ekf, anchors, tuning, t, anyhow, history):
     """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
-    window = _recent(ekf, tuning.start_window)
+    window = recent(ekf, tuning.start_window)
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
@@ -59,9 +60,19 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     accel = _mean_accel(ekf.imu, tuning)
     z, z_std = _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
     share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance)
-    if not anyhow and (share < AGREE or not workspace.contains(ekf.workspace, x)):
+    good = share >= AGREE and workspace.contains(ekf.workspace, x)
+    pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
+    at_rest, its = x.copy(), covariance.copy()
+    on_ground = standing.weigh(pairs, anchors, ekf.workspace, tuning, z, z_std, at_rest, its)
+    still = ground.is_still(pairs, anchors, at_rest, ekf.still_covariance)
+    if still or (anyhow and not good):
+        x, covariance, good = at_rest, its, good or on_ground
+    if not (good or anyhow):
         return
+    if still:
+        standing.stop(x, covariance, ekf.still_covariance)
     _begin(ekf, tuning, t, x, covariance, tuning.initial_yaw, tuning.initial_yaw_std)
+    ekf.resting, ekf.rest_since = still and tuning.zero_velocity, t
     add_reset(ekf, t, history)
 
 
@@ -125,7 +136,7 @@ def _begin(ekf, tuning, t, x, covariance, yaw, yaw_std):
         _put(hypothesis, x, covariance)
         _spread_attitude(hypothesis.P, tuning, yaw_std)
     ekf.best = 0
-    ekf.t = ekf.last_tdoa = t
+    ekf.t = ekf.last_tdoa = ekf.sure = t
     ekf.consistency = 1.0
     ekf.running = True
 
@@ -145,8 +156,11 @@ def _turn(hypothesis, yaw, std):
 
 @compiled
 def recover(ekf, anchors, tuning, t, history):
-    """If the window agrees on a position and the filter on another one, go there; attitude and biases stay."""
-    window = _recent(ekf, min(tuning.start_window, RECOVERY_WINDOW))
+    """If the window agrees on a position and the filter on another one, go there; attitude and biases stay.
+
+    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter was right, and no farther.
+    """
+    window = recent(ekf, min(tuning.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
@@ -157,12 +171,19 @@ def recover(ekf, anchors, tuning, t, history):
     explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
     if not workspace.contains(ekf.workspace, x) or share < AGREE_ANYHOW or share < CLEARLY_MORE + explained:
         return
+    if tuning.use_imu and not ekf.distrusted and t - ekf.imu.t < tuning.imu_timeout:
+        since, away = t - ekf.sure, 0.0
+        for k in range(3):
+            away += (x[k] - ekf.hypotheses[ekf.best].x[k]) ** 2
+        if math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
+            return
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
         _put(hypothesis, x, covariance)
     ekf.consistency = 1.0
+    ekf.rest_since = t
     ekf.recoveries += 1
     add_reset(ekf, t, history)
 
@@ -196,7 +217,7 @@ def _known_height(ekf, tuning, up, t):
 
 
 @compiled
-def _recent(ekf, seconds):
+def recent(ekf, seconds):
     """The TDOAs of the last `seconds`: (n,) of TDOA."""
     first = ekf.kept - 1
     since = ekf.window[ekf.kept - 1].t - seconds

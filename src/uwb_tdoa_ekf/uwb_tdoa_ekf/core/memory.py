@@ -10,6 +10,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects.slope import N_STATES
 
+from .ground import MOST_PAIRS, PAIR
 from .sensor_functions import rows_of
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
 from .update import INNOVATION, OFFSET_STATES
@@ -79,7 +80,9 @@ ANCHOR = _record(
     ("excess_variance", float),  # m^2, of what is received of it beyond tdoa_std, see noise.py
     ("learned", float),  # s, stamp of the last change
     ("delay", float),  # m, that it is found to have since it changed in flight,
-    ("delay_variance", float),  # and its variance, m^2
+    ("delay_variance", float),  # and its variance, m^2;
+    ("late", float),  # probability that it is late because tag and anchor are near the ground, see ground.py, 0: it cannot be,
+    ("judged", float),  # s, and the stamp of the last TDOA that was asked
 )
 
 HEIGHT = _record(
@@ -125,6 +128,14 @@ EKF = _record(
     ("plausibility", PLAUSIBILITY),  # of the inertial samples,
     ("distrusted", bool),  # which are not used, because they cannot be right
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
+    ("resting", bool),  # the tag does not move, see rest.py,
+    ("rest_since", float),  # s, stamps: since when,
+    ("next_look", float),  # and before which not to look again,
+    ("doubts", int),  # looks in a row in which its TDOAs have changed, and in which it was not known to rest
+    ("stills", int),  # but neither TDOAs nor inertial samples showed that it moves,
+    ("shaking", float),  # m^2/s^4, power of the vibration of a tag that is not at rest, over some seconds
+    ("lift", float, 3),  # m/s, that the inertial sensor has felt lately at rest, in the world
+    ("sure", float),  # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
     ("workspace", float, (2, 3)),  # m, lower and upper bounds, see workspace.py
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),
@@ -141,6 +152,8 @@ EKF = _record(
     # Scratch: nothing below outlives an event.
     ("transition", TRANSITION),
     ("innovation", INNOVATION),
+    ("pairs", PAIR, MOST_PAIRS),
+    ("still_covariance", float, (3, 3)),
 )
 
 # What comes out.
@@ -187,9 +200,9 @@ class Output(NamedTuple):
 def new_memory(positions, functions=()):
     """Memory of a filter that has seen nothing; positions : (N, 3) m, of the anchors; functions : SensorFunctions."""
     memory = Memory(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
-    memory.anchors["position"], memory.anchors["learned"] = positions, -np.inf
+    memory.anchors["position"], memory.anchors["learned"], memory.anchors["judged"] = positions, -np.inf, -np.inf
     ekf = memory.record
-    for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge"):
+    for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge", "next_look", "sure"):
         ekf[stamp] = -np.inf
     ekf.imu.t = ekf.plausibility.contradicted = -np.inf
     for stamp in ("heard", "changed", "used", "judged", "pulls_since", "ignored_until"):

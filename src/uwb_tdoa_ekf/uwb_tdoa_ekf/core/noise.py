@@ -1,8 +1,11 @@
 """How noisy each anchor is, learned from the innovations while flying."""
 
+import numpy as np
+
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 LARGEST_OUTLIER = 5.0  # standard deviations that one outlier counts as at most
+LARGEST_STEP = 0.1  # share of an anchor's variance that one innovation makes at most: ten say what one cannot
 
 
 @compiled
@@ -29,6 +32,6 @@ def learn(a, b, t, innovation, tuning):
 
 @compiled
 def _learn_one(anchor, t, excess, memory):
-    step = min(1.0, max(0.0, t - anchor.learned) / memory)
+    step = min(LARGEST_STEP, max(0.0, t - anchor.learned) / memory) if anchor.learned > -np.inf else 1.0
     anchor.excess_variance = max(0.0, anchor.excess_variance + step * excess)
     anchor.learned = t

@@ -44,7 +44,7 @@ def update_innovation(hypothesis, innovation, tuning):
     if w < NEGLIGIBLE:
         innovation.weight, innovation.total_variance = 0.0, np.inf
         return
-    innovation.weight, innovation.total_variance = w, prior + noise * tuning.tdoa_correlation_length / w
+    innovation.weight, innovation.total_variance = w, prior + noise * tuning.tdoa_correlation_length * innovation.repeated / w
     kalman(hypothesis, innovation)
 
 
@@ -55,7 +55,7 @@ def update_gate(hypothesis, innovation, tuning):
     if innovation.value**2 > tuning.gate**2 * (prior + noise):
         innovation.weight, innovation.total_variance = 0.0, np.inf
         return
-    innovation.weight, innovation.total_variance = 1.0, prior + noise * tuning.tdoa_correlation_length
+    innovation.weight, innovation.total_variance = 1.0, prior + noise * tuning.tdoa_correlation_length * innovation.repeated
     kalman(hypothesis, innovation)
 
 
@@ -74,7 +74,8 @@ def update_m_estimation(hypothesis, innovation, tuning):
     y0 = S[0, 0] * g0 + S[1, 0] * g1 + S[2, 0] * g2  # S' h'; its other elements are zero
     y1 = S[1, 1] * g1 + S[2, 1] * g2
     y2 = S[2, 2] * g2
-    noise, loss = innovation.noise_variance * tuning.tdoa_correlation_length, tuning.loss
+    noise = innovation.noise_variance * tuning.tdoa_correlation_length * innovation.repeated
+    loss = tuning.loss
     e0 = e1 = e2 = 0.0  # scaled error of the state, eq. 9
     for _ in range(tuning.iterations):
         left = innovation.value - y0 * e0 - y1 * e1 - y2 * e2

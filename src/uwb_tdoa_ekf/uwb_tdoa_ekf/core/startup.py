@@ -8,6 +8,8 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
+from .ground import solve
+
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
@@ -59,7 +61,7 @@ def locate(window, anchors, workspace, std, z, z_std, x, covariance):
     for k in range(6):
         system[k, k] += variance * prior_information[k]
     both = np.concatenate((system[:, :6], np.eye(6)), axis=1)
-    _solve(both)
+    solve(both)
     covariance[:, :] = both[:, 6:] * variance
     return np.mean(np.abs(residuals) < INLIER)
 
@@ -101,25 +103,10 @@ def _step(trial, system, prior_information, mean):
     for k in range(6):
         system[k, k] += prior_information[k]
         system[k, 6] += prior_information[k] * (mean[k] - trial[k])
-    _solve(system)
+    solve(system)
     step = system[:, 6]
     length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
     trial += min(1.0, LONGEST_STEP / max(length, 1e-9)) * step
-
-
-@compiled
-def _solve(system):
-    """Turn the right sides of positive definite equations, (n, n + m), into their solutions. (LAPACK is scipy's, whose import takes
-    a fifth of a second.)"""
-    n, columns = system.shape
-    for k in range(n):
-        pivot = system[k, k]
-        for j in range(k, columns):
-            system[k, j] /= pivot
-        for i in range(n):
-            factor = system[i, k]
-            for j in range(k, columns if i != k else 0):
-                system[i, j] -= factor * system[k, j]
 
 
 @compiled

@@ -28,6 +28,7 @@ INNOVATION = np.dtype(
             ERROR_STATES,
         ),  # P h', of state and prediction; the gain is this over total_variance
         ("on_offset", float),  # entry of the Jacobian row for the offset of the barometer: 0, but for its own altitudes
+        ("repeated", float),  # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does not move
         ("weight", float),  # 0 to 1, given by robust.update
         ("total_variance", float),  # of the value, as the update took it
         ("factor", float, (ERROR_STATES, 3)),  # scratch of the M-estimation
@@ -49,7 +50,7 @@ def project(P, innovation):
     variance = 0.0
     for n in range(innovation.entries):
         variance += innovation.row[n] * covariance[innovation.states[n]]
-    innovation.prior_variance, innovation.on_offset = variance, 0.0
+    innovation.prior_variance, innovation.on_offset, innovation.repeated = variance, 0.0, 1.0
 
 
 @compiled

@@ -5,7 +5,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from .update import update_state
 
 SMALLEST = 3.0  # m from the middle of the anchors to each bound at least, however flat they lie
-STD = 1.0  # m, of the pseudo-measurement that a tag outside is at the bound, once with each TDOA
+STD = 1.0  # m, of what is known before anything is measured: a tag outside is at the bound
 
 
 @compiled
@@ -29,13 +29,24 @@ def contains(bounds, x):
 
 
 @compiled
+def is_filled(bounds, P):
+    """True if a tag whose error has covariance P may be anywhere in `bounds` (2, 3): its standard deviation exceeds their diagonal."""
+    spread = size = 0.0
+    for k in range(3):
+        spread += P[k, k]
+        size += (bounds[1, k] - bounds[0, k]) ** 2
+    return spread > size
+
+
+@compiled
 def constrain(hypothesis, innovation, bounds, axis):
     """Soft constraint of one axis: pull a tag that is outside towards its workspace. Returns whether it was.
 
-    Wrong TDOAs, e.g. late arrivals on a floor, are often explained best by a tag far away.
+    Only while less is known of the axis: what is told once is not told better by being repeated, and TDOAs that agree on a place
+    outside are right.
     """
     x = hypothesis.x[axis]
-    if bounds[0, axis] <= x <= bounds[1, axis]:
+    if bounds[0, axis] <= x <= bounds[1, axis] or hypothesis.P[axis, axis] <= STD**2:
         return False
     update_state(hypothesis, innovation, axis, min(max(x, bounds[0, axis]), bounds[1, axis]), STD)
     return True

@@ -1,0 +1,342 @@
+"""A tag near the ground: anchors that may be late there, and where a tag stands that does not move.
+
+Between two antennas near the ground the reflected ray, whose phase the ground turns, cancels the direct one where both are nearly
+equally long (two-ray ground-reflection model, e.g. Rappaport, Wireless Communications, ch. 4). The receiver then takes a later
+arrival for the first, metres late. By how much is not known; that it may be so follows from the two heights and the distance.
+"""
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
+
+GRAZING = math.tan(math.radians(15.0))  # elevation below which the ground turns the phase of what it reflects
+HALF_WAVE = 0.0375  # m, at 4 GHz: rays that differ by more do not cancel
+HIGHEST = 1.0  # m above the ground; above, no anchor near the ground can be late for that
+LATEST = 6.0  # m, lateness of an anchor is up to that, the more probable, the larger: the way by what reflects is a detour
+FARTHER = 1e-3  # 1/m, density of what is later still, and of outliers of any kind
+RARE = 0.02  # probability that an anchor is late, and that it is not, at least,
+USUAL = 0.1  # and that it is late where nothing tells
+CHANGE_TIME = 2.0  # s after which what an anchor was does not tell what it is
+DEVIATIONS = 3.0  # standard deviations that a tag may be lower than the filter has it
+NOT_USED = 0.2  # probability that both anchors of a TDOA are in time, below which it says nothing
+
+MOST_PAIRS, MOST_ANCHORS = 64, 24  # of a window that are looked at, those heard first
+FEWEST_PAIRS = 3
+STILL_TDOAS = 2  # of a pair in each half of the window, at least
+SMALLEST_SPREAD = 0.02  # m, of the values of a pair
+STILL_SPEED = 0.3  # m/s; a velocity that is not known better than that may be none
+LIKELY_SPEED = 1.0  # m/s, of a tag of which nothing is known
+STILL_SCALE, STILL_SWEEPS = 2.5, 5  # standard deviations of a change from which on it is the lateness that has changed
+MOVES = 12.0  # normalised square of a velocity that is not zero
+EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5  # median normalised square of the changes at rest, and by how much one of n is larger, times sqrt(n)
+
+GROUND_STD = 0.15  # m, of the height of the tag of a body that stands on the ground
+GROUND_HEIGHT = 0.05  # m, its mean
+PAIR_SHARE, ANCHOR_SHARE = 0.4, 1.0  # of tdoa_std: standard deviation of a pair's own error, and of an anchor's
+USUAL_LATENESS, LATENESS_STD, ALIKE_STD = 2.0, 2.0, 0.3  # m: what late anchors have in common, and by how much they differ from it
+OTHER, TIMELY = 0.1, 0.5  # how probable other lateness is, and none, beside one that is alike
+ABOVE_STD, BESIDE_STD = 0.2, 2.0  # m; a tag is not above the workspace, and not often beside it
+SWEEPS = 25
+
+PAIR = np.dtype(
+    [
+        ("a", np.int64), ("b", np.int64),  # rows of its anchors
+        ("value", float), ("change", float), ("change_variance", float),  # m, median; median of the second half less that of the first
+        ("apart", float),  # s between the two halves
+    ],
+    align=True,
+)  # fmt: skip
+
+
+@compiled
+def may_be_late(position, x, lower, ground):
+    """Whether an anchor at `position` (3,) may be late at a tag at x (3,), m, or up to `lower` m below it, over level ground."""
+    tag, anchor = max(x[2] - ground - lower, 0.0), max(position[2] - ground, 0.0)
+    distance = math.hypot(x[0] - position[0], x[1] - position[1])
+    return tag + anchor < GRAZING * distance and 2.0 * tag * anchor < HALF_WAVE * distance
+
+
+@compiled
+def find_lateness(a, b, hypothesis, t, ground):
+    """Predict to stamp t, s, how probable it is that each of two ANCHORs is late at a HYPOTHESIS over level ground. Returns whether either
+    can be."""
+    lower = DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
+    if hypothesis.x[2] - lower > ground + HIGHEST:
+        a.late = b.late = 0.0
+        return False
+    _predict_lateness(a, hypothesis.x, lower, t, ground)
+    _predict_lateness(b, hypothesis.x, lower, t, ground)
+    return a.late > 0.0 or b.late > 0.0
+
+
+@compiled
+def _predict_lateness(anchor, x, lower, t, ground):
+    if not may_be_late(anchor.position, x, lower, ground):
+        anchor.late = 0.0
+    else:
+        step = min(1.0, max(0.0, t - anchor.judged) / CHANGE_TIME)
+        anchor.late = min(max(anchor.late + step * (USUAL - anchor.late), RARE), 1.0 - RARE)
+    anchor.judged = t
+
+
+@compiled
+def in_time(a, b, innovation):
+    """Probability that a TDOA between two of ANCHOR, an INNOVATION after `project` of the best HYPOTHESIS, is of two anchors in time.
+
+    After `find_lateness`; what is known of each anchor becomes what it is after that TDOA (a filter of four modes, Bar-Shalom et al.,
+    Estimation with Applications to Tracking and Navigation, 2001, section 11.6, without an exchange of states: being late tells no place).
+    """
+    late_a, late_b = a.late, b.late
+    r, variance = innovation.value, innovation.prior_variance + innovation.noise_variance
+    gauss = math.exp(-0.5 * r * r / variance)
+    neither = (1.0 - late_a) * (1.0 - late_b) * (gauss / math.sqrt(2.0 * math.pi * variance) + FARTHER)
+    of_b = (1.0 - late_a) * late_b * _lateness(r)
+    of_a = (1.0 - late_b) * late_a * _lateness(-r)
+    both = late_a * late_b * max(FARTHER, (1.0 - abs(r) / LATEST) / LATEST)
+    total = neither + of_a + of_b + both
+    a.late, b.late = (of_a + both) / total, (of_b + both) / total
+    return neither / total
+
+
+@compiled
+def _lateness(r):
+    """Density, 1/m, of an innovation r, m, by one late anchor."""
+    return max(2.0 * r / LATEST**2, FARTHER) if r < LATEST else FARTHER
+
+
+@compiled
+def find_pairs(window, pairs):
+    """Fill in (k,) of PAIR what each pair of anchors, in either order, says in a window (n,) of TDOA, n > 0. Returns how many there are.
+
+    The scatter within halves of the window is that of all pairs.
+    """
+    n, count = len(window), 0
+    middle = 0.5 * (window[0].t + window[n - 1].t)
+    values, deviations, known = np.empty((2, n)), np.empty(n), 0
+    for i in range(n):
+        a, b = window[i].a, window[i].b
+        k = 0
+        while k < count and not _is_of(window[i], pairs[k].a, pairs[k].b):
+            k += 1
+        if k < count or count == len(pairs):
+            continue
+        m0 = m1 = 0
+        t0 = t1 = 0.0
+        for j in range(i, n):
+            tdoa = window[j]
+            if _is_of(tdoa, a, b):
+                d = tdoa.d if tdoa.a == a else -tdoa.d
+                if tdoa.t < middle:
+                    values[0, m0], t0, m0 = d, t0 + tdoa.t, m0 + 1
+                else:
+                    values[1, m1], t1, m1 = d, t1 + tdoa.t, m1 + 1
+        pair = pairs[count]
+        pair.a, pair.b, pair.change_variance = a, b, np.inf
+        if m0 >= STILL_TDOAS and m1 >= STILL_TDOAS:
+            first, second = np.median(values[0, :m0]), np.median(values[1, :m1])
+            for half, m, value in ((0, m0, first), (1, m1, second)):
+                for j in range(m):
+                    deviations[known] = abs(values[half, j] - value) * math.sqrt(m / (m - 1.0))
+                    known += 1
+            pair.change, pair.apart = second - first, t1 / m1 - t0 / m0
+            pair.change_variance = 1.57 * (1.0 / m0 + 1.0 / m1)
+        for j in range(m1):
+            values[0, m0 + j] = values[1, j]
+        pair.value = np.median(values[0, : m0 + m1])
+        count += 1
+    spread = 1.48 * np.median(deviations[:known]) if known else np.inf
+    for k in range(count):
+        pairs[k].change_variance *= max(spread, SMALLEST_SPREAD) ** 2
+    return count
+
+
+@compiled
+def _is_of(tdoa, a, b):
+    return (tdoa.a == a and tdoa.b == b) or (tdoa.a == b and tdoa.b == a)
+
+
+@compiled
+def is_still(pairs, anchors, x, covariance):
+    """True if the TDOAs of most (k,) of PAIR stay what they are: whatever their anchors are late by, the tag does not move.
+
+    x : (3,) m, about where it is; covariance (3, 3) m^2/s^2 of the velocity that they would have shown is filled, large where that is not
+    known. Least squares of the changes, robust against anchors whose lateness has changed.
+    """
+    n, changes, ratios = 0, np.empty((len(pairs), 5)), np.empty(len(pairs))
+    for k in range(len(pairs)):
+        pair = pairs[k]
+        if pair.change_variance < np.inf:
+            linearized_tdoa(x, anchors[pair.a].position, anchors[pair.b].position, changes[n, :3])
+            changes[n, 3], changes[n, 4] = pair.change / pair.apart, pair.change_variance / pair.apart**2
+            ratios[n] = pair.change**2 / pair.change_variance
+            n += 1
+    if n < FEWEST_PAIRS or np.median(ratios[:n]) > EXPECTED_RATIO + LARGEST_RATIO / math.sqrt(n):
+        return False
+    both, v = np.empty((3, 7)), np.zeros(3)
+    for sweep in range(STILL_SWEEPS):
+        both[:, :] = 0.0
+        for k in range(3):
+            both[k, k], both[k, 3 + k] = 1.0 / LIKELY_SPEED**2, 1.0
+        for k in range(n):
+            row = changes[k]
+            r = row[3] - row[0] * v[0] - row[1] * v[1] - row[2] * v[2]
+            weight = 1.0 / (row[4] * (1.0 + r * r / (STILL_SCALE**2 * row[4])))
+            for i in range(3):
+                for j in range(3):
+                    both[i, j] += weight * row[i] * row[j]
+                both[i, 6] += weight * row[i] * row[3]
+        information = both[:, :3].copy()
+        solve(both)
+        v[:] = both[:, 6]
+    covariance[:, :] = both[:, 3:6]
+    size = 0.0
+    for i in range(3):
+        for j in range(3):
+            size += v[i] * information[i, j] * v[j]
+    return size < MOVES and covariance[0, 0] + covariance[1, 1] < STILL_SPEED**2
+
+
+@compiled
+def explain(pairs, anchors, workspace, prior, tuning, z, z_std, on_ground, x, covariance):
+    """Where a tag at rest is, by what (k,) of PAIR say, as far as anchors are alike.
+
+    prior : (4, 3), position that is known before, m, and its information, 1/m^2; z, z_std : m, a height that is known and its standard deviation, NaN for none; on_ground : anchors near the ground may be late;
+    x : (3,) m, where to begin, becomes the most probable position; covariance (3, 3) m^2 is filled. Returns minus the logarithm of its
+    probability, up to a constant.
+
+    An error of its own for each anchor, and one for each pair, rarely large (Student's distribution). Of the anchors near the ground most
+    are alike late, as that is the way by what reflects, some by anything, and some in time (a mixture). Iteratively re-weighted least
+    squares.
+    """
+    rows, places = _heard(pairs, anchors)
+    n = 3 + len(rows) + 1
+    system, u = np.empty((n, n + 1)), np.zeros(n)
+    u[:3] = x
+    u[n - 1] = USUAL_LATENESS if on_ground else 0.0
+    late = np.zeros(len(rows), np.bool_)
+    for sweep in range(SWEEPS):
+        for i in range(len(rows)):
+            late[i] = on_ground and may_be_late(anchors[rows[i]].position, u, 0.0, tuning.ground_height)
+            if sweep == 0:
+                u[3 + i] = USUAL_LATENESS if late[i] else 0.0
+        _equations(pairs, anchors, places, late, workspace, prior, tuning, z, z_std, u, system)
+        if not solve(system):
+            return np.inf
+        step = system[:, n]
+        length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+        for j in range(n):
+            u[j] += min(1.0, 2.0 / max(length, 1e-9)) * step[j]
+    cost = _equations(pairs, anchors, places, late, workspace, prior, tuning, z, z_std, u, system)
+    x[:] = u[:3]
+    both = np.concatenate((system[:, :n], np.eye(n)), axis=1)
+    if not solve(both):
+        return np.inf
+    covariance[:, :] = both[:3, n : n + 3]
+    return cost
+
+
+@compiled
+def _heard(pairs, anchors):
+    """Rows of the anchors that are heard, and for each pair the places of its two anchors among these (k, 2)."""
+    rows, places, count = np.empty(MOST_ANCHORS, np.int64), np.full((len(pairs), 2), -1), 0
+    for k in range(len(pairs)):
+        for side in range(2):
+            row = pairs[k].a if side == 0 else pairs[k].b
+            j = 0
+            while j < count and rows[j] != row:
+                j += 1
+            if j == count and count < MOST_ANCHORS:
+                rows[count] = row
+                count += 1
+            places[k, side] = j if j < MOST_ANCHORS else -1
+    return rows[:count], places
+
+
+@compiled
+def _equations(pairs, anchors, places, late, workspace, prior, tuning, z, z_std, u, system):
+    """Normal equations of a step from u (n,): position, error of each anchor heard, what late ones have in common; (n, n + 1) is filled.
+    Returns the cost."""
+    n = len(u)
+    system[:, :] = 0.0
+    row, cost = np.empty(3), 0.0
+    of_pair, of_anchor = PAIR_SHARE * tuning.tdoa_std, ANCHOR_SHARE * tuning.tdoa_std
+    states, entries = np.empty(5, np.int64), np.empty(5)
+    for k in range(len(pairs)):
+        i, j = places[k, 0], places[k, 1]
+        if i < 0 or j < 0:
+            continue
+        r = pairs[k].value - linearized_tdoa(u, anchors[pairs[k].a].position, anchors[pairs[k].b].position, row) - u[3 + j] + u[3 + i]
+        square = 0.5 * (r / of_pair) ** 2
+        cost += math.log1p(square)
+        for axis in range(3):
+            states[axis], entries[axis] = axis, row[axis]
+        states[3], entries[3], states[4], entries[4] = 3 + i, -1.0, 3 + j, 1.0
+        _add(system, states, entries, r, 1.0 / (of_pair**2 * (1.0 + square)))
+    for i in range(len(late)):
+        if late[i]:
+            apart = u[3 + i] - u[n - 1]
+            square = 0.5 * (apart / ALIKE_STD) ** 2
+            alike, other, timely = 1.0 / (1.0 + square), OTHER, TIMELY * math.exp(-0.5 * (u[3 + i] / of_anchor) ** 2)
+            total = alike + other + timely
+            cost -= math.log(total)
+            states[0], entries[0], states[1], entries[1] = 3 + i, 1.0, n - 1, -1.0
+            _add(system, states[:2], entries[:2], -apart, alike / total / (ALIKE_STD**2 * (1.0 + square)))
+            _add(system, states[:1], entries[:1], -u[3 + i], timely / total / of_anchor**2)
+            _add(system, states[:1], entries[:1], 0.0, 1.0 / LATENESS_STD**2)
+        else:
+            square = 0.5 * (u[3 + i] / of_anchor) ** 2
+            cost += math.log1p(square)
+            states[0], entries[0] = 3 + i, 1.0
+            _add(system, states[:1], entries[:1], -u[3 + i], 1.0 / (of_anchor**2 * (1.0 + square)))
+    apart = u[n - 1] - USUAL_LATENESS
+    cost += 0.5 * (apart / LATENESS_STD) ** 2 if late.any() else 0.0
+    states[0], entries[0] = n - 1, 1.0
+    _add(system, states[:1], entries[:1], -apart, 1.0 / LATENESS_STD**2)
+    for axis in range(3):
+        states[0] = axis
+        low, high = workspace[0, axis], workspace[1, axis]
+        for k in range(3):
+            system[axis, k] += prior[1 + axis, k]
+            system[axis, n] += prior[1 + axis, k] * (prior[0, k] - u[k])
+            cost += 0.5 * (prior[0, axis] - u[axis]) * prior[1 + axis, k] * (prior[0, k] - u[k])
+        outside = u[axis] - min(max(u[axis], low), high)
+        std = ABOVE_STD if axis == 2 else BESIDE_STD
+        cost += 0.5 * (outside / std) ** 2
+        if outside != 0.0:
+            _add(system, states[:1], entries[:1], -outside, 1.0 / std**2)
+    if not math.isnan(z):
+        cost += 0.5 * ((u[2] - z) / z_std) ** 2 - math.log((workspace[1, 2] - workspace[0, 2]) / (2.5 * z_std))
+        states[0] = 2
+        _add(system, states[:1], entries[:1], z - u[2], 1.0 / z_std**2)
+    return cost
+
+
+@compiled
+def _add(system, states, entries, r, weight):
+    """One scalar equation: sum of entries * step of the states = r."""
+    last = system.shape[1] - 1
+    for i in range(len(states)):
+        for j in range(len(states)):
+            system[states[i], states[j]] += weight * entries[i] * entries[j]
+        system[states[i], last] += weight * entries[i] * r
+
+
+@compiled
+def solve(system):
+    """Turn the right sides of positive definite equations, (n, n + m), into their solutions; returns False if they have none. (LAPACK is
+    scipy's, whose import takes a fifth of a second.)"""
+    n, columns = system.shape
+    for k in range(n):
+        pivot = system[k, k]
+        if not pivot > 1e-12:
+            return False
+        for j in range(k, columns):
+            system[k, j] /= pivot
+        for i in range(n):
+            factor = system[i, k]
+            for j in range(k, columns if i != k else 0):
+                system[i, j] -= factor * system[k, j]
+    return True

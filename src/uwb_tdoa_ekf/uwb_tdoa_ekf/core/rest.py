@@ -1,0 +1,132 @@
+"""A tag that does not move: its velocity is zero, and what it hears from one place tells that place once.
+
+Inertial samples alone cannot tell rest from a steady glide, and they shake while rotors idle on the ground. TDOAs can, whatever
+their systematic errors are: at rest they stay what they are.
+"""
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+from . import ground, hypotheses, standing
+from .history import add_update
+from .memory import HYPOTHESES
+from .state import GRAVITY, rotation
+from .update import update_state
+
+PERIOD = 0.05  # s between zero-velocity updates
+QUIET_STD, SHAKING_STD = 0.02, 0.15  # m/s, of them, where the inertial sensor is quiet, and where it is not
+SPEED = 0.05  # m/s; a quiet tag that is known to be slower stands still: it might also glide
+LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between looks at the TDOAs, and s of these
+MOST_DOUBTS, UNFELT = 3, 0.06  # looks in a row after which changed TDOAs are no chance, one in twenty is; m/s of lift that is none
+LONG, LONG_ENOUGH = 10, 3  # looks in a row after which a quiet tag is at rest, and not at a turning point; as many are enough
+EARLY = 1.5  # s after the start, or its last rest, when nothing tells of any motion
+AGAIN = 0.3  # s between corrections of the place of a tag that stands, or hovers low
+GATE = 3.0  # standard deviations of the velocity that inertial samples tell beyond which the tag moves
+CALM, SHAKING_MEMORY = 0.1, 2.0  # share of the vibration of these seconds, s, that is left where rotors, or wheels, have stopped
+LIFT, QUIET_LIFT, LIFT_MEMORY = 0.25, 0.1, 0.7  # m/s, upwards, and of a quiet sensor to any side, that a tag at rest cannot have felt within these seconds
+AWAY = 1.5  # s after that for which it is not at rest again
+SILENT = 0.5  # s without TDOAs after which a tag that shakes is not known to be at rest
+SAME_ERROR = 0.01  # s after which TDOAs of a tag that does not move tell again what they have told
+
+
+@compiled
+def repetition(ekf, t):
+    """How many times over TDOAs stamped t, s, tell what those before them have told: their errors stay while the tag does."""
+    return 1.0 + (t - ekf.rest_since) / SAME_ERROR if ekf.resting else 1.0
+
+
+@compiled
+def feel(ekf, sample, dt):
+    """Take an IMU_SAMPLE of a tag that is at rest, dt s after the one before: if it is lifted, it moves as fast as that has made it."""
+    if not ekf.resting:
+        ekf.shaking += min(1.0, dt / SHAKING_MEMORY) * (np.sum(ekf.imu.vibration) - ekf.shaking)
+        return
+    best, R = ekf.hypotheses[ekf.best], ekf.transition.rotation
+    rotation(best.x[6], best.x[7], best.x[8], best.x[9], R)
+    for k in range(3):
+        force = -GRAVITY if k == 2 else 0.0
+        for j in range(3):
+            force += R[k, j] * (sample.accel[j] - best.x[10 + j])
+        ekf.lift[k] += dt * (force - ekf.lift[k] / LIFT_MEMORY)
+    aside = math.hypot(ekf.lift[0], ekf.lift[1])
+    if ekf.lift[2] < LIFT and not (ekf.quiet and max(aside, abs(ekf.lift[2])) > QUIET_LIFT):
+        return
+    for h in range(HYPOTHESES):
+        hypothesis = ekf.hypotheses[h]
+        for k in range(3, 6):
+            hypothesis.x[k] = ekf.lift[k - 3] if ekf.quiet or k == 5 else 0.0
+            hypothesis.P[k, :] = 0.0
+            hypothesis.P[:, k] = 0.0
+            hypothesis.P[k, k] = LIFT**2
+    ekf.resting, ekf.next_look = False, sample.t + AWAY
+
+
+@compiled
+def look(ekf, anchors, tuning, window, t, records):
+    """Whether the tag is at rest, by a window (n,) of TDOA up to stamp t, s, where that can be; not before ekf.next_look."""
+    ekf.next_look = t + LOOK_PERIOD
+    best = ekf.hypotheses[ekf.best]
+    calm = ekf.quiet or np.sum(ekf.imu.vibration) < CALM * ekf.shaking
+    if not (ekf.resting or calm or standing.is_near_ground(best, tuning)):
+        return
+    count = ground.find_pairs(window, ekf.pairs)
+    still = ground.is_still(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
+    if ekf.resting:
+        ekf.doubts = 0 if still else ekf.doubts + 1
+        ekf.resting = ekf.doubts < (MOST_DOUBTS if np.abs(ekf.lift).max() < UNFELT else 1)
+    elif still or ekf.quiet:
+        ekf.lift[:] = 0.0
+        ekf.doubts = 0
+        ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
+        landed = standing.land(ekf, ekf.pairs[:count], anchors, tuning, calm, t, records)
+        long = ekf.stills >= (LONG if t - ekf.rest_since > EARLY else LONG_ENOUGH)
+        ekf.resting = calm and landed
+        if not landed and long and not _moves(best, QUIET_STD):
+            ekf.resting = True
+        elif not landed and ekf.stills >= LONG:
+            standing.find_again(ekf, ekf.pairs[:count], window, anchors, tuning, t, records)
+        if ekf.resting:
+            ekf.rest_since = t
+        if landed and not calm:
+            ekf.next_look = t + AGAIN
+
+
+@compiled
+def hold(ekf, t, records):
+    """Zero velocity, one axis after the other, for a tag at rest, and for a quiet one that TDOAs have shown to be slow."""
+    if ekf.resting and not ekf.quiet and t - ekf.last_tdoa > SILENT:
+        ekf.resting = False
+    if not (ekf.resting or ekf.quiet) or t < ekf.next_rest:
+        return
+    ekf.next_rest = t + PERIOD
+    std = QUIET_STD if ekf.quiet else SHAKING_STD
+    if ekf.resting and not ekf.quiet and _moves(ekf.hypotheses[ekf.best], std):
+        ekf.resting, ekf.next_look = False, t + LOOK_WINDOW
+    for h in range(HYPOTHESES):
+        hypothesis = ekf.hypotheses[h]
+        x, P = hypothesis.x, hypothesis.P
+        if not hypotheses.alive(hypothesis):
+            continue
+        slow = ekf.resting
+        if not slow:
+            slow = ekf.quiet
+            for state in range(3, 6):
+                slow = slow and abs(x[state]) < SPEED and P[state, state] < SPEED**2
+        if not slow:
+            continue
+        for state in range(3, 6):
+            update_state(hypothesis, ekf.innovation, state, 0.0, std)
+            if h == ekf.best:
+                add_update(ekf, t, records)
+
+
+@compiled
+def _moves(hypothesis, std):
+    """Whether inertial samples contradict a velocity of zero, +- std m/s."""
+    for state in range(3, 6):
+        if hypothesis.x[state] ** 2 > GATE**2 * (hypothesis.P[state, state] + std**2):
+            return True
+    return False

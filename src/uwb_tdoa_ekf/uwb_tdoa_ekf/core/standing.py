@@ -1,0 +1,177 @@
+"""Where a tag is that does not move: on the ground, with anchors that are late there, or somewhere else.
+
+Nothing is assumed: the explanations are weighed by their probability, and the covariance of the one that is taken is as wide as they
+are apart.
+"""
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+from . import ground
+from .history import add_reset, add_update
+from .hypotheses import alive
+from .memory import HYPOTHESES
+from .startup import locate
+from .update import update_state
+
+SPEED_STD = 0.05  # m/s, of a tag at rest, beyond what its TDOAs tell
+# Minus the logarithm of the probability, before it is seen,
+ABSURD = 20.0  # that a tag is above or below its workspace,
+UNUSUAL = 3.0  # that anchors are late because they are near the ground,
+DECISIVE = 6.0  # and by how much the ground must be more probable than what the filter says of a tag that lands
+HOVER_STD = 0.3  # m, of the place of a tag that seems to stand but may hover
+LANDING_STD = 0.5  # m, by which the filter may be wrong beyond what it says when a tag lands
+
+
+@compiled
+def weigh(pairs, anchors, bounds, tuning, z, z_std, x, covariance):
+    """Weigh three explanations of (k,) of ground.PAIR by a tag at rest that may be anywhere in its workspace `bounds` (2, 3): position
+    x (6,) with its covariance (6, 6), the ground, and the ground with anchors that are late there.
+
+    z, z_std : m, a height that is known and its standard deviation, NaN for none. The best one goes to x and covariance. Returns
+    whether it is on the ground.
+    """
+    prior = np.zeros((4, 3))
+    for k in range(3):
+        prior[0, k], half = 0.5 * (bounds[0, k] + bounds[1, k]), 0.5 * (bounds[1, k] - bounds[0, k])
+        prior[1 + k, k] = 1.0 / half**2
+    cost, position, each = np.empty(3), np.empty((3, 3)), np.empty((3, 3, 3))
+    position[0] = x[:3]
+    cost[0] = ground.explain(pairs, anchors, bounds, prior, tuning, z, z_std, False, position[0], each[0])
+    if not bounds[0, 2] <= x[2] <= bounds[1, 2]:
+        cost[0] += ABSURD
+    position[0], each[0] = x[:3], covariance[:3, :3]
+    starts = np.empty((4, 2))
+    for start in range(4):
+        for k in range(2):
+            starts[start, k] = prior[0, k] + 0.25 * (bounds[1, k] - bounds[0, k]) * (1.0 if (start >> k) & 1 else -1.0)
+    _on_ground(pairs, anchors, bounds, prior, tuning, z, z_std, starts, cost, position, each)
+    best = _mix(cost, position, each)
+    x[:3] = position[best]
+    covariance[:3, :3] = each[best]
+    covariance[:3, 3:] = 0.0
+    covariance[3:, :3] = 0.0
+    return best > 0
+
+
+@compiled
+def _on_ground(pairs, anchors, bounds, prior, tuning, z, z_std, starts, cost, position, each):
+    """Fill in cost, position and its covariance of the explanations 1 and 2: on the ground, without and with late anchors."""
+    floor, floor_std = tuning.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD
+    if not math.isnan(z):
+        floor, floor_std = z, z_std
+    trial, its = np.empty(3), np.empty((3, 3))
+    for late in range(2):
+        cost[1 + late] = np.inf
+        for start in range(len(starts)):
+            trial[0], trial[1], trial[2] = starts[start, 0], starts[start, 1], floor
+            c = ground.explain(pairs, anchors, bounds, prior, tuning, floor, floor_std, late == 1, trial, its)
+            if c < cost[1 + late]:
+                cost[1 + late] = c
+                position[1 + late], each[1 + late] = trial, its
+    cost[2] += UNUSUAL
+
+
+@compiled
+def _mix(cost, position, each):
+    """Place of the most probable explanation; its covariance becomes that of all of them about its position (spread of the means)."""
+    best = np.argmin(cost)
+    weights = np.exp(cost[best] - cost)
+    weights /= np.sum(weights)
+    for k in range(len(cost)):
+        if k != best and weights[k] > 0.0:
+            for i in range(3):
+                for j in range(3):
+                    each[best, i, j] += weights[k] * (position[k, i] - position[best, i]) * (position[k, j] - position[best, j])
+    return best
+
+
+@compiled
+def stop(x, covariance, of_velocity):
+    """Position and velocity x (6,) and their covariance (6, 6) become those of a tag at rest, as far as of_velocity (3, 3) m^2/s^2 tells."""
+    x[3:] = 0.0
+    covariance[:, 3:] = 0.0
+    covariance[3:, :] = 0.0
+    for k in range(3):
+        for j in range(3):
+            covariance[3 + k, 3 + j] = of_velocity[k, j]
+        covariance[3 + k, 3 + k] += SPEED_STD**2
+
+
+@compiled
+def is_near_ground(hypothesis, tuning):
+    """Whether a tag may stand on the ground, by the height of a HYPOTHESIS."""
+    lowest = hypothesis.x[2] - ground.DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
+    return lowest < tuning.ground_height + ground.GROUND_HEIGHT + ground.GROUND_STD
+
+
+@compiled
+def land(ekf, pairs, anchors, tuning, stands, t, records):
+    """TDOAs of a tag stay what they are at stamp t, s: if (k,) of PAIR tell that it is on the ground, go there. Returns whether.
+
+    stands : it does not move; else it may also hover low, which it is told with care.
+    """
+    best = ekf.hypotheses[ekf.best]
+    if not is_near_ground(best, tuning):
+        return False
+    prior, wide = np.empty((4, 3)), best.P[:3, :3].copy()
+    for k in range(3):
+        wide[k, k] += LANDING_STD**2
+    prior[0], prior[1:] = best.x[:3], _inverse(wide)
+    cost, position, each = np.empty(3), np.empty((3, 3)), np.empty((3, 3, 3))
+    position[0] = best.x[:3]
+    cost[0] = ground.explain(pairs, anchors, ekf.workspace, prior, tuning, np.nan, np.nan, False, position[0], each[0])
+    starts = np.empty((1, 2))
+    starts[0, 0], starts[0, 1] = best.x[0], best.x[1]
+    _on_ground(pairs, anchors, ekf.workspace, prior, tuning, np.nan, np.nan, starts, cost, position, each)
+    k = 1 if cost[1] < cost[2] else 2
+    if cost[k] + DECISIVE > cost[0]:
+        return False
+    if stands:
+        _put(ekf, position[k], each[k], t, records)
+        return True
+    for h in range(HYPOTHESES):
+        if not alive(ekf.hypotheses[h]):
+            continue
+        for axis in range(3):
+            update_state(ekf.hypotheses[h], ekf.innovation, axis, position[k, axis], HOVER_STD)
+            if h == ekf.best:
+                add_update(ekf, t, records)
+    return True
+
+
+@compiled
+def find_again(ekf, pairs, window, anchors, tuning, t, records):
+    """A tag lies still at stamp t, s, but inertial samples have told that it moves: they were wrong, and it may be anywhere."""
+    x, covariance = np.empty(6), np.empty((6, 6))
+    locate(window, anchors, ekf.workspace, tuning.tdoa_std, np.nan, np.nan, x, covariance)
+    weigh(pairs, anchors, ekf.workspace, tuning, np.nan, np.nan, x, covariance)
+    _put(ekf, x[:3], covariance[:3, :3], t, records)
+    ekf.resting, ekf.rest_since = True, t
+    ekf.recoveries += 1
+
+
+@compiled
+def _put(ekf, position, covariance, t, records):
+    """Every hypothesis to a position (3,), m, with its covariance (3, 3), at rest; attitude and biases stay."""
+    for h in range(HYPOTHESES):
+        hypothesis = ekf.hypotheses[h]
+        hypothesis.P[:6, :] = 0.0
+        hypothesis.P[:, :6] = 0.0
+        hypothesis.offset_P[:] = 0.0
+        hypothesis.x[:3] = position
+        hypothesis.P[:3, :3] = covariance
+        stop(hypothesis.x[:6], hypothesis.P[:6, :6], ekf.still_covariance)
+    ekf.consistency = 1.0
+    add_reset(ekf, t, records)
+
+
+@compiled
+def _inverse(matrix):
+    """Inverse of a positive definite (3, 3)."""
+    both = np.concatenate((matrix, np.eye(3)), axis=1)
+    ground.solve(both)
+    return both[:, 3:]
