@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
-from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE, AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_bias.correction.poses import known_yaw_std, parts_of, rotated_in_yaw
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
@@ -50,6 +50,16 @@ def test_with_nothing_to_correct_with_measurements_pass():
     found = correct(corrector, [0.5, 2.0])
     assert found.bias.tolist() == [0, 0] and found.std.tolist() == [0, 0] and found.corrected.tolist() == [1, 1]
     assert found.status.tolist() == [PASSED, PASSED]
+
+
+def test_what_the_filter_weighs_is_left_in():
+    floor = CATALOGUE["floor_multipath"]({"4.delay": 3.3, "4.height": 5.0})
+    assert floor.weighed and Corrector(ANCHORS, EffectSet((floor,))).idle
+    both = climbing(Corrector(ANCHORS, EffectSet((floor, *DELAYS))), [0.0, 1.0])
+    alone = climbing(Corrector(ANCHORS, DELAYS), [0.0, 1.0])
+    assert both.model == "anchor_delay"
+    found, expected = correct(both, [1.5, 1.6]), correct(alone, [1.5, 1.6])
+    assert np.array_equal(found.bias, expected.bias) and np.array_equal(found.std, expected.std)
 
 
 def test_model_names_effects_and_network():

@@ -120,6 +120,46 @@ def test_lever_arm_without_attitude_cannot_tell_and_adds_nothing_to_the_set():
     np.testing.assert_array_equal(together, expected)
 
 
+def standing(heights, x=0.0):
+    """Samples at heights (n,), m, above (x, 0), of TDOAs from an anchor 0 that is on time to anchor 1."""
+    anchors, n = Anchors.from_positions([[4, 4, 3], [5, 0, 0.2]], ids=[0, 1]), len(heights)
+    p = np.column_stack([np.full(n, x), np.zeros(n), heights])
+    return Samples(np.arange(n) / 100.0, np.zeros(n, int), np.ones(n, int), p, np.full((n, 4), np.nan), anchors)
+
+
+def test_on_the_floor_an_anchor_is_late_below_its_height_and_may_be_about_it():
+    floor = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12})
+    samples = standing(np.array([0.0, 0.03, 0.08, 0.12, 0.18, 1.0]))
+    bias, noise = floor.bias(samples), floor.noise_std(samples)
+    np.testing.assert_allclose(bias, [3.0, 3.0, 3.0, 1.5, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(noise, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], atol=2e-3)  # late or not: 3 m times sqrt(p (1 - p))
+    hopping = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12, "1.noise": 0.4})
+    np.testing.assert_allclose(hopping.noise_std(samples)[[0, 3, 5]], [0.4, np.sqrt(1.5**2 + 0.5 * 0.4**2), 0.0], atol=2e-3)
+
+
+def test_away_from_where_the_floor_was_seen_it_is_not_taken_out_but_feared():
+    floor = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12, "x": 0.0, "y": 0.0})
+    near, far = (standing(np.array([0.03]), x) for x in (0.1, 4.0))
+    assert floor.bias(near)[0] == pytest.approx(3.0, abs=0.02) and floor.noise_std(near)[0] < 0.4
+    assert abs(floor.bias(far)[0]) < 0.01 and floor.noise_std(far)[0] == pytest.approx(3.0, abs=0.01)
+
+
+def test_regressors_of_the_floor_are_what_its_delays_do():
+    samples = random_samples(3)
+    ids, rng = samples.anchors.ids.tolist(), np.random.default_rng(3)
+    samples.p[:, 2] = rng.uniform(0.0, 0.3, len(samples))
+    delays = {f"{i}.delay": rng.uniform(0.0, 4.0) for i in ids}
+    floor = EFFECTS["floor_multipath"]({**delays, "x": 0.5, "y": -0.5})
+    np.testing.assert_allclose(floor.regressors(samples, list(delays)) @ list(delays.values()), floor.bias(samples), atol=1e-9)
+
+
+def test_advice_on_the_floor_names_the_anchors_that_are_late_by_much():
+    values = {"0.delay": 3.3, "1.delay": 0.4, "2.delay": 2.8, "0.height": 0.1, "2.height": 0.13}
+    mount, hang = EFFECTS["floor_multipath"](values, {key: 0.05 for key in values if key.endswith("delay")}).advice()
+    assert "0.13 m" in mount and "anchors 0 and 2 are up to 3.30 ± 0.05 m late" in mount and "anchors 0 and 2" in hang
+    assert EFFECTS["floor_multipath"]().advice() == ()
+
+
 def test_empty_set():
     effects = EffectSet()
     assert len(effects) == 0 and effects.name == "none"

@@ -49,9 +49,10 @@ class Corrector:
     """
 
     def __init__(self, anchors, effects=None, network=None, lag=POSE_LAG, history=4096):
-        """anchors : Anchors; effects : EffectSet or None; network : Network or None; lag : s; history : poses kept."""
+        """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs stay in; network : Network or None;
+        lag : s; history : poses kept."""
         self.anchors = anchors
-        self.effects = effects or EffectSet()
+        self.effects = EffectSet(tuple(effect for effect in effects or () if not effect.weighed))
         self.network = network
         self.lag = lag
         parts = [self.effects.name] if len(self.effects) else []
@@ -62,6 +63,7 @@ class Corrector:
     def reset(self):
         """Forget all poses."""
         self._poses = Poses(self._history)
+        self._latest = None  # Samples of the latest TDOAs
         self._newest = None  # latest stamp of a TDOA
         self._first = self._last = None  # stamp of the first TDOA; stamp and later anchor of the last one
 
@@ -69,6 +71,12 @@ class Corrector:
     def idle(self):
         """True if there is nothing to correct with."""
         return not len(self.effects) and self.network is None
+
+    @property
+    def outside(self):
+        """Phrases on those effects of which less than half was taken out of some of the latest TDOAs, because they were not seen
+        where those were."""
+        return [] if self._latest is None else self.effects.outside(self._latest)
 
     def add_pose(self, t, p, q, v=np.nan, yaw_std=0.0):
         """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, v (3,) m/s, world, NaN for an unknown one, yaw_std
@@ -88,7 +96,7 @@ class Corrector:
         """
         if self.idle or len(t) == 0:
             return Correction.none(d)
-        samples = self.samples(t, a, b)
+        self._latest = samples = self.samples(t, a, b)
         bias, std, slope, state = self.contribution(samples)
         status = np.full(len(t), EFFECTS if len(self.effects) else PASSED, dtype=np.uint8)
         if self.network is not None:

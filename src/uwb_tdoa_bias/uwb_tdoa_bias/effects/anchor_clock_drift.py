@@ -21,6 +21,7 @@ class AnchorClockDrift(AnchorEffect):
     }
     reference = "Sidorenko et al., Sensors 2019, 19, 2942; DW1000 user manual: 2.15 mm per degree"
     portable = False
+    covariates = ("time",)
 
     def delay_per_unit(self, samples):
         return samples.t - samples.start

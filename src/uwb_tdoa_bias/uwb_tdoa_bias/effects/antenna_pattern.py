@@ -4,7 +4,8 @@ import numpy as np
 
 from ..foundation.antenna import Antenna
 from ..foundation.radio import FLAT_MOUNT, into_frame
-from .base import ArrivalEffect, tile
+from .base import ArrivalEffect
+from .samples import tile
 from .wording import listed, significant, size
 
 UNIT = Antenna(delay_span=1.0)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from .affine import IDENTITY
+from .domain import checked
 from .samples import Samples, true_samples
 from .wording import LARGEST, listed, measured, significant
 
@@ -33,7 +34,7 @@ class Effect:
     """A named systematic error with scalar parameters. One effect, one file: subclass and list it in EFFECTS.
 
     values : {parameter name: value in `unit`}; std : the same keys, standard errors, empty if unknown;
-    source : where the values came from, free text.
+    source : where the values came from, free text; domain : {covariate: (low, high)}, where it was seen, see `domain.py`.
     An effect says what it does to measurements, and by that how it is undone, the same way in a node, off line and in a
     recording: `bias` and `noise_std` of TDOAs, `stamp_offset` of streams, `sensor_model` of inertial samples, heights and
     velocities, `sensor_bias` of inertial samples, `sensor_functions` of what these do by the state of the filter. For `diagnose`
@@ -43,6 +44,7 @@ class Effect:
     values: dict = field(default_factory=dict)
     std: dict = field(default_factory=dict)
     source: str = ""
+    domain: dict = field(default_factory=dict, kw_only=True)
 
     name: ClassVar[str]
     unit: ClassVar[str]
@@ -56,10 +58,12 @@ class Effect:
     channels: ClassVar[tuple] = ("tdoa",)  # where it shows: names of channels of diagnose
     fitted: ClassVar[bool] = True  # False: found by a detector of its own, not by linear regression
     portable: ClassVar[bool] = True  # goes with the tag, the vehicle and the anchors' modules to another installation
+    covariates: ClassVar[tuple] = ()  # what it is a function of, and must not be taken beyond: its domain is of these
     settings: ClassVar[tuple] = ()  # further entries in effects.yaml, constructor arguments
     price: ClassVar[float] = 0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
     distinguished_by: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
     usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
+    weighed: ClassVar[bool] = False  # may be there or not: the filter weighs that, and no Corrector takes it out
     needs_reference: ClassVar[bool] = False  # cannot be told from the filter's innovations alone
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
     uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
@@ -81,6 +85,7 @@ class Effect:
                         f"between -{bound:g} and {bound:g}."
                     )
             setattr(self, group, read)
+        self.domain = checked(self.name, self.domain)
 
     @classmethod
     def check_key(cls, key):
@@ -248,11 +253,6 @@ def need_truth(effect, flight):
     """Raise InputError if the flight has no ground truth to compute `effect` at."""
     if flight.truth is None or len(flight.truth) == 0:
         raise InputError(f"{flight.name}: holds no ground truth, which {effect.name} needs.")
-
-
-def tile(samples, values):
-    """Per-sample values (n, ...) repeated for both anchors: (2n, ...)."""
-    return np.concatenate([values, values])
 
 
 def check_anchor(name, text, key):

@@ -7,10 +7,10 @@ import numpy as np
 from ..foundation.compiled import compiled
 from ..foundation.radio import into_frame
 from ..foundation.vibration import VIBRATION_CORNER, low_pass, track_vibration
-from .base import tile
-from .samples import ImuSamples
+from .samples import ImuSamples, tile
 
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes
+UPWARDS = ("height", "elevation")  # change where a tag leaves the floor
 OF_MOTION = ("speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor")  # need a history
 
 

@@ -15,12 +15,13 @@ from .aid_corrector import AidCorrector
 from .base import Effect
 from .catalogue import EFFECTS
 from .covariance import Covariance
+from .domain import LITTLE, faded, in_words
 from .imu_corrector import ImuCorrector
 from .label_error import LabelCorrector
 from .smooth_term import SmoothTerm
 from .stamp_error import shifted
 
-ENTRY = ("values", "std", "source")
+ENTRY = ("values", "std", "source", "domain")
 STREAMS = ("tdoa", "imu", "truth")  # whose stamps are moved, beside those of AIDS
 
 
@@ -40,12 +41,15 @@ class EffectSet:
     def __len__(self):
         return len(self.effects)
 
+    def __iter__(self):
+        return iter(self.effects)
+
     def bias(self, samples):
-        """Sum of all contributions to what `samples.channel` measures, (n,): of Samples to d_ab, metres. An effect that cannot
-        tell (unknown attitude) adds nothing."""
+        """Sum of all contributions to what `samples.channel` measures, (n,): of Samples to d_ab, metres, faded where they were not
+        seen. An effect that cannot tell (unknown attitude) adds nothing."""
         total = np.zeros(len(samples))
         for effect in (effect for effect in self.effects if samples.channel in effect.channels):
-            part = effect.bias(samples)
+            part = faded(effect, samples)[0]
             total += np.where(np.isfinite(part), part, 0.0)
         return total
 
@@ -60,11 +64,22 @@ class EffectSet:
         return sum((effect.uncorrected(samples) for effect in mine), np.zeros(samples.reading.shape))
 
     def noise_std(self, samples):
-        """Standard deviation that the effects add to d_ab, (n,) metres."""
+        """Standard deviation that the effects add to d_ab, (n,) metres, with what of them is not taken out because they were not
+        seen there."""
         total = np.zeros(len(samples))
         for effect in self._noisy:
             total += effect.noise_std(samples) ** 2
+        for effect in self._limited:
+            total += faded(effect, samples)[1] ** 2
         return np.sqrt(total)
+
+    def outside(self, samples):
+        """Of Samples: phrases on those effects of which less than half is taken out of some, because they were not seen there."""
+        return [in_words(effect) for effect in self._limited if np.min(faded(effect, samples)[2], initial=1.0) < LITTLE]
+
+    @cached_property
+    def _limited(self):
+        return [effect for effect in self.effects if effect.domain and "tdoa" in effect.channels]
 
     @cached_property
     def _noisy(self):
@@ -157,6 +172,8 @@ class EffectSet:
 
 
 def _plain(value):
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
     return list(value) if isinstance(value, tuple) else value
 
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from .affine import IDENTITY
 from .covariates import OF_IMU, ImuFeatures
+from .domain import LITTLE, in_words, share
 
 SENSORS = ("gyro", "accel")
 
@@ -21,16 +22,25 @@ class ImuCorrector:
             self._undo.append(undo)
         still = np.zeros((1, len(OF_IMU)))
         self._additive = [e for e in effects if any(e.sensor_bias(channel, still) is not None for channel in SENSORS)]
-        self._features = ImuFeatures()
+        self._features, self._latest = ImuFeatures(), still[:0]
         self.idle = not self._additive and all(
             effect.sensor_model(channel) is IDENTITY for effect in effects for channel in SENSORS
         )
+
+    @property
+    def outside(self):
+        """Phrases on those effects of which less than half was taken out of some of the latest samples, because they were not seen
+        there."""
+        return [in_words(effect) for effect in self._additive if any(self._is_beyond(*limits) for limits in effect.domain.items())]
+
+    def _is_beyond(self, covariate, limits):
+        return covariate in OF_IMU and np.min(share(self._latest[:, OF_IMU.index(covariate)], limits), initial=1.0) < LITTLE
 
     def correct(self, t, gyro, accel):
         """t (n,) s; gyro (n, 3) rad/s; accel (n, 3) m/s^2. Returns corrected (gyro, accel)."""
         sensed = [undo(samples) for undo, samples in zip(self._undo, (gyro, accel))]
         if self._additive:
-            features = self._features(t, *sensed)
+            self._latest = features = self._features(t, *sensed)
             for effect in self._additive:
                 for channel, samples in zip(SENSORS, sensed):
                     part = effect.sensor_bias(channel, features)

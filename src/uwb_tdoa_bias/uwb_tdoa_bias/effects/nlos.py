@@ -3,7 +3,8 @@
 import numpy as np
 
 from ..foundation.errors import InputError
-from .base import ArrivalEffect, check_anchor, tile
+from .base import ArrivalEffect, check_anchor
+from .samples import tile
 from .marks import Region
 from .wording import measured, significant
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from .base import ArrivalEffect, tile
+from .base import ArrivalEffect
+from .samples import tile
 from .wording import significant, size
 
 EXAMPLES = 4.0, 8.0  # m, distances that advice names
@@ -23,6 +24,7 @@ class RangeBias(ArrivalEffect):
         "received_power_bias": "one range at many headings: power changes with the antennas, range does not",
         "range_scale": "a flight near to and far from the anchors",
     }
+    covariates = ("range",)
     reference = "Decawave APS011: the range error is a bent function of received power, hence of range"
 
     @classmethod

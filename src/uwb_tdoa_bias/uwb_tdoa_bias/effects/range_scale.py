@@ -20,6 +20,7 @@ class RangeScale(Effect):
         "the tag converts ticks to metres with a wrong length: a wrong clock frequency, speed of propagation or unit"
     )
     confounded_with = ("range_bias", "anchor_position", "truth_frame")
+    covariates = ("range",)
     reference = "DW1000 user manual: one tick is 15.65 ps, 4.69 mm"
 
     @classmethod

@@ -3,7 +3,8 @@
 import numpy as np
 
 from ..foundation.radio import NOMINAL_GAIN, RadioLink, power_bias, received_power_dbm
-from .base import ArrivalEffect, tile
+from .base import ArrivalEffect
+from .samples import tile
 from .wording import measured, significant
 
 LINK = RadioLink()

@@ -52,6 +52,10 @@ class Samples:
         kept = {"anchors": self.anchors, "start": self.start}
         return Samples(**{name: _repeated(value, times) for name, value in vars(self).items() if name not in kept}, **kept)
 
+    def until(self, t):
+        """Samples as if none were later than t, s."""
+        return replace(self, t=np.minimum(self.t, t))
+
     @property
     def position_a(self):
         """(n, 3) antennas of the first anchors, m."""
@@ -61,6 +65,11 @@ class Samples:
     def position_b(self):
         """(n, 3) antennas of the second anchors, m."""
         return self.anchors.positions[self.b]
+
+
+def tile(samples, values):
+    """Per-sample values (n, ...) repeated for both anchors: (2n, ...)."""
+    return np.concatenate([values, values])
 
 
 def _repeated(value, times):

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .domain import faded
 from .motion import Motion
 
 REACH = 0.3  # m and m/s to either side
@@ -25,7 +26,7 @@ def slope_of(effects, samples):
             groups.setdefault(effect.states, []).append(effect)
     for states, alike in groups.items():
         moved = _moved(samples, states)
-        here, *sides = sum(_known(effect.bias(moved)) for effect in alike).reshape(-1, n)
+        here, *sides = sum(_known(faded(effect, moved)[0]) for effect in alike).reshape(-1, n)
         bias += here
         for k, (down, up) in zip(states, zip(sides[::2], sides[1::2])):
             slope[:, k] += (up - down) / (2.0 * REACH)

@@ -9,13 +9,16 @@ import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
-from .base import Effect, known_anchors, once_per_anchors, tile
+from .base import Effect, known_anchors, once_per_anchors
+from .samples import tile
+from .domain import FADE, bounded, share
 from .covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_STATE, OF_TDOA, STATES, sensor_covariate
 from .sensor_function import SensorFunction
 from .shapes import SHAPES, functions
 from .smooth_words import sentences
 
 DEGREE = 2
+GONE = 4 * FADE  # share of the width of a domain beyond which nothing is left of a function
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
 AID_CHANNELS = ("height", "pressure", *(f"velocity.{axis}" for axis in "xyz"))
 FORMS = ("common", "arrival", "anchor", "pair", "direction")
@@ -106,6 +109,10 @@ class SmoothTerm(Effect):
         parts = list(dict.fromkeys(key.rpartition(".")[0] for key in keys))
         of = f" of {self.form} {parts[0]}" if len(parts) == 1 and parts[0] else ""
         return f"{self.channel}{of} over {self.covariate}"
+
+    @property
+    def covariates(self):
+        return (self.covariate,) if bounded(self.covariate) else ()
 
     @property
     def uses_attitude(self):
@@ -214,15 +221,22 @@ class SmoothTerm(Effect):
     def sensor_bias(self, channel, features):
         if channel not in self.channels or self.covariate not in OF_IMU:
             return None
-        out = np.zeros((len(features), 3))
-        out[:, self._axis] = self.curve(features[:, OF_IMU.index(self.covariate)])
+        out, values = np.zeros((len(features), 3)), features[:, OF_IMU.index(self.covariate)]
+        out[:, self._axis] = self._faded_curve(values)
         return out
+
+    def _faded_curve(self, values):
+        """`curve`, faded where it was not seen."""
+        limits = self.domain.get(self.covariate)
+        return self.curve(values) if limits is None else self.curve(values) * share(values, limits)
 
     def sensor_functions(self):
         if self.channel not in IMU_CHANNELS or self.covariate not in OF_STATE:
             return ()
-        ends = self.knots[0], self.knots[-1]
-        return (SensorFunction.of(self.curve, self.channel, self.covariate, *ends, periodic=self.shape == "wave"),)
+        low, high = self.domain.get(self.covariate, (self.knots[0], self.knots[-1]))
+        beyond = GONE * (high - low) if self.domain else 0.0
+        periodic = self.shape == "wave" and not self.domain
+        return (SensorFunction.of(self._faded_curve, self.channel, self.covariate, low - beyond, high + beyond, periodic),)
 
     @property
     def _axis(self):
