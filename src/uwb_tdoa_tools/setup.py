@@ -33,6 +33,7 @@ setup(
     ],
     extras_require={
         "dask": ["distributed>=2024.1"],  # for --dask
+        "oracle": ["rotorpy>=3.0"],  # beside which a test flies the vehicle of `fly`
         "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
     },
     data_files=[
@@ -49,6 +50,7 @@ setup(
             "demo = uwb_tdoa_tools.executables:demo",
             "diagnose = uwb_tdoa_tools.executables:diagnose",
             "evaluate = uwb_tdoa_tools.executables:evaluate",
+            "fly = uwb_tdoa_tools.executables:fly",
             "inject = uwb_tdoa_tools.executables:inject",
             "plan = uwb_tdoa_tools.executables:plan",
             "record = uwb_tdoa_tools.executables:record",

@@ -16,9 +16,10 @@ from .trajectories import Trajectory
 __all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
 
 
-def simulate(config):
+def simulate(config, trajectory=None):
     """Fly `config`, a SimulationConfig, and return the Flight. Raises InputError where it does not fit together.
 
+    trajectory : what has motion(t) and motors(t) of a Trajectory, to fly instead of the config's own.
     truth : exact poses.
     extra : "tdoa_truth" (t, bias, multipath, noise, outlier, m: what each TDOA holds besides geometry) and
         "state_truth" (at the stamps of the truth: velocity vx, vy, vz in the world, m/s, and the biases of the inertial
@@ -26,7 +27,7 @@ def simulate(config):
     meta : source, format, protocol, config, and under "parameters" the constants that the errors were made with.
     """
     filled, room = config.complete()
-    trajectory = Trajectory(filled, room, filled.random("trajectory"))
+    trajectory = trajectory or Trajectory(filled, room, filled.random("trajectory"))
     t_imu = np.arange(1, int(filled.duration * filled.imu_rate) + 1) / filled.imu_rate
     samples, gyro_bias, accel_bias = imu.measure(t_imu, trajectory, filled.imu_errors, filled.random)
     t_truth = np.arange(1, int(filled.duration * filled.truth_rate) + 1) / filled.truth_rate
@@ -37,7 +38,7 @@ def simulate(config):
     state = {"t": t_truth}
     for name, values in (("v", motion.v), ("gyro_bias_", gyro_bias[newest]), ("accel_bias_", accel_bias[newest])):
         state.update({name + axis: values[:, k] for k, axis in enumerate("xyz")})
-    parameters["take_off"], parameters["landing"] = trajectory.take_off, trajectory.landing
+    parameters |= {name: getattr(trajectory, name, None) for name in ("take_off", "landing")}
     room_name = config.constellation if config.anchors is None else "anchors"
     return Flight(
         name=f"sim-{config.trajectory}-{config.protocol}-{room_name}-{config.seed}",

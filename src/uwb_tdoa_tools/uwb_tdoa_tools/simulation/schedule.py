@@ -32,26 +32,29 @@ class Schedule:
     sender: np.ndarray
 
 
-def make_schedule(protocol, n_anchors, duration, rng):
-    """The Schedule of `protocol` ("tdoa2" or "tdoa3") over 0 ... duration, s, for n_anchors (at least 2) anchors."""
-    return (_tdoa2 if protocol == "tdoa2" else _tdoa3)(n_anchors, duration, rng)
+def make_schedule(protocol, n_anchors, duration, rng, rate=None):
+    """The Schedule of `protocol` ("tdoa2" or "tdoa3") over 0 ... duration, s, for n_anchors (at least 2) anchors. rate : TDOAs per
+    second, which losses (tdoa2) or waits (tdoa3) are for; default: what these give."""
+    if protocol == "tdoa2":
+        return _tdoa2(n_anchors, duration, rng, PACKET_LOSS if rate is None else 1.0 - np.sqrt(min(rate * SLOT, 1.0)))
+    return _tdoa3(n_anchors, duration, rng, TDOA3_MEAN_WAIT if rate is None else max(1.0 / rate - TDOA3_DEAD_TIME, 0.0))
 
 
-def _tdoa2(n_anchors, duration, rng):
+def _tdoa2(n_anchors, duration, rng, loss):
     """A ring: anchors send in turn, and every packet is compared with the one of the slot before."""
     n = max(int(duration / SLOT), 2)
     sender = np.arange(n) % n_anchors
     jitter = np.clip(SLOT_JITTER * rng.standard_normal(n), -0.4 * SLOT, 0.4 * SLOT)
     t = (np.arange(n) + 0.5) * SLOT + jitter
-    received = rng.random(n) >= PACKET_LOSS
+    received = rng.random(n) >= loss
     k = 1 + np.flatnonzero(received[1:] & received[:-1])
     return Schedule(t[k], sender[k - 1], sender[k], k - 1, k, sender)
 
 
-def _tdoa3(n_anchors, duration, rng):
+def _tdoa3(n_anchors, duration, rng, wait):
     """Any order: a packet of a random anchor is compared with the newest packet of a random other one."""
-    n = int(1.3 * duration / (TDOA3_DEAD_TIME + TDOA3_MEAN_WAIT)) + 50
-    t = np.cumsum(TDOA3_DEAD_TIME + rng.exponential(TDOA3_MEAN_WAIT, n))
+    n = int(1.3 * duration / (TDOA3_DEAD_TIME + wait)) + 50
+    t = np.cumsum(TDOA3_DEAD_TIME + rng.exponential(wait, n))
     b = rng.integers(0, n_anchors, n)
     a = (b + rng.integers(1, n_anchors, n)) % n_anchors
     n = np.searchsorted(t, duration)

@@ -24,8 +24,8 @@ HEADING_TIME = 3.0  # s, over which a heading along the track is smoothed
 MAX_ACCELERATION = 8.0  # m/s^2, what a small quadrotor still flies
 SPIN_UP = 0.5  # s, the motors turn before take-off and after landing
 
-_STEP = Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])  # 0 to 1 with four derivatives zero at both ends
-_RAMP = _STEP.integ()
+STEP = Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])  # 0 to 1 with four derivatives zero at both ends
+_RAMP = STEP.integ()
 
 
 def circle(s, config, room, rng):
@@ -163,7 +163,7 @@ class Trajectory:
                 "change place, height or radius."
             )
         if not config.start_in_air:
-            lift = _STEP(np.clip(tau / rise, 0.0, 1.0)) * _STEP(np.clip((air - tau) / rise, 0.0, 1.0))
+            lift = STEP(np.clip(tau / rise, 0.0, 1.0)) * STEP(np.clip((air - tau) / rise, 0.0, 1.0))
             ground = room.lower[2] + REST_HEIGHT
             p[:, 2] = ground + lift * (p[:, 2] - ground)
         yaw = _yaw(s, p, config)

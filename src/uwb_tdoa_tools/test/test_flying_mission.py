@@ -1,0 +1,93 @@
+import math
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, REFUSED, WAITING, Mission, Rules
+from uwb_tdoa_tools.flying.path import Circles
+
+LEVEL = np.array([0.0, 0.0, math.sin(0.2), math.cos(0.2)])  # yaw 0.4
+STEP = 0.01
+
+
+class Said:
+    """An estimate that says what it is told to."""
+
+    def __init__(self, mission):
+        self.mission, self.t = mission, 0.0
+
+    def until(self, end, deviation=0.1, support=0.0, stale=False):
+        """What was wanted at `end`, s."""
+        wanted = None
+        while self.t < end - 1e-9:
+            t = round(self.t, 9)
+            pose = None if stale else (t, np.zeros(3), np.zeros(3), LEVEL)
+            wanted = self.mission.decide(t, pose, deviation, support)
+            self.t += STEP
+        return wanted
+
+
+@pytest.fixture
+def said():
+    return Said(Mission(Circles(), (1.0, 2.0), 0.03))
+
+
+def test_it_rests_and_takes_off_with_the_yaw_that_it_has(said):
+    assert said.until(3.99) is None and said.mission.state == WAITING
+    wanted = said.until(4.02)
+    assert said.mission.state == FLYING and said.mission.started == pytest.approx(4.0)
+    np.testing.assert_allclose(wanted[0], [1.0, 2.0, 0.03], atol=1e-3)
+    assert said.mission.yaw == pytest.approx(0.4)
+
+
+def test_it_waits_for_an_estimate_that_knows_where_it_is_and_refuses_at_last(said):
+    assert said.until(6.0, deviation=1.01) is None and said.mission.state == WAITING
+    said.until(6.02, deviation=0.99)
+    assert said.mission.state == FLYING and said.mission.started == pytest.approx(6.0)
+    other = Said(Mission(Circles(), (0.0, 0.0), 0.0))
+    other.until(14.02, stale=True)
+    assert other.mission.state == REFUSED
+
+
+def test_it_is_up_flies_its_circles_and_sinks(said):
+    said.until(7.0)
+    np.testing.assert_allclose(said.until(7.02)[0], [1.0, 2.0, 1.23], atol=1e-3)
+    halfway = said.until(15.01)[0]
+    np.testing.assert_allclose(halfway, [1.0, 2.0, 1.23], atol=0.02)  # one of two circles
+    np.testing.assert_allclose(said.until(11.0 + 16.0 + 0.01)[0, 2], 0.43, atol=5e-3)
+    sinking = said.until(30.0)
+    assert np.isnan(sinking[0, 2]) and sinking[1, 2] < 0.0 and said.mission.state == FLYING  # to wherever the ground is
+
+
+def test_what_it_stands_on_ends_it_near_the_end_alone(said):
+    said.until(15.0, support=0.9)
+    assert said.mission.state == FLYING
+    said.until(26.0)
+    assert said.until(26.1, support=0.31) is None
+    assert said.mission.state == DONE and said.mission.ended == pytest.approx(26.0)
+
+
+def test_lost_it_stops_and_sinks_and_goes_on_where_it_was(said):
+    before = said.until(12.0)
+    wanted = said.until(13.0, deviation=1.6)
+    assert said.mission.state == LOST and said.mission.lost == pytest.approx(12.0)
+    assert np.isnan(wanted[0]).all() and wanted[1, 2] == -Rules().sink
+    assert np.isnan(said.until(14.0, deviation=1.2)[0]).all()  # not yet good enough to go on
+    after = said.until(14.01)
+    assert said.mission.state == FLYING and said.mission.lost == pytest.approx(12.0)
+    np.testing.assert_allclose(after[0], before[0], atol=0.02)
+    np.testing.assert_allclose(said.mission.wanted(np.array([13.5]))[0, 0], before[0], atol=0.02)
+
+
+def test_lost_it_lands_where_it_is(said):
+    said.until(12.0)
+    said.until(13.0, stale=True)
+    assert said.mission.state == LOST
+    assert said.until(13.1, stale=True, support=0.5) is None and said.mission.state == DONE
+
+
+def test_what_never_feels_the_ground_stops_its_rotors_in_the_end(said):
+    said.until(4.0 + 23.0 + Rules().longest_sink - 0.1)
+    assert said.mission.state == FLYING
+    said.until(4.0 + 23.0 + Rules().longest_sink + 0.1)
+    assert said.mission.state == DONE

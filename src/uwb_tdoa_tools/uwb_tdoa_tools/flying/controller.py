@@ -1,0 +1,145 @@
+"""A cascade that flies a quadrotor by an estimate of position, velocity and attitude, and by its gyroscope, and by nothing else.
+
+Position and velocity to a wanted acceleration, that to thrust and attitude (geometric control on SE(3): Lee, Leok and McClamroch, CDC
+2010), attitude to body rates, rates to rotor speeds. The outer part runs as often as there are estimates, the inner one at each sample
+of the gyroscope. Between estimates the attitude turns as the gyroscope says. Compiled, without ROS.
+"""
+
+from dataclasses import asdict, dataclass, fields
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Vehicle
+
+FELT = 0.1  # s over which the accelerometer tells what carries the vehicle
+
+
+@dataclass(frozen=True)
+class Gains:
+    """position : 1/s, from an error of position, at most `reach` m of it, to a velocity; velocity : 1/s, to an acceleration;
+    integral : 1/s^2, of the velocity's error, at most `most_integral` m/s^2; attitude, yaw : 1/s, to body rates; rate, yaw_rate : 1/s,
+    to angular accelerations; damping : of the angular acceleration that is felt; most_tilt : rad; most_rate : rad/s;
+    least_thrust, most_thrust : of the weight."""
+
+    position: float = 1.5
+    reach: float = 0.75
+    velocity: float = 4.5
+    integral: float = 0.7
+    most_integral: float = 2.0
+    attitude: float = 8.0
+    yaw: float = 3.0
+    rate: float = 40.0
+    yaw_rate: float = 8.0
+    damping: float = 1.6
+    most_tilt: float = 0.5
+    most_rate: float = 6.0
+    least_thrust: float = 0.3
+    most_thrust: float = 1.8
+
+
+NUMBERS = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
+
+
+class Controller:
+    """thrust : N, wanted of all rotors together; lift : N, what they have come to, as felt over FELT; rates : (3,) rad/s, wanted; integral : (3,) m/s^2, world."""
+
+    def __init__(self, gains=None, vehicle=None):
+        """gains : Gains; vehicle : Vehicle, as far as the controller knows it."""
+        self.gains, self.vehicle = gains or Gains(), vehicle or Vehicle()
+        self.numbers = np.array([tuple(asdict(self.gains).values())], NUMBERS)[0]
+        self.weight = self.vehicle.mass * GRAVITY
+        self.rates, self.integral = np.zeros(3), np.zeros(3)
+        self.thrust = self.lift = 0.0
+
+    def fly(self, p, v, q, wanted, yaw, dt):
+        """Set thrust and rates. p (3,) m, v (3,) m/s, q (4,) x y z w: the estimate; wanted (3, 3): position, velocity and
+        acceleration, NaN in the position where only the velocity counts; yaw : rad; dt : s since the last call."""
+        self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * FELT)) * (self.thrust - self.lift)
+        self.thrust = outer(p, v, q, wanted, yaw, dt, self.weight, self.numbers, self.integral, self.rates)
+
+    def support(self, force):
+        """Share of the weight that something else than the rotors carries. force : m/s^2, specific, along the body's z, as felt."""
+        return force / GRAVITY - self.lift / (self.weight * (1.0 + self.integral[2] / GRAVITY))
+
+    def stop(self):
+        """Rotors off."""
+        self.thrust = self.lift = 0.0
+        self.rates[:] = self.integral[:] = 0.0
+
+
+@compiled
+def outer(p, v, q, wanted, yaw, dt, weight, gains, integral, rates):
+    """See Controller.fly. integral (3,) and rates (3,) are written to. Returns the thrust, N."""
+    a, error = np.empty(3), np.empty(3)
+    far = 0.0
+    for k in range(3):
+        off = wanted[0, k] - p[k]
+        error[k] = 0.0 if math.isnan(off) else off
+        far += error[k] ** 2
+    shorter = gains.position * min(1.0, gains.reach / max(math.sqrt(far), 1e-9))
+    for k in range(3):
+        slow = wanted[1, k] + shorter * error[k] - v[k]
+        most = gains.most_integral
+        integral[k] = min(max(integral[k] + gains.integral * min(max(slow, -0.5), 0.5) * dt, -most), most)
+        a[k] = wanted[2, k] + gains.velocity * slow + integral[k]
+    a[2] = max(a[2] + GRAVITY, gains.least_thrust * GRAVITY)
+    level, most = math.hypot(a[0], a[1]), math.tan(gains.most_tilt) * a[2]
+    if level > most:
+        a[0] *= most / level
+        a[1] *= most / level
+    size = math.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
+    zx, zy, zz = a[0] / size, a[1] / size, a[2] / size
+    # the wanted axes: z along the thrust, x as near to the yaw as that allows
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    yx, yy, yz = -zz * sy, zz * cy, zx * sy - zy * cy
+    length = math.sqrt(yx * yx + yy * yy + yz * yz)
+    yx, yy, yz = yx / length, yy / length, yz / length
+    xx, xy, xz = yy * zz - yz * zy, yz * zx - yx * zz, yx * zy - yy * zx
+    x, y, z, s = q[0], q[1], q[2], q[3]
+    r00, r01, r02 = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * s), 2.0 * (x * z + y * s)
+    r10, r11, r12 = 2.0 * (x * y + z * s), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * s)
+    r20, r21, r22 = 2.0 * (x * z - y * s), 2.0 * (y * z + x * s), 1.0 - 2.0 * (x * x + y * y)
+    # e = (Rd' R - R' Rd) / 2, of which the three numbers
+    yz_, zy_ = yx * r02 + yy * r12 + yz * r22, zx * r01 + zy * r11 + zz * r21
+    zx_, xz_ = zx * r00 + zy * r10 + zz * r20, xx * r02 + xy * r12 + xz * r22
+    xy_, yx_ = xx * r01 + xy * r11 + xz * r21, yx * r00 + yy * r10 + yz * r20
+    rates[0] = -gains.attitude * 0.5 * (zy_ - yz_)
+    rates[1] = -gains.attitude * 0.5 * (xz_ - zx_)
+    rates[2] = -gains.yaw * 0.5 * (yx_ - xy_)
+    for k in range(3):
+        rates[k] = min(max(rates[k], -gains.most_rate), gains.most_rate)
+    along = a[0] * r02 + a[1] * r12 + a[2] * r22
+    return weight / GRAVITY * min(max(along, gains.least_thrust * GRAVITY), gains.most_thrust * GRAVITY)
+
+
+@compiled
+def inner(thrust, rates, gyro, before, dt, gains, vehicle, speeds):
+    """From thrust, N, and rates (3,) rad/s, both wanted, to rotor speeds (4,) rad/s. gyro, before : (3,) rad/s, felt now and dt s ago;
+    gains, vehicle : numbers of both."""
+    if thrust <= 0.0:
+        speeds[:] = 0.0
+        return
+    mx = vehicle.inertia_xy * (gains.rate * (rates[0] - gyro[0]) - gains.damping * (gyro[0] - before[0]) / dt)
+    my = vehicle.inertia_xy * (gains.rate * (rates[1] - gyro[1]) - gains.damping * (gyro[1] - before[1]) / dt)
+    mz = vehicle.inertia_z * gains.yaw_rate * (rates[2] - gyro[2])
+    most = vehicle.thrust * vehicle.top_speed**2
+    for k in range(ROTORS):
+        tilt = 0.25 * (CORNERS[k, 1] * mx - CORNERS[k, 0] * my) / (0.5 * vehicle.arm)
+        turn = 0.25 * SPIN[k] * mz * vehicle.thrust / vehicle.moment
+        turn = min(max(turn, -0.1 * most), 0.1 * most)  # yaw comes last
+        lift = 0.25 * thrust + tilt + turn
+        speeds[k] = math.sqrt(min(max(lift, 0.01 * most), most) / vehicle.thrust)
+
+
+@compiled
+def turned(q, rate, dt):
+    """Turn the attitude q (4,) x y z w by a body rate (3,) rad/s for dt, s, in place."""
+    angle = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2) * dt
+    share = 0.5 * dt if angle < 1e-9 else math.sin(0.5 * angle) / angle * dt
+    a, b, c, d = rate[0] * share, rate[1] * share, rate[2] * share, math.cos(0.5 * angle)
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    q[0], q[1] = w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a
+    q[2], q[3] = w * c + x * b - y * a + z * d, w * d - x * a - y * b - z * c

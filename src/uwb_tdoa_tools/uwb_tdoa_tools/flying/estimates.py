@@ -1,0 +1,112 @@
+"""Who tells the controller where it is: our filter, as the nodes run it, or somebody else's, built as a shared library."""
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector, LabelCorrector
+from uwb_tdoa_ekf.estimator import Estimator, Odometry
+from uwb_tdoa_ekf.offline import poses_of
+
+from ..benchmark.peer import EVENT, Peer
+
+NOTHING = Odometry(np.empty(0), *(np.empty((0, n)) for n in (3, 3, 4, 3, 3)), np.empty((0, 9, 9)))
+
+
+class OurFilter:
+    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs."""
+
+    def __init__(self, anchors, config, effects=None):
+        """anchors : Anchors; config : FilterConfig; effects : EffectSet to correct what was measured with, or None."""
+        effects = effects or EffectSet()
+        self._anchors, self._corrector = anchors, Corrector(anchors, effects)
+        self._labels, self._of_imu, self._of_aids = (kind(effects.effects) for kind in (LabelCorrector, ImuCorrector, AidCorrector))
+        self._offset = effects.stamp_offset
+        self._estimator = Estimator(anchors, config, functions=effects.sensor_functions)
+        self._parts, self._newest = [NOTHING], None
+
+    def tell(self, t, p, std):
+        """Tell that it is at p (3,) m at t, s, to so many m."""
+        self._estimator.tell_pose(t, p, std**2 * np.eye(3))
+
+    def take(self, measured):
+        """Take what arrived: Measured."""
+        imu, tdoa = measured.imu, measured.tdoa
+        if len(imu):
+            samples = imu.t - self._offset("imu"), imu.gyro, imu.accel
+            self._estimator.add_imu(samples[0], *(samples[1:] if self._of_imu.idle else self._of_imu.correct(*samples)))
+        if len(tdoa):
+            t, (a, b, d) = tdoa.t - self._offset("tdoa"), self._labels.correct(tdoa.a, tdoa.b, tdoa.d)
+            known = self._corrector.correct(t, self._anchors.index(a), self._anchors.index(b), d)
+            self._estimator.add_tdoa(t, a, b, known.corrected, known.std**2 + tdoa.variance, known.slope, known.state)
+        for stream, part in measured.aids.items():
+            if len(part.t):
+                columns = (part.t - self._offset(stream), *list(vars(part).values())[1:])
+                getattr(self._estimator, f"add_{stream}")(*(columns if self._of_aids.idle else self._of_aids.correct(stream, *columns)))
+        odometry, _ = self._estimator.advance()
+        if len(odometry):
+            self._parts.append(odometry)
+            self._newest = odometry
+            if not self._corrector.idle:
+                self._corrector.add_pose(*poses_of(odometry))
+
+    @property
+    def pose(self):
+        """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
+        if self._newest is None:
+            return None
+        return self._newest.t[-1], self._newest.p[-1], self._newest.v[-1], self._newest.q[-1]
+
+    @property
+    def deviation(self):
+        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one."""
+        if self._newest is None:
+            return math.inf
+        P = self._newest.covariance[-1]
+        return math.sqrt(max(P[0, 0], P[1, 1], P[2, 2]))
+
+    @property
+    def odometry(self):
+        """Odometry, all that came out."""
+        return Odometry(*(np.concatenate([getattr(part, name) for part in self._parts]) for name in vars(NOTHING)))
+
+
+class TheirFilter:
+    """A Peer behind the same calls. It is told place and yaw at the start, knows no effects, and says nothing of its covariance."""
+
+    deviation = 0.0  # m; nobody knows
+
+    def __init__(self, library, anchors, yaw, place=None):
+        """library : path; anchors : Anchors; yaw : rad; place : (3,) m, or None. Raises InputError."""
+        self._peer, self._anchors = Peer(library), anchors
+        q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
+        self._peer.start(anchors.positions, np.full(3, np.nan) if place is None else place, q)
+        self._states = []
+
+    def take(self, measured):
+        """Take what arrived: Measured, of which other sensors are passed over."""
+        imu, tdoa = measured.imu, measured.tdoa
+        samples, ranges = np.zeros(len(imu), EVENT), np.zeros(len(tdoa), EVENT)
+        samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
+        ranges["t"], ranges["d"] = tdoa.t, tdoa.d
+        ranges["a"], ranges["b"] = self._anchors.index(tdoa.a), self._anchors.index(tdoa.b)
+        events = np.concatenate([samples, ranges])
+        if len(events):
+            self._peer.run(events[np.argsort(events["t"], kind="stable")])
+            self._states.append((events["t"].max(), *self._peer.state()))
+
+    @property
+    def pose(self):
+        """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate that is one, or None."""
+        if not self._states or not all(np.isfinite(part).all() for part in self._states[-1]):
+            return None
+        return self._states[-1]
+
+    @property
+    def odometry(self):
+        """Odometry, all that came out; covariances NaN."""
+        if not self._states:
+            return NOTHING
+        t, p, v, q = map(np.array, zip(*self._states))
+        return Odometry(t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), np.full((len(t), 9, 9), np.nan))

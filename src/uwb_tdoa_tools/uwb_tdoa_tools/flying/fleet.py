@@ -1,0 +1,41 @@
+"""Many flights, on all cores, with what they came to kept on the way."""
+
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+
+from .. import parallel
+from ..bags.bag import write_bag
+from ..results_file import ResultsFile
+from .plots import drawn
+from .trial import fly
+from .verdict import judge
+
+
+def kept(path, asked):
+    """Context of a ResultsFile, or of a dict where path is None. asked : as of ResultsFile. Raises InputError."""
+    return nullcontext({}) if path is None else ResultsFile(path, asked)
+
+
+def flown(tasks, done, record=None, draw=False, jobs=None, dask=None):
+    """Generator of (verdict, Drawn or None), of Tasks in turn; those that are in `done`, by their seeds, are not flown again.
+
+    record : folder for a bag of each, or None; draw : give what is drawn; jobs, dask : as of `parallel.over`.
+    """
+    missing = [task for task in tasks if str(task.seed) not in done]
+    made = parallel.over(partial(_one, record, draw), missing, jobs, dask)
+    for task in tasks:
+        key, picture = str(task.seed), None
+        if key not in done:
+            done[key], picture = next(made)
+        yield done[key], picture
+    next(made, None)  # to its end, so that its processes are kept
+
+
+def _one(record, draw, task):
+    """(verdict, Drawn or None) of a Task."""
+    one = fly(task)
+    verdict = judge(one)
+    if record is not None:
+        write_bag(one.flight, Path(record) / one.flight.name, "mcap", False)
+    return verdict, drawn(one, verdict) if draw else None

@@ -1,0 +1,83 @@
+"""Wait, take off, fly, land: decided by nothing but the estimate, its deviation, and what the accelerometer feels."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+WAITING, FLYING, LOST, DONE, REFUSED = "waiting", "flying", "lost", "done", "refused"
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When to do what. rest : s before the rotors start at the earliest; patience : s after that, to wait for an estimate that is good
+    enough; arm, lost : m, largest standard deviation of a coordinate to start with, and beyond which it is lost; stale : s, an older
+    estimate is none; sink : m/s, while it is lost; carried : of the weight: it stands where it feels that much more support than usual;
+    near_end : s before the path's end from which on it may; longest_sink : s."""
+
+    rest: float = 4.0
+    patience: float = 10.0
+    arm: float = 1.0
+    lost: float = 1.5
+    stale: float = 0.6
+    sink: float = 0.25
+    carried: float = 0.09
+    near_end: float = 1.5
+    longest_sink: float = 10.0
+
+
+USUAL = 2.0  # s over which it learns what support it feels in the air, where there is none: its accelerometer has an offset
+
+
+class Mission:
+    """One flight along a path. state : of WAITING ...; started, ended : s, when the rotors started and stopped, or None; lost : s, when
+    its estimate first said that it was lost, or None: then it stops, sinks, and goes on with its path only if it is told where it is while
+    it is still in the air; yaw : rad, which it holds."""
+
+    def __init__(self, path, place, ground, rules=None, begin=0.0):
+        """path : Circles; place (2,) m; ground : m, of the body's origin; begin : s, when it was switched on."""
+        self.place, self.ground, self.rules, self.begin = place, ground, rules or Rules(), begin
+        self._path, self._clock = path.along(place, ground), []  # (s, s since the start of the path) of each call
+        self.state, self.started, self.ended, self.lost, self.yaw = WAITING, None, None, None, 0.0
+        self._usual = 0.0  # support, of the weight
+
+    def decide(self, t, pose, deviation, support):
+        """What the controller is to do at t, s: (3, 3) position, velocity, acceleration, NaN where it does not matter; None for rotors
+        off. pose : as of an estimate, or None; deviation : m; support : of the weight, that something else than the rotors carries, as
+        felt."""
+        rules = self.rules
+        good = pose is not None and t - pose[0] <= rules.stale
+        if self.state == WAITING and t >= self.begin + rules.rest:
+            if good and deviation <= rules.arm:
+                self.state, self.started, self._last, self._sinking = FLYING, t, t, t
+                x, y, z, w = pose[3]
+                self.yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            elif t >= self.begin + rules.rest + rules.patience:
+                self.state = REFUSED
+        if self.state not in (FLYING, LOST):
+            return None
+        if not good or deviation > rules.lost:
+            self.lost = t if self.lost is None else self.lost
+            self._sinking = t if self.state != LOST else self._sinking
+            self.state = LOST
+        elif self.state == LOST and good and deviation <= rules.arm:
+            self.state = FLYING
+        along = (self._clock[-1][1] if self._clock else 0.0) + (0.0 if self.state == LOST else t - self._last)
+        self._clock.append((t, along))
+        if self.state != LOST and along < self._path.duration - rules.near_end:
+            self._usual += min(1.0, (t - self._last) / USUAL) * (support - self._usual)
+        self._last = t
+        near_end = self.state == LOST or along > self._path.duration - rules.near_end
+        if near_end and (support - self._usual > rules.carried or t - self._sinking > rules.longest_sink):
+            self.state, self.ended = DONE, t
+            return None
+        if self.state != LOST:
+            self._sinking = t if along < self._path.duration else self._sinking
+            return self._path.at(np.array([along]))[0]
+        wanted = np.zeros((3, 3))
+        wanted[0], wanted[1, 2] = math.nan, -rules.sink
+        return wanted
+
+    def wanted(self, t):
+        """Of the path, (n, 3, 3), at t (n,) s."""
+        return self._path.at(np.interp(t, *np.transpose(self._clock)))

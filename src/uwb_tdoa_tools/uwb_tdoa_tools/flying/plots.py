@@ -1,0 +1,71 @@
+"""Pictures of flights: one map of all, and of one of them the errors with three sigma."""
+
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+import numpy as np
+
+from ..scoring.metrics import position_at
+
+SPACING = 0.05  # s
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is drawn of a flight: t (n,) s, p (n, 3) m, the truth; wanted (n, 3) m, NaN where nothing was; error and sigma (k, 3) m of the
+    estimate at stamps (k,) s; verdict : as of `judge`."""
+
+    t: np.ndarray
+    p: np.ndarray
+    wanted: np.ndarray
+    stamps: np.ndarray
+    error: np.ndarray
+    sigma: np.ndarray
+    verdict: dict
+
+
+def drawn(flown, verdict):
+    """Drawn, of a Flown."""
+    truth, odometry = flown.flight.truth, flown.odometry
+    every = max(1, round(SPACING / (truth.t[1] - truth.t[0])))
+    t, p = truth.t[::every], truth.p[::every]
+    wanted = np.full(p.shape, np.nan)
+    for mission in (mission for mission in flown.missions if mission.started is not None):
+        inside = (t >= mission.started) & (t <= (mission.ended or np.inf))
+        wanted[inside] = mission.wanted(t[inside])[:, 0]
+    rows = np.unique(np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING))) if len(odometry) else []
+    stamps = odometry.t[rows]
+    error = odometry.p[rows] - position_at(stamps, truth)
+    sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[rows, :3, :3]))
+    return Drawn(t, p, wanted, stamps, error, sigma, verdict)
+
+
+def plot(flights, anchors, path):
+    """Draw [Drawn] among Anchors to an image file: a map and the heights of all, and the errors of the worst."""
+    figure = Figure(figsize=(14, 8), layout="constrained")
+    left, right = figure.subfigures(1, 2)
+    landed = sum(one.verdict["landed"] for one in flights)
+    figure.suptitle(f"{landed} of {len(flights)} landed")
+    above, height = left.subplots(2, 1, height_ratios=(3, 1))
+    above.plot(*anchors.positions[:, :2].T, "k^")
+    for one in flights:
+        colour = "tab:green" if one.verdict["landed"] else "tab:red"
+        above.plot(*one.p[:, :2].T, color=colour, linewidth=0.7, alpha=0.6)
+        above.plot(*one.p[-1, :2], "x", color=colour)
+        height.plot(one.t, one.p[:, 2], color=colour, linewidth=0.7, alpha=0.6)
+    above.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    height.set(xlabel="t, s", ylabel="z, m")
+    worst = max(flights, key=_badness)
+    right.suptitle(f"seed {worst.verdict['seed']}: {worst.verdict['why'] or 'landed'}")
+    for k, (axes, axis) in enumerate(zip(right.subplots(3, 1, sharex=True), "xyz")):
+        axes.plot(worst.t, worst.wanted[:, k] - worst.p[:, k], "0.6", label="wanted - true")
+        axes.plot(worst.stamps, worst.error[:, k], label="estimated - true")
+        axes.fill_between(worst.stamps, -3 * worst.sigma[:, k], 3 * worst.sigma[:, k], alpha=0.2, label="three sigma")
+        axes.set(ylabel=f"{axis}, m")
+    axes.set(xlabel="t, s")
+    axes.legend()
+    figure.savefig(path, dpi=120)
+
+
+def _badness(one):
+    return not one.verdict["landed"], one.verdict["tracking"] or 0.0

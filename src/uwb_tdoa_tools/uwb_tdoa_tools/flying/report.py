@@ -1,0 +1,60 @@
+"""What many flights came to, in words and for JSON."""
+
+from collections import Counter
+
+import numpy as np
+
+from .verdict import PHASES
+
+DISHONEST = 3.0  # standard deviations of a coordinate
+MEDIANS = "tracking", "estimation", "place", "touchdown"
+
+
+def summary(verdicts):
+    """dict for JSON, of verdicts as of `judge`: counts, medians and largest of the figures, per phase too."""
+    out = {"flights": len(verdicts), "landed": sum(one["landed"] for one in verdicts)}
+    out["why"] = dict(Counter(one["why"] for one in verdicts if one["why"]).most_common())
+    out["safe"] = sum(one["safe"] for one in verdicts)
+    out["armed"] = sum(one["started"] is not None for one in verdicts)
+    known = [one["armed_deviations"] for one in verdicts if one["armed_deviations"] is not None]
+    out["armed_beyond_three_deviations"] = sum(value > DISHONEST for value in known) if known else None  # a peer tells none
+    out["said_lost"] = sum(one["said_lost"] is not None for one in verdicts)
+    for name in (*MEDIANS, "armed_off"):
+        out[name] = _spread([one[name] for one in verdicts])
+    for phase in PHASES:
+        mine = [one["phases"][phase] for one in verdicts if phase in one["phases"]]
+        out[phase] = {name: _spread([one[name] for one in mine]) for name in ("rmse", "largest", "nees")}
+    return out
+
+
+def _spread(values):
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    return {"median": float(np.median(known)), "least": float(min(known)), "most": float(max(known))}
+
+
+def text(summed):
+    """Lines of a summary."""
+    lines = [f"{summed['landed']} of {summed['flights']} landed; {summed['safe']} without a crash"]
+    lines += [f"  {count} {why}" for why, count in summed["why"].items()]
+    beyond = summed["armed_beyond_three_deviations"]
+    lines.append(
+        f"armed {summed['armed']}, of these {'?' if beyond is None else beyond} while the estimate was more than three of its "
+        f"deviations off; {summed['said_lost']} said that they were lost"
+    )
+    for name, what in (
+        ("armed_off", "estimate off when armed, m"),
+        ("tracking", "off the path in the air, m"),
+        ("place", "landed from the wanted place, m"),
+        ("touchdown", "touchdown, m/s"),
+    ):
+        lines.append(f"{what:34s}{_range(summed[name])}")
+    lines.append(f"{'estimate':10s}{'rmse, m':>24s}{'largest, m':>24s}{'NEES':>24s}")
+    for phase in PHASES:
+        lines.append(f"{phase:10s}" + "".join(f"{_range(summed[phase][name]):>24s}" for name in ("rmse", "largest", "nees")))
+    return "\n".join(lines)
+
+
+def _range(spread):
+    return "-" if spread is None else f"{spread['median']:.2f} ({spread['least']:.2f} - {spread['most']:.2f})"

@@ -1,0 +1,204 @@
+"""What radio, inertial sensor and the others of one flight say: all that does not depend on the path is drawn beforehand, by seed."""
+
+import math
+
+import numpy as np
+from scipy.signal import butter, lfilter
+
+from uwb_tdoa_bias.effects import EFFECTS, Samples
+from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.pressure import pressure_at
+
+from ..simulation.aids import LEAST_STD, RATE, SITE
+from ..simulation.ranging import outliers, tdoa_noise
+from ..simulation.schedule import make_schedule
+from .loop import IMU_RATE
+
+FloorMultipath = EFFECTS["floor_multipath"]
+NEAR_FLOOR = 0.5  # m, above which the floor does nothing
+LOW = 1.0  # m, below which an anchor is one of the low ones
+GUST_TIME = 1.0  # s, correlation time of gusts
+PERSON = 0.25, 1.8, 1.0  # m, radius and height of a person; m/s
+BLOCKED, BLOCK_TIME = (0.2, 2.0), 0.5  # m, by which what passes through a person is late, drawn anew each so many s
+ALTITUDE_STD, VELOCITY_STD = 0.08, 0.05  # m and m/s, noise of a barometer and of a velocity
+NEVER = np.inf, np.inf
+
+
+def random(seed, part):
+    """The numpy Generator of the named part of flight `seed`."""
+    return np.random.default_rng([seed, *part.encode()])
+
+
+class Radio:
+    """The TDOAs of one flight. t (n,) s; a, b (n,) rows of the anchors; silent : (begin, end) s, in which none is heard; changed : s, from
+    which on anchor `other` is silent or late."""
+
+    def __init__(self, world, seed, duration):
+        """world : World; duration : s."""
+        anchors = world.anchors
+        self.positions, n = anchors.positions, len(anchors)
+        schedule = make_schedule(world.protocol, n, duration, random(seed, "schedule"), world.rate)
+        self.t, self.a, self.b = schedule.t, schedule.a, schedule.b
+        self.silent, self.changed, self.other = NEVER, np.inf, int(random(seed, "change").integers(n))
+        self._world, rng = world, random(seed if world.installation is None else world.installation, "anchors")
+        self._error = tdoa_noise(schedule, np.full(n, world.noise / math.sqrt(2.0)), False, random(seed, "tdoa noise"))
+        self._error += _outliers(world, len(self.t), random(seed, "outliers"))
+        # per anchor: constant delay; amplitude and phase of the bias over the bearing
+        self.constants = np.stack([world.delay * rng.standard_normal(n), world.bearing_bias * rng.random(n), 2.0 * np.pi * rng.random(n)], axis=1)
+        late, height = rng.uniform(*world.floor_delay, n), rng.uniform(*world.floor_height, n)
+        low = anchors.ids[self.positions[:, 2] < LOW].tolist() if world.floor_effect else ()
+        self.floor = FloorMultipath({f"{i}.{part}": of[anchors.index(i)] for i in low for part, of in (("delay", late), ("height", height))})
+        self._anchors, self._at_times = anchors, random(seed, "floor").random((len(self.t), 2))
+        self._way = _walk(world, duration, random(seed, "person")) if world.person else np.empty((0, 2))
+        self._blocked = random(seed, "blocked").uniform(*BLOCKED, (int(duration / BLOCK_TIME) + 1, n))
+
+    def happens(self, silent, changed):
+        """Say when its world's silence begins, and from when on its world's change holds, s."""
+        self.silent = (silent, silent + self._world.silence[1]) if self._world.silence else NEVER
+        self.changed = changed
+
+    def measured(self, rows, p):
+        """d (k,) m, NaN where nothing was heard, of the TDOAs in a slice of rows, taken by a tag at p (k, 3) m."""
+        t, a, b, d = self.t[rows], self.a[rows], self.b[rows], np.empty(len(p))
+        _measure(p, a, b, self.positions, self.constants, d)
+        d += self._error[rows]
+        if self.floor.values and p[:, 2].min(initial=NEAR_FLOOR) < NEAR_FLOOR:
+            d += self._near_floor(rows, p)
+        if len(self._way):
+            late = self._blocked[(t / BLOCK_TIME).astype(int)]
+            person = self._way[(t * IMU_RATE).astype(int)]
+            for anchor, sign in ((b, 1.0), (a, -1.0)):
+                through = _passes(p, self.positions[anchor], person)
+                d += sign * np.where(through, late[np.arange(len(t)), anchor], 0.0)
+        mine = (t >= self.changed) & ((a == self.other) | (b == self.other))
+        if self._world.change == "late":
+            d += np.where(mine, np.where(b == self.other, 1.0, -1.0) * self._world.lateness, 0.0)
+        elif self._world.change == "silent":
+            d[mine] = np.nan
+        d[(t >= self.silent[0]) & (t < self.silent[1])] = np.nan
+        return d
+
+    def _near_floor(self, rows, p):
+        """What the floor adds, (k,) m: an anchor is late or not, as often as FloorMultipath says."""
+        t, a, b = self.t[rows], self.a[rows], self.b[rows]
+        samples, both = Samples(t, a, b, p, np.full((len(p), 4), np.nan), self._anchors), np.concatenate([a, b])
+        late = self.floor.of_each(self._anchors)[0][both]
+        late = np.where(self._at_times[rows].T.ravel() * late < self.floor.delays(samples, both), late, 0.0)
+        return late[len(p) :] - late[: len(p)]
+
+
+@compiled
+def _measure(p, a, b, positions, constants, out):
+    """Geometry and what is late at each of two anchors, (k,) m. constants (n, 3): see Radio."""
+    for i in range(len(p)):
+        out[i] = _heard(p[i], positions[b[i]], constants[b[i]]) - _heard(p[i], positions[a[i]], constants[a[i]])
+
+
+@compiled
+def _heard(p, anchor, late):
+    x, y, z = p[0] - anchor[0], p[1] - anchor[1], p[2] - anchor[2]
+    return math.sqrt(x * x + y * y + z * z) + late[0] + late[1] * math.sin(2.0 * math.atan2(y, x) + late[2])
+
+
+def _outliers(world, n, rng):
+    """(n,) m, zero but for the given share."""
+    if not world.outlier_size:
+        return outliers(n, world.outlier_share, rng)
+    return np.where(rng.random(n) < world.outlier_share, rng.uniform(-world.outlier_size, world.outlier_size, n), 0.0)
+
+
+def _walk(world, duration, rng):
+    """Where somebody is who walks from one place at a wall to the next: (n, 2) m, at each sample of the inertial sensor."""
+    half, places, stamps = 0.5 * np.array(world.size[:2]), [], [0.0]
+    while stamps[-1] <= duration:
+        place = rng.uniform(-half, half)
+        wall = rng.integers(2)
+        place[wall] = math.copysign(half[wall], rng.standard_normal())
+        if places:
+            stamps.append(stamps[-1] + np.linalg.norm(place - places[-1]) / PERSON[2])
+        places.append(place)
+    t = np.arange(int(duration * IMU_RATE) + 2) / IMU_RATE
+    return np.stack([np.interp(t, stamps, column) for column in np.transpose(places)], axis=1)
+
+
+def _passes(p, anchor, person):
+    """Whether the ways from p (k, 3) to anchors (k, 3) lead through a person at (k, 2), all m: (k,) bool."""
+    way = anchor - p
+    share = np.sum((person - p[:, :2]) * way[:, :2], axis=1) / np.maximum(np.sum(way[:, :2] ** 2, axis=1), 1e-9)
+    nearest = p + np.clip(share, 0.0, 1.0)[:, None] * way
+    return (np.linalg.norm(nearest[:, :2] - person, axis=1) < PERSON[0]) & (nearest[:, 2] < PERSON[1])
+
+
+class Inertial:
+    """Errors of the inertial sensor at each of its samples: errors (n, 6) rad/s and m/s^2; shaking (n, 3) m/s^2, of turning rotors."""
+
+    def __init__(self, world, seed, duration):
+        of, n, dt = world.imu, int(duration * IMU_RATE) + 1, 1.0 / IMU_RATE
+        self.errors = np.empty((n, 6))
+        for columns, name, start, walk, noise in (
+            (slice(0, 3), "gyro", of.gyro_bias, of.gyro_bias_walk, of.gyro_noise),
+            (slice(3, 6), "accel", of.accel_bias, of.accel_bias_walk, of.accel_noise),
+        ):
+            rng = random(seed, name)
+            bias = start * rng.standard_normal(3) + np.cumsum(walk * math.sqrt(dt) * rng.standard_normal((n, 3)), axis=0)
+            self.errors[:, columns] = bias + noise / math.sqrt(dt) * rng.standard_normal((n, 3))
+        rng, band = random(seed, "vibration"), world.vibration_band
+        self.shaking = rng.standard_normal((n, 3))
+        if band:
+            self.shaking = lfilter(*butter(2, band, fs=IMU_RATE), self.shaking, axis=0)
+            self.shaking /= self.shaking.std(axis=0)
+        self.shaking = np.array(world.vibration) * (self.shaking + world.rectified * np.sign(rng.standard_normal(3)))
+
+
+def gusts(world, seed, duration):
+    """Wind at each sample of the inertial sensor, (n, 3) m/s: exponentially correlated."""
+    n = int(duration * IMU_RATE) + 1
+    decay = math.exp(-1.0 / (IMU_RATE * GUST_TIME))
+    white = random(seed, "wind").standard_normal((n, 3))
+    white[1:] *= math.sqrt(1.0 - decay**2)
+    return world.gust * lfilter([1.0], [1.0, -decay], white, axis=0)
+
+
+class Aid:
+    """Another sensor of one flight. t (n,) s."""
+
+    rate, width = RATE, 1  # Hz; numbers per measurement
+
+    def __init__(self, world, seed, duration):
+        self.world, rate = world, self.rate_in(world)
+        self.t = np.arange(0.5, duration * rate) / rate
+        self.noise = random(seed, type(self).__name__).standard_normal((len(self.t), self.width))
+
+    def rate_in(self, world):
+        """Hz."""
+        return self.rate
+
+    def measured(self, rows, p, q, v, height):
+        """Columns of the measurements in a slice of rows, of a body at p (k, 3) m, q (k, 4), with v (k, 3) m/s in its own frame, `height`
+        (k,) m above what is below it: tuple."""
+        raise NotImplementedError
+
+
+class RangeFinder(Aid):
+    def rate_in(self, world):
+        return world.height_rate
+
+    def measured(self, rows, p, q, v, height):
+        up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
+        seen = height / np.maximum(up, 1e-3) + self.world.height_noise * self.noise[rows, 0]
+        return (np.where((up > 0.0) & (seen <= self.world.height_range), np.maximum(seen, 0.0), np.inf),)
+
+
+class Barometer(Aid):
+    def measured(self, rows, p, q, v, height):
+        return (pressure_at(SITE + p[:, 2] + ALTITUDE_STD * self.noise[rows, 0]),)
+
+
+class Speedometer(Aid):
+    width = 3
+
+    def measured(self, rows, p, q, v, height):
+        return v + VELOCITY_STD * self.noise[rows], np.full(v.shape, max(VELOCITY_STD, LEAST_STD))
+
+
+AIDS = {"height": RangeFinder, "pressure": Barometer, "velocity": Speedometer}

@@ -1,0 +1,155 @@
+"""A vehicle in a world, turn by turn: what it does, and what its sensors say of that."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth, Velocity
+
+from .loop import IMU_RATE, interval, poses_at
+from .sensors import AIDS, Inertial, Radio, gusts, random
+from .vehicle import ATTITUDE, GRAVITY, POSITION, STATE, VELOCITY, Vehicle, ground_at
+
+TICK = 4  # samples of the inertial sensor, from one turn of the controller to the next
+DT = TICK / IMU_RATE  # s
+STARTS = 0.5  # m from the middle of the hall, along each axis, to the middle of where it flies
+WEIGHED = 0.05  # largest relative error of the mass that its controller believes
+TABLE_RADIUS = 0.4  # m
+LIFTED = 0.5  # m, by which hands lift it
+RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects see
+STREAMS = {"height": Height, "pressure": Pressure, "velocity": Velocity}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What came in one turn. imu : Imu; tdoa : Tdoas; aids : {stream: Height, Pressure or Velocity}, of those that the world has."""
+
+    imu: Imu
+    tdoa: Tdoas
+    aids: dict
+
+
+class Simulator:
+    """One vehicle for so many seconds. state (17,), as of `vehicle`; vehicle : the true Vehicle; believed : the one that its controller is
+    told; times (n,) s, states (n, 17), contact (n,) number of feet on the ground: at each sample of the inertial sensor, up to `done`."""
+
+    def __init__(self, world, seed, duration, radius=0.0):
+        """world : World; duration : s; radius : m, of the circle whose point nearest to +x it starts from."""
+        self.world, rng = world, random(seed, "place")
+        middle, yaw = rng.uniform(-STARTS, STARTS, 2), rng.uniform(-np.pi, np.pi)
+        mass = rng.uniform(*world.mass)
+        x, y = middle[0] + radius, middle[1]
+        table = {"table": world.table, "table_x": x, "table_y": y, "table_radius": TABLE_RADIUS} if world.table else {}
+        self.vehicle = Vehicle(mass=mass, **table)
+        self.believed = Vehicle(mass=mass * (1.0 + rng.uniform(-WEIGHED, WEIGHED)))
+        self.yaw, self.state = yaw, self.vehicle.at_rest(x, y, yaw)
+        self._numbers, self._known = self.vehicle.numbers(), self.believed.numbers()
+        self.radio, self._inertial = Radio(world, seed, duration), Inertial(world, seed, duration)
+        self._aids = {name: AIDS[name](world, seed, duration) for name in world.aids}
+        self._wind, self._rng = gusts(world, seed, duration), random(seed, "effects")
+        n = len(self._wind)
+        self.times, self.states, self.contact = np.arange(n) / IMU_RATE, np.empty((n, STATE)), np.zeros(n)
+        self.samples = np.zeros((n, 6))
+        self.done, self.states[0], self._gyro, self._hands = 0, self.state, np.zeros((2, 3)), None
+        self._heard, self._first = dict.fromkeys(("tdoa", *world.aids), 0), None
+
+    @property
+    def now(self):
+        """s"""
+        return self.times[self.done]
+
+    @property
+    def over(self):
+        """True when there is no time left."""
+        return self.done + TICK >= len(self.times)
+
+    @property
+    def ground(self):
+        """Height of what is below it, m."""
+        return ground_at(self._numbers, self.state[0], self.state[1])
+
+    def advance(self, controller):
+        """Fly one turn by what a Controller wants, or be carried on by hands. Returns Measured."""
+        k = self.done
+        rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
+        if self._hands is None:
+            interval(
+                self.state, self._gyro, controller.thrust, controller.rates, controller.numbers, self._known, self._numbers,
+                self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows],
+                self.states[rows], self.samples[rows], self.contact[rows],
+            )  # fmt: skip
+        else:
+            self._be_carried(rows)
+        self.done += TICK
+        imu = Imu(self.times[rows], self.samples[rows, :3], self.samples[rows, 3:])
+        new, p, _ = self._poses("tdoa", self.radio.t, lately)
+        radio, ids = self.radio, self.world.anchors.ids
+        d = radio.measured(new, p)
+        heard = np.isfinite(d)
+        tdoa = Tdoas(radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard])
+        aids = {name: self._felt(name, sensor, lately) for name, sensor in self._aids.items()}
+        return self._disturbed(Measured(imu, tdoa, aids))
+
+    def lift(self, by, seconds):
+        """Be carried by (2,) m, lifted and put down, within so many s, from now on."""
+        begin, end = self.state.copy(), self.now + seconds
+        way = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, LIFTED], [*by, LIFTED], [*by, 0.0]])
+        self._hands = begin, self.now, end, way
+
+    def _be_carried(self, rows):
+        begin, since, until, way = self._hands
+        t, h = self.times[rows], 0.5 / IMU_RATE
+        at = [begin[POSITION] + _along(way, (t + shift - since) / (until - since)) for shift in (-2.0 * h, 0.0, 2.0 * h)]
+        v, a = (at[2] - at[0]) / (4.0 * h), (at[2] - 2.0 * at[1] + at[0]) / (2.0 * h) ** 2
+        states = np.tile(begin, (len(t), 1))
+        states[:, POSITION], states[:, VELOCITY], states[:, 10:] = at[1], v, 0.0
+        self.states[rows], self.contact[rows] = states, 0.0
+        self.samples[rows] = self._inertial.errors[rows]
+        back = Rotation.from_quat(begin[ATTITUDE]).inv()
+        self.samples[rows, 3:] += back.apply(a + np.array([0.0, 0.0, GRAVITY]))
+        self.state[:] = states[-1]
+        self._gyro[:] = self.samples[rows.stop - 1, :3]
+        if t[-1] >= until:
+            self._hands = None
+            self.state[VELOCITY] = 0.0
+
+    def _poses(self, stream, t, lately):
+        """(slice, p (k, 3) m, q (k, 4)): what of a stream with stamps t (n,) s is new, and the poses then."""
+        first = self._heard[stream]
+        new = slice(first, int(np.searchsorted(t, self.now, side="right")))
+        p, q = np.empty((new.stop - first, 3)), np.empty((new.stop - first, 4))
+        poses_at(t[new], self.times[lately], self.states[lately], p, q)
+        self._heard[stream] = new.stop
+        return new, p, q
+
+    def _felt(self, name, sensor, lately):
+        new, p, q = self._poses(name, sensor.t, lately)
+        v = np.broadcast_to(self.state[VELOCITY], p.shape)
+        inside = Rotation.from_quat(q).inv().apply(v) if len(q) else v
+        return STREAMS[name](sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground))
+
+    def _disturbed(self, measured):
+        """Measured, with the world's effects in it, put there as `inject` does."""
+        if not len(self.world.effects) or not len(measured.tdoa):
+            return measured
+        tdoa = measured.tdoa
+        self._first = self._first if self._first is not None else (tdoa, self.states[0])
+        first, at = self._first  # of the flight: times count from it
+        columns = (np.concatenate([getattr(first, name)[:1], getattr(tdoa, name)]) for name in ("t", "a", "b", "d"))
+        recent = slice(max(self.done - RECENT, 0), self.done + 1)
+        states, t = np.concatenate([at[None], self.states[recent]]), np.concatenate([first.t[:1] - 1e-3, self.times[recent]])
+        truth = Truth(t, states[:, POSITION], states[:, ATTITUDE])
+        flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **measured.aids)
+        for effect in self.world.effects.effects:
+            flight = effect.inject(flight, self._rng)
+        tdoa = Tdoas(*(column[1:] for column in vars(flight.tdoa).values()))
+        return replace(measured, tdoa=tdoa, imu=flight.imu, aids={name: getattr(flight, name) for name in measured.aids})
+
+
+def _along(way, share):
+    """(n, 3) m, along places (m, 3), smoothly from each to the next, at shares (n,) of the whole time."""
+    part = np.clip(share, 0.0, 1.0) * (len(way) - 1)
+    k = np.minimum(part.astype(int), len(way) - 2)
+    x = (part - k)[:, None]
+    return way[k] + x**3 * (10.0 - 15.0 * x + 6.0 * x**2) * (way[k + 1] - way[k])

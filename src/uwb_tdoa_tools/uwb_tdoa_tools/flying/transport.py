@@ -1,0 +1,36 @@
+"""The way from the sensors to the estimate: it takes time, the same for all streams and more for some messages."""
+
+import numpy as np
+
+from .simulator import Measured
+
+
+class Transport:
+    """Holds what was measured until it arrives; within a stream nothing overtakes."""
+
+    def __init__(self, latency, jitter, rng):
+        """latency : s, of everything; jitter : s, mean of what comes on top; rng : numpy Generator."""
+        self._latency, self._jitter, self._rng = latency, jitter, rng
+        self._waiting = {}  # by stream: [what waits, when it arrives (n,) s, the last arrival]
+
+    def arrived(self, measured, now):
+        """Measured that has arrived by `now`, s, after one more Measured was sent."""
+        if not self._latency and not self._jitter:
+            return measured
+        parts = {"imu": measured.imu, "tdoa": measured.tdoa, **measured.aids}
+        parts = {stream: self._due(stream, part, now) for stream, part in parts.items()}
+        return Measured(parts.pop("imu"), parts.pop("tdoa"), parts)
+
+    def _due(self, stream, part, now):
+        held, arrival, last = self._waiting.get(stream, (None, np.empty(0), 0.0))
+        delay = self._latency + self._rng.exponential(self._jitter, len(part)) if self._jitter else np.full(len(part), self._latency)
+        came = np.maximum.accumulate(np.maximum(part.t + delay, last))
+        part = part if held is None else type(part)(*map(np.concatenate, zip(vars(held).values(), vars(part).values())))
+        arrival = np.concatenate([arrival, came])
+        due = int(np.searchsorted(arrival, now, side="right"))
+        self._waiting[stream] = _rows(part, slice(due, None)), arrival[due:], came[-1] if len(came) else last
+        return _rows(part, slice(0, due))
+
+
+def _rows(part, rows):
+    return type(part)(*(column[rows] for column in vars(part).values()))

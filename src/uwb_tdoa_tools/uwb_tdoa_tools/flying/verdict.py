@@ -1,0 +1,157 @@
+"""What became of a flight, by ground truth alone."""
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_ekf.estimator import Odometry
+
+from ..scoring.metrics import nees, position_at
+from .mission import DONE, REFUSED
+from .trial import REST_AFTER
+from .vehicle import POSITION, VELOCITY
+
+AIR = 0.3  # m above the ground, from which on it is in the air
+UPRIGHT = math.radians(30.0)
+NEAR, SLOW = 0.3, 0.6  # m from the wanted place and m/s at touchdown, of a flight that has landed
+GENTLE = 1.0  # m/s at touchdown, of one that has not crashed
+LOST = 1.0  # m; an estimate that is further off is none
+SPACING = 0.02  # s between the estimates that are judged
+PHASES = "before", "lift_off", "air", "landing", "after"
+
+
+def judge(flown):
+    """dict for JSON, of a Flown: the verdict and its figures; None where there is nothing to say. Of several flights the last one's; what
+    kept an earlier one from landing counts for all.
+
+    landed : took off, and stood upright in the end within NEAR of the wanted place, having touched it at less than SLOW; why : what was
+    missing, "" where it landed; safe : it never left the ground, or came down upright at less than GENTLE, wherever; place : m, from the wanted one; touchdown : m/s; tracking : m, root mean square of the distance to the
+    wanted path in the air; armed_off : m, of the estimate when the rotors started, armed_deviations : the same of its coordinates in
+    their standard deviations, the largest; lost : s, first instant in the air at which the estimate is more than LOST off, and said_lost :
+    s, when it said so itself; phases : {phase: figures of the estimate}.
+    """
+    ends = [(mission.ended or math.inf) + REST_AFTER for mission in flown.missions]
+    verdicts = [_judge(flown, mission, end) for mission, end in zip(flown.missions, ends)]
+    failed = [one["why"] for one in verdicts if one["why"]]
+    if flown.task.again and len(verdicts) == 1:
+        failed = failed or ["did not fly again"]
+    why = failed[0] if failed else ""
+    if len(verdicts) > 1 and why:
+        why = f"{'first' if verdicts[0]['why'] else 'second'} flight: {why}"
+    return {"seed": flown.task.seed, "landed": not why, **verdicts[-1], "why": why}
+
+
+def _judge(flown, mission, end):
+    """Figures of one Mission, until `end`, s."""
+    truth = flown.flight.truth
+    inside = slice(*np.searchsorted(truth.t, (mission.begin, end)))
+    truth = Truth(truth.t[inside], truth.p[inside], truth.q[inside])
+    states, contact = flown.states[inside], flown.contact[inside]
+    odometry = _between(flown.odometry, mission.begin, end)
+    crash = flown.crash if mission is flown.missions[-1] else ""
+    t, height = truth.t, states[:, 2] - mission.ground
+    tilt = np.arccos(np.clip(1.0 - 2.0 * (states[:, 6] ** 2 + states[:, 7] ** 2), -1.0, 1.0))
+    aloft = np.flatnonzero(height > AIR)
+    took_off = bool(len(aloft))
+    first, last = (aloft[0], aloft[-1]) if took_off else (None, None)
+    tracking, touchdown = None, None
+    if took_off:
+        touched = last + np.flatnonzero(contact[last:] > 0)
+        if len(touched):
+            speeds = np.linalg.norm(states[last : touched[-1] + 1, VELOCITY], axis=1)
+            onset = touched[(contact[touched - 1] == 0)]
+            touchdown = float(speeds[np.maximum(onset - 1 - last, 0)].max())
+        inside = slice(first, last + 1, 8)
+        wanted = mission.wanted(t[inside])[:, 0]
+        off = np.nan_to_num(states[inside, POSITION] - wanted)  # no height is wanted where it sinks to the ground
+        tracking = _rms(np.linalg.norm(off, axis=1))
+    place = float(np.linalg.norm(states[-1, :2] - mission.place))
+    figures = {
+        "took_off": took_off,
+        "place": place,
+        "touchdown": touchdown,
+        "upright": bool(tilt[-1] < UPRIGHT),
+        "tracking": tracking,
+        "started": mission.started,
+        "ended": mission.ended,
+        "said_lost": mission.lost,
+        "duration": float(t[-1]),
+        **_armed(odometry, truth, mission),
+        **_estimation(odometry, truth, mission, first, last),
+    }
+    figures["why"] = _why(crash, mission, figures)
+    gentle = not took_off or (mission.state == DONE and touchdown is not None and touchdown < GENTLE)
+    figures["safe"] = bool(gentle and figures["upright"] and not crash)
+    return figures
+
+
+def _between(odometry, begin, end):
+    """The part of an Odometry."""
+    inside = slice(*np.searchsorted(odometry.t, (begin, end)))
+    return Odometry(*(column[inside] for column in vars(odometry).values()))
+
+
+def _why(crash, mission, figures):
+    """What kept it from having landed, in words, "" for nothing."""
+    if mission.state == REFUSED:
+        return "refused to arm"
+    if not figures["took_off"]:
+        return f"{crash} on the ground" if crash else "did not take off"
+    if crash:
+        return crash
+    if not figures["upright"]:
+        return "not upright"
+    if figures["touchdown"] is None or mission.ended is None:
+        return "did not come down"
+    if figures["touchdown"] >= SLOW:
+        return "came down hard"
+    return "landed elsewhere" if figures["place"] >= NEAR else ""
+
+
+def _armed(odometry, truth, mission):
+    """How far the estimate was off when the rotors started."""
+    started = mission.started
+    if started is None:
+        return {"armed_off": None, "armed_deviations": None}
+    k = int(np.searchsorted(odometry.t, started, side="right")) - 1
+    error = odometry.p[k] - position_at(odometry.t[k : k + 1], truth)[0]
+    deviations = float(np.max(np.abs(error) / np.sqrt(np.diag(odometry.covariance[k])[:3])))
+    return {"armed_off": float(np.linalg.norm(error)), "armed_deviations": deviations if math.isfinite(deviations) else None}
+
+
+def _estimation(odometry, truth, mission, first, last):
+    """Figures of the estimate, per phase, and when it was lost."""
+    if not len(odometry):
+        return {"lost": None, "estimation": None, "phases": {}}
+    stamps = np.arange(odometry.t[0], odometry.t[-1], SPACING)
+    rows = np.unique(np.searchsorted(odometry.t, stamps))
+    t = odometry.t[rows]
+    error = odometry.p[rows] - position_at(t, truth)
+    distance, covariance = np.linalg.norm(error, axis=1), odometry.covariance[rows, :3, :3]
+    normalised = nees(error, covariance) if np.isfinite(covariance).all() else np.full(len(error), np.nan)  # a peer tells none
+    end = truth.t[-1]
+    started, ended = mission.started or end, mission.ended or end
+    up, down = (truth.t[first], truth.t[last]) if first is not None else (ended, ended)
+    limits = [-math.inf, started, max(up, started), max(down, started), max(ended, down), math.inf]
+    phases = {
+        name: _figures(distance[inside], normalised[inside])
+        for name, begin, stop in zip(PHASES, limits, limits[1:])
+        if (inside := (t >= begin) & (t < stop)).any()
+    }
+    far = np.flatnonzero((distance > LOST) & (t >= started) & (t < ended))
+    air = phases.get("air")
+    return {"lost": float(t[far[0]]) if len(far) else None, "estimation": air and air["rmse"], "phases": phases}
+
+
+def _figures(distance, normalised):
+    usable = normalised[np.isfinite(normalised)]
+    return {
+        "rmse": _rms(distance),
+        "largest": float(distance.max()),
+        "nees": float(usable.mean()) if len(usable) else None,
+    }
+
+
+def _rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,58 @@
+"""Motion along any path, for what the families of trajectories do not do: tags that are carried, driven, thrown, or far away."""
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from .trajectories import DRAG, GRAVITY, STEP, Motion
+
+KNOT = 0.02  # s, of the spline through the path
+APART = 1e-4  # s, over which attitudes are differentiated
+
+
+class Path:
+    """What simulate() takes as a trajectory.
+
+    duration : s; position : function of stamps (n,) s, 0 to duration, that gives (n, 3) m, with four derivatives; attitude :
+    function of stamps that gives a Rotation, body to world, or None for that of a multirotor, whose thrust carries it; running : (begin, end) s,
+    of its motors, or None.
+    """
+
+    def __init__(self, duration, position, attitude=None, running=None):
+        t = np.arange(-2.0 * KNOT, duration + 2.5 * KNOT, KNOT)
+        self._p, self._attitude, self._running = make_interp_spline(t, position(t), k=5), attitude or self._flown, running
+
+    def motion(self, t):
+        """The Motion at the stamps t, (n,) s."""
+        t = np.asarray(t, dtype=float)
+        p, v, a = (self._p(t, k) for k in range(3))
+        turn = self._attitude(t)
+        rates = (self._attitude(t - APART).inv() * self._attitude(t + APART)).as_rotvec() / (2.0 * APART)
+        q = turn.as_quat()
+        return Motion(p, v, a, q, rates, turn.inv().apply(a + [0.0, 0.0, GRAVITY]))
+
+    def motors(self, t):
+        """Whether the motors turn at the stamps t: (n,) bool."""
+        t = np.asarray(t)
+        return (t >= self._running[0]) & (t <= self._running[1]) if self._running else np.zeros(len(t), bool)
+
+    def _flown(self, t):
+        """Thrust along body z, as of a Trajectory, yaw 0."""
+        z = self._p(t, 2) + [0.0, 0.0, GRAVITY] + DRAG * self._p(t, 1)
+        z /= np.linalg.norm(z, axis=1, keepdims=True)
+        y = np.cross(z, [1.0, 0.0, 0.0])
+        y /= np.linalg.norm(y, axis=1, keepdims=True)
+        return Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=2))
+
+
+def between(*stops):
+    """A position for Path: from one stop (stamp s, x, y, z m) to the next, at rest at each."""
+    stamps, places = np.array([stop[0] for stop in stops]), np.array([stop[1:] for stop in stops], dtype=float)
+
+    def position(t):
+        t = np.clip(t, stamps[0], stamps[-1])
+        k = np.clip(np.searchsorted(stamps, t, side="right") - 1, 0, len(stamps) - 2)
+        share = STEP((t - stamps[k]) / (stamps[k + 1] - stamps[k]))[:, None]
+        return places[k] + share * (places[k + 1] - places[k])
+
+    return position
