@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -134,6 +135,20 @@ def test_qos_and_type_hashes_are_recorded(tmp_path, storage):
             assert qos.reliability == QosReliability.RELIABLE
             assert connection.digest == store.hash_rihs01(connection.msgtype)
             assert connection.digest.startswith("RIHS01_") and len(connection.digest) == 71
+
+
+@BOTH
+@pytest.mark.parametrize("told", ["other", "none"])
+def test_metadata_may_tell_another_qos_than_the_data_file(tmp_path, storage, told):
+    flight = small_flight(0.05)
+    write_bag(flight, tmp_path / "flight", storage)
+    file = tmp_path / "flight" / "metadata.yaml"
+    content = yaml.safe_load(file.read_text())
+    for entry in content["rosbag2_bagfile_information"]["topics_with_message_count"]:
+        (qos,) = entry["topic_metadata"]["offered_qos_profiles"]
+        entry["topic_metadata"]["offered_qos_profiles"] = [] if told == "none" else [{**qos, "reliability": "best_effort"}]
+    file.write_text(yaml.safe_dump(content))
+    assert differences(flight, read_bag(tmp_path / "flight")) == []
 
 
 def test_existing_output(tmp_path):

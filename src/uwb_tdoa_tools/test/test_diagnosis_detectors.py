@@ -1,15 +1,16 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_tools.diagnosis.attribution import attribute, effects_of, near_floor, on_floor
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
-from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
 
-OF_NOISE = ("outlier_rate", "noise_level", "noise_correlation", "floor_multipath")
+OF_NOISE = ("outlier_rate", "noise_level", "noise_correlation")
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +68,61 @@ def test_an_anchor_that_is_blocked_already_is_not_searched_again(clean):
     keys = {c.terms[0].keys for c in first}
     again = DETECTORS["nlos"].search(table, model, first)
     assert not keys & {c.terms[0].keys for c in again}
+
+
+LATE = {"0.delay": 3.3, "2.delay": 2.8, "5.delay": 3.6, "7.delay": 3.3}
+LOW = {f"{i}.height": 0.1 for i in (0, 2, 5, 7)}
+
+
+def near(*flights):
+    return [near_floor(part) for part in seen(*flights)]
+
+
+def on_the_floor(*flights, named=True):
+    """Effects found near the floor of some flights."""
+    return effects_of(on_floor(near(*flights), [DETECTORS["floor_multipath"]] if named else [], True, []))
+
+
+@pytest.fixture(scope="module")
+def landed(clean):
+    return EFFECTS["floor_multipath"]({**LATE, **LOW}).inject(clean)
+
+
+def test_anchors_that_are_late_on_the_floor_are_found_with_their_heights(landed):
+    (found,) = on_the_floor(landed)
+    assert {key for key in found.values if key.endswith(".delay")} == set(LATE)
+    for key, value in LATE.items():
+        assert found.values[key] == pytest.approx(value, abs=0.1), key
+    for key, height in LOW.items():
+        assert height / 1.5 < found.values[key] < height * 1.5, key
+
+
+def test_the_floor_is_described_without_a_name_for_it(landed):
+    """By functions of the height: together they say that low anchors are metres late below, and on time above."""
+    found = on_the_floor(landed, named=False)
+    assert found and all(effect.covariate in ("height", "elevation") for effect in found)
+    (part,) = near(landed)
+    samples, low = part["tdoa"].samples, part["tdoa"].samples.p[:, 2] < 0.05
+    told, true = (EffectSet(tuple(effects)).bias(samples) for effects in (found, [EFFECTS["floor_multipath"]({**LATE, **LOW})]))
+    assert np.mean((true - told)[low] ** 2) < 0.3 * np.mean(true[low] ** 2)
+
+
+def test_nothing_is_found_on_a_floor_that_does_nothing(clean):
+    assert not on_the_floor(clean) and not on_the_floor(clean, named=False)
+
+
+def test_one_anchor_that_is_late_there_is_not_the_floor(clean):
+    blocked = EFFECTS["floor_multipath"]({"2.delay": 1.9, "2.height": 0.1}).inject(clean)
+    assert all(effect.name != "floor_multipath" for effect in on_the_floor(blocked))
+
+
+def test_what_is_found_in_the_air_does_not_depend_on_the_floor(clean, landed):
+    assert [e.values for e in effects_of(attribute([landed], GroundTruth(), undeclared=False).selection)] == [
+        e.values for e in effects_of(attribute([clean], GroundTruth(), undeclared=False).selection)
+    ]
+
+
+def test_a_path_that_is_an_estimate_tells_nothing_of_the_floor(clean):
+    reference = Nothing()
+    part = residuals(reference.prepare(clean), reference, EffectSet())
+    assert near_floor(part) == {}

@@ -47,6 +47,13 @@ def test_the_loop_is_closed(flight, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_what_is_late_on_the_floor_goes_to_the_file_whatever_the_air_says(flight):
+    result = diagnose([effect_of("floor_multipath", True, 0).inject(flight)])
+    assert result.effects.name == "floor_multipath" and not result.refused
+    assert result.after["pooled"]["rmse_3d"] == result.before["pooled"]["rmse_3d"]
+
+
+@pytest.mark.slow
 def test_without_truth(flight):
     result = diagnose([effect_of("anchor_delay", True, 4).inject(flight)], reference=Nothing())
     assert {finding.effect.name for finding in result.findings if finding.added} == {"anchor_position", "anchor_delay"}

@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.offline import poses_of, run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.detectors import Detection
-from uwb_tdoa_tools.diagnosis.judging import Baseline, Case, _gain_interval, borne_out, compare, cross_fitted, score, useful, why_not
+from uwb_tdoa_tools.diagnosis.judging import Baseline, Case, _gain_interval, borne_out, compare, cross_fitted, judge, score, useful, why_not
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
 from uwb_tdoa_tools.studies.diagnosis.grammar import Undeclared
@@ -119,12 +119,6 @@ def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_n
     assert kept.detections == () and "does not make the filter better" in kept.refused[-1].why
 
 
-def test_noise_on_the_floor_is_never_added(flights, attribution):
-    """An estimate that is wrongly there would believe no TDOA, and stay."""
-    floor = Detection(EFFECTS["floor_multipath"]({"size": 17.0}), "tdoa", {})
-    assert useful(replace(attribution, detections=(floor,)), flights, Baseline(NONE)).detections == ()
-
-
 def test_a_rehearsal_at_the_poses_of_the_run_itself_is_that_run(flights):
     effects = EffectSet((AnchorDelay({"1": 0.3}), TagLeverArm({"x": 0.1, "z": 0.1})))
     run = run_offline(flights[0], None, Corrector(flights[0].anchors, effects))
@@ -155,6 +149,29 @@ def test_before_and_after_with_intervals(flights):
     low, high = after["pooled"]["rmse_3d_gain_ci"]
     assert 0.4 < low < high < 1.0
     assert [row["flight"] for row in after["runs"]] == [flight.name for flight in flights]
+    for side in (before, after):
+        for row in side["runs"]:
+            assert row["phases"]["in_the_air"]["rmse_3d"] == pytest.approx(row["rmse_3d"])
+            assert {"first_3_s", "last_3_s", "whole"} <= set(row["phases"])
+        assert side["pooled"]["phases"]["whole"]["runs"] == len(flights)
+    first, second = (side["pooled"]["phases"]["first_3_s"]["rmse_3d"] for side in (before, after))
+    assert second < first
+
+
+def test_halves_of_a_flight_count_what_is_before_and_after_the_fit_once(flights):
+    single = attribute(flights[:1], TRUTH, undeclared=False)
+    cases, run = cross_fitted(single, flights[:1], NONE, (), ()), Baseline(NONE).run(flights[0])
+    parts, whole = [score(case, run).phases() for case in cases], score(Case(flights[0], NONE), run).phases()
+    for name, figures in whole.items():
+        assert sum(part[name]["duration"] for part in parts) == pytest.approx(figures["duration"]), name
+        assert figures["count"] <= sum(part[name]["count"] for part in parts) <= figures["count"] + 10, name  # on an edge, in both
+
+
+def test_without_flights_held_out_it_is_said_that_the_choice_was_made_on_the_same(flights, attribution):
+    chosen_on = "chosen on all of them"
+    baseline = Baseline(NONE)
+    assert chosen_on in judge(attribution, flights, (), baseline, NONE, TRUTH)[2]
+    assert chosen_on not in judge(attribution, flights[:1], flights[1:], baseline, NONE, TRUTH)[2]
 
 
 def test_without_truth_positions_and_delays_of_anchors_are_applied_if_they_explain_the_innovations():

@@ -59,6 +59,17 @@ def test_the_verdict_has_the_error_before_and_after_its_interval_and_how_many_fl
     assert any("flights that took no part in the fit: 2 flights" in sentence for sentence in found.more)
 
 
+def test_the_report_tells_every_phase_of_the_judged_flights(result, page):
+    before, after = (side["pooled"]["phases"]["first_3_s"]["rmse_3d"] for side in (result.before, result.after))
+    assert after < before
+    (sentence,) = [one for one in verdict(result).sentences if one.startswith("Outside of that, before and after: ")]
+    assert f"first 3 s {100 * before:.1f} cm (NEES " in sentence and f" to {100 * after:.1f} cm (NEES " in sentence
+    text = said(page)
+    assert "From the floor to the floor" in text and f"{100 * before:.1f} → {100 * after:.1f}; NEES" in text
+    flat = " ".join(result.as_text().split())
+    assert sentence in flat
+
+
 @pytest.mark.parametrize("gain", [[-0.1, 0.4], [0.0, 0.4], None])
 def test_a_gain_that_may_be_chance_is_not_called_one(result, gain):
     found = verdict(judged(result, {"one": 0.3}, {"one": 0.25}, gain))
@@ -162,6 +173,18 @@ def test_entries_are_ordered_by_worth_those_not_added_last(result):
 def test_worth_in_words(result, worth, words, matters):
     (entry,) = entries(replace(result, findings=[finding(delay(), worth=worth)]))
     assert worth_in_words(entry) == words and entry.matters == matters
+
+
+def test_what_is_on_the_floor_alone_is_not_judged_by_the_air(result):
+    values = {"2.height": 0.1, "2.noise": 0.3, "2.delay": 2.8}
+    floor = replace(finding(EFFECTS["floor_multipath"](values, {"2.delay": 0.1}), worth=None), on_floor=True)
+    changed = judged(result, {"one": 0.3}, {"one": 0.3}, [-0.1, 0.1], findings=[floor])
+    assert verdict(changed).headline.startswith("The position error (3D RMSE) stays 30.0 cm: what is added acts near the floor alone")
+    (entry,) = entries(changed)
+    assert worth_in_words(entry) == "not told by errors in the air" and entry.values.startswith("2.delay = 2.8 ± 0.1, ")
+    told = SmoothTerm({"2.c0": 0.0, "2.c1": -1.5}, {"2.c1": 0.1}, covariate="height", form="anchor", knots=(0.0, 0.1, 1.0), shape="step")
+    (entry,) = entries(judged(result, {"one": 0.3}, {"one": 0.3}, None, findings=[replace(finding(told, False, None), on_floor=True)]))
+    assert "near the floor is told, and not taken out" in entry.why_not
 
 
 def test_what_else_it_could_be_stands_in_one_place(result):
@@ -316,7 +339,7 @@ def test_every_abbreviation_is_spelled_out_and_every_effect_explained(all_pages)
 def test_a_row_is_either_worth_something_or_says_why_it_is_not_in_the_file(result):
     findings = [
         finding(delay(), worth=0.03),
-        finding(EFFECTS["floor_multipath"]({"size": 2.0}, {"size": 0.1}), False, None, tried=False),
+        finding(EFFECTS["floor_multipath"]({"2.delay": 2.0}, {"2.delay": 0.1}), False, None, tried=False),
     ]
     changed = replace(
         result, findings=findings, refused=[Refused("floor_multipath", "does not make the filter better")]

@@ -115,6 +115,50 @@ def test_report_of_one_flight(flight, bag, tmp_path, capsys):
     assert table[1].startswith(flight.name) and f"{row['rmse_3d']:.3f}" in table[1]
 
 
+def test_report_of_the_phases_of_one_flight_and_of_several(bag, tmp_path, capsys):
+    one = report([bag, "--no-bias"], tmp_path)["runs"][0]
+    expected = ["at_rest_before", "first_3_s", "to_0.3_m", "in_the_air", "last_3_s", "at_rest_after", "whole"]
+    assert list(one["phases"]) == expected and one["part"] == "in_the_air"
+    assert one["phases"]["in_the_air"]["rmse_3d"] == pytest.approx(one["rmse_3d"])
+    assert 0.0 < one["phases"]["at_rest_before"]["rmse_3d"] < 0.1 and one["phases"]["at_rest_after"]["nees_mean"] < 9.0
+    assert one["phases"]["at_rest_before"]["without_estimate"] > 0.0 == one["phases"]["last_3_s"]["without_estimate"]
+    assert 0.0 < one["ready_delay"] < 1.0
+    capsys.readouterr()
+    told = report([bag, bag, "--no-bias", "--markdown", tmp_path / "table.md"], tmp_path)
+    assert [run["phases"] for run in told["runs"]] == [one["phases"]] * 2
+    for name, figures in told["pooled"]["phases"].items():
+        assert figures["runs"] == 2 and figures["rmse_3d"] == pytest.approx(one["phases"][name]["rmse_3d"]), name
+    for text in (capsys.readouterr().out, (tmp_path / "table.md").read_text()):
+        for title in ("at rest before, 2 s", "first 3 s", "last 3 s", "at rest after", "whole recording"):
+            assert title in text
+
+
+def test_a_smoothed_estimate_has_phases_too(bag, tmp_path):
+    phases = report([bag, "--no-bias", "--smooth"], tmp_path)["runs"][0]["phases"]
+    assert phases["at_rest_before"]["count"] > 50 and phases["at_rest_after"]["rmse_3d"] < 0.1
+
+
+def test_a_recording_of_a_rover_is_judged(flight, tmp_path, capsys):
+    """It never exceeds 0.3 m."""
+    down = [0.0, 0.0, 1.2]
+    anchors = replace(flight.anchors, positions=flight.anchors.positions - down)
+    truth = replace(flight.truth, p=np.minimum(flight.truth.p, [np.inf, np.inf, 1.2]) - down)
+    write_bag(replace(flight, anchors=anchors, truth=truth), tmp_path / "rover")
+    (row,) = report([tmp_path / "rover", "--no-bias"], tmp_path)["runs"]
+    assert row["part"] == "moving" and row["phases"]["moving"]["count"] > 100 and "in_the_air" not in row["phases"]
+    assert "moving" in capsys.readouterr().out
+
+
+def test_what_was_kept_before_there_were_phases_is_refused(bag, tmp_path, capsys):
+    kept = tmp_path / "kept"
+    assert main([str(bag), "--no-bias", "--resume", str(kept)]) == 0
+    first, line = map(json.loads, kept.read_text().splitlines())
+    del first["asked"]["version of the figures"], line["result"]["phases"]
+    kept.write_text(f"{json.dumps(first)}\n{json.dumps(line)}\n")
+    assert main([str(bag), "--no-bias", "--resume", str(kept)]) == 2
+    assert "its results were made with another version of the figures" in capsys.readouterr().err
+
+
 def test_corrects_with_what_bias_node_takes_unasked(flight, bag, tmp_path, capsys):
     effects = tmp_path / "effects.yaml"
     EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.1}),)).to_yaml(effects)
@@ -246,7 +290,7 @@ def test_table_beside_others(flight, bag, tmp_path):
         "other,firmware,std,0.1,0.1,0.1,0.5,0.0,False\n"
     )
     assert main([str(bag), "--markdown", str(tmp_path / "table.md"), "--beside", str(peers)]) == 0
-    header, rule, row = (line.strip("| ").split(" | ") for line in (tmp_path / "table.md").read_text().splitlines())
+    header, rule, row = (line.strip("| ").split(" | ") for line in (tmp_path / "table.md").read_text().splitlines()[:3])
     assert header[0] == "flight" and header[-2:] == ["firmware std", "firmware robust"] and len(rule) == len(header)
     assert row[0] == flight.name and row[-2:] == ["0.173", "diverged"]
     peers.write_text("name,error\nx,1\n")

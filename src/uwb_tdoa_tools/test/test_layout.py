@@ -16,12 +16,13 @@ PACKAGES = ORDER[1:]
 ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
     uwb_tdoa_bias.foundation.ros uwb_tdoa_bias.foundation.ros_anchors uwb_tdoa_bias.foundation.ros_frames
-    uwb_tdoa_bias.foundation.ros_parameters uwb_tdoa_bias.foundation.ros_streams uwb_tdoa_bias.foundation.ros_wire
+    uwb_tdoa_bias.foundation.ros_parameters uwb_tdoa_bias.foundation.ros_spinning
+    uwb_tdoa_bias.foundation.ros_streams uwb_tdoa_bias.foundation.ros_wire
     uwb_tdoa_ekf.compile_nodes uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters
     uwb_tdoa_ekf.launching
     uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.localization_node uwb_tdoa_ekf.outputs
     uwb_tdoa_ekf.monitoring.health
-    uwb_tdoa_tools.benchmark.nodes uwb_tdoa_tools.benchmark.rates uwb_tdoa_tools.benchmark.source
+    uwb_tdoa_tools.benchmark.graph uwb_tdoa_tools.benchmark.load uwb_tdoa_tools.benchmark.nodes uwb_tdoa_tools.benchmark.rates uwb_tdoa_tools.benchmark.source
     uwb_tdoa_tools.benchmark.suite uwb_tdoa_tools.commands.bench uwb_tdoa_tools.commands.demo
     uwb_tdoa_tools.commands.record uwb_tdoa_tools.commands.replay uwb_tdoa_tools.live.demo uwb_tdoa_tools.live.follow
     uwb_tdoa_tools.live.followed_nodes uwb_tdoa_tools.live.listen
@@ -46,12 +47,14 @@ KEYS = {
     "onnxruntime": ("python3-onnxruntime-pip", "onnxruntime"),
     "pytest": ("python3-pytest", "pytest"),
     "rosbags": ("python3-rosbags-pip", "rosbags"),
+    "rotorpy": (None, "rotorpy"),  # an oracle of tests, for who wants it
     "scipy": ("python3-scipy", "scipy"),
     "sklearn": ("python3-sklearn", "scikit-learn"),
     "threadpoolctl": ("python3-sklearn", "scikit-learn"),  # which needs it itself
     "tqdm": ("python3-tqdm", "tqdm"),
     "yaml": ("python3-yaml", "PyYAML"),
 }
+STARTED = {"uwb_tdoa_ekf": {"ros2bag", "ros2launch", "rviz2"}}  # by launch files, and what starts these
 RUNNERS = {"ament_flake8", "ament_pep257", "python3-pytest-xdist"}  # of the tests, which import them not, or where they are
 
 
@@ -186,7 +189,7 @@ def keys(names):
 @pytest.mark.parametrize("package", PACKAGES)
 def test_package_xml_declares_what_is_imported_and_nothing_else(package):
     used = keys(needed(package, package, "launch") | names_of_messages(package))
-    assert declared(package, "depend", "exec_depend") == used
+    assert declared(package, "depend", "exec_depend") == used | STARTED.get(package, set())
     tests = keys(needed(package, "test")) - used
     assert declared(package, "test_depend") - RUNNERS == tests
 
@@ -200,6 +203,8 @@ def test_setup_py_declares_what_is_imported_and_nothing_else(package):
     extras = ast.literal_eval(given["extras_require"])
     tests = {re.match(r"[\w.-]+", text)[0] for text in extras.pop("test")}
     assert tests == {"hypothesis", "pytest"} <= needed(package, "test")
+    oracle = {re.match(r"[\w.-]+", text)[0] for text in extras.pop("oracle", ())}  # of tests that are skipped without it
+    assert oracle <= needed(package, "test")
     required = [*ast.literal_eval(given["install_requires"]), *(text for some in extras.values() for text in some)]
     names = {re.match(r"[\w.-]+", text)[0] for text in required} - {"setuptools"}
     imported = needed(package, package)

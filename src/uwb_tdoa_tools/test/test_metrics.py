@@ -49,7 +49,7 @@ def test_airborne_is_from_the_first_to_the_last_instant_above_the_limit():
 def test_errors_are_against_the_truth_interpolated_to_the_estimate():
     truth = straight(rate=2.0)  # much coarser than the estimate, which is off its grid
     odometry = estimate(truth, constant(0.1, -0.2, 0.3))
-    t, error, covariance = position_errors(odometry, truth)
+    t, error, covariance = position_errors(odometry, truth, *airborne(truth))
     assert t[0] >= 1.0 and t[-1] <= 9.0 and len(t) == 801
     np.testing.assert_allclose(error, np.tile([0.1, -0.2, 0.3], (801, 1)), atol=1e-9)
     assert covariance.shape == (801, 3, 3)
@@ -60,7 +60,7 @@ def test_what_lies_in_a_hole_of_the_truth_has_no_error():
     odometry = estimate(truth, constant(0.1, -0.2, 0.3))
     known = (truth.t < 4.0) | (truth.t > 6.0)
     truth = Truth(truth.t[known], truth.p[known] ** 2, truth.q[known])  # nothing to be interpolated
-    t, _, _ = position_errors(odometry, truth)
+    t, _, _ = position_errors(odometry, truth, *airborne(truth))
     assert np.sum(t <= 4.0) > 100 and np.sum(t >= 6.0) > 100 and not np.any((t > 4.02) & (t < 5.98))
 
 

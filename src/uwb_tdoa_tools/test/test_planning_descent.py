@@ -1,6 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.planning import descent
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.descent import descend, errors_and_slopes, failing_and_slopes
 from uwb_tdoa_tools.planning.goal import UNUSABLE, Goal
@@ -86,5 +91,45 @@ def test_anchors_that_locate_nothing_have_no_slopes():
     x, points = low.start(np.random.default_rng(0).random((6, 2))), POINTS * [1, 1, 0] + [0, 0, 1]
     errors, slopes = errors_and_slopes(goal, low, x, points)
     assert (errors == UNUSABLE).all() and not slopes.any()
-    share, along = failing_and_slopes(goal, low, np.zeros(6 * low.width), POINTS)
-    assert share == 1.0 and not along.any()
+    with pytest.raises(InputError, match="plane"):
+        failing_and_slopes(goal, low, x, points)
+    with pytest.raises(InputError, match="hull"):
+        failing_and_slopes(goal, low, np.zeros(6 * low.width), points)  # all in one place
+
+
+@pytest.mark.parametrize("objective", ["worst", "mean"])
+def test_a_descent_leaves_a_start_at_which_the_goal_cannot_be_told(objective):
+    """A slope of zero that was made up there would be a valley: the descent would be over before it began."""
+    goal, layout, x = case(objective=objective)
+    level = np.column_stack([np.linspace(0.05, 0.95, 6), np.full(6, 0.5)])  # round the walls, half-way up
+    x = layout.start(level)
+    goal = replace(goal, points=POINTS * [1, 1, 0] + [0, 0, 1.5])
+    with pytest.raises(InputError):
+        failing_and_slopes(goal, layout, x, goal.points)
+    found = descend(goal, layout, goal.points, x, 15)
+    assert goal.score(layout.anchors(x)) >= UNUSABLE
+    assert goal.score(layout.anchors(found)) < 1.0
+
+
+@pytest.mark.parametrize("objective", ["worst", "mean"])
+def test_a_descent_does_not_end_where_the_goal_cannot_be_told(objective, monkeypatch):
+    """Told only within 0.02 of the start, which the first step leaves."""
+    goal, layout, x = case(objective=objective, criterion="round")
+    before = goal.judge(layout.anchors(x))[objective]
+
+    def told_near(goal, layout, at, points):
+        if np.abs(at - x).max() > 0.02:
+            raise InputError("too far")
+        return failing_and_slopes(goal, layout, at, points)
+
+    monkeypatch.setattr(descent, "failing_and_slopes", told_near)
+    found = descend(goal, layout, POINTS, x, 15)
+    assert 1e-4 < np.abs(found - x).max() <= 0.02
+    assert goal.judge(layout.anchors(found))[objective] < before
+
+
+def test_a_start_that_no_shaking_helps_is_given_back():
+    goal, _, _ = case()
+    low = Layout(Places([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3))
+    x = low.start(np.random.default_rng(0).random((6, 2)))
+    np.testing.assert_array_equal(descend(goal, low, POINTS, x, 15), x)

@@ -14,7 +14,9 @@ from uwb_tdoa_ekf.estimator import VERDICTS  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import OK, WARN, Health  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_tools.scoring.metrics import airborne  # noqa: E402
+from uwb_tdoa_tools.studies import aids  # noqa: E402
 from uwb_tdoa_tools.studies.aids import FAULTS, ONSET, bounds, of_four, only  # noqa: E402
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight  # noqa: E402
 
 # What the filter copes with is no reason to warn: steps, single wrong ranges, and a barometer that drifts.
@@ -74,3 +76,14 @@ def test_four_anchors_keep_their_tdoas_and_a_height_makes_their_bound_smaller(fl
     plain, aided, all_of_them = bounds([few], np.inf), bounds([few], 0.02), bounds([flight], np.inf)
     assert (aided < plain).all() and aided[2] < 0.02 and all_of_them[3] < plain[3]
     assert plain[3] == pytest.approx(np.linalg.norm(plain[:3]))
+
+
+def test_the_table_of_worth_tells_the_floor_too(capsys, monkeypatch):
+    monkeypatch.setattr(aids, "SETS", ((), ("height",)))
+    hop = simulate(SimulationConfig(seed=1, duration=14.0, floor_time=1.5, imu_rate=200.0, truth_rate=50.0, height_noise=0.02))
+    aids._worth([hop], FilterConfig(), aids.SETS)
+    head, rule, *rows = capsys.readouterr().out.splitlines()
+    assert head.endswith("| at rest before, 2 s | first 3 s | last 3 s | at rest after |")
+    assert len({row.count("|") for row in (head, rule, *rows)}) == 1
+    for row in rows[:2]:
+        assert all(0.0 < float(cell) < 1.0 for cell in row.strip("| ").split(" | ")[-4:])

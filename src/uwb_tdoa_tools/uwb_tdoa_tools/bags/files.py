@@ -102,6 +102,7 @@ def _opened(path, folder, salvage):
                 check_whole(folder)
         reader = Reader(readable)
         reader.open()
+        _take_qos_of_metadata(reader)
         reader.remarks = remarks
         for connection in reader.connections:
             if not re.fullmatch(r"[/\w]+", connection.topic) or not re.fullmatch(r"\w+/\w+/\w+", connection.msgtype):
@@ -111,6 +112,15 @@ def _opened(path, folder, salvage):
     except Exception as error:  # rosbags raises whatever its parsers run into
         raise _damaged(path, error) from error
     return reader
+
+
+def _take_qos_of_metadata(reader):
+    """Have data files offer each topic as metadata.yaml says: rosbags skips the messages of a topic of which they say another QoS."""
+    told = {(one.topic, one.msgtype): one.ext.offered_qos_profiles for one in reader.connections}
+    for file in getattr(reader.storage, "storages", ()):
+        for k, one in enumerate(file.connections):
+            qos = told.get((one.topic, one.msgtype), one.ext.offered_qos_profiles)
+            file.connections[k] = one._replace(ext=one.ext._replace(offered_qos_profiles=qos))
 
 
 def messages(path, reader, connections):

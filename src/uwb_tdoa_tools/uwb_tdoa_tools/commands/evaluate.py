@@ -13,7 +13,7 @@ from .. import cli, options, parallel
 from ..results_file import asked_of
 from ..scoring import table
 from ..scoring.judge import Judge, results
-from ..scoring.metrics import Pool, as_json
+from ..scoring.metrics import FIGURES, Pool, as_json
 
 NO_MATTER = ("flights", "survey", "json", "markdown", "beside", "resume", "jobs", "dask")  # to what is kept of a flight
 
@@ -27,7 +27,8 @@ def parser():
     """Its options."""
     made = cli.parser(
         "evaluate",
-        "Errors of the estimate against ground truth over the airborne part (truth z > 0.3 m), in metres.\n"
+        "Errors of the estimate against ground truth, in metres: in the air (truth z > 0.3 m), and in each phase of the recording,\n"
+        "at rest before and after too (without: s with no estimate; step: the largest jump of the error between two estimates).\n"
         "Runs bias correction and filter here, as the nodes would, or takes a recorded odometry (exit code 1 if TDOAs were\n"
         "late for it, as far as uwb/residual was recorded too).",
         "evaluate flight.bag",
@@ -96,24 +97,23 @@ def _evaluate(args):
     if not args.odometry:
         print(f"correcting with: {'+'.join(part.name for part in (judge.effects, judge.network) if part) or 'nothing'}")
     print(table.head())
-    rows, pool = [], Pool()
-    asked = asked_of(args, NO_MATTER, ("effects", "config", "model"))
+    told, pool = [], Pool()
+    asked = asked_of(args, NO_MATTER, ("effects", "config", "model")) | {"version of the figures": FIGURES}
     for result in results(judge, found, args.resume, asked, args.jobs, args.dask):
         pool.add(result)
-        rows += [result.row] if args.json or args.markdown else []  # else nothing grows with the number of flights
+        told += [result] if args.json or args.markdown else []  # else nothing grows with the number of flights
         tqdm.write(table.line(result.row))
     together = pool.figures()
     if len(found) > 1:
         print(table.line(together))
         print(f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
               f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
+    print("", *table.lines_of_phases(together["phases"] if len(found) > 1 else result.phases), sep="\n")
     if args.json:
-        report = {"runs": [as_json(row) for row in rows], "pooled": as_json(together)}
-        cli.write_json(args.json, report)
+        cli.write_json(args.json, {"runs": [one.as_json() for one in told], "pooled": as_json(together)})
     if args.markdown:
-        rows += [together] * (len(found) > 1)
         others = table.read_others(args.beside) if args.beside else {}
-        Path(args.markdown).write_text(table.markdown(rows, others))
+        Path(args.markdown).write_text(table.markdown_of(told, pool, others))
     if late := judge.late_tdoas():
         cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
                 "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip

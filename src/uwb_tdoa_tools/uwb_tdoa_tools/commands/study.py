@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from .. import cli
-from ..studies import aids, crazyflie, noise, recalibrating, scale, surveying
+from ..studies import aids, crazyflie, noise, recalibrating, scale, situations, surveying
 from ..studies.checking import figures as checking, in_flight
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
@@ -24,6 +24,7 @@ STUDIES = {
     "random-splits": splits,
     "recalibrating": recalibrating,
     "scale": scale,
+    "situations": situations,
     "spin": spin,
     "surveying": surveying,
 }
@@ -43,6 +44,7 @@ of measured flights: flights/, util/, surveys/.
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
   scale            processor time and memory over flights, anchors and effects (docs/speed.md)
+  situations       where a tag can be and what can happen to it, simulated (docs/reliability.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
   surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
 """
@@ -74,6 +76,7 @@ def parser():
         "study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "study recalibrating --data DATA --only const1",
         "study scale --out scale/",
+        "study situations --resume situations.jsonl",
         "study spin --out spin.png",
         "study surveying --data DATA --draws 5 --only const1",
     )

@@ -1,16 +1,18 @@
 """From flights to a model: which effects are there, how large, how sure, and what else it could be."""
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects.covariates import UPWARDS
 from uwb_tdoa_bias.foundation.anchors import Anchors
 
 from ..parallel import in_one_thread
 from .channels import CHANNELS, residuals
 from .detectors import DETECTORS
+from .domains import Seen
 from .findings import Finding, Refused
 from .over_flights import of_one, shares
 from .regression.confounding import alternatives
@@ -27,6 +29,7 @@ MAPS_GAIN, MAPS_SURE = 20.0, 3.0  # held-out log-likelihood, twice, and its t va
 DISGUISED = 4  # times that what disguises itself as noise is searched for before noise is measured
 SAME_STORY = 0.05  # share of what a model explains that a simpler one may explain less
 FOR_MAPS = 3  # flights: a map of fewer is of their paths, and misleads others; two that fly alike bear each other out
+ON_FLOOR = 0.5  # m by which a function of UPWARDS changes at least near the floor, to be told
 MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
 
 
@@ -34,7 +37,8 @@ MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring
 class Attribution:
     """residuals, remaining : [{channel: ChannelResidual}] under the base model and under the whole; selection : Selection;
     detections : (Detection, ...); candidates : all declared Candidates; refused : (Refused, ...); names : of the flights; alone :
-    ((name of a flight, Selection), ...) of what one flight shows and the others do not."""
+    ((name of a flight, Selection), ...) of what one flight shows and the others do not; floor : Selection of what there is near the
+    floor, beside what is found in the air; None if nobody knows; floor_names : of the flights of its Table."""
 
     residuals: list
     remaining: list
@@ -44,11 +48,24 @@ class Attribution:
     refused: tuple
     names: tuple
     alone: tuple = ()
+    floor: Selection | None = None
+    floor_names: tuple = ()
+
+    @cached_property
+    def seen(self):
+        """Seen, of what the residuals hold."""
+        return Seen(self.residuals)
 
     @property
     def effects(self):
-        """All Effects found: tuple."""
-        return (*effects_of(self.selection), *(detection.effect for detection in self.detections))
+        """All Effects found that may be taken out: tuple."""
+        in_the_air = self.seen.limited((*effects_of(self.selection), *(detection.effect for detection in self.detections)))
+        return (*in_the_air, *self.of_floor)
+
+    @property
+    def of_floor(self):
+        """Effects found near the floor that the filter may be told: tuple. Functions without a name would go on in the air."""
+        return tuple(effect for effect in effects_of(self.floor) if effect.weighed) if self.floor else ()
 
     def of(self, kept):
         """The Attribution of what was Kept."""
@@ -58,6 +75,8 @@ class Attribution:
         """[Finding], those by regression first, those of one flight alone last."""
         out = _findings(self.selection, self.candidates, self.names)
         out += map(_of_detection, self.detections)
+        if self.floor:
+            out += [replace(finding, on_floor=True) for finding in _findings(self.floor, [], self.floor_names)]
         for name, selection in self.alone:
             out += [replace(finding, flight=name) for finding in _findings(selection, [], (name,))]
         return out
@@ -70,7 +89,8 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
     kinds : names of the declared effects to look for, None for all; undeclared : look for functions without a name too;
     progress() is called now and then; over(function, items) : as map, but for the time and the process in which each is done.
     """
-    detectors = [detector for name, detector in DETECTORS.items() if kinds is None or name in kinds]
+    wanted = [detector for name, detector in DETECTORS.items() if kinds is None or name in kinds]
+    detectors = [detector for detector in wanted if not detector.on_floor]
 
     def at(model):
         return residuals_of(flights, reference, EffectSet((*base.effects, *model)), progress, over)
@@ -84,7 +104,7 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
         table = _linearised(current, declared, model)
         tables.append(table)
         if inflation is None:
-            inflation = _inflation(table, declared, [detector for detector in detectors if detector.disguises])
+            inflation = _inflation(table, declared, partial(_search, [detector for detector in detectors if detector.disguises]))
         progress()
         selection = select(table, declared, inflation, search, progress=progress)
         model = effects_of(selection)
@@ -113,7 +133,37 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
     alone, names = [], tuple(flight.name for flight in flights)
     if undeclared and len(flights) > 1 and all(reference.positions_known):
         alone = [(names[k], own) for k, own in of_one(remaining, inflation, _views, search, over)]
-    return Attribution(under_base, remaining, selection, found, declared, tuple(refused), names, tuple(alone))
+    near = [(name, part) for name, part in zip(names, map(near_floor, remaining)) if part]
+    floor = None
+    if near:
+        floor = on_floor([part for _, part in near], [one for one in wanted if one.on_floor], undeclared, refused, progress)
+    floor_names = tuple(name for name, _ in near)
+    return Attribution(
+        under_base, remaining, selection, found, declared, tuple(refused), names, tuple(alone), floor, floor_names
+    )  # fmt: skip
+
+
+def near_floor(residuals):
+    """{channel: ChannelResidual} of what is near the floor in the residuals of a flight; {} of nothing."""
+    parts = {name: part.of_floor() for name, part in residuals.items()}
+    return {name: part for name, part in parts.items() if part is not None}
+
+
+def on_floor(residuals, detectors, undeclared, refused, progress=lambda: None):
+    """Selection of what [{channel: ChannelResidual}] near the floor show: effects with a name, or, where there is none, functions of what
+    changes with the height: at one place all else is the same.
+
+    A few seconds, of errors of metres, are looked at by themselves: among all that is in the air they would pass for outliers, or pull
+    at what is fitted there."""
+    table = table_of(residuals)
+    found = select(table, [], _inflation(table, [], partial(_search, detectors)), partial(_search, detectors), progress=progress)
+    if undeclared and not found.chosen:
+        views = {name: [view for view in views if view.covariate in UPWARDS] for name, views in _views(table).items()}
+        scan = Scan(table, views)
+        inflation = _inflation(table, [], lambda *fitted: scan(*fitted)[:1])
+        found = select(table, [], inflation, scan=scan, progress=progress)
+        found = found.only([one for one in found.chosen if _is_large(one, found)])
+    return _that_hold_on_other_data(found, refused)
 
 
 def effects_of(selection):
@@ -215,12 +265,18 @@ def _linearised(found, candidates, model):
     return table.with_contribution([(term.effect, term.columns) for term in own])
 
 
-def _inflation(table, declared, detectors):
-    """(groups,) loss of independence, on the residual of a fit with all that is declared, and with what `detectors` find."""
+def _is_large(candidate, selection):
+    """Whether a chosen Candidate moves what it moves by ON_FLOOR: less is of the place, of which a few seconds tell nothing."""
+    part = selection.table.matrix(candidate.columns) @ selection.fit.values(candidate.columns)
+    return np.ptp(part) > ON_FLOOR
+
+
+def _inflation(table, declared, search):
+    """(groups,) loss of independence, on the residual of a fit with all that is declared, and with what `search`, as of `select`, finds."""
     known, model = list(declared), fit(table, columns_of(declared))
     for _ in range(DISGUISED):
         alike = replace(model, inflation=np.ones_like(model.inflation))
-        found = [candidate for detector in detectors for candidate in detector.search(table, alike, known)]
+        found = search(table, alike, known)
         if not found:
             break
         known += found

@@ -94,10 +94,10 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     before, after, judged_on = judged
     refused = [*attribution.refused, *kept.refused]
     why_not = judging.why_not(before, after, max(reference.shift_std(flight.name).max() for flight in flights)) if reference.judges else None
-    if why_not and len(effects) > len(base):
+    if why_not and len(effects) > len(base) + len(attribution.of_floor):  # of those it tells nothing
         refused.append(Refused("all", why_not))
-        effects, after, kept = base, before, replace(judging.nothing(attribution), worth=kept.worth)
-        model = attribution.of(kept)
+        after, kept = before, replace(judging.nothing(attribution), worth=kept.worth)
+        effects, model = merged(base, attribution.of_floor, kept.selection), attribution.of(kept)
     remaining = residuals_of(flights, reference, effects, saying("judging"), over)
     baseline.prepare(flights, saying("judging"), over)
     runs = [baseline.run(flight) for flight in flights]
@@ -133,7 +133,10 @@ def _findings(attribution, model, kept):
         worth = [kept.worth[each] for each in tried if each in kept.worth]
         return replace(finding, added=added, worth=float(np.sum(worth)) if worth else None)
 
-    out = [judged(finding, finding.effect.usable) for finding in model.findings()]
+    def usable_there(finding):
+        return finding.effect.weighed if finding.on_floor else finding.effect.usable
+
+    out = [judged(finding, usable_there(finding)) for finding in model.findings()]
     added = {finding.key for finding in out}
     return out + [judged(finding, False) for finding in attribution.findings() if finding.key not in added]
 

@@ -17,7 +17,7 @@ class Finding:
     for what a detector found in what is left; added : is in the model that is written; worth : m by which the filter's 3D
     RMSE is larger without it, None if nobody tried; together_with : covariates of the same candidate; shares : (Share, ...) of
     `over_flights`, how much of it each flight shows; flight : name of the only flight that shows it, None for what was fitted to
-    all.
+    all; on_floor : was found near the floor, beside all that was found in the air.
     """
 
     effect: Effect
@@ -31,6 +31,7 @@ class Finding:
     together_with: tuple = ()
     shares: tuple = ()
     flight: str | None = None
+    on_floor: bool = False
 
     @property
     def declared(self):

@@ -14,6 +14,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.estimator import VERDICTS
 from uwb_tdoa_ekf.offline import poses_of, run_offline
 
+from ..scoring.by_phase import EVERYTHING
 from ..scoring.metrics import Score, as_json, pooled
 from .attribution import effects_of, recurs
 from .calibration import calibrate
@@ -32,17 +33,20 @@ SURE = 4.0
 DRIFTS = ("line", "beyond", "below", "parabola")  # shapes of a function of the time that may come again, as a clock warms up
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
 WORTH_OF_ONE = 0.05  # share of the error by which it must grow, for the effect to stay, if a single flight shows it: others differ
+SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
 SECOND = "give a second flight with this one"
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A flight to judge on, and an EffectSet that it took no part in fitting. spans : ((first, last), ...) s, None for all."""
+    """A flight to judge on, and an EffectSet that it took no part in fitting. spans : ((first, last), ...) s, None for all; reach : the
+    same for phases, which those at either end of the flight go on to its begin and its end for."""
 
     flight: object
     effects: EffectSet
     spans: tuple | None = None
+    reach: tuple = EVERYTHING
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +77,7 @@ def cross_fitted(attribution, flights, base, candidates, detections, most=None):
     them, evenly taken, if there are more."""
     table, selection = attribution.selection.table, attribution.selection
     if len(flights) > 1:
-        parts = [(k, table.flight != k, None) for k in range(len(flights))]
+        parts = [(k, table.flight != k, {}) for k in range(len(flights))]
     else:
         # in turns, so that both parts are of all of the flight
         start, since = float(flights[0].tdoa.t[0]), table.t - table.t.min()
@@ -82,12 +86,14 @@ def cross_fitted(attribution, flights, base, candidates, detections, most=None):
         edges = start + table.t.min() + length * np.arange(number.max() + 2)
         edges[-1] = start + table.t.max()
         spans = list(zip(edges[:-1].tolist(), edges[1:].tolist()))
-        parts = [(0, number % 2 != k, tuple(spans[k::2])) for k in range(2)]
+        reach = [(-np.inf, spans[0][1]), *spans[1:-1], (spans[-1][0], np.inf)] if len(spans) > 1 else EVERYTHING
+        parts = [(0, number % 2 != k, {"spans": tuple(spans[k::2]), "reach": tuple(reach[k::2])}) for k in range(2)]
     out, columns = [], columns_of(candidates)
-    for k, rows, spans in parts[:: -(-len(parts) // (most or len(parts)))]:
+    for k, rows, which in parts[:: -(-len(parts) // (most or len(parts)))]:
         others = replace(selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows))
         found = usable([*effects_of(others), *(detection.effect for detection in detections)])
-        out.append(Case(flights[k], EffectSet((*base.effects, *found.effects)), spans))
+        fitted = [number for number in range(len(flights)) if number != k] or [k]
+        out.append(Case(flights[k], EffectSet((*base.effects, *attribution.seen.limited(found.effects, fitted))), **which))
     return out
 
 
@@ -252,6 +258,7 @@ def judge(attribution, flights, holdout, baseline, effects, reference, progress=
         on = "each half of the flight, every other 5 s, with effects fitted to the other"
         if len(flights) > 1:
             on = "each flight with effects fitted to the others"
+        on += SELECTED_ON
     else:
         cases = [Case(flight, effects) for flight in flights]
         on = "the flights that were fitted, by their innovations alone"
@@ -281,7 +288,7 @@ def why_not(before, after, shift_std):
 
 
 def compare(cases, baseline, progress=lambda: None, shift_std=lambda name: np.zeros(3), over=map):
-    """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, besides
+    """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, phases too, besides
     residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts
     what the references of whole flights may be off by too. shift_std : of a Reference; over : as of `attribute`."""
     sides, draws = [], []
@@ -292,6 +299,7 @@ def compare(cases, baseline, progress=lambda: None, shift_std=lambda name: np.ze
             scores.append(score(case, run))
             blocks.append(_blocks(scores[-1]))
             row = as_json(scores[-1].row())
+            row |= {"phases": as_json(scores[-1].phases())}
             rows.append({**row, "residual_spread": _spread(run), "rmse_3d_ci": _interval(blocks[-1:])})
         spreads = [row["residual_spread"] for row in rows if row["residual_spread"] is not None]
         together = {**as_json(pooled(scores)), "residual_spread": float(np.mean(spreads)) if spreads else None}
@@ -304,19 +312,10 @@ def compare(cases, baseline, progress=lambda: None, shift_std=lambda name: np.ze
 def score(case, run):
     """Score of a Run on a Case. Raises InputError where there is no estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
-    odometry = run.odometry
-    if case.spans is not None:  # both, as the truth would be interpolated over what lies between spans
-        truth, odometry = (_inside(part, case.spans) for part in (truth, odometry))
-    out = Score(case.flight.name, odometry, truth, run.residuals)
+    out = Score(case.flight.name, run.odometry, truth, run.residuals, case.flight.tdoa.t, case.spans, case.reach)
     if not len(out.t):
         raise InputError(f"{case.flight.name}: the filter gives no estimate in the part to judge on; see what evaluate says.")
     return out
-
-
-def _inside(part, spans):
-    """What of a Truth or an Odometry is stamped within spans ((first, last), ...), s."""
-    inside = np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0)
-    return replace(part, **{name: values[inside] for name, values in vars(part).items()})
 
 
 def _runs(cases, baseline, after, progress, over):

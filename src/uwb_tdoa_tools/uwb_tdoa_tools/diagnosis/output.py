@@ -93,6 +93,7 @@ def _finding(finding):
         "could_be_mistaken_for": list(effect.confounded_with),
         **_over_flights(finding),
         "added": finding.added,
+        "on_floor": finding.on_floor,
     }
 
 
@@ -115,6 +116,7 @@ def _function(finding):
         "usable": effect.usable,
         **_over_flights(finding),
         "added": finding.added,
+        "on_floor": finding.on_floor,
     }
 
 

@@ -16,6 +16,8 @@ from .precision import bound, position_error, weigh
 
 SOFT = 0.05  # of |q|^2 - 1, over which failure sets in where derivatives are needed
 EDGE = 0.05  # m over which the hull ends, likewise
+FAILED = 10.0  # of the objective, a logarithm
+SHAKEN = 0.0, 1e-3, 1e-2, 0.1  # of what is allowed, by which a start is moved that tells nothing
 CLOSE = 1e-4  # of the objective: a step that gains less is the last
 _CHUNK = 1_000_000  # numbers in the largest array of one step
 
@@ -56,21 +58,22 @@ def errors_and_slopes(goal, layout, x, points):
 def failing_and_slopes(goal, layout, x, points):
     """A smooth stand-in for the share of points (n, 3) that are not flyable, and its derivatives along x: (len(x),).
 
-    Outside of the anchors' hull or, for the criterion "pairings", where one of them has two solutions."""
+    Outside of the anchors' hull or, for the criterion "pairings", where one of them has two solutions. Raises InputError where that
+    cannot be told: two anchors have met, or all are in a plane."""
+    anchors = layout.anchors(x)
     try:
-        anchors = layout.anchors(x)
         good, along = _inside(anchors.positions, points, goal.installation.unknowns)
-        if goal.criterion == "pairings":
-            subsets = Subsets(anchors, goal.installation.unknowns)
-            excess = subsets.discriminant(points) / SOFT
-            single = expit(-excess).prod(axis=1)
-            along = along * single[:, None, None]
-            weights = (good * single)[:, None] * expit(excess) / SOFT
-            good, more = good * single, -subsets.slopes(points, weights)
-        else:
-            more = 0.0
-    except (InputError, QhullError):
-        return 1.0, np.zeros(len(x))
+    except QhullError as error:
+        raise InputError("anchors: they span no hull; take some of them out of the plane of the others.") from error
+    if goal.criterion == "pairings":
+        subsets = Subsets(anchors, goal.installation.unknowns)
+        excess = subsets.discriminant(points) / SOFT
+        single = expit(-excess).prod(axis=1)
+        along = along * single[:, None, None]
+        weights = (good * single)[:, None] * expit(excess) / SOFT
+        good, more = good * single, -subsets.slopes(points, weights)
+    else:
+        more = 0.0
     along = -(along.sum(axis=0) + more) / len(points)
     positions, _, steps = layout.nudged(x)
     here, moved = layout.free(positions)
@@ -101,35 +104,75 @@ def _inside(positions, points, k):
 def descend(goal, layout, points, x, sweeps):
     """x after at most `sweeps` steps of SLSQP (scipy.optimize) towards the goal at points (n, 3).
 
-    The worst case is not smooth, but the smallest s that no point's log error exceeds is, with a constraint per point.
+    The worst case is not smooth, but the smallest s that no point's log error exceeds is, with a constraint per point. Where the goal
+    cannot be told there is no slope, and none is made up: such a step is taken back, being FAILED worse than any other; where SLSQP
+    would go on from there, the best x so far is returned. A start there is shaken until the goal can be told, and returned if it never is.
     """
-    size, seen = len(x), {}
+    size, seen, best, (low, high) = len(x), {}, [np.inf, x], np.transpose(layout.bounds)
 
     def at(x):
-        x = np.clip(np.nan_to_num(x), *np.transpose(layout.bounds))  # SLSQP has been seen to ask for NaN
+        """(errors, slopes, failing, slopes of that) at x. Raises InputError where they cannot be told."""
+        if not np.isfinite(x).all():
+            raise InputError("layout: no numbers")  # SLSQP has been seen to ask for NaN
+        x = np.clip(x, low, high)
         if (key := x.tobytes()) not in seen:
             seen.clear()
             errors, slopes = errors_and_slopes(goal, layout, x, points)
-            seen[key] = errors, slopes, *failing_and_slopes(goal, layout, x, points)
+            failing, more = failing_and_slopes(goal, layout, x, points)
+            seen[key] = errors, slopes, failing, more
+            if (value := (errors.mean() if goal.objective == "mean" else errors.max()) * (1.0 + failing)) < best[0]:
+                best[:] = value, x
         return seen[key]
 
-    def worst(z):
-        _, _, failing, slopes = at(z[:size])
-        return z[size] + np.log1p(failing), np.append(slopes / (1.0 + failing), 1.0)
+    def tried(function, otherwise):
+        def value(z):
+            try:
+                return function(z)
+            except InputError:
+                return otherwise
+
+        return value
 
     def mean(x):
-        errors, slopes, failing, more = at(x)
-        return np.log(errors.mean() * (1.0 + failing)), slopes.mean(axis=0) / errors.mean() + more / (1.0 + failing)
+        errors, _, failing, _ = at(x)
+        return np.log(errors.mean() * (1.0 + failing))
 
-    options = {"method": "SLSQP", "jac": True, "options": {"maxiter": sweeps, "ftol": CLOSE}}
-    if goal.objective == "mean":
-        found = minimize(mean, x, bounds=layout.bounds, **options)
-    else:
-        below = {
-            "type": "ineq",
-            "fun": lambda z: z[size] - np.log(at(z[:size])[0]),
-            "jac": lambda z: np.column_stack([-at(z[:size])[1] / at(z[:size])[0][:, None], np.ones(len(points))]),
-        }
-        z = np.append(x, np.log(at(x)[0].max()))
-        found = minimize(worst, z, bounds=[*layout.bounds, (None, None)], constraints=[below], **options)
-    return np.clip(found.x[:size], *np.transpose(layout.bounds)) if np.isfinite(found.x).all() else x
+    def mean_slopes(x):
+        errors, slopes, failing, more = at(x)
+        return slopes.mean(axis=0) / errors.mean() + more / (1.0 + failing)
+
+    def worst_slopes(z):
+        _, _, failing, slopes = at(z[:size])
+        return np.append(slopes / (1.0 + failing), 1.0)
+
+    options = {"method": "SLSQP", "options": {"maxiter": sweeps, "ftol": CLOSE}}
+    try:
+        x = _told_near(at, np.clip(x, low, high), low, high)
+        if goal.objective == "mean":
+            found = minimize(tried(mean, FAILED), x, jac=mean_slopes, bounds=layout.bounds, **options)
+        else:
+            below = {
+                "type": "ineq",
+                "fun": tried(lambda z: z[size] - np.log(at(z[:size])[0]), np.full(len(points), -FAILED)),
+                "jac": lambda z: np.column_stack([-at(z[:size])[1] / at(z[:size])[0][:, None], np.ones(len(points))]),
+            }
+            worst = tried(lambda z: z[size] + np.log1p(at(z[:size])[2]), FAILED)
+            z, bounds = np.append(x, np.log(at(x)[0].max())), [*layout.bounds, (None, None)]
+            found = minimize(worst, z, jac=worst_slopes, bounds=bounds, constraints=[below], **options)
+        at(found.x[:size])
+    except InputError:
+        return best[1]
+    return np.clip(found.x[:size], low, high)
+
+
+def _told_near(at, x, low, high):
+    """x, or an x near it where `at` can tell the goal; moved at random by more and more of what is allowed. Raises InputError."""
+    rng = np.random.default_rng(0)
+    for share in SHAKEN:
+        shaken = np.clip(x + share * (high - low) * rng.uniform(-1.0, 1.0, len(x)), low, high)
+        try:
+            at(shaken)
+            return shaken
+        except InputError as error:
+            last = error
+    raise last

@@ -17,7 +17,7 @@ def evaluate(flight, config=None, effects=None, network=None, engine=run_offline
     engine : run_offline, or smooth, which uses what came after each estimate too."""
     need_truth(flight)
     result = engine(flight, config, Corrector(flight.anchors, with_antenna(effects, flight), network))
-    return Score(flight.name, result.odometry, judging_truth(flight, effects), result.residuals), result
+    return Score(flight.name, result.odometry, judging_truth(flight, effects), result.residuals, flight.tdoa.t), result
 
 
 def with_antenna(effects, flight):

@@ -49,7 +49,7 @@ class Judge:
             tqdm.write(f"{flight.name}: {remark}", file=sys.stderr)
         if self.odometry:
             odometry = read_odometry(self.odometry, *self._where)
-            score = Score(flight.name, odometry, flight.truth)
+            score = Score(flight.name, odometry, flight.truth, heard=flight.tdoa.t)
         else:
             engine = smooth if self.smoothed else run_offline
             score, run = evaluate(flight, self.config, self.effects, self.network, engine)

@@ -1,7 +1,8 @@
 """How far an estimate is from ground truth, and whether its covariance is honest."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 import math
 
 import numpy as np
@@ -9,22 +10,33 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 
+from .by_phase import EVERYTHING, Judged, Together
 from .distribution import Distribution
+from .phases import AIRBORNE, TITLES, in_the_air, motion, phases
 
-AIRBORNE = 0.3  # m; errors count from the first to the last instant above this height
 LOST = 1.0  # m; a larger error is no estimate
 LOST_SHARE = 0.25  # of the airborne time; more is a diverged run
 HOLE = 0.5  # s without a true pose, and SPARSE times their usual interval, over which none is interpolated
 SPARSE = 4.0
 START_GRACE = 1.0  # s into the airborne part by which the first estimate must have come
+FIGURES = 2  # version of what a Result holds
+READY = 100  # TDOAs that a filter may take to begin with
 
 
 def airborne(truth):
     """(first, last) stamp of the truth, s, with z above 0.3 m. Raises InputError if it never is."""
-    above = np.flatnonzero(truth.p[:, 2] > AIRBORNE)
-    if len(above) == 0:
+    found = in_the_air(truth)
+    if found is None:
         raise InputError(f"truth: z never exceeds {AIRBORNE} m, so that no part of this flight counts; is it a flight?")
-    return truth.t[above[0]], truth.t[above[-1]]
+    return found
+
+
+def judged_part(truth):
+    """(name, first, last) of the phase that the figures of a whole run are of: in the air; moving, where that never is; or all, where
+    the tag does not move at all."""
+    found = {"in_the_air": in_the_air(truth), "moving": motion(truth), "whole": (truth.t[0], truth.t[-1])}
+    name = next(name for name, span in found.items() if span)
+    return name, *found[name]
 
 
 def position_at(t, truth):
@@ -32,12 +44,11 @@ def position_at(t, truth):
     return np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
 
 
-def position_errors(odometry, truth):
-    """Errors over the airborne part, the truth interpolated to the stamps of the estimate, except in holes of it.
+def position_errors(odometry, truth, first, last):
+    """Errors from `first` to `last`, s, the truth interpolated to the stamps of the estimate, except in holes of it.
 
     Returns (t (n,) s, error (n, 3) m, covariance (n, 3, 3) m^2 of the position).
     """
-    first, last = airborne(truth)
     chosen = (odometry.t >= first) & (odometry.t <= last) & ~_in_holes(odometry.t, truth.t)
     t = odometry.t[chosen]
     covariance = getattr(odometry, "covariance", getattr(odometry, "pose_covariance", None))
@@ -46,11 +57,28 @@ def position_errors(odometry, truth):
 
 def _in_holes(t, known):
     """Which stamps t (n,) s lie in holes between the stamps `known` (m,), s, of the truth: (n,) bool."""
-    apart = np.diff(known)
-    if not len(apart):
+    if len(known) < 2:
         return np.zeros(len(t), bool)
-    k = np.clip(np.searchsorted(known, t, side="right") - 1, 0, len(apart) - 1)
-    return (apart > max(HOLE, SPARSE * np.median(apart)))[k] & (t > known[k]) & (t < known[k + 1])
+    k = np.clip(np.searchsorted(known, t, side="right") - 1, 0, len(known) - 2)
+    return _holes(known)[k] & (t > known[k]) & (t < known[k + 1])
+
+
+def _holes(known):
+    """After which of the stamps `known` (m,), s, of a truth is a hole: (m - 1,) bool."""
+    apart = np.diff(known)
+    return apart > max(HOLE, SPARSE * np.median(apart)) if len(apart) else np.zeros(0, bool)
+
+
+def _known_spans(known):
+    """(k, 2) s: from where to where the stamps `known` (m,), s, of a truth have no holes."""
+    last = np.append(_holes(known), True)
+    return np.column_stack([known[np.append(True, last[:-1])], known[last]])
+
+
+def _inside(part, spans):
+    """What of a Truth or an Odometry is stamped within spans ((first, last), ...), s."""
+    inside = np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0)
+    return replace(part, **{name: values[inside] for name, values in vars(part).items()})
 
 
 def nees(error, covariance):
@@ -92,26 +120,50 @@ def coverage(error, covariance, sigmas=3.0):
 class Score:
     """Errors of one run against its ground truth.
 
-    t (n,) s; p (n, 3) m, true positions; error (n, 3) m; covariance (n, 3, 3) m^2; first, last : s, in the air.
+    part : what they are of, see judged_part; t (n,) s; p (n, 3) m, true positions; error (n, 3) m; covariance (n, 3, 3) m^2;
+    first, last : s, of that part.
     """
 
-    def __init__(self, name, odometry, truth, residuals=None):
-        """name : of the flight; odometry : Odometry; truth : Truth; residuals : Residuals or None."""
-        self.name = name
-        self.t, self.error, self.covariance = position_errors(odometry, truth)
+    def __init__(self, name, odometry, truth, residuals=None, heard=None, spans=None, reach=EVERYTHING):
+        """name : of the flight; odometry : Odometry; truth : Truth; residuals : Residuals or None; heard : (n,) s, stamps of the
+        TDOAs, or None; spans : ((first, last), ...) s, what of the part counts, None for all; reach : the same of the phases."""
+        self.name, self._whole, self._heard, self._reach = name, (odometry, truth), heard, reach
+        if spans is not None:  # both, as the truth would be interpolated over what lies between spans
+            truth, odometry = (_inside(part, spans) for part in (truth, odometry))
+        self.part, self.first, self.last = judged_part(truth)
+        self.t, self.error, self.covariance = position_errors(odometry, truth, self.first, self.last)
         self.p = position_at(self.t, truth)
-        self.first, self.last = airborne(truth)
         self.nees = nees(self.error, self.covariance)
         self.nis = nis(residuals) if residuals is not None else np.empty(0)
 
+    @cached_property
+    def judged(self):
+        """Judged: the errors of all of the recording."""
+        odometry, truth = self._whole
+        t, error, covariance = position_errors(odometry, truth, truth.t[0], truth.t[-1])
+        return Judged(t, error, covariance, nees(error, covariance), odometry.t, _known_spans(truth.t))
+
+    def phases(self):
+        """The figures of each phase of this run: {name: dict of `Judged.figures`}."""
+        return {name: self.judged.figures(*span, self._reach) for name, span in phases(self._whole[1]).items()}
+
     def row(self):
-        """The figures of this run: a dict. "late_start": nothing but that has made it a diverged run."""
-        out = {"flight": self.name, **summary(self.error, self.nees, self.nis)}
+        """The figures of this run, of its part: a dict. "late_start": nothing but that has made it a diverged run; "ready_delay": s
+        from the 100th TDOA to the first estimate, below 0 if that came before."""
+        out = {"flight": self.name, "part": self.part, **summary(self.error, self.nees, self.nis)}
         late = not len(self.t) or self.t[0] > self.first + START_GRACE
         lost = out["diverged"] or not len(self.t) or self.t[-1] < self.last - START_GRACE
         out["diverged"], out["late_start"] = bool(lost or late), bool(late and not lost)
-        out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else float("inf")
+        out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else math.inf
+        out["ready_delay"] = self._ready_delay()
         return {**out, **_named(coverage(self.error, self.covariance))}
+
+    def _ready_delay(self):
+        """s from the 100th TDOA to the first estimate; NaN where nobody knows the TDOAs, or there are fewer, inf without an estimate."""
+        stamps = self._whole[0].t
+        if self._heard is None or len(self._heard) < READY:
+            return math.nan
+        return float(stamps[0] - np.sort(self._heard)[READY - 1]) if len(stamps) else math.inf
 
     def result(self):
         """Result: this run as the figures of many need it."""
@@ -121,28 +173,35 @@ class Score:
         if count:
             sums |= {name: count * share for name, share in _named(coverage(self.error, self.covariance)).items()}
         samples = {"distance": distance, "nees": self.nees, "nis": self.nis}
-        return Result(self.row(), sums, {name: Distribution.of(values) for name, values in samples.items()})
+        return Result(self.row(), sums, {name: Distribution.of(values) for name, values in samples.items()}, self.phases())
 
 
 @dataclass(frozen=True)
 class Result:
     """What a run leaves for the figures of many, of a size that does not depend on its length. row : Score.row; sums : {name: sum
-    over its samples}; distributions : {quantity: Distribution}."""
+    over its samples}; distributions : {quantity: Distribution}; phases : Score.phases."""
 
     row: dict
     sums: dict
     distributions: dict
+    phases: dict
 
     def as_dict(self):
         """For JSON, without loss."""
         parts = {name: part.as_list() for name, part in self.distributions.items()}
-        return {"row": _as_texts(self.row), "sums": _as_texts(self.sums), "distributions": parts}
+        of_phases = {name: _as_texts(figures) for name, figures in self.phases.items()}
+        return {"row": _as_texts(self.row), "sums": _as_texts(self.sums), "distributions": parts, "phases": of_phases}
 
     @classmethod
     def from_dict(cls, content):
         """Of what `as_dict` gives."""
         parts = {name: Distribution.from_list(numbers) for name, numbers in content["distributions"].items()}
-        return cls(_from_texts(content["row"]), _from_texts(content["sums"]), parts)
+        of_phases = {name: _from_texts(figures) for name, figures in content["phases"].items()}
+        return cls(_from_texts(content["row"]), _from_texts(content["sums"]), parts, of_phases)
+
+    def as_json(self):
+        """All figures of the run, as JSON takes them."""
+        return as_json({**self.row, "phases": self.phases})
 
 
 class Pool:
@@ -151,6 +210,7 @@ class Pool:
     def __init__(self):
         self._sums, self._distributions, self._runs, self._total, self._largest = Counter(), {}, 0, 0.0, 0.0
         self._row = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
+        self._ready, self._phases = math.nan, {}
 
     def add(self, result):
         """Count a Result."""
@@ -160,11 +220,19 @@ class Pool:
         self._distributions = {name: known[name] + part if name in known else part for name, part in result.distributions.items()}
         self._total, self._largest = self._total + row["rmse_3d"], float(np.max([self._largest, row["rmse_3d"]]))
         self._row["start_delay"] = max(self._row["start_delay"], row["start_delay"])
+        self._ready = float(np.fmax(self._ready, row["ready_delay"]))  # NaN of those that cannot tell
         for key in ("diverged", "late_start"):
             self._row[key] += row[key]
 
+        for name, figures in result.phases.items():
+            self._phases.setdefault(name, Together()).add(figures)
+
+    def phases(self):
+        """{name of a phase: dict of `Together.figures`}, of those that any of the runs has."""
+        return {name: self._phases[name].figures() for name in TITLES if name in self._phases}
+
     def figures(self):
-        """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE. Medians are right to 1 %. Of one run at least."""
+        """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE, phases. Medians are right to 1 %. Of one run at least."""
         distance, count = self._distributions["distance"], self._distributions["distance"].count
         shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
         out = {"flight": f"{self._runs} pooled"}
@@ -174,9 +242,9 @@ class Pool:
         for name in ("nees", "nis"):
             part = self._distributions[name]
             out |= {f"{name}_mean": part.mean, f"{name}_median": part.median}
-        out |= {name: shares.get(name, math.nan) for name in _named(np.zeros(3))} | self._row
+        out |= {name: shares.get(name, math.nan) for name in _named(np.zeros(3))} | self._row | {"ready_delay": self._ready}
         out["rmse_3d_mean_of_runs"], out["rmse_3d_max_of_runs"] = self._total / self._runs, self._largest
-        return out
+        return {**out, "phases": self.phases()}
 
 
 def pooled(scores):
@@ -188,8 +256,10 @@ def pooled(scores):
 
 
 def as_json(row):
-    """JSON has no NaN and no infinity: null."""
-    return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}
+    """JSON has no NaN and no infinity: null; of dicts in it, too."""
+    if isinstance(row, dict):
+        return {key: as_json(value) for key, value in row.items()}
+    return None if isinstance(row, float) and not math.isfinite(row) else row
 
 
 def _as_texts(numbers):
@@ -198,7 +268,8 @@ def _as_texts(numbers):
 
 
 def _from_texts(numbers):
-    return {key: float(value) if isinstance(value, str) and key != "flight" else value for key, value in numbers.items()}
+    """Of what `_as_texts` gives; those that were texts before stay."""
+    return {key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value for key, value in numbers.items()}
 
 
 def _named(shares):

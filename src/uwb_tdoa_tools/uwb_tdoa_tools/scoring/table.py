@@ -1,11 +1,20 @@
 """Errors as tables: lines for the screen, and Markdown, beside what others reach."""
 
+import math
+
 from ..readers.tables import number, read_table
+from .phases import NEAR_THE_FLOOR, TITLES
 
 COLUMNS = {
     "rmse_x": "x", "rmse_y": "y", "rmse_z": "z", "rmse_3d": "3D", "median_3d": "median", "max_3d": "max",
     "frac_gt_1m": ">1 m", "nees_mean": "NEES", "nis_mean": "NIS", "start_delay": "delay",
 }  # fmt: skip
+PHASE = {  # of the figures of a phase
+    "duration": "s", "rmse_x": "x", "rmse_y": "y", "rmse_z": "z", "rmse_3d": "3D", "max_3d": "max", "std_3d": "stated",
+    "nees_mean": "NEES", "step": "step", "without_estimate": "without, s",
+}  # fmt: skip
+OF_RUNS = {"rmse_3d_median_of_runs": "runs: median", "rmse_3d_max_of_runs": "largest", "nees_mean_max_of_runs": "largest NEES"}
+SHORT = {"rmse_3d": "3D", "max_3d": "max", "nees_mean": "NEES", "without_estimate": "without, s"}
 ERRORS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "median_3d", "max_3d")
 
 
@@ -32,11 +41,53 @@ def lines_of_errors(scores):
 def markdown(rows, others):
     """The table of rows, in metres, with one column per other estimator, as `read_others` gives them."""
     table = [["flight", *COLUMNS.values(), *others]]
-    table.append(["---"] + ["---:"] * (len(table[0]) - 1))
     for row in rows:
         cells = [f"{row[key]:.3f}" for key in COLUMNS] + [peer.get(row["flight"], "") for peer in others.values()]
         table.append([row["flight"], *cells])
-    return "".join("| " + " | ".join(cells) + " |\n" for cells in table)
+    return _as_markdown(table)
+
+
+def lines_of_phases(phases):
+    """Lines of the phases of one run, `Score.phases`, or of several, `Pool.phases`."""
+    head, *rows = _table_of_phases(phases)
+    return [f"{row[0]:20s}" + "".join(f"{cell:>{max(8, len(title)) + 1}s}" for cell, title in zip(row[1:], head[1:])) for row in (head, *rows)]
+
+
+def markdown_of(results, pool, others):
+    """All tables of Results, and of the Pool of them: those of `markdown`, and of phases of all and of each."""
+    rows = [result.row for result in results]
+    if len(results) == 1:
+        return f"{markdown(rows, others)}\n{_as_markdown(_table_of_phases(results[0].phases))}"
+    together = pool.figures()
+    of_all, of_each = _table_of_phases(together["phases"]), _table_of_runs(results)
+    return f"{markdown([*rows, together], others)}\n{_as_markdown(of_all)}\n{_as_markdown(of_each)}"
+
+
+def _table_of_runs(results):
+    titles = [f"{TITLES[name]}: {first}" if first == "3D" else first for name in NEAR_THE_FLOOR for first in SHORT.values()]
+    table = [["flight", *titles, "step until z > 0.3 m", "ready, s"]]
+    for result in results:
+        cells = [_cell(result.phases.get(phase, {}).get(key)) for phase in NEAR_THE_FLOOR for key in SHORT]
+        step = result.phases.get("to_0.3_m", {}).get("step")
+        table.append([result.row["flight"], *cells, _cell(step), _cell(result.row["ready_delay"])])
+    return table
+
+
+def _table_of_phases(phases):
+    columns = PHASE | (OF_RUNS if any("runs" in figures for figures in phases.values()) else {})
+    rows = [[TITLES[name], *(_cell(figures[key]) for key in columns)] for name, figures in phases.items()]
+    return [["phase", *columns.values()], *rows]
+
+
+def _cell(value):
+    """A number, or nothing where there is none."""
+    return "" if value is None or math.isnan(value) else f"{value:.{1 if abs(value) >= 100.0 else 2 if abs(value) >= 10.0 else 3}f}"
+
+
+def _as_markdown(table):
+    """A table, its head first, whose first column is text."""
+    ruled = [table[0], ["---"] + ["---:"] * (len(table[0]) - 1), *table[1:]]
+    return "".join("| " + " | ".join(cells) + " |\n" for cells in ruled)
 
 
 def read_others(path):

@@ -19,7 +19,8 @@ from ..planning.installation import Installation
 from ..planning.precision import bound, information
 from ..readers import inputs
 from ..scoring.evaluation import evaluate
-from ..scoring.metrics import airborne, position_at
+from ..scoring.metrics import airborne, pooled, position_at
+from ..scoring.phases import NEAR_THE_FLOOR, TITLES
 
 SETS = (), ("height",), ("pressure",), ("height", "pressure"), ("velocity",), ("height", "velocity")
 VELOCITY_RATE, VELOCITY_STD = 25.0, 0.1  # Hz, m/s: of a velocity made of the ground truth, where none was recorded
@@ -110,7 +111,8 @@ def bounds(flights, height_std):
 
 
 def _worth(flights, config, sets):
-    print("| aids | x | y | z | 3D | largest 3D | at take-off | NEES | coverage |\n|---|" + 8 * "---:|")
+    titles = " | ".join(TITLES[name] for name in NEAR_THE_FLOOR)
+    print(f"| aids | x | y | z | 3D | largest 3D | at take-off | NEES | coverage | {titles} |\n|---|" + (8 + len(NEAR_THE_FLOOR)) * "---:|")
     for names in sets:
         scores = [evaluate(only(flight, names), config)[0] for flight in flights]
         rows = [score.row() for score in scores]
@@ -120,10 +122,12 @@ def _worth(flights, config, sets):
         least = min(row[f"coverage_3sigma_{axis}"] for row in rows for axis in "xyz")
         cells = [f"{value:.3f}" for value in (*means, max(row["rmse_3d"] for row in rows), take_off)]
         cells += [f"{min(nees):.1f} - {max(nees):.1f}", f"{least:.3f}"]
+        phases = pooled(scores)["phases"]
+        cells += [f"{phases[name]['rmse_3d']:.3f}" if name in phases else "" for name in NEAR_THE_FLOOR]
         print(f"| {', '.join(names) or 'none'} | {' | '.join(cells)} |")
     for words, std in (("", np.inf), (", with a height", config.height_std)):
         cells = [f"{value:.3f}" for value in bounds(flights, std)]
-        print(f"| *bound of one round{words}* | {' | '.join(cells)} | | | | |")
+        print(f"| *bound of one round{words}* | {' | '.join(cells)} |{(4 + len(NEAR_THE_FLOOR)) * ' |'}")
 
 
 def faults(flights, config):

@@ -69,6 +69,10 @@ class ChannelResidual:
     samples: object
     residual: np.ndarray
 
+    def of_floor(self):
+        """The ChannelResidual of what is near the floor, which is not among its rows; None if there is no telling of it."""
+        return None
+
     def rows(self):
         """Rows for a fit."""
         raise NotImplementedError

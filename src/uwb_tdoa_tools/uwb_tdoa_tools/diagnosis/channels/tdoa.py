@@ -1,7 +1,7 @@
 """TDOAs.
 
 Neighbouring TDOAs are alike, so that hundreds a second are not hundreds of facts. They are averaged, pair by pair, over
-cells of half a second, without the outliers of the cell; what likeness is left between cells is counted in the fit.
+cells of half a second, near the floor of half the height at most, without the outliers of the cell; what likeness is left between cells is counted in the fit.
 """
 
 from dataclasses import dataclass, replace
@@ -22,25 +22,35 @@ from .knots import knots_of
 from .views import views_of_pairs
 
 CELL = 0.5  # s
+LOWEST, LEVEL = 0.02, 0.5  # m, and by how much the logarithm of a height may differ within a cell near the floor, where heights matter
 OUTLIER = 4.0  # spreads within a cell
 QUICK = ("interval", *CATEGORIES)  # covariates that change from one TDOA to the next
 WILD = 20.0  # m; a larger residual is no measurement
+FEWEST_ON_FLOOR = 50  # TDOAs
 
 
 @dataclass(frozen=True)
 class TdoaResidual(ChannelResidual):
     """samples : Samples, of the whole recording; residual (n,) m; airborne (n,) bool, False for those near the floor before
-    and after; innovations : Innovations where the path is only an estimate: these are the residual, and what the path
+    and after; fitted (n,) bool, those that are looked at: in the air, but for `of_floor`; floor_known : whether the reference knows
+    the path near the floor too; innovations : Innovations where the path is only an estimate: these are the residual, and what the path
     follows is taken out of regressors."""
 
     samples: Samples
     residual: np.ndarray
     airborne: np.ndarray
+    fitted: np.ndarray
+    floor_known: bool = False
     innovations: Innovations | None = None
+
+    def of_floor(self):
+        """The TdoaResidual that looks at those near the floor alone; None if there is no telling of them, or they are few."""
+        near = ~self.airborne & (np.abs(self.residual) < WILD)
+        return replace(self, fitted=near) if self.floor_known and near.sum() >= FEWEST_ON_FLOOR else None
 
     @cached_property
     def cells(self):
-        """How the TDOAs in the air are averaged."""
+        """How the TDOAs that are looked at are averaged."""
         return Cells(self)
 
     def rows(self):
@@ -69,10 +79,13 @@ class Cells:
     """The cells of one flight, and the averages over them."""
 
     def __init__(self, part):
-        samples, chosen = part.samples, np.flatnonzero(part.airborne)
+        samples, chosen = part.samples, np.flatnonzero(part.fitted)
         n = len(samples.anchors)
         t = samples.t[chosen]
         cell = ((t - t[0]) / CELL).astype(np.int64)
+        level = (np.log(np.maximum(samples.p[chosen, 2], LOWEST) / LOWEST) / LEVEL).astype(np.int64)
+        level[part.airborne[chosen]] = 0
+        cell = cell * (level.max() + 1) + level
         pair = samples.a[chosen].astype(np.int64) * n + samples.b[chosen]
         label = cell * n * n + pair
         y = part.residual[chosen]
@@ -128,10 +141,11 @@ class Tdoa(Channel):
         else:
             residual = innovations.value
         first, last = comparison.span
-        return TdoaResidual(samples, residual, (t >= first) & (t <= last), innovations)
+        airborne = (t >= first) & (t <= last)
+        return TdoaResidual(samples, residual, airborne, airborne, comparison.reference.knows_floor, innovations)
 
     def smooth_terms(self, residuals):
-        out, chosen = [], [part.airborne for part in residuals]
+        out, chosen = [], [part.fitted for part in residuals]
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
             values = [_covariate(name, part.samples) for part in residuals]
             knots = None

@@ -23,6 +23,7 @@ class Detector:
     """
 
     effect: ClassVar[type]
+    on_floor: ClassVar[bool] = False  # looks at what is near the floor, the others at what is in the air
     disguises: ClassVar[bool] = False  # what it searches for dominates its channel: unless found first, it counts as noise
 
     def search(self, table, model, chosen):

@@ -1,54 +1,104 @@
-"""Is the floor near? No sample in the air shows it."""
+"""Which anchors are late near the floor, and below which height."""
 
 import numpy as np
+from scipy.optimize import nnls
 
 from uwb_tdoa_bias.effects import EFFECTS
 
-from .base import Detection, Detector
+from ..regression.terms import Candidate, Term
+from .base import Detector
 
-BIN = 1.0  # s, taken as independent
-FEWEST_BINS, FEWEST = 4, 50
-SURE = 5.0  # standard errors
-RATIO = 2.0  # to the scatter in the air, above which it is noise of its own
-NEAR = 0.2  # strength of the effect that counts as near the floor
-WILD = 20.0  # m that an outlier counts as
+NEAR = 0.4  # m above z = 0; higher up nobody has seen it
+HEIGHTS = np.geomspace(0.05, 0.3, 12)  # m, that are tried
+SWEEPS = 2  # over the anchors, each of which then gets a height of its own
+FEWEST, FEWEST_ROWS = 2, 20  # anchors that are late: one alone is blocked; rows near the floor
+ONE_PLACE = 0.5  # m about which it took off and landed
+LEAST, GOOD_PART = 0.5, 0.5  # m, and share of the largest, by which those are late that come into the model first
+SCALE, NU = 0.2, 4.0  # m, of Student's t: of what is left of an anchor that is late by several echoes in turn
+ITERATIONS = 8
+LITTLE = 1e-3  # information, 1/m^2, that an anchor is on time: what all share is not seen
+LEAST_NOISE, WILD = 0.2, 3.0  # m: less is that of any anchor, more an outlier
+ENOUGH = 5.0  # TDOAs, that count as often as they are
 
 
 class FloorMultipathDetector(Detector):
-    """Size from the regression of what is near the floor on the effect's shape if that is sure, else from how much more
-    the residuals scatter than in the air."""
+    """Fits a delay of every anchor at once, below one height or each below its own. Those that are late by much, two at least, come
+    into the model first, the others then."""
 
     effect = EFFECTS["floor_multipath"]
+    on_floor = True
 
-    def detect(self, residuals):
-        sums, low, high, strengths = [], [], [], []
-        for part in (flight["tdoa"] for flight in residuals if "tdoa" in flight):
-            samples, r = part.samples, np.clip(part.residual, -WILD, WILD)
-            strength = self.effect.strength(samples.p[:, 2])
-            near = strength > NEAR
-            if part.innovations is not None or near.sum() < FEWEST or part.airborne.sum() < FEWEST:
-                continue  # where it stands is not known, or it was not there
-            x = self.effect().regressors(samples, ("size",))[near, 0]
-            bins = np.unique(((samples.t[near] - samples.start) / BIN).astype(int), return_inverse=True)[1]
-            sums.append(np.stack([np.bincount(bins, x * r[near]), np.bincount(bins, x * x)], axis=1))
-            low.append(r[near])
-            high.append(r[part.airborne])
-            strengths.append(strength[near])
-        if sum(map(len, sums)) < FEWEST_BINS:
-            return None
-        sums, low, high = np.concatenate(sums), np.concatenate(low), np.concatenate(high)
-        size = sums[:, 0].sum() / max(sums[:, 1].sum(), 1e-12)
-        error = np.sqrt(np.sum((sums[:, 0] - size * sums[:, 1]) ** 2)) / max(sums[:, 1].sum(), 1e-12)
-        air, floor = (1.4826 * np.median(np.abs(part)) for part in (high, low))
-        evidence = {
-            "standard_errors": round(float(size / max(error, 1e-9)), 1),
-            "scatter_over_air": round(float(floor / air), 1),
-        }
-        if size < SURE * error:
-            if floor < RATIO * air:
-                return None
-            size = np.sqrt(max(floor**2 - air**2, 0.0) / np.mean(np.concatenate(strengths) ** 2))
-        if size < self.effect.negligible:
-            return None
-        effect = self.effect({"size": min(size, self.effect.bound)}, {"size": max(error, 1e-6)}, "diagnose")
-        return Detection(effect, "tdoa", evidence)
+    def search(self, table, model, chosen):
+        parts = [part for _, channel, _, part in table.parts if channel == "tdoa"]
+        rows = table.rows_of("tdoa")
+        place = table.place[rows]
+        low = np.flatnonzero(place[:, 2] < NEAR)
+        if len(low) < FEWEST_ROWS or any(part.innovations is not None for part in parts):
+            return []  # it was not there, or nobody knows where it was
+        ids = parts[0].samples.anchors.ids.tolist()
+        mine = {key for candidate in chosen if candidate.name == self.effect.name for key in candidate.terms[0].keys}
+        new = [k for k, i in enumerate(ids) if f"{i}.delay" not in mine]
+        if not new:
+            return []
+        lowest = place[low[place[low, 2] < max(HEIGHTS[0], 2.0 * place[low, 2].min())], :2]
+        middle = np.median(lowest, axis=0)
+        one_place = np.hypot(*(lowest - middle).T).max() < ONE_PLACE
+        where = dict(zip("xy", middle.tolist())) if one_place else {}  # seen at several places, it may be like that at others
+        columns = [np.concatenate([_below(height, part)[:, new] for part in parts])[low] for height in HEIGHTS]
+        trials = _Trials(np.stack(columns), model.residual[rows][low], table.count[rows][low])
+        delays, at = trials.best()
+        late = delays > (self.effect.negligible if mine else max(LEAST, GOOD_PART * delays.max()))
+        late &= HEIGHTS[at] < HEIGHTS[-1]  # what goes on higher up is not of the floor
+        if late.sum() < (1 if mine else FEWEST):
+            return []
+        some = [ids[new[k]] for k in np.flatnonzero(late)]
+        limits = {f"{i}.height": float(HEIGHTS[k]) for i, k in zip(some, at[late])}
+        limits |= {f"{i}.noise": float(std) for i, std in zip(some, trials.noises(at)[late]) if std > LEAST_NOISE}
+        term = Term(self.effect({**limits, **where}, source="diagnose"), tuple(f"{i}.delay" for i in some))
+        return [Candidate((term,), 2.0 * np.log(len(HEIGHTS)) * len(some))]
+
+
+def _below(height, part):
+    """What a delay of each anchor adds to the rows of a TdoaResidual if it is late below a height, m, and never above: (n, anchors). A row of
+    which nobody knows whether it is late would fit neither."""
+    samples, low = part.samples, part.samples.p[:, 2] < height
+    anchors = range(len(samples.anchors))
+    return np.stack([part.cells.mean(low * (1.0 * (samples.b == k) - (samples.a == k))) for k in anchors], axis=1)
+
+
+class _Trials:
+    """Delays of anchors in a residual (n,), m, of so many TDOAs (n,) each, below one of the heights of columns (heights, n, anchors)."""
+
+    def __init__(self, columns, residual, count):
+        self._columns, self._y, self._count = columns, residual, np.minimum(count, ENOUGH)
+
+    def best(self):
+        """(delays (anchors,) m, places of the heights (anchors,))."""
+        count = self._columns.shape[2]
+        at = self._best(np.full(count, k) for k in range(len(self._columns)))
+        for _ in range(SWEEPS):
+            for anchor in range(count):
+                tried = np.repeat(at[None], len(self._columns), axis=0)
+                tried[:, anchor] = range(len(tried))
+                at = self._best(tried)
+        return self._fit(at)[1], at
+
+    def _best(self, tried):
+        return min(tried, key=lambda at: self._fit(at)[0])
+
+    def noises(self, at):
+        """(anchors,) m: standard deviation of what is left of each while it is late."""
+        x = self._columns[at, :, np.arange(len(at))].T
+        power = np.minimum(np.abs(self._y - x @ self._fit(at)[1]), WILD) ** 2
+        root, both = np.sqrt(self._count), np.hstack([x**2, np.ones((len(x), 1))])
+        return np.sqrt(nnls(root[:, None] * both, root * power)[0][:-1])
+
+    def _fit(self, at):
+        """(loss, delays) of robust least squares. None is early: else those that are on time could be, and the others not late."""
+        x, weight = self._columns[at, :, np.arange(len(at))].T, self._count
+        for _ in range(ITERATIONS):
+            root = np.linalg.cholesky((x * weight[:, None]).T @ x + LITTLE * np.eye(x.shape[1])).T
+            beta = nnls(root, np.linalg.solve(root.T, x.T @ (weight * self._y)))[0]
+            off = (self._y - x @ beta) / SCALE
+            weight = self._count * (NU + 1.0) / (NU + off**2)
+        return float(self._count @ np.log1p(off**2 / NU)), beta

@@ -10,6 +10,7 @@ class GroundTruth(Reference):
     """The ground truth that the recording holds."""
 
     words = "the recorded ground truth"
+    knows_floor = True
 
     def __init__(self, config=None, constraints=()):
         """config : FilterConfig and constraints, which no known pose needs."""

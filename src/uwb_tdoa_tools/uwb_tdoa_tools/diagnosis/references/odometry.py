@@ -24,6 +24,7 @@ class Odometry(GroundTruth):
     """
 
     attitude_known = False
+    knows_floor = False  # the path begins and ends above it
 
     def __init__(self, config=None, constraints=()):
         """config : FilterConfig; constraints : OdometryPaths, and Marks that lie on them."""

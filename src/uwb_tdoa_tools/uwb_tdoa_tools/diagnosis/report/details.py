@@ -4,6 +4,7 @@ from html import escape
 
 from uwb_tdoa_bias.effects.wording import rounded, significant
 
+from ...scoring.phases import TITLES
 from ..channels import CHANNELS
 from . import curves
 from .entries import entries
@@ -102,6 +103,33 @@ def _errors(diagnosis):
     bounds = ("95 % of 3D RMSE before", "after") if rows and len(rows[0]) > 1 + len(shown) else ()
     head = ("run", *(title for _, title, _ in shown), *bounds)
     return paragraphs([note], "note") + table(head, rows, numbers=range(1, len(head)))
+
+
+def phases(diagnosis):
+    """The error of every run in each phase of its recording, before and after."""
+    sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
+    found = [[row.get("phases", {}) for row in side] for side in sides]
+    names = [name for name in TITLES if any(name in phases for phases in found[0])]
+    if not names:
+        return ""
+    rows = [
+        (run, *(_phase(first.get(name), second.get(name)) for name in names))
+        for run, first, second in zip([*labels(diagnosis), "all"], *found)
+    ]
+    note = (
+        "3D RMSE in centimetres, before → after; and NEES, which is 3 if the filter judges itself rightly, more if it is too sure. "
+        "Every other error of this page is of the time in the air."
+    )
+    head = ("run", *(TITLES[name] for name in names))
+    return paragraphs([note], "note") + table(head, rows, numbers=range(1, len(head)))
+
+
+def _phase(*sides):
+    """A cell of figures of one phase, before and after."""
+    if None in sides:
+        return ""
+    errors, judged = (" → ".join(_figure(side, key, "", factor) for side in sides) for key, factor in (("rmse_3d", CM), ("nees_mean", 1.0)))
+    return f"{errors}; NEES {judged}"
 
 
 def _figure(row, key, title, factor):

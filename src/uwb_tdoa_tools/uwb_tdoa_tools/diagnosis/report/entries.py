@@ -76,7 +76,7 @@ def entries(diagnosis):
 def worth_in_words(entry):
     """ "1.5 cm" """
     if entry.worth is None:
-        return "not known"
+        return "not told by errors in the air" if entry.findings[0].on_floor else "not known"
     if abs(entry.worth) < LEAST_WORTH:
         return "less than 0.1 cm"
     return f"{entry.worth * CM:.1f} cm" if entry.worth > 0.0 else f"nothing ({entry.worth * CM:.1f} cm)"
@@ -133,7 +133,8 @@ def _values(finding):
     if not finding.declared:
         return f"a function without a name ({effect.shape})"
     told = significant(effect)
-    shown = [f"{key} = {measured(value, effect.std.get(key))}" for key, value in effect.values.items() if key in told]
+    fitted_first = sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0]))
+    shown = [f"{key} = {measured(value, effect.std.get(key))}" for key, value in fitted_first if key in told]
     rest, vague = shown[SHOWN:], len(effect.values) - len(shown)
     words = shown[:SHOWN] + ([f"{len(rest)} more"] if rest else [])
     if not words:
@@ -146,6 +147,8 @@ def _why_not(finding, refused):
         return ""
     if finding.flight:
         return f"belongs to {finding.flight} alone"
+    if finding.on_floor:
+        return "a function that was found near the floor is told, and not taken out"
     label = finding.candidates[0].label if finding.candidates else finding.effect.label
     reasons = {item.what: item.why for item in reversed(refused)}
     if label in reasons:

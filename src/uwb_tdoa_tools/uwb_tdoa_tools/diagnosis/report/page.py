@@ -1,7 +1,7 @@
 """The report: one page of HTML that holds everything itself."""
 
 from .curves import errors_over_time
-from .details import details, terms
+from .details import details, phases, terms
 from .entries import entries
 from .maps import maps
 from .markup import page, paragraphs, section
@@ -21,6 +21,7 @@ def html(diagnosis):
         worth(diagnosis, found),
         section("Where in the room", maps(diagnosis)),
         section("When in the flight", errors_over_time(diagnosis)),
+        section("From the floor to the floor", phases(diagnosis)),
         not_told(diagnosis),
         section(
             "Details",

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from uwb_tdoa_bias.effects.wording import listed
 
+from ...scoring.phases import NEAR_THE_FLOOR, TITLES
 from ..calibration import LEFT
 from .left_over import left_over
 
@@ -14,7 +15,7 @@ ERROR = "The position error (3D RMSE)"
 @dataclass(frozen=True)
 class Verdict:
     """headline : one sentence; more : (sentence, ...), what has to be known with it; kind : "better", "unsure" (it may
-    be chance), "same" (nothing is added), "nothing" (nothing was found) or "unknown" (no ground truth)."""
+    be chance), "same" (nothing is added, or on the floor alone), "nothing" (nothing was found) or "unknown" (no ground truth)."""
 
     headline: str
     more: tuple
@@ -70,7 +71,10 @@ def _judged(diagnosis):
     gain, interval = 1.0 - after["rmse_3d"] / before["rmse_3d"], after.get("rmse_3d_gain_ci")
     change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
     more = [_intervals(before, after, interval), f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}."]
-    more += [*_shared(diagnosis), *_caveats(diagnosis), *_worse(diagnosis), *_diverged(diagnosis), *left_over(diagnosis)]
+    more += [*_over_phases(diagnosis), *_shared(diagnosis), *_caveats(diagnosis), *_worse(diagnosis), *_diverged(diagnosis), *left_over(diagnosis)]
+    if all(finding.on_floor for finding in diagnosis.findings if finding.added):
+        stays = f"{ERROR} stays {centimetres(after['rmse_3d'])}: what is added acts near the floor alone, where the filter weighs it."
+        return Verdict(stays, tuple(more), "same")
     if interval and interval[0] > 0.0:
         return Verdict(f"{ERROR} falls {change}: {_share(gain)} of it is gone.", tuple(more), "better")
     more.append(
@@ -93,7 +97,7 @@ def _nothing_added(diagnosis):
     pooled, found = diagnosis.before["pooled"], len({finding.key for finding in diagnosis.findings})
     interval = f"95 % interval {_bounds(pooled['rmse_3d_ci'])} cm"
     error = f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {_flights(diagnosis)}."
-    more = (error, *_shared(diagnosis), *_diverged(diagnosis), *left_over(diagnosis))
+    more = (error, *_over_phases(diagnosis), *_shared(diagnosis), *_diverged(diagnosis), *left_over(diagnosis))
     if not found:
         return Verdict(
             "Nothing was found: what the model leaves of the measurements looks like noise.", more, "nothing"
@@ -140,6 +144,23 @@ def _flights(diagnosis):
     count = len(_names(diagnosis))
     seconds = sum(score.last - score.first for score in diagnosis.before["scores"])
     return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s in the air"
+
+
+def _over_phases(diagnosis):
+    """The errors outside of the air, which those above do not hold."""
+    before, after = (side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after))
+    parts = []
+    for name in (name for name in NEAR_THE_FLOOR if name in before):
+        sides = [_of_phase(side[name]) for side in (before, after)]
+        parts.append(f"{TITLES[name]} {' to '.join(dict.fromkeys(sides))}")
+    return [f"Outside of that, before and after: {'; '.join(parts)}."] if parts else []
+
+
+def _of_phase(figures):
+    """The 3D RMSE and the NEES of a phase."""
+    if figures["rmse_3d"] is None:
+        return "unknown"
+    return centimetres(figures["rmse_3d"]) + ("" if figures["nees_mean"] is None else f" (NEES {figures['nees_mean']:.1f})")
 
 
 def _shared(diagnosis):

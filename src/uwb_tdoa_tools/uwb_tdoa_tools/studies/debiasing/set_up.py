@@ -12,6 +12,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import INTERPOLATORS, LayerConfig, Layers, Part, fit
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -50,6 +51,9 @@ class Measured:
         return Part(self.p, self.true, self.covariance)
 
 
+AVERAGING = FilterConfig(zero_velocity=False)  # a stay is measured: its noise is averaged, as that of a tag that may move
+
+
 def add_options(add):
     """The options of the study."""
     add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
@@ -85,7 +89,7 @@ def measure(task, seed):
     flight = simulate(config)
     delays = SimulationConfig.anchor_delay_std * np.random.default_rng([seed, 4]).standard_normal(len(flight.anchors))
     flight = EFFECTS["anchor_delay"](dict(zip(map(str, flight.anchors.ids.tolist()), delays.tolist()))).inject(flight)
-    odometry = run_offline(_held_level(flight)).odometry
+    odometry = run_offline(_held_level(flight), AVERAGING).odometry
     rows = odometry.t > SETTLE
     columns = (
         odometry.t,

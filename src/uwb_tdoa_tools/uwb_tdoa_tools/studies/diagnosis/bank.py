@@ -30,7 +30,10 @@ SIZES = {
     "antenna_pattern": ({"tag": 0.08}, {"tag": 0.3, "anchor": 0.3}),
     "anchor_clock_drift": ({"N": 0.0015}, {"N": 0.01}),
     "nlos": ({"N.delay": 0.15, "N.start": 20.0, "N.end": 32.0}, {"N.delay": 0.6, "N.start": 20.0, "N.end": 32.0}),
-    "floor_multipath": ({"size": 0.3}, {"size": 2.0}),
+    "floor_multipath": (
+        {"0.delay": 0.8, "2.delay": 0.8, "0.height": 0.15, "2.height": 0.15},
+        {"0.delay": 3.3, "2.delay": 2.8, "5.delay": 3.6, "7.delay": 3.3, **{f"{i}.height": 0.15 for i in (0, 2, 5, 7)}},
+    ),
     "gyro_bias": ({"z": 0.005}, {"x": 0.03, "y": -0.03, "z": 0.05}),
     "gyro_scale": ({"z": 0.03}, {"z": 0.1}),
     "accel_bias": ({"x": 0.08}, {"x": 0.3, "y": -0.3, "z": 0.2}),
@@ -177,7 +180,8 @@ def _right(effects, attribution):
         for key, value in effect.values.items():
             if effect.name == "outlier_rate":
                 value = value + (1.0 - value) * SimulationConfig.outlier_probability  # on top of what is nominal
-            if key.endswith((".start", ".end")):
+            limits = (".start", ".end", ".height") if effect.name == "floor_multipath" else (".start", ".end")
+            if key.endswith(limits):
                 continue
             error = abs(other.values.get(key, 0.0) - value)
             if error > max(0.1 * abs(value), 3.0 * other.std.get(key, 0.0)):

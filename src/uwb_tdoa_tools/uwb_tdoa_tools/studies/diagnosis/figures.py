@@ -20,10 +20,10 @@ from ...scoring.plots import plt
 from ...surveying.blocked import with_blocked
 from ...surveying.survey import survey
 from ...surveying.tape import Tape
-from . import bank, blind, faults, measured, referenced, undeclared
+from . import bank, blind, faults, floor, measured, referenced, undeclared
 
 PARTS = (
-    "bank", "aids", "no-truth", "undeclared", "blind", "several", "faults", "injected", "measured", "measured-aids", "references", "speed",
+    "bank", "aids", "no-truth", "undeclared", "blind", "several", "faults", "injected", "measured", "measured-aids", "floor", "references", "speed",
 )  # fmt: skip
 SEVERAL_MEASURED, SEVERAL_SIMULATED = 3, 4  # flights with the same effect: no measured group of one protocol has more
 
@@ -42,7 +42,7 @@ def add_options(add):
 def run(args):
     """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
-    on_data = dict.fromkeys(("faults", "injected", "measured", "measured-aids", "references"), ("data",))
+    on_data = dict.fromkeys(("faults", "injected", "measured", "measured-aids", "floor", "references"), ("data",))
     for option in {"undeclared": ("cases",), **on_data}.get(args.part, ()):
         if getattr(args, option) is None:
             raise InputError(f"--{option}: {args.part} needs it.")
@@ -58,6 +58,7 @@ def run(args):
         "injected": _injected,
         "measured": _measured,
         "measured-aids": _measured_aids,
+        "floor": _floor,
         "references": _references,
         "speed": _speed,
     }[args.part](args)
@@ -171,6 +172,10 @@ def _measured(args):
 def _measured_aids(args):
     results = _each([(name,) for name in measured.AIDED], lambda name: measured.run(args.data, name, args.out, AIDS))
     return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
+
+
+def _floor(args):
+    return {"figures": floor.figures(args.data), "cases": []}
 
 
 def _references(args):

@@ -12,6 +12,7 @@ from ...diagnosis import diagnose
 from ...diagnosis.attribution import attribute
 from ...diagnosis.findings import usable
 from ...diagnosis.references import GroundTruth
+from ...scoring.phases import NEAR_THE_FLOOR
 from .bank import AIDED as ON_AIDS, SIZES, effect_of
 
 _T2, _T3 = "flights/0425/TDOA2/0425-traj", "flights/0425/TDOA3/0425-traj"
@@ -64,7 +65,7 @@ PRESENT = (
     "outlier_rate",
     "noise_correlation",
     "floor_multipath",
-)  # in every measured flight, and cannot be taken out first
+)  # in every measured flight
 
 
 def load(data, paths, aids=()):
@@ -76,6 +77,16 @@ def load(data, paths, aids=()):
 def folder_of(name):
     """Name of the folder of a split's results."""
     return name.replace(" ", "-")
+
+
+def _phases(content):
+    """{phase: [3D RMSE m before, after]} of what is not in the air, of all judged flights."""
+    before, after = (content[side]["pooled"]["phases"] for side in ("before", "after"))
+    return {name: [_rounded(side[name]["rmse_3d"]) for side in (before, after)] for name in NEAR_THE_FLOOR if name in before}
+
+
+def _rounded(value):
+    return None if value is None else round(value, 3)
 
 
 def run(data, name, out, aids=()):
@@ -96,6 +107,7 @@ def run(data, name, out, aids=()):
         "after": round(float(np.mean(sides["after"])), 3),
         "gain 95 %": content["after"]["pooled"].get("rmse_3d_gain_ci"),
         "diverged": sum(row["diverged"] for row in content["after"]["runs"]),
+        "phases before, after": _phases(content),
         "found": [f["effect"] for f in content["findings"]],
         "without a name": [f"{t['channel']}/{t['covariate']}/{t['form']}" for t in content["unattributed"]],
     }

@@ -1,0 +1,91 @@
+"""The phases of a recording, by what its ground truth tells of the motion. Together they are the whole recording; some overlap.
+
+    at_rest_earlier   what is before that
+    at_rest_before    the last 2 s before the departure
+    first_3_s         from the departure on: lift-off
+    to_0.3_m          from the departure to the first instant with z > 0.3 m
+    in_the_air        from the first to the last instant with z > 0.3 m, as it was always counted
+    moving            from the departure to the arrival, where the four around it leave out some of that
+    last_3_s          until the arrival: landing
+    at_rest_after     from the arrival on
+    whole             all that there is ground truth of
+
+Departure and arrival are the first and the last instant at which the tag is away from where it rests, which is the median of its
+positions in the first, and in the last, half second. Floors are not at z = 0 everywhere, and a tag sits above them as high as its
+vehicle is. So a tag that rests below 0.3 m in a recording that exceeds that departs when it is 0.07 m above its own height at rest: in the
+raw logs of the UTIL data, where that is 0.03 m, at z = 0.1 m; in their constellations, where it is 0.08 m, at 0.15 m, which is up to a
+second after z = 0.1 m. Any other tag, a rover that never leaves the floor, a person's, one that starts on a table, is away when it is 0.1 m
+from its place; one that gets there within a second began, or ended, in motion, and has no phase of rest there. A phase
+that a recording does not have is not told; one that never moves is `at_rest_before` all the time.
+"""
+
+import numpy as np
+
+AIRBORNE = 0.3  # m of z
+RISE = 0.07  # m above its height at rest: away from the floor
+MOVED = 0.1  # m from its place at rest: away, where height tells nothing
+SETTLED = 0.5  # s at either end, whose median is the place at rest
+SHORTEST = 1.0  # s within MOVED that are rest
+BEFORE, ENDS = 2.0, 3.0  # s of the phases before the departure; after it, and before the arrival
+
+TITLES = {
+    "at_rest_earlier": "at rest, earlier",
+    "at_rest_before": "at rest before, 2 s",
+    "first_3_s": "first 3 s",
+    "to_0.3_m": "until z > 0.3 m",
+    "in_the_air": "in the air",
+    "moving": "moving",
+    "last_3_s": "last 3 s",
+    "at_rest_after": "at rest after",
+    "whole": "whole recording",
+}
+NEAR_THE_FLOOR = "at_rest_before", "first_3_s", "last_3_s", "at_rest_after"  # told of each run where several are
+
+
+def in_the_air(truth):
+    """(first, last) stamp of a Truth, s, with z above 0.3 m; None if there is none."""
+    above = np.flatnonzero(truth.p[:, 2] > AIRBORNE)
+    return (float(truth.t[above[0]]), float(truth.t[above[-1]])) if len(above) else None
+
+
+def motion(truth):
+    """(departure, arrival) of a Truth, s, its first and last stamp where it begins or ends in motion; None if it never moves."""
+    t, p = truth.t, truth.p
+    flies = in_the_air(truth) is not None
+
+    def away(place):
+        """(which poses are away from it; s that they must stay there for a rest)."""
+        if flies and place[2] <= AIRBORNE:
+            return np.flatnonzero(p[:, 2] - place[2] > RISE), 0.0
+        return np.flatnonzero(np.linalg.norm(p - place, axis=1) > MOVED), SHORTEST
+
+    left, shortest = away(np.median(p[t <= t[0] + SETTLED], axis=0))
+    back, least = away(np.median(p[t >= t[-1] - SETTLED], axis=0))
+    if not len(left) and not len(back):
+        return None
+    departure = t[left[0]] if len(left) and t[left[0]] - t[0] >= shortest else t[0]
+    arrival = t[back[-1]] if len(back) and t[-1] - t[back[-1]] >= least else t[-1]
+    return float(departure), float(max(departure, arrival))
+
+
+def phases(truth):
+    """{name: (begin, end) s} of a Truth, in the order of TITLES, those alone that it has."""
+    begin, end = float(truth.t[0]), float(truth.t[-1])
+    moving, flown = motion(truth), in_the_air(truth)
+    if moving is None:
+        found = {"at_rest_before": (begin, end), "in_the_air": flown}
+    else:
+        departure, arrival = moving
+        found = {
+            "at_rest_earlier": (begin, departure - BEFORE),
+            "at_rest_before": (max(begin, departure - BEFORE), departure),
+            "first_3_s": (departure, min(departure + ENDS, arrival)),
+            "to_0.3_m": flown and (departure, flown[0]),
+            "in_the_air": flown,
+            "last_3_s": (max(arrival - ENDS, departure), arrival),
+            "at_rest_after": (arrival, end),
+        }
+        if flown is None or departure + ENDS < flown[0] or flown[1] < arrival - ENDS:
+            found["moving"] = moving
+    found["whole"] = begin, end
+    return {name: found[name] for name in TITLES if found.get(name) and found[name][1] > found[name][0]}
