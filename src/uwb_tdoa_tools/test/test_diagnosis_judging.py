@@ -111,8 +111,8 @@ def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_n
         return useful(replace(attribution, detections=(noise,)), noisy, Baseline(NONE)), noise
 
     rng = np.random.default_rng(0)
-    noisy = [EFFECTS["noise_level"]({"0-1": 1.5, "1-2": 1.5}).inject(flight, rng) for flight in flights]
-    kept, noise = judged(1.5)
+    noisy = [EFFECTS["noise_level"]({"0-1": 0.3, "1-2": 0.3}).inject(flight, rng) for flight in flights]  # no gate rejects that
+    kept, noise = judged(0.3)
     assert kept.detections == (noise,) and kept.worth[noise] > 0.0
     noisy = flights
     kept, noise = judged(3.0)
