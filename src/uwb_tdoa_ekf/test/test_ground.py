@@ -7,7 +7,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import (
-    MOST_PAIRS, NOT_USED, PAIR, explain, find_lateness, find_pairs, in_time, is_still, may_be_late,
+    ALIKE, IN_TIME, KNOWN, MOST_PAIRS, NOT_USED, PAIR, explain, find_lateness, find_pairs, in_time, is_still, may_be_late,
 )  # fmt: skip
 from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
 from uwb_tdoa_ekf.core.workspace import set_bounds
@@ -18,8 +18,8 @@ TUNING = FilterConfig().tuning()
 
 
 @compiled
-def explained(pairs, anchors, bounds, prior, tuning, z, z_std, on_ground, x, covariance):
-    return explain(pairs, anchors, bounds, prior, tuning[0], z, z_std, on_ground, x, covariance)
+def explained(pairs, anchors, bounds, prior, tuning, z, z_std, lateness, x, covariance):
+    return explain(pairs, anchors, bounds, prior, tuning[0], z, z_std, lateness, x, covariance)
 
 
 @compiled
@@ -103,6 +103,24 @@ def test_on_the_ground_it_is_found_whether_or_not_anchors_are_late(late):
         p = np.array([*np.random.default_rng(seed).uniform([1.5, 1.5], [5.5, 6.5]), 0.03])
         each = np.where(LOW, late + 0.2 * np.random.default_rng(seed).standard_normal(8), 0.0) if late else 0.0
         x, covariance = np.array([3.5, 4.0, 0.05]), np.empty((3, 3))
-        cost = explained(heard(p, late=each, seed=seed), anchors, bounds, prior, TUNING, 0.05, 0.15, late > 0.0, x, covariance)
+        lateness = ALIKE if late else IN_TIME
+        cost = explained(heard(p, late=each, seed=seed), anchors, bounds, prior, TUNING, 0.05, 0.15, lateness, x, covariance)
         assert np.isfinite(cost) and np.linalg.norm(x - p) < 0.25
         assert (np.linalg.eigvalsh(covariance) > 0.0).all()
+
+
+def test_what_is_known_of_late_anchors_places_it_better_than_what_they_have_in_common():
+    floor = np.where(LOW, 3.4, 0.3) + 0.1 * np.arange(8)
+    memory, bounds, prior = new_memory(POSITIONS, floor=(floor, 0.05, np.nan)), np.empty((2, 3)), np.zeros((4, 3))
+    set_bounds(memory.anchors, 1.0, bounds)
+    prior[0], prior[1:] = bounds.mean(axis=0), np.eye(3) / 25.0
+    off = {ALIKE: [], KNOWN: []}
+    for seed in range(10):
+        p, covariance = np.array([*np.random.default_rng(seed).uniform([1.5, 1.5], [5.5, 6.5]), 0.03]), np.empty((3, 3))
+        pairs = heard(p, late=floor, seed=seed)
+        for lateness, each in off.items():
+            x = np.array([3.5, 4.0, 0.05])
+            explained(pairs, memory.anchors, bounds, prior, TUNING, 0.05, 0.15, lateness, x, covariance)
+            each.append(np.linalg.norm(x - p))
+        assert off[KNOWN][-1] < 0.1
+    assert np.mean(off[KNOWN]) < 0.5 * np.mean(off[ALIKE])

@@ -3,46 +3,54 @@
 from dataclasses import replace
 
 from flights import corners, fly
+from live import assert_same
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
 PLACE = np.array([2.5, 5.0, 0.03])
 
 
-def on_floor(seed, duration, late=3.3, shaking=0.0, lift=np.inf):
-    """A flight that stands at PLACE and, from `lift` s on, rises by 0.5 m/s^2 for 2 s and stays up; the anchors at 0.15 m are `late` m
-    later while it is below 0.12 m. shaking : m/s^2, white, of the accelerometer."""
+def on_floor(seed, duration, late=3.3, shaking=0.0, lift=np.inf, back=np.inf, known=None):
+    """A flight that stands at PLACE and, from `lift` s on, rises by 0.5 m/s^2 for 2 s, stays up, and comes down likewise from `back` s on;
+    while it is below 0.12 m the anchors at 0.15 m are about `late` m later, or all by `known` (8,) m. shaking : m/s^2, white, of the
+    accelerometer."""
     low = replace(corners(), positions=np.array(corners().positions) + [0.0, 0.0, 0.15])
     flight, rng = fly(seed, duration, hover=True, anchors=low, imu_rate=400.0, tdoa_rate=360.0), np.random.default_rng(seed)
 
-    def height(t):
-        since = np.clip(t - lift, 0.0, 2.0)
+    def risen(t):
+        since = np.clip(t, 0.0, 2.0)
         return np.where(since < 1.0, 0.25 * since**2, 0.25 + 0.5 * (since - 1.0) - 0.25 * (since - 1.0) ** 2)
 
     def at(t):
-        return PLACE + np.stack([0.0 * t, 0.0 * t, height(t)], axis=1)
+        return PLACE + np.stack([0.0 * t, 0.0 * t, risen(t - lift) - risen(t - back)], axis=1)
+
+    def force(t):
+        return np.where((t >= 0.0) & (t < 1.0), 0.5, np.where((t >= 1.0) & (t < 2.0), -0.5, 0.0))
 
     t, positions = flight.tdoa.t, low.positions
     a, b = low.index(flight.tdoa.a), low.index(flight.tdoa.b)
     p = at(t)
     of_anchor = np.where(positions[:, 2] < 1.0, late + 0.2 * rng.standard_normal(len(positions)), 0.0)
+    of_anchor = of_anchor if known is None else known
     near = p[:, 2] < 0.12
     d = tdoa(p, positions[a], positions[b]) + 0.08 * rng.standard_normal(len(t)) + near * (of_anchor[b] - of_anchor[a])
-    since = flight.imu.t - lift
-    up = np.where((since >= 0.0) & (since < 1.0), 0.5, np.where((since >= 1.0) & (since < 2.0), -0.5, 0.0))
+    up = force(flight.imu.t - lift) - force(flight.imu.t - back)
     accel = flight.imu.accel + np.stack([0.0 * up, 0.0 * up, up], axis=1) + shaking * rng.standard_normal((len(up), 3))
     truth = replace(flight.truth, p=at(flight.truth.t))
     return replace(flight, tdoa=replace(flight.tdoa, d=d), imu=Imu(flight.imu.t, flight.imu.gyro, accel), truth=truth)
 
 
-def run(flight, **config):
+def run(flight, corrector=None, **config):
     """(t, error (n, 3) m, NEES (n,)) of the odometry."""
-    odometry = run_offline(flight, FilterConfig(**config)).odometry
+    odometry = run_offline(flight, FilterConfig(**config), corrector).odometry
     error = odometry.p - np.stack([np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(odometry.covariance[:, :3, :3]), error)
     return odometry.t, error, nees
@@ -64,6 +72,37 @@ def test_it_leaves_the_floor_with_the_tag(shaking):
         assert np.linalg.norm(error, axis=1).max() < 0.5 and step < 0.3
         assert np.linalg.norm(error[t > 6.0], axis=1).max() < 0.25
         assert nees.mean() < 9.0
+
+
+def test_it_comes_down_with_the_tag_while_rotors_still_turn():
+    for seed in range(4):
+        t, error, nees = run(on_floor(seed, 12.0, shaking=0.6, lift=3.0, back=7.0))
+        landed = t > 9.5
+        assert np.linalg.norm(error[landed], axis=1).max() < 0.5 and nees[landed].mean() < 9.0
+        assert np.linalg.norm(error[(t > 6.0) & ~landed], axis=1).max() < 0.5
+
+
+def test_delays_that_are_known_of_the_floor_make_it_sharp():
+    delays = np.where(np.array(corners().positions)[:, 2] < 1.0, 3.3, [0.0, 0.6, 0.0, 0.0] * 2) + 0.05 * np.arange(8)
+    values = {f"{i}.delay": delay for i, delay in zip(corners().ids, delays)} | {"x": PLACE[0], "y": PLACE[1]}
+    for seed in range(4):
+        flight = on_floor(seed, 8.0, shaking=0.6, lift=5.0, known=delays)
+        corrector = Corrector(flight.anchors, EffectSet((EFFECTS["floor_multipath"](values),)))
+        (t, without, _), (_, error, nees) = run(flight), run(flight, corrector)
+        rest = t < 4.9
+        assert np.linalg.norm(error[rest], axis=1).max() < 0.25 and nees[rest].mean() < 9.0
+        assert np.sqrt(np.mean(error[rest] ** 2)) < 0.6 * np.sqrt(np.mean(without[rest] ** 2))
+        assert np.linalg.norm(error[t > 7.0], axis=1).max() < 0.3
+
+
+def test_live_the_delays_of_the_floor_do_the_same():
+    delays = np.where(np.array(corners().positions)[:, 2] < 1.0, 3.3, 0.3)
+    flight = on_floor(0, 3.0, known=delays)
+    known = EffectSet((EFFECTS["floor_multipath"]({f"{i}.delay": delay for i, delay in zip(flight.anchors.ids, delays)}),))
+    estimator = Estimator(flight.anchors, reorder=0.0, floor=known.on_floor(flight.anchors))
+    estimator.add_imu(flight.imu.t, flight.imu.gyro, flight.imu.accel)
+    estimator.add_tdoa(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
+    assert_same(estimator.finish()[0], run_offline(flight, None, Corrector(flight.anchors, known)).odometry)
 
 
 def test_a_tag_that_lies_still_stays_where_it_is_without_tdoas():

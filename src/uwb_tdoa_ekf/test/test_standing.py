@@ -9,16 +9,16 @@ from uwb_tdoa_ekf.core.workspace import set_bounds
 
 
 @compiled
-def weighed(pairs, anchors, bounds, tuning, x, covariance):
-    return weigh(pairs, anchors, bounds, tuning[0], np.nan, np.nan, x, covariance)
+def weighed(ekf, pairs, anchors, tuning, x, covariance):
+    return weigh(ekf[0], pairs, anchors, tuning[0], np.nan, np.nan, x, covariance)
 
 
-def placed(p, elsewhere, late=0.0, seed=0):
+def placed(p, elsewhere, late=0.0, seed=0, memory=None):
     """(position (3,), standard deviations (3,), on the ground?) of a tag at rest at p, if a start has found it `elsewhere`."""
-    anchors, bounds = new_memory(POSITIONS).anchors, np.empty((2, 3))
-    set_bounds(anchors, 1.0, bounds)
+    memory = memory or new_memory(POSITIONS)
+    set_bounds(memory.anchors, 1.0, memory.record.workspace)
     x, covariance = np.array([*elsewhere, 0.0, 0.0, 0.0]), 0.04 * np.eye(6)
-    on_ground = weighed(heard(p, late=late, seed=seed), anchors, bounds, TUNING, x, covariance)
+    on_ground = weighed(memory.ekf, heard(p, late=late, seed=seed), memory.anchors, TUNING, x, covariance)
     return x[:3], np.sqrt(np.diag(covariance)[:3]), on_ground
 
 
@@ -52,3 +52,14 @@ def test_where_two_explanations_are_alike_its_deviation_is_as_large_as_they_are_
     p = [2.5, 5.0, 0.35]
     x, std, _ = placed(p, [2.5, 5.0, 0.5])
     assert abs(x[2] - p[2]) < 3.0 * std[2]
+
+
+@pytest.mark.parametrize("seen, true", [([2.5, 5.0], True), ([np.nan, np.nan], True), ([6.5, 1.0], False)])
+def test_delays_that_are_known_count_where_they_were_seen(seen, true):
+    """Elsewhere the echoes are others: there they differ by what nobody knows."""
+    floor, p = np.where(LOW, 3.4, 0.3) + 0.1 * np.arange(8), [2.5, 5.0, 0.03]
+    memory = new_memory(POSITIONS, floor=(floor, 0.05, seen))
+    late = floor if true else np.where(LOW, 2.2, 0.0)
+    x, std, on_ground = placed(p, [2.5, 5.0, 7.5], late, memory=memory)
+    assert on_ground and memory.record.late_as_known == true
+    assert np.linalg.norm(x - p) < (0.1 if true else 0.3) and (np.abs(x - p) < 3.0 * std).all()

@@ -139,7 +139,7 @@ class EkfNode(ros.StreamNode):
         if self._estimator is not None:
             self._publish(*self._estimator.finish())
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
-        self._estimator = Estimator(anchors, self._config, self._reorder, self._lag, self._effects.sensor_functions)
+        self._estimator = Estimator(anchors, self._config, self._reorder, self._lag, self._effects.sensor_functions, self._effects.on_floor(anchors))
         self._imu_corrector = ImuCorrector(self._effects.effects)
         ignored = [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else []
         self._watch, self._restarts = StreamWatch(anchors, self._lag, ignored), 0

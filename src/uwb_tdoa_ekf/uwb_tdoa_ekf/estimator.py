@@ -80,9 +80,10 @@ class Estimator:
     invalid if it lies ahead.
     """
 
-    def __init__(self, anchors, config=None, reorder=0.003, lag=0.25, functions=()):
-        """anchors : Anchors; config : FilterConfig; reorder, lag : s; functions : SensorFunctions that are known."""
-        self.anchors, self._functions = anchors, functions
+    def __init__(self, anchors, config=None, reorder=0.003, lag=0.25, functions=(), floor=None):
+        """anchors : Anchors; config : FilterConfig; reorder, lag : s; functions : SensorFunctions that are known; floor : what is known
+        of the anchors at a tag on the floor, see `EffectSet.on_floor`."""
+        self.anchors, self._known = anchors, (functions, floor)
         self.config = config or FilterConfig()
         self.reorder, self.lag = reorder, lag
         self._tuning = self.config.tuning()
@@ -94,7 +95,7 @@ class Estimator:
         self._clear()
 
     def _clear(self):
-        self._memory, self._monitor = new_memory(self.anchors.positions, self._functions), Monitor(self.anchors)
+        self._memory, self._monitor = new_memory(self.anchors.positions, *self._known), Monitor(self.anchors)
         self._waiting = [Waiting(kind) for kind in KINDS]
         self._gates, self._orders = [StampGate() for _ in STREAMS], [Order() for _ in STREAMS]
         self._fed_until = -math.inf  # s, stamp of the last measurement that the filter has been fed with

@@ -60,7 +60,7 @@ def run_offline(flight, config=None, corrector=None, records=None):
     imu = _imu_samples(flight.imu if config.use_imu else None)
     imu_t = imu["t"].copy()  # side by side in memory, to be searched
     (aids, places), outcome_of_aids = rows_of(flight, config), []
-    memory, tuning = new_memory(positions, corrector.effects.sensor_functions), config.tuning()
+    memory, tuning = new_memory(positions, corrector.effects.sensor_functions, corrector.weighed.on_floor(flight.anchors)), config.tuning()
     bias, std, outcome, parts, fed, felt = np.zeros(len(tdoa)), np.zeros(len(tdoa)), _not_fed(len(tdoa)), [], 0, 0
     monitor = Monitor(flight.anchors) if config.compensate_changes else None
     at_once = RECORDED_AT_ONCE if records is not None else len(tdoa)

@@ -49,10 +49,10 @@ class Corrector:
     """
 
     def __init__(self, anchors, effects=None, network=None, lag=POSE_LAG, history=4096):
-        """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs stay in; network : Network or None;
+        """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs stay in, as `weighed`; network : Network or None;
         lag : s; history : poses kept."""
         self.anchors = anchors
-        self.effects = EffectSet(tuple(effect for effect in effects or () if not effect.weighed))
+        self.effects, self.weighed = (EffectSet(tuple(e for e in effects or () if e.weighed == weighed)) for weighed in (False, True))
         self.network = network
         self.lag = lag
         parts = [self.effects.name] if len(self.effects) else []

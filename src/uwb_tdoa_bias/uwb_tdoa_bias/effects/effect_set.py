@@ -100,6 +100,10 @@ class EffectSet:
         """All SensorFunctions: what the filter itself takes out of inertial samples."""
         return tuple(function for effect in self.effects for function in effect.sensor_functions())
 
+    def on_floor(self, anchors):
+        """What the filter is told of some Anchors at a tag on the floor, as of `FloorMultipath.on_floor`; None if no effect knows."""
+        return next((effect.on_floor(anchors) for effect in self.effects if effect.weighed), None)
+
     def stamp_offset(self, stream):
         """Seconds by which the stamps of a stream of a Flight are late, by its name."""
         return sum(effect.stamp_offset(stream) for effect in self.effects)

@@ -64,9 +64,17 @@ class FloorMultipath(ArrivalEffect):
 
     @once_per_anchors
     def of_each(self, anchors):
-        """(delays, heights, noises), each (anchors,) m, of some Anchors: what the filter may be told."""
+        """(delays, heights, noises), each (anchors,) m, of some Anchors."""
         ids = anchors.ids.tolist()
         return tuple(np.array([self.values.get(f"{i}.{part}", default) for i in ids]) for part, default in zip(PARTS, (0.0, HEIGHT, 0.0)))
+
+    def on_floor(self, anchors):
+        """(delays of some Anchors at a tag on the floor, NaN where not known, their standard deviations, each (anchors,) m; x and y, (2,)
+        m, of where that was seen, NaN if that is not known)."""
+        delays, _, noises = self.of_each(anchors)
+        known = np.array([f"{i}.delay" in self.values for i in anchors.ids.tolist()])
+        stds = np.array([self.std.get(f"{i}.delay", 0.0) for i in anchors.ids.tolist()])
+        return np.where(known, delays, np.nan), np.hypot(noises, stds), np.array([self.values.get(name, np.nan) for name in PLACE])
 
     def _late(self, samples, rows):
         """(share of the time that the anchors in `rows` (k * n,) are late there, as far as it is the same echo), each (k * n,)."""

@@ -23,7 +23,7 @@ MAX_STEP = 0.05  # s, longest single prediction
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 STRAIGHT = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
-RECORDS_OF_TDOA = 1 + 3 + 1 + 3 + 1  # in a history, at most: its update, workspace, fixed height, a place at rest, a start or a recovery
+RECORDS_OF_TDOA = 1 + 3 + 1 + 6 + 1  # in a history, at most: its update, workspace, fixed height, a place at rest, a start or a recovery
 RECORDS_OF_REST = 3  # one per axis
 RECORDS_OF_AID = 3  # one per component of a velocity
 
@@ -212,14 +212,21 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
     it is near the ground: then it tells nothing."""
     a, b, innovation = anchors[tdoa.a], anchors[tdoa.b], ekf.innovation
     innovation.noise_variance = tuning.tdoa_std**2 + tdoa.variance + a.delay_variance + b.delay_variance
-    known = b.delay - a.delay
+    change = known = b.delay - a.delay
+    on_floor = ekf.resting and ekf.late_as_known
+    if on_floor and not math.isnan(a.floor_delay):
+        known -= a.floor_delay
+        innovation.noise_variance += a.floor_std**2
+    if on_floor and not math.isnan(b.floor_delay):
+        known += b.floor_delay
+        innovation.noise_variance += b.floor_std**2
     if tuning.adapt_noise:
         innovation.noise_variance += noise.excess_variance(a, b)
-    if ground.find_lateness(a, b, ekf.hypotheses[ekf.best], tdoa.t, tuning.ground_height):
+    if not on_floor and ground.find_lateness(a, b, ekf.hypotheses[ekf.best], tdoa.t, tuning.ground_height):
         _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
         in_time = ground.in_time(a, b, innovation)
         if in_time < ground.NOT_USED:
-            residual.innovation = innovation.value + known
+            residual.innovation = innovation.value + change
             residual.variance = innovation.prior_variance + innovation.noise_variance
             residual.verdict = REJECTED
             return True
@@ -236,7 +243,7 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
             if tuning.adapt_noise:
                 noise.learn(a, b, tdoa.t, innovation, tuning)
     if a.delay != 0.0 or b.delay != 0.0:
-        residual.innovation += known
+        residual.innovation += change
         if residual.verdict == USED:
             residual.verdict = COMPENSATED
     return False

@@ -40,6 +40,8 @@ USUAL_LATENESS, LATENESS_STD, ALIKE_STD = 2.0, 2.0, 0.3  # m: what late anchors 
 OTHER, TIMELY = 0.1, 0.5  # how probable other lateness is, and none, beside one that is alike
 ABOVE_STD, BESIDE_STD = 0.2, 2.0  # m; a tag is not above the workspace, and not often beside it
 SWEEPS = 25
+KNOWN_STD = 0.1  # m, by which an anchor may be late beyond what is known
+IN_TIME, ALIKE, KNOWN = range(3)  # what an explanation takes anchors near the ground for: late by what they have in common; as is known
 
 PAIR = np.dtype(
     [
@@ -200,36 +202,42 @@ def is_still(pairs, anchors, x, covariance):
 
 
 @compiled
-def explain(pairs, anchors, workspace, prior, tuning, z, z_std, on_ground, x, covariance):
+def explain(pairs, anchors, workspace, prior, tuning, z, z_std, lateness, x, covariance):
     """Where a tag at rest is, by what (k,) of PAIR say, as far as anchors are alike.
 
-    prior : (4, 3), position that is known before, m, and its information, 1/m^2; z, z_std : m, a height that is known and its standard deviation, NaN for none; on_ground : anchors near the ground may be late;
-    x : (3,) m, where to begin, becomes the most probable position; covariance (3, 3) m^2 is filled. Returns minus the logarithm of its
+    prior : (4, 3), position that is known before, m, and its information, 1/m^2; z, z_std : m, a height that is known and its standard
+    deviation, NaN for none; lateness : IN_TIME, ALIKE or KNOWN; x : (3,) m, where to begin, becomes the most probable position; covariance (3, 3) m^2 is filled. Returns minus the logarithm of its
     probability, up to a constant.
 
-    An error of its own for each anchor, and one for each pair, rarely large (Student's distribution). Of the anchors near the ground most
-    are alike late, as that is the way by what reflects, some by anything, and some in time (a mixture). Iteratively re-weighted least
-    squares.
+    An error of its own for each anchor, and one for each pair, rarely large (Student's distribution). ALIKE: of the anchors near the
+    ground most are late by the same, as that is the way by what reflects, some by anything, and some in time (a mixture). KNOWN: the
+    error of an anchor is about its floor_delay. Iteratively re-weighted least squares.
     """
     rows, places = _heard(pairs, anchors)
     n = 3 + len(rows) + 1
     system, u = np.empty((n, n + 1)), np.zeros(n)
     u[:3] = x
-    u[n - 1] = USUAL_LATENESS if on_ground else 0.0
-    late = np.zeros(len(rows), np.bool_)
+    u[n - 1] = USUAL_LATENESS if lateness == ALIKE else 0.0
+    late, errors = np.zeros(len(rows), np.bool_), np.zeros((len(rows), 2))
+    errors[:, 1] = ANCHOR_SHARE * tuning.tdoa_std
+    for i in range(len(rows)):
+        anchor = anchors[rows[i]]
+        if lateness == KNOWN and not math.isnan(anchor.floor_delay):
+            errors[i, 0], errors[i, 1] = anchor.floor_delay, math.hypot(anchor.floor_std, KNOWN_STD)
+            u[3 + i] = anchor.floor_delay
     for sweep in range(SWEEPS):
         for i in range(len(rows)):
-            late[i] = on_ground and may_be_late(anchors[rows[i]].position, u, 0.0, tuning.ground_height)
-            if sweep == 0:
-                u[3 + i] = USUAL_LATENESS if late[i] else 0.0
-        _equations(pairs, anchors, places, late, workspace, prior, tuning, z, z_std, u, system)
+            late[i] = lateness == ALIKE and may_be_late(anchors[rows[i]].position, u, 0.0, tuning.ground_height)
+            if sweep == 0 and late[i]:
+                u[3 + i] = USUAL_LATENESS
+        _equations(pairs, anchors, places, late, errors, workspace, prior, tuning, z, z_std, u, system)
         if not solve(system):
             return np.inf
         step = system[:, n]
         length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
         for j in range(n):
             u[j] += min(1.0, 2.0 / max(length, 1e-9)) * step[j]
-    cost = _equations(pairs, anchors, places, late, workspace, prior, tuning, z, z_std, u, system)
+    cost = _equations(pairs, anchors, places, late, errors, workspace, prior, tuning, z, z_std, u, system)
     x[:] = u[:3]
     both = np.concatenate((system[:, :n], np.eye(n)), axis=1)
     if not solve(both):
@@ -256,9 +264,9 @@ def _heard(pairs, anchors):
 
 
 @compiled
-def _equations(pairs, anchors, places, late, workspace, prior, tuning, z, z_std, u, system):
+def _equations(pairs, anchors, places, late, errors, workspace, prior, tuning, z, z_std, u, system):
     """Normal equations of a step from u (n,): position, error of each anchor heard, what late ones have in common; (n, n + 1) is filled.
-    Returns the cost."""
+    errors : (k, 2) m, expected error of an anchor that is not late, and its standard deviation. Returns the cost."""
     n = len(u)
     system[:, :] = 0.0
     row, cost = np.empty(3), 0.0
@@ -287,10 +295,11 @@ def _equations(pairs, anchors, places, late, workspace, prior, tuning, z, z_std,
             _add(system, states[:1], entries[:1], -u[3 + i], timely / total / of_anchor**2)
             _add(system, states[:1], entries[:1], 0.0, 1.0 / LATENESS_STD**2)
         else:
-            square = 0.5 * (u[3 + i] / of_anchor) ** 2
-            cost += math.log1p(square)
+            apart, std = errors[i, 0] - u[3 + i], errors[i, 1]
+            square = 0.5 * (apart / std) ** 2
+            cost += math.log1p(square) + math.log(std / of_anchor)
             states[0], entries[0] = 3 + i, 1.0
-            _add(system, states[:1], entries[:1], -u[3 + i], 1.0 / (of_anchor**2 * (1.0 + square)))
+            _add(system, states[:1], entries[:1], apart, 1.0 / (std**2 * (1.0 + square)))
     apart = u[n - 1] - USUAL_LATENESS
     cost += 0.5 * (apart / LATENESS_STD) ** 2 if late.any() else 0.0
     states[0], entries[0] = n - 1, 1.0

@@ -63,7 +63,7 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     good = share >= AGREE and workspace.contains(ekf.workspace, x)
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     at_rest, its = x.copy(), covariance.copy()
-    on_ground = standing.weigh(pairs, anchors, ekf.workspace, tuning, z, z_std, at_rest, its)
+    on_ground = standing.weigh(ekf, pairs, anchors, tuning, z, z_std, at_rest, its)
     still = ground.is_still(pairs, anchors, at_rest, ekf.still_covariance)
     if still or (anyhow and not good):
         x, covariance, good = at_rest, its, good or on_ground
@@ -117,7 +117,7 @@ def place(ekf, anchors, tuning, t, pose, history):
                 _turn(hypothesis, pose.yaw, pose.yaw_std)
                 if h != ekf.best:
                     hypothesis.log_weight = -np.inf
-    ekf.consistency = 1.0
+    ekf.consistency, ekf.late_as_known = 1.0, False
     add_reset(ekf, t, history)
 
 
@@ -182,7 +182,7 @@ def recover(ekf, anchors, tuning, t, history):
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
         _put(hypothesis, x, covariance)
-    ekf.consistency = 1.0
+    ekf.consistency, ekf.late_as_known = 1.0, False
     ekf.rest_since = t
     ekf.recoveries += 1
     add_reset(ekf, t, history)

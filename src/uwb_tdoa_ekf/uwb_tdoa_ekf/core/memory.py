@@ -82,7 +82,9 @@ ANCHOR = _record(
     ("delay", float),  # m, that it is found to have since it changed in flight,
     ("delay_variance", float),  # and its variance, m^2;
     ("late", float),  # probability that it is late because tag and anchor are near the ground, see ground.py, 0: it cannot be,
-    ("judged", float),  # s, and the stamp of the last TDOA that was asked
+    ("judged", float),  # s, and the stamp of the last TDOA that was asked;
+    ("floor_delay", float),  # m, by which it was late at a tag on the ground, NaN: nobody knows,
+    ("floor_std", float),  # m, and its standard deviation
 )
 
 HEIGHT = _record(
@@ -129,6 +131,8 @@ EKF = _record(
     ("distrusted", bool),  # which are not used, because they cannot be right
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
     ("resting", bool),  # the tag does not move, see rest.py,
+    ("floor_place", float, 2),  # m, x and y of where anchors are known to be late on the ground, NaN: anywhere,
+    ("late_as_known", bool),  # and they are, where the tag came to rest last
     ("rest_since", float),  # s, stamps: since when,
     ("next_look", float),  # and before which not to look again,
     ("doubts", int),  # looks in a row in which its TDOAs have changed, and in which it was not known to rest
@@ -197,11 +201,13 @@ class Output(NamedTuple):
     aids: np.ndarray = np.empty(0, RESIDUAL)
 
 
-def new_memory(positions, functions=()):
-    """Memory of a filter that has seen nothing; positions : (N, 3) m, of the anchors; functions : SensorFunctions."""
+def new_memory(positions, functions=(), floor=None):
+    """Memory of a filter that has seen nothing; positions : (N, 3) m, of the anchors; functions : SensorFunctions; floor : as of
+    `EffectSet.on_floor`."""
     memory = Memory(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
     memory.anchors["position"], memory.anchors["learned"], memory.anchors["judged"] = positions, -np.inf, -np.inf
     ekf = memory.record
+    memory.anchors["floor_delay"], memory.anchors["floor_std"], ekf["floor_place"][:] = floor or (np.nan, 0.0, np.nan)
     for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge", "next_look", "sure"):
         ekf[stamp] = -np.inf
     ekf.imu.t = ekf.plausibility.contradicted = -np.inf

@@ -17,24 +17,26 @@ from .state import GRAVITY, rotation
 from .update import update_state
 
 PERIOD = 0.05  # s between zero-velocity updates
-QUIET_STD, SHAKING_STD = 0.02, 0.15  # m/s, of them, where the inertial sensor is quiet, and where it is not
-SPEED = 0.05  # m/s; a quiet tag that is known to be slower stands still: it might also glide
-LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between looks at the TDOAs, and s of these
-MOST_DOUBTS, UNFELT = 3, 0.06  # looks in a row after which changed TDOAs are no chance, one in twenty is; m/s of lift that is none
-LONG, LONG_ENOUGH = 10, 3  # looks in a row after which a quiet tag is at rest, and not at a turning point; as many are enough
-EARLY = 1.5  # s after the start, or its last rest, when nothing tells of any motion
-AGAIN = 0.3  # s between corrections of the place of a tag that stands, or hovers low
-GATE = 3.0  # standard deviations of the velocity that inertial samples tell beyond which the tag moves
-CALM, SHAKING_MEMORY = 0.1, 2.0  # share of the vibration of these seconds, s, that is left where rotors, or wheels, have stopped
-LIFT, QUIET_LIFT, LIFT_MEMORY = 0.25, 0.1, 0.7  # m/s, upwards, and of a quiet sensor to any side, that a tag at rest cannot have felt within these seconds
-AWAY = 1.5  # s after that for which it is not at rest again
+QUIET_STD, SHAKING_STD = 0.02, 0.15  # m/s, standard deviation of such an update: of a quiet inertial sensor, and of one that shakes
+SPEED = 0.05  # m/s; a quiet tag that is known to be slower stands, a faster one may glide
+LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two looks at the TDOAs, and s of TDOAs in each
+MOST_DOUBTS = 3  # looks in a row with changed TDOAs that end a rest: one look in twenty shows a change by chance
+UNFELT = 0.06  # m/s; where the inertial sensor has felt more lift than that, one such look ends the rest
+LONG = 10  # looks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
+EARLY, LONG_ENOUGH = 1.5, 3  # s after the start, or after its last rest began, within which so many looks are enough
+AGAIN = 0.3  # s between two corrections of a tag that is near the ground, and is not known to stand
+GATE = 3.0  # standard deviations of the velocity that inertial samples tell, beyond which the tag moves
+CALM, SHAKING_MEMORY = 0.1, 2.0  # rotors or wheels have stopped when the vibration is below that share of its mean over so many seconds
+LIFT, QUIET_LIFT = 0.25, 0.1  # m/s that end a rest when the inertial sensor feels them: upwards, and to any side where it is quiet
+LIFT_MEMORY = 0.7  # s over which what it feels adds up
+AWAY = 1.5  # s after such an end, for which the tag is not taken for one at rest again
 SILENT = 0.5  # s without TDOAs after which a tag that shakes is not known to be at rest
-SAME_ERROR = 0.01  # s after which TDOAs of a tag that does not move tell again what they have told
+SAME_ERROR = 0.01  # s; TDOAs of a tag at rest have the same errors: those of each such interval repeat what is known once more
 
 
 @compiled
 def repetition(ekf, t):
-    """How many times over TDOAs stamped t, s, tell what those before them have told: their errors stay while the tag does."""
+    """Factor on the variance of a TDOA stamped t, s: how many times over the TDOAs of this rest have told the same, errors included."""
     return 1.0 + (t - ekf.rest_since) / SAME_ERROR if ekf.resting else 1.0
 
 
@@ -77,20 +79,21 @@ def look(ekf, anchors, tuning, window, t, records):
     if ekf.resting:
         ekf.doubts = 0 if still else ekf.doubts + 1
         ekf.resting = ekf.doubts < (MOST_DOUBTS if np.abs(ekf.lift).max() < UNFELT else 1)
-    elif still or ekf.quiet:
+    else:
         ekf.lift[:] = 0.0
         ekf.doubts = 0
         ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
-        landed = standing.land(ekf, ekf.pairs[:count], anchors, tuning, calm, t, records)
+        stands = calm and (still or ekf.quiet)
+        landed = standing.land(ekf, ekf.pairs[:count], anchors, tuning, still, stands, t, records)
         long = ekf.stills >= (LONG if t - ekf.rest_since > EARLY else LONG_ENOUGH)
-        ekf.resting = calm and landed
+        ekf.resting = stands and landed
         if not landed and long and not _moves(best, QUIET_STD):
-            ekf.resting = True
+            ekf.resting, ekf.late_as_known = True, False
         elif not landed and ekf.stills >= LONG:
             standing.find_again(ekf, ekf.pairs[:count], window, anchors, tuning, t, records)
         if ekf.resting:
             ekf.rest_since = t
-        if landed and not calm:
+        if landed and not stands:
             ekf.next_look = t + AGAIN
 
 

@@ -17,30 +17,33 @@ from .memory import HYPOTHESES
 from .startup import locate
 from .update import update_state
 
+EXPLANATIONS = 4  # elsewhere, and on the ground with each lateness of ground.explain
 SPEED_STD = 0.05  # m/s, of a tag at rest, beyond what its TDOAs tell
 # Minus the logarithm of the probability, before it is seen,
 ABSURD = 20.0  # that a tag is above or below its workspace,
-UNUSUAL = 3.0  # that anchors are late because they are near the ground,
+UNUSUAL = 3.0  # that anchors are late because they are near the ground, by what nobody knows,
+REACH = 1.0  # m from where they are known to be late, over which echoes become others
 DECISIVE = 6.0  # and by how much the ground must be more probable than what the filter says of a tag that lands
 HOVER_STD = 0.3  # m, of the place of a tag that seems to stand but may hover
-LANDING_STD = 0.5  # m, by which the filter may be wrong beyond what it says when a tag lands
+FEWEST_LATE = 1.5  # anchors that are late because the tag is low, where its TDOAs change
+LANDING_STD = 0.2, 0.2, 0.5  # m, by which the filter may be wrong beyond what it says when a tag lands: mostly in height
 
 
 @compiled
-def weigh(pairs, anchors, bounds, tuning, z, z_std, x, covariance):
-    """Weigh three explanations of (k,) of ground.PAIR by a tag at rest that may be anywhere in its workspace `bounds` (2, 3): position
-    x (6,) with its covariance (6, 6), the ground, and the ground with anchors that are late there.
+def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
+    """Weigh the explanations of (k,) of ground.PAIR by a tag at rest that may be anywhere in its workspace: position x (6,) with its
+    covariance (6, 6), and the ground, with each lateness of ground.explain.
 
     z, z_std : m, a height that is known and its standard deviation, NaN for none. The best one goes to x and covariance. Returns
     whether it is on the ground.
     """
-    prior = np.zeros((4, 3))
+    prior, bounds = np.zeros((4, 3)), ekf.workspace
     for k in range(3):
         prior[0, k], half = 0.5 * (bounds[0, k] + bounds[1, k]), 0.5 * (bounds[1, k] - bounds[0, k])
         prior[1 + k, k] = 1.0 / half**2
-    cost, position, each = np.empty(3), np.empty((3, 3)), np.empty((3, 3, 3))
+    cost, position, each = np.empty(EXPLANATIONS), np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3))
     position[0] = x[:3]
-    cost[0] = ground.explain(pairs, anchors, bounds, prior, tuning, z, z_std, False, position[0], each[0])
+    cost[0] = ground.explain(pairs, anchors, bounds, prior, tuning, z, z_std, ground.IN_TIME, position[0], each[0])
     if not bounds[0, 2] <= x[2] <= bounds[1, 2]:
         cost[0] += ABSURD
     position[0], each[0] = x[:3], covariance[:3, :3]
@@ -48,8 +51,9 @@ def weigh(pairs, anchors, bounds, tuning, z, z_std, x, covariance):
     for start in range(4):
         for k in range(2):
             starts[start, k] = prior[0, k] + 0.25 * (bounds[1, k] - bounds[0, k]) * (1.0 if (start >> k) & 1 else -1.0)
-    _on_ground(pairs, anchors, bounds, prior, tuning, z, z_std, starts, cost, position, each)
+    _on_ground(ekf, pairs, anchors, prior, tuning, z, z_std, starts, cost, position, each)
     best = _mix(cost, position, each)
+    ekf.late_as_known = best == 1 + ground.KNOWN
     x[:3] = position[best]
     covariance[:3, :3] = each[best]
     covariance[:3, 3:] = 0.0
@@ -58,21 +62,27 @@ def weigh(pairs, anchors, bounds, tuning, z, z_std, x, covariance):
 
 
 @compiled
-def _on_ground(pairs, anchors, bounds, prior, tuning, z, z_std, starts, cost, position, each):
-    """Fill in cost, position and its covariance of the explanations 1 and 2: on the ground, without and with late anchors."""
+def _on_ground(ekf, pairs, anchors, prior, tuning, z, z_std, starts, cost, position, each):
+    """Fill in cost, position and its covariance of the explanations from 1 on: on the ground, with each lateness."""
     floor, floor_std = tuning.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD
     if not math.isnan(z):
         floor, floor_std = z, z_std
     trial, its = np.empty(3), np.empty((3, 3))
-    for late in range(2):
-        cost[1 + late] = np.inf
-        for start in range(len(starts)):
+    known = False
+    for i in range(len(anchors)):
+        known = known or not math.isnan(anchors[i].floor_delay)
+    for lateness in range(EXPLANATIONS - 1):
+        k = 1 + lateness
+        cost[k] = np.inf
+        for start in range(len(starts) if lateness != ground.KNOWN or known else 0):
             trial[0], trial[1], trial[2] = starts[start, 0], starts[start, 1], floor
-            c = ground.explain(pairs, anchors, bounds, prior, tuning, floor, floor_std, late == 1, trial, its)
-            if c < cost[1 + late]:
-                cost[1 + late] = c
-                position[1 + late], each[1 + late] = trial, its
-    cost[2] += UNUSUAL
+            c = ground.explain(pairs, anchors, ekf.workspace, prior, tuning, floor, floor_std, lateness, trial, its)
+            if c < cost[k]:
+                cost[k], position[k], each[k] = c, trial, its
+    cost[1 + ground.ALIKE] += UNUSUAL
+    if known and not math.isnan(ekf.floor_place[0]):
+        for axis in range(2):
+            cost[1 + ground.KNOWN] += 0.5 * ((position[1 + ground.KNOWN, axis] - ekf.floor_place[axis]) / REACH) ** 2
 
 
 @compiled
@@ -109,35 +119,43 @@ def is_near_ground(hypothesis, tuning):
 
 
 @compiled
-def land(ekf, pairs, anchors, tuning, stands, t, records):
-    """TDOAs of a tag stay what they are at stamp t, s: if (k,) of PAIR tell that it is on the ground, go there. Returns whether.
+def land(ekf, pairs, anchors, tuning, still, stands, t, records):
+    """If (k,) of PAIR tell at stamp t, s, that a tag is on the ground, go there. Returns whether.
 
-    stands : it does not move; else it may also hover low, which it is told with care.
+    still : TDOAs stay what they are; stands : it does not move; else it may also hover low, which it is told with care.
     """
     best = ekf.hypotheses[ekf.best]
-    if not is_near_ground(best, tuning):
+    if not is_near_ground(best, tuning) or not (still or np.sum(anchors["late"]) > FEWEST_LATE):
         return False
     prior, wide = np.empty((4, 3)), best.P[:3, :3].copy()
     for k in range(3):
-        wide[k, k] += LANDING_STD**2
+        wide[k, k] += LANDING_STD[k] ** 2
     prior[0], prior[1:] = best.x[:3], _inverse(wide)
-    cost, position, each = np.empty(3), np.empty((3, 3)), np.empty((3, 3, 3))
+    cost, position, each = np.empty(EXPLANATIONS), np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3))
     position[0] = best.x[:3]
-    cost[0] = ground.explain(pairs, anchors, ekf.workspace, prior, tuning, np.nan, np.nan, False, position[0], each[0])
+    cost[0] = ground.explain(pairs, anchors, ekf.workspace, prior, tuning, np.nan, np.nan, ground.IN_TIME, position[0], each[0])
     starts = np.empty((1, 2))
     starts[0, 0], starts[0, 1] = best.x[0], best.x[1]
-    _on_ground(pairs, anchors, ekf.workspace, prior, tuning, np.nan, np.nan, starts, cost, position, each)
-    k = 1 if cost[1] < cost[2] else 2
+    _on_ground(ekf, pairs, anchors, prior, tuning, np.nan, np.nan, starts, cost, position, each)
+    k = 1 + np.argmin(cost[1:])
     if cost[k] + DECISIVE > cost[0]:
         return False
     if stands:
+        ekf.late_as_known = k == 1 + ground.KNOWN
         _put(ekf, position[k], each[k], t, records)
         return True
     for h in range(HYPOTHESES):
         if not alive(ekf.hypotheses[h]):
             continue
-        for axis in range(3):
+        for axis in range(0 if still else 2, 3):
+            P = ekf.hypotheses[h].P
+            P[axis, axis] = max(P[axis, axis], HOVER_STD**2)  # what is told again tells nothing new
             update_state(ekf.hypotheses[h], ekf.innovation, axis, position[k, axis], HOVER_STD)
+            if h == ekf.best:
+                add_update(ekf, t, records)
+        for axis in range(3 if still else 0):
+            std = math.sqrt(ekf.still_covariance[axis, axis] + SPEED_STD**2)
+            update_state(ekf.hypotheses[h], ekf.innovation, 3 + axis, 0.0, std)
             if h == ekf.best:
                 add_update(ekf, t, records)
     return True
@@ -148,7 +166,7 @@ def find_again(ekf, pairs, window, anchors, tuning, t, records):
     """A tag lies still at stamp t, s, but inertial samples have told that it moves: they were wrong, and it may be anywhere."""
     x, covariance = np.empty(6), np.empty((6, 6))
     locate(window, anchors, ekf.workspace, tuning.tdoa_std, np.nan, np.nan, x, covariance)
-    weigh(pairs, anchors, ekf.workspace, tuning, np.nan, np.nan, x, covariance)
+    weigh(ekf, pairs, anchors, tuning, np.nan, np.nan, x, covariance)
     _put(ekf, x[:3], covariance[:3, :3], t, records)
     ekf.resting, ekf.rest_since = True, t
     ekf.recoveries += 1

@@ -23,7 +23,7 @@ class OurFilter:
         self._anchors, self._corrector = anchors, Corrector(anchors, effects)
         self._labels, self._of_imu, self._of_aids = (kind(effects.effects) for kind in (LabelCorrector, ImuCorrector, AidCorrector))
         self._offset = effects.stamp_offset
-        self._estimator = Estimator(anchors, config, functions=effects.sensor_functions)
+        self._estimator = Estimator(anchors, config, functions=effects.sensor_functions, floor=effects.on_floor(anchors))
         self._parts, self._newest = [NOTHING], None
 
     def tell(self, t, p, std):
