@@ -1,5 +1,7 @@
 """How colcon and pip install the package."""
 
+from glob import glob
+
 from setuptools import find_packages, setup
 
 NAME = "uwb_tdoa_tools"
@@ -39,6 +41,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/config", glob("config/*.yaml")),
+        (f"share/{NAME}/launch", glob("launch/*.py")),
     ],
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
@@ -59,6 +63,7 @@ setup(
             "study = uwb_tdoa_tools.executables:study",
             "survey = uwb_tdoa_tools.executables:survey",
             "train = uwb_tdoa_tools.executables:train",
+            "vehicle_node = uwb_tdoa_tools.executables:vehicle_node",
         ]
     },
 )

@@ -213,12 +213,12 @@ def test_a_bag_is_played_on_its_time(launched):  # the fixture puts the stubs in
 
 def test_the_layout_of_rviz_is_yaml():
     content = yaml.safe_load((ROOT / "rviz" / "tdoa.rviz").read_text())
-    assert {each["Name"] for each in content["Visualization Manager"]["Displays"]} >= {"Odometry", "Anchors", "TF"}
+    assert {each["Name"] for each in content["Visualization Manager"]["Displays"]} >= {"Odometry", "Ground truth", "Anchors", "TF"}
 
 
 def test_the_layout_of_foxglove_shows_what_the_nodes_publish():
     content = json.loads((ROOT / "foxglove" / "tdoa.json").read_text())
-    kinds = {"/odometry": Odometry, "/uwb/residual": TdoaResidual, "/uwb/anchors/markers": None, "/diagnostics": None}
+    kinds = {"/odometry": Odometry, "/uwb/residual": TdoaResidual, "/uwb/anchors/markers": None, "/ground_truth/pose": None, "/diagnostics": None}
     panels = content["configById"]
     assert panels["3D!room"]["topics"].keys() | {panels["DiagnosticSummary!all"]["topicToRender"]} <= kinds.keys()
     paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]

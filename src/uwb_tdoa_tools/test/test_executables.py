@@ -29,6 +29,7 @@ NODES = {
     "debias_node": "uwb_tdoa_ekf.debias_node",
     "ekf_node": "uwb_tdoa_ekf.ekf_node",
     "localization_node": "uwb_tdoa_ekf.localization_node",
+    "vehicle_node": "uwb_tdoa_tools.vehicle_node",
 }
 MEMBERS = {"localization_node": ("bias_node", "ekf_node")}  # whose parameters it takes, too
 COMMANDS = {"compile_nodes": "uwb_tdoa_ekf.compile_nodes"} | {
@@ -119,7 +120,7 @@ def documented(tmp_path_factory):
                     assert words[0] == EVERY[words[1]].partition(".")[0], (where, words)
                     found.append((where, words[1], words[2:]))
                 else:
-                    assert verb in ("test", "build", "shell", "help", "launch", "bag"), (where, verb)
+                    assert verb in ("test", "build", "shell", "help", "launch", "bag", "service"), (where, verb)
             else:
                 found.append((where, first, words))
     return found
@@ -135,7 +136,7 @@ def test_every_documented_command_is_a_command_line(documented):
     for where, name, words in documented:
         if name in NODES:
             given = re.findall(r"-p (\w+):=", " ".join(words))
-            assert words[:1] == ["--ros-args"] and given and set(given) <= parameters(name), (where, name, words)
+            assert words[:1] == ["--ros-args"] and given and set(given) <= parameters(name) | {"use_sim_time"}, (where, name, words)
         elif words:  # without any, it is the name of the executable in a sentence
             assert parses(name, words), (where, name, words)
 

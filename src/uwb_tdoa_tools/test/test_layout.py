@@ -27,7 +27,7 @@ ROS = """
     uwb_tdoa_tools.commands.record uwb_tdoa_tools.commands.replay uwb_tdoa_tools.live.demo uwb_tdoa_tools.live.follow
     uwb_tdoa_tools.live.followed_nodes uwb_tdoa_tools.live.listen
     uwb_tdoa_tools.live.player uwb_tdoa_tools.live.processes uwb_tdoa_tools.live.record uwb_tdoa_tools.live.replay
-    uwb_tdoa_tools.live.run uwb_tdoa_tools.live.session
+    uwb_tdoa_tools.flying.over_topics uwb_tdoa_tools.live.run uwb_tdoa_tools.live.session uwb_tdoa_tools.vehicle_node
 """.split()
 IS_ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces|domain_coordinator|ament_index_python")
 # import name: (rosdep key, name on the Python package index); ROS packages are imported under their own name
@@ -212,7 +212,7 @@ def test_setup_py_declares_what_is_imported_and_nothing_else(package):
 
 
 def test_messages_declare_what_they_are_made_of():
-    texts = "".join(path.read_text() for path in (SRC / "uwb_tdoa_msgs" / "msg").glob("*.msg"))
+    texts = "".join(path.read_text() for path in (SRC / "uwb_tdoa_msgs").glob("*/*"))
     assert declared("uwb_tdoa_msgs", "depend") == set(re.findall(r"^(\w+)/\w+", texts, flags=re.MULTILINE))
 
 
@@ -228,7 +228,8 @@ def test_every_executable_starts_behind_an_entry_point_of_its_name(package):
         assert (module, attribute) == (f"{package}.executables", name)
         assert entries[name] in modules() and entries[name].rpartition(".")[2] == name
     if package == "uwb_tdoa_tools":
-        assert set(entries.values()) == {name for name in modules() if name.startswith("uwb_tdoa_tools.commands.")}
+        commands = {name for name in modules() if name.startswith("uwb_tdoa_tools.commands.")}
+        assert set(entries.values()) == commands | {"uwb_tdoa_tools.vehicle_node"}
 
 
 @pytest.mark.parametrize("module", [name for name in modules() if name.startswith("uwb_tdoa_tools.commands.")])

@@ -1,6 +1,6 @@
 """The entry points that setup.py names: one for each file in commands/."""
 
-from uwb_tdoa_bias.foundation.executable import executable
+from uwb_tdoa_bias.foundation.executable import executable, node_executable
 
 bench = executable("uwb_tdoa_tools.commands.bench")
 check = executable("uwb_tdoa_tools.commands.check")
@@ -18,3 +18,4 @@ simulate = executable("uwb_tdoa_tools.commands.simulate")
 study = executable("uwb_tdoa_tools.commands.study")
 survey = executable("uwb_tdoa_tools.commands.survey")
 train = executable("uwb_tdoa_tools.commands.train")
+vehicle_node = node_executable("uwb_tdoa_tools.vehicle_node")

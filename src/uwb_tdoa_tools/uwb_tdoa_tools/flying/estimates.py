@@ -26,9 +26,9 @@ class OurFilter:
         self._estimator = Estimator(anchors, config, functions=effects.sensor_functions, floor=effects.on_floor(anchors))
         self._parts, self._newest = [NOTHING], None
 
-    def tell(self, t, p, std):
-        """Tell that it is at p (3,) m at t, s, to so many m."""
-        self._estimator.tell_pose(t, p, std**2 * np.eye(3))
+    def tell(self, t, p, std, yaw):
+        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN where nobody knows."""
+        self._estimator.tell_pose(t, p, std**2 * np.eye(3), yaw, std)
 
     def take(self, measured):
         """Take what arrived: Measured."""

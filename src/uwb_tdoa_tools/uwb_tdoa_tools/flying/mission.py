@@ -32,13 +32,14 @@ USUAL = 2.0  # s over which it learns what support it feels in the air, where th
 class Mission:
     """One flight along a path. state : of WAITING ...; started, ended : s, when the rotors started and stopped, or None; lost : s, when
     its estimate first said that it was lost, or None: then it stops, sinks, and goes on with its path only if it is told where it is while
-    it is still in the air; yaw : rad, which it holds."""
+    it is still in the air; yaw : rad, wanted now."""
 
     def __init__(self, path, place, ground, rules=None, begin=0.0):
-        """path : Circles; place (2,) m; ground : m, of the body's origin; begin : s, when it was switched on."""
-        self.place, self.ground, self.rules, self.begin = place, ground, rules or Rules(), begin
+        """path : Circles, or what else has `along`; place (2,) m; ground : m, of the body's origin; begin : s, when it was switched on."""
+        self.ground, self.rules, self.begin = ground, rules or Rules(), begin
         self._path, self._clock = path.along(place, ground), []  # (s, s since the start of the path) of each call
-        self.state, self.started, self.ended, self.lost, self.yaw = WAITING, None, None, None, 0.0
+        self.state, self.started, self.ended, self.lost = WAITING, None, None, None
+        self.yaw = self._first_yaw = 0.0
         self._usual = 0.0  # support, of the weight
 
     def decide(self, t, pose, deviation, support):
@@ -50,8 +51,7 @@ class Mission:
         if self.state == WAITING and t >= self.begin + rules.rest:
             if good and deviation <= rules.arm:
                 self.state, self.started, self._last, self._sinking = FLYING, t, t, t
-                x, y, z, w = pose[3]
-                self.yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+                self._first_yaw = yaw_of(pose[3])
             elif t >= self.begin + rules.rest + rules.patience:
                 self.state = REFUSED
         if self.state not in (FLYING, LOST):
@@ -62,7 +62,7 @@ class Mission:
             self.state = LOST
         elif self.state == LOST and good and deviation <= rules.arm:
             self.state = FLYING
-        along = (self._clock[-1][1] if self._clock else 0.0) + (0.0 if self.state == LOST else t - self._last)
+        along = self.along + (0.0 if self.state == LOST else t - self._last)
         self._clock.append((t, along))
         if self.state != LOST and along < self._path.duration - rules.near_end:
             self._usual += min(1.0, (t - self._last) / USUAL) * (support - self._usual)
@@ -73,11 +73,28 @@ class Mission:
             return None
         if self.state != LOST:
             self._sinking = t if along < self._path.duration else self._sinking
+            self.yaw = self._first_yaw + self._path.turned(along)
             return self._path.at(np.array([along]))[0]
         wanted = np.zeros((3, 3))
         wanted[0], wanted[1, 2] = math.nan, -rules.sink
         return wanted
 
+    @property
+    def place(self):
+        """(2,) m, where it is to land."""
+        return self._path.end
+
+    @property
+    def along(self):
+        """s since the start of the path."""
+        return self._clock[-1][1] if self._clock else 0.0
+
     def wanted(self, t):
         """Of the path, (n, 3, 3), at t (n,) s."""
         return self._path.at(np.interp(t, *np.transpose(self._clock)))
+
+
+def yaw_of(q):
+    """rad, of q (4,) x y z w."""
+    x, y, z, w = q
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

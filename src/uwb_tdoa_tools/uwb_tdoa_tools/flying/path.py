@@ -44,23 +44,32 @@ class Circles:
 
 
 class Reference:
-    """Position, velocity and acceleration, (n, 3, 3), m and s, wanted since the rotors started; at its end it sinks, and no height is wanted."""
+    """Position, velocity and acceleration, (n, 3, 3), m and s, wanted since the rotors started; at its end it sinks, and no height is wanted.
+    duration : s until then; end (2,) m, where."""
 
     def __init__(self, p):
         """p : (m, 3) m, each KNOT s, from the start on."""
         knots = KNOT * np.arange(len(p))
         spline = make_interp_spline(knots, p, k=5)
-        self.duration, fine = knots[-1], np.arange(0.0, knots[-1], FINE)
+        self.duration, self.end, fine = knots[-1], p[-1, :2], np.arange(0.0, knots[-1], FINE)
         self._grid = np.stack([spline(fine), spline.derivative(1)(fine), spline.derivative(2)(fine)], axis=1)
 
     def at(self, t):
         """At t (n,) s; (n, 3, 3)."""
         out = self._grid[np.clip(np.rint(t / FINE).astype(int), 0, len(self._grid) - 1)]
-        after = t > self.duration
-        out[after, 0, 2] = np.nan  # as fast as that, from wherever it is: the ground is where it is felt
-        out[after, 1:] = 0.0
-        out[after, 1, 2] = -SINK
-        return out
+        return sinking(out, t > self.duration)
+
+    def turned(self, t):
+        """rad by which it is to be turned t s after the start: it holds its yaw."""
+        return 0.0
+
+
+def sinking(wanted, after):
+    """Of what is wanted, (n, 3, 3), have it sink where `after`, (n,) bool."""
+    wanted[after, 0, 2] = np.nan  # as fast as that, from wherever it is: the ground is where it is felt
+    wanted[after, 1:] = 0.0
+    wanted[after, 1, 2] = -SINK
+    return wanted
 
 
 def _smooth(x):

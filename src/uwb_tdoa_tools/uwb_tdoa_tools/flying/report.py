@@ -56,5 +56,13 @@ def text(summed):
     return "\n".join(lines)
 
 
+def sentence(verdict):
+    """One of them in words."""
+    if not verdict["landed"]:
+        return f"not landed: {verdict['why']}"
+    figures = f"{verdict['place']:.2f} m from the wanted place at {verdict['touchdown']:.2f} m/s"
+    return f"landed {figures}, in the air {verdict['tracking']:.2f} m off the path"
+
+
 def _range(spread):
     return "-" if spread is None else f"{spread['median']:.2f} ({spread['least']:.2f} - {spread['most']:.2f})"

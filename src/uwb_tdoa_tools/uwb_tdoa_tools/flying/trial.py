@@ -63,51 +63,62 @@ class Flown:
 
 
 class Trial:
-    """A Task under way."""
+    """A Task under way. simulator : Simulator; source : who tells where it is; missions : [Mission], the last one under way; crash : as of
+    Flown."""
 
-    def __init__(self, task):
+    def __init__(self, task, source=None, lasts=None):
+        """source : something like OurFilter, default: what the Task says; lasts : s, default: as long as it can take."""
         world, seed, rules = task.world, task.seed, task.rules
         longest = rules.rest + rules.patience + task.path.duration + rules.longest_sink + REST_AFTER
-        duration = longest * (2 if task.again else 1) + (PAUSE + CARRY_TIME if task.again else 0.0)
+        duration = lasts or longest * (2 if task.again else 1) + (PAUSE + CARRY_TIME if task.again else 0.0)
         self.task, self.simulator = task, Simulator(world, seed, duration, task.path.radius)
         self._rng = random(seed, "task")
         told = random(seed, "told")
         place, off = self.simulator.state[POSITION] + TOLD_STD * told.standard_normal(3), TOLD_STD * told.standard_normal()
-        yaw, config = self.simulator.yaw + off, task.config
-        if task.peer is not None:
-            self.source = TheirFilter(task.peer, world.anchors, yaw, place if task.told == "place" else None)
-        else:
-            if task.yaw == "known":
-                config = replace(config, initial_yaw=yaw, initial_yaw_std=TOLD_STD)
-            self.source = OurFilter(world.anchors, config, task.effects)
-            if task.told == "place":
-                self.source.tell(TOLD_AT, place, TOLD_STD)
+        yaw = self.simulator.yaw + off
+        self.source = source or _filter_of(task, place, yaw)
+        if task.told == "place" and task.peer is None:
+            self.source.tell(TOLD_AT, place, TOLD_STD, yaw if task.yaw == "known" else math.nan)
         self.controller = Controller(task.gains, self.simulator.believed)
         self.transport = Transport(world.latency, world.jitter, random(seed, "transport"))
         self.missions, self.crash, self._arrived = [], "", []
 
     def fly(self):
         """One mission from where it stands, until it has rested for a while after it, or has come to an end."""
-        simulator, rules, path = self.simulator, self.task.rules, self.task.path
-        state = simulator.state
-        mission = Mission(path, state[:2].copy(), state[2], rules, simulator.now)
-        self.missions.append(mission)
-        moment = _moment(self.task.world.silence, path, rules, self._rng)
-        felt = int(FELT * IMU_RATE)
-        while not (simulator.over or self.crash or mission.state == REFUSED):
-            now, pose, k = simulator.now, self.source.pose, simulator.done
-            started = mission.begin + rules.rest if mission.started is None else mission.started
-            simulator.radio.happens(started + moment, started + 0.5 * path.duration)
-            force = np.mean(simulator.samples[max(k - felt, 0) : k + 1, 5])
-            wanted = mission.decide(now, pose, self.source.deviation, self.controller.support(force))
-            if wanted is not None:
-                attitude = self._turned_since(pose[3], pose[0], k)
-                self.controller.fly(pose[1], pose[2], attitude, wanted, mission.yaw, DT)
-            else:
-                self.controller.stop()
-                if mission.state == DONE and now > mission.ended + REST_AFTER:
-                    return
-            self._turn()
+        self.begin()
+        while not self.over:
+            self.turn()
+
+    def begin(self, path=None, rules=None):
+        """Begin a mission from where it stands; path, rules : default: those of the Task."""
+        state, task = self.simulator.state, self.task
+        self.missions.append(Mission(path or task.path, state[:2].copy(), state[2], rules or task.rules, self.simulator.now))
+        self._moment = _moment(task.world.silence, task.path, task.rules, self._rng)
+
+    @property
+    def over(self):
+        """True when the mission under way has come to an end, or nothing more can come."""
+        mission = self.missions[-1]
+        rested = mission.state == DONE and self.simulator.now > mission.ended + REST_AFTER
+        return bool(rested or mission.state == REFUSED or self.crash or self.simulator.over)
+
+    def turn(self):
+        """One turn of the controller, as the mission under way decides; rotors off without one."""
+        wanted = self._decide(self.missions[-1]) if self.missions else None
+        if wanted is None:
+            self.controller.stop()
+        else:
+            p, v, q, yaw = *self.source.pose[1:], self.missions[-1].yaw
+            self.controller.fly(p, v, self._turned_since(q, self.source.pose[0]), wanted, yaw, DT)
+        self._turn()
+
+    def _decide(self, mission):
+        """What a Mission wants now."""
+        simulator, k = self.simulator, self.simulator.done
+        started = mission.begin + mission.rules.rest if mission.started is None else mission.started
+        simulator.radio.happens(started + self._moment, started + 0.5 * self.task.path.duration)
+        force = np.mean(simulator.samples[max(k - int(FELT * IMU_RATE), 0) : k + 1, 5])
+        return mission.decide(simulator.now, self.source.pose, self.source.deviation, self.controller.support(force))
 
     def rest(self, seconds):
         """Stand, or be carried, with rotors off."""
@@ -122,9 +133,9 @@ class Trial:
         self.source.take(measured)
         self.crash = _crash(self.simulator, self.task.world)
 
-    def _turned_since(self, attitude, since, k):
-        """An attitude (4,) of `since`, s, turned by the rates that were felt until sample k."""
-        times, samples, attitude = self.simulator.times, self.simulator.samples, attitude.copy()
+    def _turned_since(self, attitude, since):
+        """An attitude (4,) of `since`, s, turned by the rates that were felt until now."""
+        times, samples, k, attitude = self.simulator.times, self.simulator.samples, self.simulator.done, attitude.copy()
         for j in range(max(int(np.searchsorted(times[: k + 1], since, side="right")), 1), k + 1):
             turned(attitude, samples[j, :3], times[j] - max(times[j - 1], since))
         return attitude
@@ -154,6 +165,15 @@ def fly(task):
         trial.rest(CARRY_TIME)
         trial.fly()
     return trial.flown
+
+
+def _filter_of(task, place, yaw):
+    """Who tells where it is, of a Task; place (3,) m and yaw, rad: what is told at the start, if it is."""
+    anchors = task.world.anchors
+    if task.peer is not None:
+        return TheirFilter(task.peer, anchors, yaw, place if task.told == "place" else None)
+    known = {"initial_yaw": yaw, "initial_yaw_std": TOLD_STD} if task.yaw == "known" else {}
+    return OurFilter(anchors, replace(task.config, **known), task.effects)
 
 
 def _moment(silence, path, rules, rng):

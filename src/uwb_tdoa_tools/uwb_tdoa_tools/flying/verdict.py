@@ -77,7 +77,7 @@ def _judge(flown, mission, end):
         "ended": mission.ended,
         "said_lost": mission.lost,
         "duration": float(t[-1]),
-        **_armed(odometry, truth, mission),
+        **_armed(flown.odometry, flown.flight.truth, mission),
         **_estimation(odometry, truth, mission, first, last),
     }
     figures["why"] = _why(crash, mission, figures)

@@ -1,0 +1,54 @@
+"""A vehicle_node and the nodes that it flies by, as processes, and a node of the test that asks and listens."""
+
+from contextlib import contextmanager
+import json
+
+from nav_msgs.msg import Odometry
+from std_msgs.msg import String
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
+from uwb_tdoa_tools.live.processes import Processes, own_domain, wait
+from uwb_tdoa_tools.live.session import session
+
+PATIENCE = 180.0  # s for anything that must happen; the very first start compiles the filter and the vehicle
+
+
+class Hall:
+    """verdicts : [dict], as they came; odometry : the newest, or None."""
+
+    def __init__(self, node, processes):
+        self.verdicts, self.odometry, self.node = [], None, node
+        self._processes = processes
+        self._ends = [
+            node.create_subscription(String, "verdict", lambda message: self.verdicts.append(json.loads(message.data)), ANCHORS_QOS),
+            node.create_subscription(Odometry, "odometry", self._on_odometry, 10),
+        ]
+
+    def _on_odometry(self, message):
+        self.odometry = message
+
+    def wait(self, condition, what, limit=PATIENCE):
+        """Listen until condition()."""
+        wait(limit, what, self._processes, self.node, condition)
+
+    def ask(self, kind, name, **request):
+        """What a service answers."""
+        client = self.node.create_client(kind, name)
+        self.wait(client.service_is_ready, name)
+        answer = client.call_async(kind.Request(**request))
+        self.wait(answer.done, f"an answer of {name}")
+        return answer.result()
+
+
+@contextmanager
+def hall(folder, *parameters, ekf=()):
+    """A Hall with all nodes, on simulated time, while the block lasts. parameters, ekf : NAME:=VALUE, of vehicle_node and ekf_node."""
+    with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
+        told = {
+            ("uwb_tdoa_bias", "bias_node"): ["use_sim_time:=true", "model_file:=''"],
+            ("uwb_tdoa_ekf", "ekf_node"): ["use_sim_time:=true", *ekf],
+            ("uwb_tdoa_tools", "vehicle_node"): ["simulated_time:=true", *parameters],
+        }
+        for (package, name), values in told.items():
+            arguments = ["--ros-args", *(word for value in values for word in ("-p", value))]
+            processes.start(package, name, *arguments, may_end_with=(0, 1) if "mission:=true" in values else ())
+        yield Hall(node, processes)

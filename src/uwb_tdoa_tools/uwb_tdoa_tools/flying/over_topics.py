@@ -1,0 +1,197 @@
+"""A filter that is reached over topics, behind the calls that a flight needs: what is measured goes out, odometry and status come in."""
+
+import math
+from types import SimpleNamespace
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistWithCovariance, TwistWithCovarianceStamped
+from nav_msgs.msg import Odometry as OdometryMessage
+import numpy as np
+from rclpy.duration import Duration
+from rosgraph_msgs.msg import Clock
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import FluidPressure, Imu, Range
+from uwb_tdoa_bias.anchors_node import markers, transforms
+from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
+from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS
+from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
+from uwb_tdoa_bias.foundation.ros_wire import Wire
+from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
+
+from ..bags.messages import BODY_FRAME, FIELD_OF_VIEW, LONGEST_RANGE, UNKNOWN_VARIANCE
+from .estimates import NOTHING
+from .sensors import VELOCITY_STD
+from .vehicle import ATTITUDE, POSITION
+
+FARTHEST, FASTEST = 1e3, 100.0  # m, m/s; what is beyond is no odometry of a hall
+LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
+MARKER_SIZE = 0.12  # m
+VARIANCES = [VELOCITY_STD**2] * 3 + [UNKNOWN_VARIANCE] * 3  # of a velocity and a rate
+STREAMS = {  # {stream: (topic, message, {field: column of its part})}
+    "imu": ("imu/data", Imu(), {"angular_velocity": "gyro", "linear_acceleration": "accel"}),
+    "tdoa": ("uwb/tdoa", Tdoa(), {"anchor_a": "a", "anchor_b": "b", "distance_difference": "d", "variance": "variance"}),
+    "height": (
+        "height",
+        Range(radiation_type=Range.INFRARED, field_of_view=FIELD_OF_VIEW, min_range=0.0, max_range=LONGEST_RANGE),
+        {"range": "range"},
+    ),
+    "pressure": ("pressure", FluidPressure(), {"fluid_pressure": "pressure"}),
+    "velocity": (
+        "velocity",
+        TwistWithCovarianceStamped(twist=TwistWithCovariance(covariance=np.diag(VARIANCES).ravel())),
+        {"twist.twist.linear": "v"},
+    ),
+    "truth": ("ground_truth/pose", PoseStamped(), {"pose": "pose"}),
+}
+
+
+class OverTopics:
+    """See `estimates.OurFilter`. deviation : m, as there; inf unless the filter says that it is running; status : EstimatorStatus, the
+    newest, or None."""
+
+    def __init__(self, node, world, pace, clock):
+        """node : ros.StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count stamps
+        from 0, not from now."""
+        self._node, self._pace, self._anchors = node, pace, world.anchors
+        self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock
+        self._now, self._told, self.status = 0.0, (), None
+        self._outputs = {name: _Output(node, *STREAMS[name]) for name in ("imu", "tdoa", *world.aids)}
+        self._truth = _Output(node, *STREAMS["truth"], frame=self._anchors.frame)
+        self._clock = node.create_publisher(Clock, "/clock", 10) if clock else None
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, "initialpose", ros.OUTPUT_QOS)
+        self._wire = Wire(OdometryMessage, "pose", "twist")
+        self._odometry = ros.StreamInput(node, OdometryMessage, "odometry")
+        self._status = ros.Input(node, EstimatorStatus, "status", self._on_status, ANCHORS_QOS)
+        anchors = anchors_to_message(self._anchors)
+        for topic, qos, content in (
+            ("/tf_static", TF_STATIC_QOS, transforms(anchors)),
+            ("uwb/anchors/markers", ANCHORS_QOS, markers(anchors, MARKER_SIZE)),
+            ("uwb/anchors", ANCHORS_QOS, anchors),  # the last one: who has it hears the others
+        ):
+            self._latched = node.create_publisher(type(content), topic, qos)
+            self._latched.publish(content)
+        self._rows = []  # (t s, p, v, q, covariance (3, 3)) of each odometry
+
+    def heard(self):
+        """Whether somebody listens to what is measured, and says what comes of it."""
+        ends = [output.subscribers for output in (self._outputs["imu"], self._outputs["tdoa"])]
+        return all(ends) and bool(self._odometry.get_publisher_count())
+
+    def wait_for_anchors(self):
+        """Wait until those who listen have the anchors, and hear everything else, too."""
+        self._latched.wait_for_all_acked(Duration(seconds=LATCHED_LIMIT))
+
+    def tell(self, t, p, std, yaw):
+        """See OurFilter; is said before what is measured first."""
+        self._told = t, p, std, yaw
+
+    def take(self, measured):
+        """Publish Measured."""
+        if self._begin is None:
+            self._begin = self._node.get_clock().now().nanoseconds
+        if self._told:
+            self._pose.publish(self._pose_of(*self._told))
+            self._told = ()
+        self._measured = measured
+        for name, part in {"imu": measured.imu, "tdoa": measured.tdoa, **measured.aids}.items():
+            self._outputs[name].publish(*self._parts(part.t), part)
+
+    def turned(self, t, state):
+        """Publish what is true at t, s, up to which everything was published: state (17,), as of `vehicle`; and on /clock the time."""
+        self._now = t
+        self._truth.publish(*self._parts(np.array([t])), SimpleNamespace(pose=np.concatenate([state[POSITION], state[ATTITUDE]])[None]))
+        if self._clock is not None:
+            self._clock.publish(Clock(clock=self._stamp(t)))
+        self._pace.sent(t, self._measured)
+
+    def listen(self):
+        """Take the odometry that has come."""
+        for frame, rows, _ in self._odometry.fetch(self._wire):
+            t = 1e-9 * (rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"] - self._begin)
+            usable = np.isfinite(rows["pose"]).all(axis=1) & np.isfinite(rows["twist"]).all(axis=1) & (frame == self._anchors.frame)
+            for k in np.flatnonzero(usable & (t <= self._now)):
+                self._hear(t[k], rows["pose"][k], rows["twist"][k])
+
+    def _hear(self, t, pose, twist):
+        p, q, covariance = pose[:3].copy(), pose[3:7].copy(), pose[7:].reshape(6, 6)[:3, :3].copy()
+        length = np.linalg.norm(q)
+        sound = length > 0.5 and (np.diag(covariance) >= 0.0).all()
+        near = np.abs(p).max() < FARTHEST and np.abs(twist[:3]).max() < FASTEST
+        if not (sound and near) or (self._rows and t <= self._rows[-1][0]):
+            return
+        q /= length
+        self._rows.append((float(t), p, Rotation.from_quat(q).apply(twist[:3]), q, covariance))
+        self._pace.heard(float(t))
+
+    def _pose_of(self, t, p, std, yaw):
+        """PoseWithCovarianceStamped, see `tell`; a variance of 0 says that nobody knows."""
+        message, known = PoseWithCovarianceStamped(), not math.isnan(yaw)
+        message.header.stamp, message.header.frame_id = self._stamp(t), self._anchors.frame
+        at, turn = message.pose.pose.position, message.pose.pose.orientation
+        at.x, at.y, at.z = p.tolist()
+        turn.z, turn.w = (math.sin(0.5 * yaw), math.cos(0.5 * yaw)) if known else (0.0, 1.0)
+        message.pose.covariance = np.diag([*[std**2] * 3, 0.0, 0.0, std**2 if known else 0.0]).ravel()
+        return message
+
+    def _on_status(self, message):
+        self.status = message
+
+    @property
+    def pose(self):
+        """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
+        return self._rows[-1][:4] if self._rows else None
+
+    @property
+    def deviation(self):
+        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one, or where the filter says that it is lost."""
+        if not self._rows or self.status is None or self.status.status != EstimatorStatus.STATUS_RUNNING:
+            return math.inf
+        return math.sqrt(np.diag(self._rows[-1][4]).max())
+
+    @property
+    def why(self):
+        """What keeps it from being flown by, in words, "" if nothing is said."""
+        if self.status is None:
+            return "nothing came on status: start ekf_node"
+        return self.status.why if self.status.status != EstimatorStatus.STATUS_RUNNING else ""
+
+    @property
+    def odometry(self):
+        """Odometry, all that came; of its covariance only that of the position, the rest 0."""
+        if not self._rows:
+            return NOTHING
+        t, p, v, q, covariance = map(np.array, zip(*self._rows))
+        whole = np.zeros((len(t), 9, 9))
+        whole[:, :3, :3] = covariance
+        return Odometry(t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), whole)
+
+    def _parts(self, t):
+        """Seconds and nanoseconds of the stamps, (n,) each, of t (n,) s."""
+        return np.divmod(self._begin + np.rint(t * 1e9).astype(np.int64), 10**9)
+
+    def _stamp(self, t):
+        second, nanosecond = self._parts(np.array([t]))
+        return ros.Time(sec=int(second[0]), nanosec=int(nanosecond[0]))
+
+
+class _Output:
+    """A stream of which only some fields differ from one message to the next. subscribers : how many hear it."""
+
+    def __init__(self, node, topic, message, columns, frame=BODY_FRAME):
+        message.header.frame_id = frame
+        self._columns, self._wire = columns, Wire(type(message), *columns)
+        self._frame, self._template = frame, self._wire.template(message)
+        self._output = StreamOutput(node, type(message), topic)
+
+    @property
+    def subscribers(self):
+        return self._output.publisher.get_subscription_count()
+
+    def publish(self, seconds, nanoseconds, part):
+        """Publish the rows of a part of a stream, with stamps of these seconds and nanoseconds (n,) each."""
+        rows = self._template.rows(len(seconds))
+        rows["sec"], rows["nanosec"] = seconds, nanoseconds
+        for field, name in self._columns.items():
+            rows[field] = getattr(part, name)
+        self._output.publish(self._frame, self._template, rows)

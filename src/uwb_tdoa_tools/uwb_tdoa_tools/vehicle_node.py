@@ -1,0 +1,135 @@
+"""vehicle_node: a simulated quadrotor that flies by the odometry of our nodes, or of others.
+
+odometry (nav_msgs/Odometry), status (EstimatorStatus)
+  -> imu/data (sensor_msgs/Imu), uwb/tdoa (Tdoa), uwb/anchors (AnchorArray, latched), ground_truth/pose (geometry_msgs/PoseStamped),
+     initialpose (geometry_msgs/PoseWithCovarianceStamped, once), verdict (std_msgs/String: JSON, latched); if asked for: height
+     (sensor_msgs/Range), pressure (sensor_msgs/FluidPressure), velocity (geometry_msgs/TwistWithCovarianceStamped), /clock.
+Services takeoff, go_to, land (Takeoff, GoTo, Land), as users of crazyswarm2 know them.
+Every parameter is documented in config/vehicle_node.yaml.
+"""
+
+import json
+import sys
+import time
+
+from rclpy.duration import Duration
+from std_msgs.msg import String
+from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
+from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all, files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_streams import Turns
+from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
+
+from .flying.over_topics import OverTopics
+from .flying.pace import Lockstep, RealTime
+from .flying.pilot import Pilot
+from .flying.report import sentence
+from .flying.sensors import AIDS
+from .flying.trial import Task, Trial
+from .flying.verdict import judge
+from .flying.world import WORLDS, world_of
+
+PARAMETERS = {  # in the order of config/vehicle_node.yaml
+    "world": Parameter("hall", "what it flies in (docs/flying.md)", choices=tuple(WORLDS)),
+    "seed": Parameter(1, "of all that is random, as of fly", 0, 2**31 - 1),
+    "told": Parameter("place", "what it tells the filter at the start: its place and yaw, to 0.1 m and 0.1 rad", choices=("nothing", "place")),
+    "aids": Parameter([""], f'what else it measures, of {", ".join(AIDS)}; [""] for nothing'),
+    "mission": Parameter(False, "fly the standard mission, say what became of it, and end, with exit code 1 unless it has landed"),
+    "simulated_time": Parameter(False, "publish /clock, and go on when the odometry is there; else in real time"),
+    "duration": Parameter(600.0, "s; how long it can be flown, without the mission", 10.0, 1800.0),
+}
+SETTLE = 1.0  # s from when somebody listens until what they say to each other is heard, too
+
+
+class VehicleNode(ros.StreamNode):
+    """A Trial on topics, and services for who flies it."""
+
+    NAME = "vehicle_node"
+
+    def __init__(self, arguments=()):
+        """arguments : of the process."""
+        super().__init__(self.NAME)
+        own = declare_all(self, PARAMETERS)
+        refuse_unknown(self)
+        self._mission, aids = own["mission"], [name for name in own["aids"] if name]
+        if unknown := sorted(set(aids) - set(AIDS)):
+            raise InputError(f"aids: {unknown[0]!r} is not one of {', '.join(AIDS)}.")
+        world, known = world_of(own["world"], aids=aids), own["told"] == "place"
+        task = Task(world, own["seed"], own["told"], "known" if known else "unknown")
+        self._pace = Lockstep() if own["simulated_time"] else RealTime()
+        self._topics = OverTopics(self, world, self._pace, own["simulated_time"])
+        self._trial = Trial(task, self._topics, None if self._mission else own["duration"])
+        self._pilot, self._judged = Pilot(self._trial), 0  # missions that were judged
+        self._verdict = self.create_publisher(String, "verdict", ANCHORS_QOS)
+        self._offered = () if self._mission else [
+            self.create_service(Takeoff, "takeoff", self._on_takeoff),
+            self.create_service(GoTo, "go_to", self._on_go_to),
+            self.create_service(Land, "land", self._on_land),
+        ]  # fmt: skip
+        self._starts = None  # time.monotonic(), s, when it begins, once somebody listens
+        say_unused([self], files_of(arguments))
+        self.turns = Turns([self])
+        self.get_logger().info("ready; waiting for who listens to imu/data and uwb/tdoa, and publishes odometry")
+
+    def take(self):
+        """A turn, if it may come. Returns True: another one is to come."""
+        self._topics.listen()
+        if self._starts is None and self._topics.heard():
+            self._topics.wait_for_anchors()
+            self._starts = time.monotonic() + SETTLE
+        if self._starts is None or time.monotonic() < self._starts or not self._pace.may_go_on():
+            return True
+        trial = self._trial
+        if self._mission and not trial.missions:
+            trial.begin()
+        trial.turn()
+        self._topics.turned(trial.simulator.now, trial.simulator.state)
+        if len(trial.missions) > self._judged and trial.over:
+            self._judge()
+        if trial.crash or trial.simulator.over:
+            self.get_logger().error(f"the flight is over: {trial.crash or 'its time is up'}")
+            raise SystemExit(1)
+        return True
+
+    def _judge(self):
+        """Say what became of the mission under way; of the standard one with the exit code."""
+        verdict, self._judged = judge(self._trial.flown), len(self._trial.missions)
+        self._verdict.publish(String(data=json.dumps(verdict)))
+        self.get_logger().info(sentence(verdict))
+        if self._mission:
+            self._verdict.wait_for_all_acked(Duration(seconds=SETTLE))
+            raise SystemExit(int(not verdict["landed"]))
+
+    def _answer(self, response, command, *values):
+        """Do what a request says, or say why not."""
+        try:
+            command(*values)
+            response.success = True
+        except InputError as error:
+            response.message = str(error)
+        return response
+
+    def _on_takeoff(self, request, response):
+        return self._answer(response, self._pilot.take_off, request.group_mask, request.height, _seconds(request.duration))
+
+    def _on_go_to(self, request, response):
+        goal = request.goal.x, request.goal.y, request.goal.z
+        values = request.group_mask, request.relative, goal, request.yaw, _seconds(request.duration)
+        return self._answer(response, self._pilot.go_to, *values)
+
+    def _on_land(self, request, response):
+        return self._answer(response, self._pilot.land, request.group_mask, request.height, _seconds(request.duration))
+
+
+def _seconds(duration):
+    return duration.sec + 1e-9 * duration.nanosec
+
+
+def main(argv=None):
+    """Run the node; returns the exit code."""
+    return ros.run(VehicleNode, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
