@@ -18,6 +18,7 @@ from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
 from .foundation import ros
 from .foundation.anchors import Anchors
+from .foundation.errors import InputError
 from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
 from .effects import EffectSet, LabelCorrector
 from .effects.tag_lever_arm import TagLeverArm
@@ -140,12 +141,14 @@ class BiasNode(ros.StreamNode):
                 self.get_logger().info(f"{TagLeverArm.name} of effects_file counts, not the transform of '{frame}'")
             elif between is None:
                 self._frame_trouble = unknown_frame("uwb/tdoa", frame, self._body)
-                if frame not in self._frames_said and len(self._frames_said) < MOST_FRAMES:
-                    self._frames_said.add(frame)
-                    self.get_logger().warning(self._frame_trouble)
             elif between[1].any():
-                arm = TagLeverArm(values=dict(zip("xyz", between[1].tolist())))
-                effects = EffectSet((*effects.effects, arm))
+                try:
+                    effects = EffectSet((*effects.effects, TagLeverArm(values=dict(zip("xyz", between[1].tolist())))))
+                except InputError as error:
+                    self._frame_trouble = f"uwb/tdoa: the place of '{frame}' on '{self._body}' in /tf_static is not taken: {error}"
+        if self._frame_trouble and frame not in self._frames_said and len(self._frames_said) < MOST_FRAMES:
+            self._frames_said.add(frame)
+            self.get_logger().warning(self._frame_trouble)
         if effects.effects == self._effects.effects:
             return
         self._effects = effects
