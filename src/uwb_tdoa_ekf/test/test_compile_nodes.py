@@ -11,6 +11,29 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rig import make_rig  # noqa: E402, F401
 
+IN_FLIGHT = """
+import sys
+from flights import fly
+import numpy as np
+from uwb_tdoa_ekf import ekf_node, estimator
+
+def compiled():
+    modules = [module for name, module in sys.modules.items() if name.startswith("uwb_tdoa_")]
+    return {each.py_func: len(each.signatures) for module in modules for each in vars(module).values() if hasattr(each, "signatures")}
+
+ekf_node.warm_up()
+before, flight = compiled(), fly(duration=20.0)
+tag, imu, tdoa = estimator.Estimator(flight.anchors), flight.imu, flight.tdoa
+for t in np.arange(0.0, 20.0, 0.02):
+    some = (imu.t >= t) & (imu.t < t + 0.02)
+    tag.add_imu(imu.t[some], imu.gyro[some], imu.accel[some])
+    some = (tdoa.t >= t) & (tdoa.t < t + 0.02)
+    tag.add_tdoa(tdoa.t[some], tdoa.a[some], tdoa.b[some], tdoa.d[some])
+    tag.advance()
+assert tag.running
+print([function.__name__ for function, count in compiled().items() if count > before.get(function, 0)])
+"""
+
 
 @pytest.mark.slow
 def test_after_it_no_node_compiles_anything(make_rig, monkeypatch):
@@ -22,3 +45,11 @@ def test_after_it_no_node_compiles_anything(make_rig, monkeypatch):
     for process in processes:
         said = "".join(process.lines)
         assert "data loaded from" in said and "data saved to" not in said
+
+
+@pytest.mark.slow
+def test_nothing_is_compiled_in_flight():
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")])}
+    ended = subprocess.run([sys.executable, "-c", IN_FLIGHT], env=environment, capture_output=True, text=True, timeout=300.0)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.strip() == "[]"

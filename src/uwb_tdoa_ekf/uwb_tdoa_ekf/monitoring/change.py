@@ -144,7 +144,7 @@ class ChangeDetector:
         n, turns = self._count - first, self._turn(np.arange(first, self._count))
         some = np.flatnonzero((self._place[turns] >= 0).any(axis=0))  # anchors that were heard
         inverse, white = _inverse(self._factor, first, n), self._white[first : self._count, some]
-        of_slices = self._place[turns][:, some], self._response[turns]
+        of_slices = np.ascontiguousarray(self._place[turns][:, some]), self._response[turns]  # or it is compiled anew in flight
         scores, information = _seen(*of_slices, inverse.T @ white, inverse.T @ inverse)
         age = np.arange(n) - np.arange(n - YOUNGEST)[:, None]  # of slices (columns) since each onset (rows)
         shapes = np.concatenate([(age >= 0).astype(float), LENGTH * np.maximum(age + 0.5, 0.0)])
