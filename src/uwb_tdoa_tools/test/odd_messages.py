@@ -6,7 +6,7 @@ received or counted as unreadable, every other one that cannot be read is counte
 """
 
 import argparse
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import json
 from pathlib import Path
 import re
@@ -61,12 +61,12 @@ class Account:
     """sent, received, unreadable, expected : messages by topic (received: streams; expected : unreadable ones of the others);
     memory : bytes after each tenth; log : bytes."""
 
-    sent: dict = field(default_factory=dict)
-    received: dict = field(default_factory=dict)
-    unreadable: dict = field(default_factory=dict)
-    expected: dict = field(default_factory=dict)
-    memory: list = field(default_factory=list)
-    log: int = 0
+    sent: dict
+    received: dict
+    unreadable: dict
+    expected: dict
+    memory: list
+    log: int
 
 
 def changed(data, rng, step=1):
@@ -111,52 +111,59 @@ def whole(kind, k):
 
 def ordeal(name, count, folder, seed=1):
     """Account of a node that is sent `count` messages on each topic."""
-    rng, out = np.random.default_rng(seed), Account()
-    streams, single = STREAMS[name], SINGLE[name]
-    kinds = {topic: kind for topic, (kind, _) in streams.items()} | single
     with surroundings(folder) as (node, processes):
-        diagnostics = Diagnostics(node)
-        told = [part for topic in streams for part in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")]
+        diagnostics, log = Diagnostics(node), processes.file(name)
+        told = [part for topic in STREAMS[name] for part in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")]
         told += ["-p", "publish_tf:=odom"] if name == "ekf_node" else ["-p", "model_file:=auto"]
         processes.start(PACKAGES[name], name, "--ros-args", *told)
-        log = processes.file(name)
         wait(READY_LIMIT, f"{name} to be ready", processes, node, lambda: ready_at(name, log.read_text(errors="replace")))
-        publishers = {topic: node.create_publisher(kind, topic, qos(topic)) for topic, kind in kinds.items()}
-        client = node.create_client(GetParameters, f"/{name}/get_parameters")
-        wait(PATIENCE, "the node to be found", processes, node, client.service_is_ready)
-        wait(PATIENCE, "it to listen", processes, node, lambda: all(p.get_subscription_count() for p in publishers.values()))
-        found = {f"publishers of {topic}" for topic in streams}  # a reliable link begins when both ends know of each other
-        wait(PATIENCE, "the node to find us", processes, node, lambda: all(diagnostics.newest(name).get(key) == "1" for key in found))
-        out.expected = dict.fromkeys(single, 0)
-        for k in range(count):  # one on each topic until the node has answered: of anchors only the last is kept
-            for topic, kind in kinds.items():
-                data = changed(whole(kind, k), rng, ALIGNED if topic in single else 1)
-                out.sent[topic] = out.sent.get(topic, 0) + 1
-                if topic in single:
-                    out.expected[topic] += not is_readable(data, kind)
-                publishers[topic].publish(data)
-            answered = client.call_async(GetParameters.Request(names=["use_sim_time"]))
-            while not answered.done() and processes.check() is None:
-                rclpy.spin_once(node, timeout_sec=PATIENCE)
-            if k % max(1, count // 10) == 0:
-                out.memory.append(memory(processes.pid(name)))
+        publishers = _publishers(node, processes, diagnostics, name)
+        out = _send(node, processes, publishers, name, count, np.random.default_rng(seed))
 
         def said(key):
             return int(diagnostics.newest(name).get(key, -1))
 
-        def judge():
-            out.unreadable = {topic: said(f"unreadable on {topic}") for topic in kinds}
-            out.received = {topic: said(key) for topic, (_, key) in streams.items()}
+        def is_settled():
+            out.unreadable = {topic: said(f"unreadable on {topic}") for topic in publishers}
+            out.received = {topic: said(key) for topic, (_, key) in STREAMS[name].items()}
             return not wrong(out)
 
         until = time.monotonic() + PATIENCE
-        while not judge() and time.monotonic() < until:
+        while not is_settled() and time.monotonic() < until:
             processes.check()
             rclpy.spin_once(node, timeout_sec=0.1)
         out.memory.append(memory(processes.pid(name)))
         processes.stop(name)
         out.log = log.stat().st_size
         assert not re.search("Traceback", log.read_text(errors="replace")), log
+    return out
+
+
+def _publishers(node, processes, diagnostics, name):
+    """{topic: publisher} of everything that the node takes, after both ends know of each other."""
+    kinds = {topic: kind for topic, (kind, _) in STREAMS[name].items()} | SINGLE[name]
+    out = {topic: node.create_publisher(kind, topic, qos(topic)) for topic, kind in kinds.items()}
+    wait(PATIENCE, "it to listen", processes, node, lambda: all(p.get_subscription_count() for p in out.values()))
+    found = {f"publishers of {topic}" for topic in STREAMS[name]}
+    wait(PATIENCE, "the node to find us", processes, node, lambda: all(diagnostics.newest(name).get(key) == "1" for key in found))
+    return out
+
+
+def _send(node, processes, publishers, name, count, rng):
+    """Account of what was sent: one message on each topic until the node has answered; of anchors only the last is kept."""
+    out = Account(dict.fromkeys(publishers, count), {}, {}, dict.fromkeys(SINGLE[name], 0), [], 0)
+    client = node.create_client(GetParameters, f"/{name}/get_parameters")
+    wait(PATIENCE, "the node to be found", processes, node, client.service_is_ready)
+    for k in range(count):
+        for topic, publisher in publishers.items():
+            kind, single = publisher.msg_type, topic in SINGLE[name]
+            data = changed(whole(kind, k), rng, ALIGNED if single else 1)
+            if single:
+                out.expected[topic] += not is_readable(data, kind)
+            publisher.publish(data)
+        wait(PATIENCE, "an answer", processes, node, client.call_async(GetParameters.Request(names=["use_sim_time"])).done)
+        if k % max(1, count // 10) == 0:
+            out.memory.append(memory(processes.pid(name)))
     return out
 
 
