@@ -102,7 +102,7 @@ def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
     streams.add(Wire(FluidPressure, "fluid_pressure"), "pressure", take)
     publisher, clock = other.create_publisher(FluidPressure, "pressure", DEEP), other.create_publisher(Clock, "/clock", DEEP)
     until(lambda: publisher.get_subscription_count() and clock.get_subscription_count())
-    assert Clock not in [each.msg_type for each in node.subscriptions]
+    assert not {Clock, FluidPressure} & {each.msg_type for each in node.subscriptions}
     spinner = Spinner([node], Turns([streams]))
     spinner._serve()
     for second in range(1, MANY + 1):
@@ -116,6 +116,25 @@ def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
         return node.get_clock().now().nanoseconds == MANY * 10**9
 
     until(is_newest)
+    spinner.close()
+
+
+def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
+    node, other = surroundings
+    stop, heard = Future(), []
+
+    def take(frame, t, rows, arrival):
+        heard.append(time.time() - arrival[0])
+        stop.set_result(None)
+
+    streams = Streams(node, ros.Epoch(), lambda: None)
+    streams.add(Wire(FluidPressure, "fluid_pressure"), "pressure", take)
+    publisher = other.create_publisher(FluidPressure, "pressure", DEEP)
+    until(publisher.get_subscription_count)
+    node.create_timer(0.1, lambda: publisher.publish(FluidPressure()))  # the process sleeps in its executor until then
+    spinner = Spinner([node], Turns([streams]))
+    spinner.spin(stop)
+    assert 0.0 <= heard[0] < 5.0
     spinner.close()
 
 

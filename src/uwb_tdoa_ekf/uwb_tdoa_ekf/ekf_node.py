@@ -228,6 +228,7 @@ class EkfNode(ros.StreamNode):
                 self.outputs.publish_residuals(invalid(t, rows["anchor_a"], rows["anchor_b"]))
 
     def _advance(self):
+        self._frames.catch_up()
         if self._estimator is not None:
             self._publish(*self._estimator.advance())
 
@@ -337,6 +338,7 @@ class EkfNode(ros.StreamNode):
         return rotation_std(*self._attitude)[0, 2]
 
     def _report(self):
+        self._frames.catch_up()  # where there is no odometry
         counts, estimator = Counter(self._past), self._estimator
         waiting = Counter(stream for stream, _ in self._early)
         if estimator is not None:

@@ -5,8 +5,9 @@ receives; a message is late from its publication until it is in the hands of who
 
   single     SingleThreadedExecutor, a callback with the bytes of each message
   events     EventsExecutor, the same
+  kept       callbacks that keep the bytes, and the EventsExecutor up to a mark, each millisecond
   beside     the streams taken in turns of a millisecond, and one callback of the EventsExecutor every 20 ms
-  spinner    ros_spinning.Spinner: the EventsExecutor up to a mark, then what the callbacks kept, in one turn
+  spinner    ros_spinning.Spinner: the streams the same way, and the EventsExecutor up to a mark every 20 ms
 """
 
 import multiprocessing
@@ -28,7 +29,7 @@ from uwb_tdoa_bias.foundation.ros_spinning import Spinner
 from uwb_tdoa_tools.live.processes import own_domain
 
 STREAMS = {Imu: "imu", Range: "tdoa"}
-WAYS = "single", "events", "beside", "spinner"
+WAYS = "single", "events", "kept", "beside", "spinner"
 STAMP = struct.Struct("<iI")
 SETTLE = 2.0  # s
 
@@ -70,21 +71,19 @@ def publish(stop):
 
 
 class Counted:
-    """Turns that only look at what was kept."""
+    """Turns that only look at what take(), a list of bytes, gives."""
 
     PERIOD = 0.001
 
-    def __init__(self, handle):
-        self.kept, self._handle = [], handle
+    def __init__(self, take, handle):
+        self._take, self._handle = take, handle
 
     def take(self):
         """One turn."""
-        if not self.kept:
-            return None
-        some, self.kept[:] = self.kept[:], []
+        some = self._take()
         for data in some:
             self._handle(data)
-        return self.PERIOD
+        return self.PERIOD if some else None
 
 
 def receive(way, seconds, queue):
@@ -99,39 +98,44 @@ def receive(way, seconds, queue):
     def count(_):
         rest[0] += 1
 
-    turns = Counted(handle)
-    callback = turns.kept.append if way == "spinner" else handle
+    def waiting():
+        return [data for each in streams for data, _ in ros.waiting(each)]
+
+    def fetch():
+        some, kept[:] = kept[:], []
+        return some
+
+    kept = []
+    callback = {"kept": kept.append, "beside": ros.unserved, "spinner": ros.unserved}.get(way, handle)
     streams = [node.create_subscription(kind, topic, callback, ros.STREAM_QOS, raw=True) for kind, topic in STREAMS.items()]
     node.create_subscription(FluidPressure, "rest", count, 10, raw=True)
-    if way == "beside":
-        type(node).subscriptions = property(lambda self: iter([one for one in self._subscriptions if one not in streams]))
     stop = Future()
     signal.signal(signal.SIGALRM, lambda *_: stop.set_result(None))
     while node.count_publishers("imu") == 0:
         time.sleep(0.05)
     time.sleep(SETTLE)
-    for stream in streams:
-        while stream.handle.take_message(stream.msg_type, True) is not None:
-            pass
+    waiting()
     cpu, began = time.process_time(), time.monotonic()
     signal.setitimer(signal.ITIMER_REAL, seconds)
     if way == "spinner":
-        Spinner([node], turns).spin(stop)
+        Spinner([node], Counted(waiting, handle)).spin(stop)
     else:
         executor = SingleThreadedExecutor() if way == "single" else EventsExecutor()
         executor.add_node(node)
-        served = 0.0
+        served, turns = 0.0, Counted(waiting if way == "beside" else fetch, handle)
         while not stop.done():
-            if way != "beside":
+            if way in ("single", "events"):
                 executor.spin_until_future_complete(stop, timeout_sec=0.2)
                 continue
-            if time.monotonic() > served + 0.02:
+            if way == "kept":
+                mark = executor.create_task(int)
+                while not mark.done():
+                    executor.spin_once(timeout_sec=0.0)
+            elif time.monotonic() > served + 0.02:
                 executor.spin_once(timeout_sec=0.0)
                 served = time.monotonic()
-            for stream in streams:
-                while (taken := stream.handle.take_message(stream.msg_type, True)) is not None:
-                    handle(taken[0])
-            time.sleep(0.001)
+            turns.take()
+            time.sleep(turns.PERIOD)
     cpu, took = time.process_time() - cpu, time.monotonic() - began
     p50, p99 = np.percentile(1e-6 * np.array(late), [50, 99])
     line = f"{len(late) / took:.0f} | {100 * cpu / took:.1f} | {1e6 * cpu / len(late):.0f} | {p50:.2f} | {p99:.1f} | {rest[0] / took:.0f}"

@@ -48,29 +48,39 @@ def publish_stream(node, kind, topic):
 
 
 class StreamNode(ParameterNode):
-    """A node whose /clock is not served by an executor (see Spinner). members : nodes that live and end with it; spinner : the
-    Spinner that serves it, once there is one."""
+    """A node whose streams and /clock are not served by an executor (see Spinner). members : nodes that live and end with it;
+    spinner : the Spinner that serves it, once there is one."""
 
     members, spinner = (), None
 
     @property
     def subscriptions(self):
         """Those that an executor serves."""
-        yield from (one for one in super().subscriptions if one.msg_type is not Clock)
+        yield from (one for one in super().subscriptions if one.msg_type is not Clock and one.callback is not unserved)
 
     def take_clock(self):
         """Set the clock of the node to the newest of /clock."""
         for clock in [one for one in super().subscriptions if one.msg_type is Clock]:
             newest = None
-            with clock.handle:
-                while (taken := clock.handle.take_message(Clock, True)) is not None:
-                    newest = taken[0]
+            for newest, _ in waiting(clock):
+                pass
             if newest is None:
                 continue
             try:
                 clock.callback(decode(newest, Clock))
             except (ValueError, OverflowError) as error:  # no time at all, or before 1970
                 self.get_logger().warning(f"/clock: passed over: {error}", throttle_duration_sec=SAY_AGAIN)
+
+
+def unserved(_):
+    """Callback of a subscription that no executor serves."""
+
+
+def waiting(subscription):
+    """Generator of what waits at a subscription that no executor serves: (bytes, information) of each message, which is taken."""
+    kind, take = subscription.msg_type, subscription.handle.take_message
+    while (taken := take(kind, True)) is not None:
+        yield taken
 
 
 class Refusals:
@@ -109,16 +119,22 @@ def _hash(end):
 
 
 class Input:
-    """Subscription of messages that come one at a time, not in streams: callback(message). What cannot be read is refused.
+    """Subscription of messages that come one at a time, not in streams: callback(message), by an executor, or in `take_all` if it is
+    not served. What cannot be read is refused.
 
     refusals : Refusals; options : of Node.create_subscription.
     """
 
-    def __init__(self, node, kind, topic, callback, qos, read=None, **options):
+    def __init__(self, node, kind, topic, callback, qos, read=None, served=True, **options):
         """read(bytes) : what is given to the callback; default the message; raises Unreadable."""
         self.refusals = Refusals(node, topic, kind)
         self._read, self._callback = read or (lambda data: decode(data, kind)), callback
-        self.subscription = node.create_subscription(kind, topic, self._take, qos, raw=True, **options)
+        self.subscription = node.create_subscription(kind, topic, self._take if served else unserved, qos, raw=True, **options)
+
+    def take_all(self):
+        """Take what waits."""
+        for data, _ in waiting(self.subscription):
+            self._take(data)
 
     def _take(self, data):
         try:
@@ -130,7 +146,7 @@ class Input:
 
 
 class StreamInput:
-    """Subscription of a stream, of which what arrives is kept until it is fetched. QoS by parameter:
+    """Subscription of a stream, of which what arrives waits in the middleware until it is fetched. QoS by parameter:
     qos_overrides.<topic>.subscription.reliability and .depth.
 
     lost : messages that were sent and that DDS did not deliver, as far as it knows; refusals : Refusals.
@@ -139,27 +155,22 @@ class StreamInput:
     def __init__(self, node, kind, topic):
         self.lost, self._before = 0, 0
         self.refusals = Refusals(node, topic, kind)
-        self._node, self._topic, self._messages, self._arrivals = node, topic, [], []
+        self._node, self._topic = node, topic
         events = SubscriptionEventCallbacks(message_lost=self._on_lost)
         self._subscription = node.create_subscription(
-            kind, topic, self._keep, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES, raw=True
+            kind, topic, unserved, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES, raw=True
         )  # fmt: skip
-
-    def _keep(self, data):
-        self._messages.append(data)
-        self._arrivals.append(time.time_ns())
-
-    def __len__(self):
-        """Messages that wait."""
-        return len(self._messages)
 
     def fetch(self, wire):
         """What has arrived, by a Wire: [(frame, rows (n,), arrivals (n,) s since 1970)], each of successive messages of one
         frame."""
-        if not self._messages:
+        messages, arrivals = [], []
+        for data, information in waiting(self._subscription):
+            messages.append(data)
+            arrivals.append(information["received_timestamp"] or time.time_ns())
+        if not messages:
             return []
-        messages, arrivals = self._messages, 1e-9 * np.array(self._arrivals)
-        self._messages, self._arrivals = [], []
+        arrivals = 1e-9 * np.array(arrivals)
         return [(frame, rows, arrivals[some]) for frame, rows, some in wire.read(messages, self.refusals.add)]
 
     def _on_lost(self, status):

@@ -20,16 +20,21 @@ TF_STATIC_QOS = QoSProfile(
 
 
 class FramesInput:
-    """Frames of /tf_static, and of /tf if they may move. trouble : a transform that is none, or None; refusals : ros.Refusals."""
+    """Frames of /tf_static, and of /tf if they may move: its messages wait until `catch_up`. trouble : a transform that is none, or
+    None; refusals : ros.Refusals."""
 
     def __init__(self, node, seconds, on_new, moving=False):
         """seconds(stamp) : s of a builtin_interfaces/Time; on_new() is called when a constant transform is new."""
         self.frames, self.trouble = Frames(), None
         self._node, self._seconds, self._on_new = node, seconds, on_new
-        ends = [ros.Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms)]
-        if moving:
-            ends.append(ros.Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, read_transforms))
-        self.refusals = [end.refusals for end in ends]
+        static = ros.Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms)
+        self._moving = [ros.Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, read_transforms, served=False)] if moving else []
+        self.refusals = [end.refusals for end in (static, *self._moving)]
+
+    def catch_up(self):
+        """Take what waits on /tf."""
+        for end in self._moving:
+            end.take_all()
 
     def _on_static(self, transforms):
         new = [self._take("/tf_static", self.frames.set, *transform[2:]) for transform in transforms]

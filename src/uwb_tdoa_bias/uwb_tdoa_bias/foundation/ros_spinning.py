@@ -1,5 +1,6 @@
-"""How everything of the graph that concerns a process is served: in the order of its arrival, by one executor."""
+"""How a process serves its streams, and everything else of the graph that concerns it: in turn, so that neither waits for the other."""
 
+import math
 import time
 
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
@@ -10,20 +11,19 @@ try:  # not in rclpy before 7.1.4; a message costs a quarter
 except ImportError:
     EventsExecutor = None
 
-LONGEST_SLEEP = 0.2  # s, until a process to which nothing comes sees a signal
-QUIET = 0.05  # s without a message of a stream, after which it is waited for, and not looked for each millisecond
+LONGEST_SLEEP = 0.2  # s, until a process without streams sees a signal
+QUIET, LOOK = 1.0, 0.02  # s without a message of a stream, after which it is looked for each LOOK s, and not each millisecond
+SERVED = 0.02  # s from one service of the graph to the next, while streams flow
 LONGEST_SERVICE = 0.05  # s; only with a SingleThreadedExecutor
-CLOCK_PERIOD = 0.02  # s from one look at /clock to the next, while anything else comes
 
 
 class Spinner:
-    """The life of the nodes of a process. Everything that comes, messages, requests, timers, goes through one executor of rclpy in
-    the order in which it came, and nothing can be passed over: each time around, a mark is put at the end of its queue, and it is
-    run until the mark comes. A stream's callback only keeps the bytes. What has come is then computed together, in a turn: a call
-    of the filter for each message would cost more than the message. Then the process rests as long as the turn took, at
-    least a millisecond; where no stream has said anything for a while it sleeps in the executor, which anything wakes. /clock
-    alone, which may come a thousand times a second for each of many nodes, is left where it is, and its newest is taken. (The SingleThreadedExecutor takes
-    four times as much for a message; `docs/measured.md` has what was measured.)
+    """The life of the nodes of a process. Messages of streams, and those of /clock and /tf, which may come a thousand times a second,
+    wait in the middleware until a turn takes and computes them together: a callback for each costs a fifth more in all, and a call of
+    the filter for each more than that. Then the process rests as long as the turn took, at least a millisecond. Every SERVED s
+    everything else of the graph, requests, timers, transforms, is served by an executor of rclpy, in the order in which it came, and
+    nothing can be passed over: a mark is put at the end of its queue, and it is run until the mark comes. Where no stream has said
+    anything for a while, the process sleeps in the executor. (`docs/measured.md` has what was measured.)
 
     longest_wait : s, the longest that anything has waited since this was set to 0.0.
     """
@@ -33,24 +33,24 @@ class Spinner:
         self.longest_wait = 0.0
         self._nodes, self._turns = nodes, turns
         self._executor = SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
-        self._clock_due, self._served = 0.0, time.monotonic()
+        self._served = time.monotonic()
         for node in nodes:
             self._executor.add_node(node)
 
     def spin(self, stop):
         """Live until the future `stop` is done, or the context ends."""
-        last = -QUIET  # when anything was taken in a turn
+        taken, sleep, quiet = -math.inf, LONGEST_SLEEP if self._turns is None else LOOK, True  # taken : when a turn last took anything
         while not stop.done() and self._nodes[0].context.ok():
-            self._guarded(self._serve)
-            rest = self._turns.take() if self._turns is not None else None
-            now = time.monotonic()
-            if rest is not None:
-                last = now
-            if now < last + QUIET:
-                time.sleep(rest or self._turns.PERIOD)
-            else:
-                self._guarded(self._executor.spin_once, timeout_sec=LONGEST_SLEEP)
+            if quiet or time.monotonic() >= self._served + SERVED:
+                self._guarded(self._serve)
+            rest, now = self._turns.take() if self._turns is not None else None, time.monotonic()
+            taken = taken if rest is None else now
+            quiet = now >= taken + QUIET
+            if quiet:
+                self._guarded(self._executor.spin_once, timeout_sec=sleep)
                 self._served = time.monotonic()
+            else:
+                time.sleep(rest or self._turns.PERIOD)
 
     def close(self):
         """Leave the nodes."""
@@ -68,10 +68,8 @@ class Spinner:
                 self._executor.spin_once(timeout_sec=0.0)
         now = time.monotonic()
         self.longest_wait, self._served = max(self.longest_wait, now - self._served), now
-        if now >= self._clock_due:
-            self._clock_due = now + CLOCK_PERIOD
-            for node in self._nodes:
-                node.take_clock()
+        for node in self._nodes:
+            node.take_clock()
 
     def _serve_each(self):
         """With the SingleThreadedExecutor, which has no queue: one of everything that waits, until nothing does, or for a while."""

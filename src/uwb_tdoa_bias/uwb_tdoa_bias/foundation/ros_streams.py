@@ -61,18 +61,16 @@ class Streams:
     def take(self, at_once=False):
         """Give everything that has arrived to those that take it; at_once : whatever they wait for. Returns whether there was
         anything, or is."""
-        if not any(len(end) for end in self.inputs.values()) and not (self._awaited and self._awaited.waiting):
-            return False
         if self._awaited is not None and not at_once:
             arrived, now = self._awaited.fetch(), time.monotonic()
             if now < self._until and not (arrived and self._awaited.newest_waiting > self._due() - ROUNDING):
-                return True
+                return bool(self._awaited.waiting)
             self._until = now + LONGEST_WAIT
         for stream in self._streams:
             stream.fetch()
         parts = [part for stream in self._streams if stream.waiting for part in stream.parts(self._epoch)]
         if not parts:
-            return True
+            return False
         if any(stream.fell for stream in self._streams):  # then it matters which stream was first
             parts = sorted((piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0])
         for take, *part in parts:
