@@ -40,6 +40,7 @@ def test_a_simulated_flight_through_the_real_nodes(tmp_path, capsys):
     assert demo.main(["--out", str(tmp_path)]) == 0
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
+    assert any(line.startswith("flown      by the estimate: landed ") for line in lines)
     raw, corrected, without_ros = (
         next(figures(line) for line in lines if line.startswith(name))
         for name in ("raw  ", "corrected  ", "corrected, without ROS")

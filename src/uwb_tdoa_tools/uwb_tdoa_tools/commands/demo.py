@@ -14,10 +14,11 @@ from ..scoring.table import lines_of_errors
 DESCRIPTION = """Take a flight, write it as a bag, replay the bag through bias_node and ekf_node over ROS topics, and
 compare the estimate with ground truth.
 
-Without --flight it is a simulated one whose anchors have delays of 0.1 m (standard deviation); the nodes correct for
-them with an effects.yaml that holds their true values, as a calibration would find them. A measured flight is corrected
-with what --effects and --model give, or else with the model that bias_node ships. "raw" is the same filter without any
-correction, run without ROS. The exit code is 1 if the estimate diverged, or messages were lost or late.
+Without --flight a simulated vehicle first takes off, flies and lands by nothing but the estimate (as in `fly`), among
+anchors that have delays of 0.1 m (standard deviation). It and the nodes correct for them with an effects.yaml that holds
+their true values, as a calibration would find them. A measured flight is corrected with what --effects and --model give,
+or else with the model that bias_node ships. "raw" is the same filter without any correction, run without ROS. The exit
+code is 1 if the estimate diverged, or messages were lost or late.
 """
 
 
@@ -55,10 +56,13 @@ def _demo(args):
     if args.flight:
         case = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
     else:
+        print("flying     a simulated vehicle; the very first time it is compiled, which takes a minute", flush=True)
         case = demo.simulated(args.out, args.effects, args.model)
     flight = case.flight
     length = flight.truth.t[-1] - flight.truth.t[0]
     print(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
+    if case.became:
+        print(f"flown      by the estimate: {case.became}")
     print(f"correction {case.corrector().model} ({', '.join(case.sources)})")
     became, scores = demo.fly(case, args.out, args.rate, lambda text: print(f"nodes      {text}", flush=True))
     in_time = _all_in_time(flight, became)

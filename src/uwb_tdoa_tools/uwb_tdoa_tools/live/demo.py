@@ -1,6 +1,6 @@
 """A flight through both nodes over topics, beside the same filter without ROS."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import shlex
 import shutil
@@ -13,20 +13,26 @@ from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.offline import run_offline
 
 from ..bags.bag import read_odometry, write_bag
+from ..flying import trial
+from ..flying.report import sentence
+from ..flying.sensors import Radio
+from ..flying.verdict import judge
+from ..flying.world import HALL
 from ..scoring.metrics import Score, airborne
-from ..simulation import SimulationConfig, simulate
 from .run import accounts, run_live
 
-SIMULATED = SimulationConfig(anchor_delay_std=0.1, duration=40.0, seed=1)
+SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # told nothing, as the nodes are
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is flown. flight : Flight; effects_file, model : what corrects it, or None; SHIPPED is a model."""
+    """What is flown. flight : Flight; effects_file, model : what corrects it, or None; SHIPPED is a model; became : what became of a flight
+    that was simulated, in words."""
 
     flight: Flight
     effects_file: Path | None
     model: str | None
+    became: str = ""
 
     def corrector(self):
         """Corrector of the flight. Raises InputError."""
@@ -41,14 +47,16 @@ class Case:
 
 
 def simulated(folder, effects_file=None, model=None):
-    """Case of a flight whose anchors are late, corrected, if nothing else is given, with their true delays as a
-    calibration would find them: an effects.yaml in the folder."""
-    flight = simulate(SIMULATED)
+    """Case of a flight by nothing but its estimate, among anchors that are late; corrected, if nothing else is given, with their
+    true delays as a calibration would find them: an effects.yaml in the folder. Raises InputError."""
     if not (effects_file or model):
-        true_delays = AnchorDelay(flight.meta["parameters"]["anchor_delays"], source="the simulation's own values")
+        delays = Radio(SIMULATED.world, SIMULATED.seed, 1.0).constants[:, 0]
+        values = dict(zip(SIMULATED.world.anchors.ids.tolist(), delays.round(4).tolist()))
         effects_file = Path(folder) / "effects.yaml"
-        EffectSet((true_delays,)).to_yaml(effects_file)
-    return Case(flight, effects_file, model)
+        EffectSet((AnchorDelay(values, source="the simulation's own values"),)).to_yaml(effects_file)
+    effects = EffectSet.from_yaml(effects_file) if effects_file else None
+    flown = trial.fly(replace(SIMULATED, effects=effects))
+    return Case(flown.flight, effects_file, model, sentence(judge(flown)))
 
 
 def measured(path, reading, effects_file=None, model=None):
