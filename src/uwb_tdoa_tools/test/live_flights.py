@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
 from uwb_tdoa_tools.live.processes import Processes, own_domain, wait
 from uwb_tdoa_tools.live.session import session
 
-PATIENCE = 180.0  # s for anything that must happen; the very first start compiles the filter and the vehicle
+PATIENCE = 400.0  # s for anything that must happen; the very first start compiles the filter and the vehicle
 
 
 class Hall:
