@@ -21,7 +21,6 @@ setup(
         "joblib>=1.3",
         "lz4>=4.0",
         "matplotlib>=3.6",
-        "numba>=0.57",
         "numpy>=1.26",
         "onnx>=1.14",
         "Pillow>=9.0",

@@ -1,5 +1,8 @@
+import os
 import re
 import struct
+import subprocess
+import sys
 import time
 import zlib
 
@@ -222,3 +225,15 @@ def test_a_header_of_many_types_takes_no_time(read):
     began = time.perf_counter()
     assert len(read(log_bytes(events=events)).tdoa) == 2
     assert time.perf_counter() - began < 5.0
+
+
+def test_a_folder_of_flights_does_not_say_where_compiled_code_is(tmp_path):
+    """numba looks for a configuration of its own where it is started; what it finds in such a cache is run."""
+    (tmp_path / ".numba_config.yaml").write_text(f"cache_dir: {tmp_path / 'planted'}\n")
+    (tmp_path / "flight.log").write_bytes(log_bytes())
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | {"XDG_CACHE_HOME": str(tmp_path)}
+    reads = "from recordings import ANCHORS; from uwb_tdoa_tools.readers import read_usd_log; read_usd_log('flight.log', ANCHORS)"
+    environment["PYTHONPATH"] = os.pathsep.join([os.path.dirname(__file__), environment.get("PYTHONPATH", "")])
+    ended = subprocess.run([sys.executable, "-c", reads], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    assert (tmp_path / "uwb_tdoa").exists() and not (tmp_path / "planted").exists()

@@ -9,6 +9,7 @@ from functools import lru_cache
 import hashlib
 import os
 from pathlib import Path
+import stat
 import sys
 
 
@@ -53,8 +54,21 @@ def _compiled(function, **options):
 
 def _base():
     """NUMBA_CACHE_DIR if set, else the user's cache folder."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home) / "uwb_tdoa")
+    home, named = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", os.environ.get("NUMBA_CACHE_DIR")
+    own = Path(home) / "uwb_tdoa"
+    return Path(named) if named and _is_ours(named, own) else own
+
+
+@lru_cache(maxsize=None)
+def _is_ours(folder, instead):
+    """Whether nobody else may have put compiled code into a folder, which would be run; says so if not, and what is used instead."""
+    if not os.path.exists(folder):
+        return True
+    found = os.stat(folder)
+    if found.st_uid in (os.getuid(), 0) and not found.st_mode & stat.S_IWOTH:
+        return True
+    print(f"NUMBA_CACHE_DIR: others may write to {folder}; {instead} is used; name a folder of your own.", file=sys.stderr)
+    return False
 
 
 @lru_cache(maxsize=None)

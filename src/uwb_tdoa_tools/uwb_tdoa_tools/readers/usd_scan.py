@@ -1,10 +1,10 @@
 """Going through the events of a micro-SD log, compiled."""
 
-from numba import njit
 import numpy as np
+from uwb_tdoa_bias.foundation.compiled import compiled
 
 
-@njit(cache=True)
+@compiled
 def scan(raw, start, end, size_of_id):
     """Offsets and ids of the events in raw[start:end], and where the scan had to stop (-1: it ended at `end`).
 
