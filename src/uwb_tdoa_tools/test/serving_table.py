@@ -7,7 +7,7 @@ receives; a message is late from its publication until it is in the hands of who
   events     EventsExecutor, the same
   kept       callbacks that keep the bytes, and the EventsExecutor up to a mark, each millisecond
   beside     the streams taken in turns of a millisecond, and one callback of the EventsExecutor every 20 ms
-  spinner    ros_spinning.Spinner: the streams the same way, and the EventsExecutor up to a mark every 20 ms
+  spinner    ros_spinning.Spinner: the streams the same way, and the EventsExecutor up to a mark every 5 ms
 """
 
 import multiprocessing

@@ -12,8 +12,8 @@ except ImportError:
     EventsExecutor = None
 
 LONGEST_SLEEP = 0.2  # s, until a process without streams sees a signal
-QUIET, LOOK = 1.0, 0.02  # s without a message of a stream, after which it is looked for each LOOK s, and not each millisecond
-SERVED = 0.02  # s from one service of the graph to the next, while streams flow
+QUIET, LOOK = 1.0, 0.05  # s without a message of a stream, after which it is looked for each LOOK s, and not each millisecond
+SERVED = 0.005  # s from one service of the graph to the next, while streams flow
 LONGEST_SERVICE = 0.05  # s; only with a SingleThreadedExecutor
 
 
