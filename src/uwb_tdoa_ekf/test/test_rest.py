@@ -64,6 +64,14 @@ def test_on_a_floor_where_low_anchors_are_late_it_is_right_and_honest(shaking):
         assert nees.mean() < 9.0
 
 
+@pytest.mark.parametrize("margin", [5.0, 1000.0])
+def test_in_a_wide_workspace_it_starts_on_the_floor_too(margin):
+    """Free in z late low anchors put it metres above the hall, which is within such a workspace."""
+    for seed in range(4):
+        t, error, nees = run(on_floor(seed, 3.0, shaking=0.6), workspace_margin=margin)
+        assert t[0] < 0.7 and np.linalg.norm(error, axis=1).max() < 0.5 and nees.mean() < 9.0
+
+
 @pytest.mark.parametrize("shaking", [0.0, 0.6])
 def test_it_leaves_the_floor_with_the_tag(shaking):
     for seed in range(4):

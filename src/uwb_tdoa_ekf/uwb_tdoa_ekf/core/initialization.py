@@ -60,10 +60,12 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     accel = _mean_accel(ekf.imu, tuning)
     z, z_std = _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
     share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance)
-    good = share >= AGREE and workspace.contains(ekf.workspace, x)
+    near = np.empty((2, 3))
+    workspace.set_bounds(anchors, standing.NEAR, near)  # beyond, a start is doubted if the ground explains the TDOAs better
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     at_rest, its = x.copy(), covariance.copy()
     on_ground = standing.weigh(ekf, pairs, anchors, tuning, z, z_std, at_rest, its)
+    good = share >= AGREE and workspace.contains(ekf.workspace, x) and (workspace.contains(near, x) or not on_ground)
     still = ground.is_still(pairs, anchors, at_rest, ekf.still_covariance)
     if still or (anyhow and not good):
         x, covariance, good = at_rest, its, good or on_ground

@@ -16,11 +16,13 @@ from .hypotheses import alive
 from .memory import HYPOTHESES
 from .startup import locate
 from .update import update_state
+from .workspace import set_bounds
 
+NEAR = 1.0  # m beyond the anchors
 EXPLANATIONS = 4  # elsewhere, and on the ground with each lateness of ground.explain
 SPEED_STD = 0.05  # m/s, of a tag at rest, beyond what its TDOAs tell
 # Minus the logarithm of the probability, before it is seen,
-ABSURD = 20.0  # that a tag is above or below its workspace,
+ABSURD = 20.0  # that a tag that rests is more than NEAR above or below the anchors,
 UNUSUAL = 3.0  # that anchors are late because they are near the ground, by what nobody knows,
 REACH = 1.0  # m from where they are known to be late, over which echoes become others
 DECISIVE = 6.0  # and by how much the ground must be more probable than what the filter says of a tag that lands
@@ -44,13 +46,14 @@ def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
     cost, position, each = np.empty(EXPLANATIONS), np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3))
     position[0] = x[:3]
     cost[0] = ground.explain(pairs, anchors, bounds, prior, tuning, z, z_std, ground.IN_TIME, position[0], each[0])
-    if not bounds[0, 2] <= x[2] <= bounds[1, 2]:
+    starts, near = np.empty((4, 2)), np.empty((2, 3))
+    set_bounds(anchors, NEAR, near)
+    if not near[0, 2] <= x[2] <= near[1, 2]:
         cost[0] += ABSURD
     position[0], each[0] = x[:3], covariance[:3, :3]
-    starts = np.empty((4, 2))
     for start in range(4):
         for k in range(2):
-            starts[start, k] = prior[0, k] + 0.25 * (bounds[1, k] - bounds[0, k]) * (1.0 if (start >> k) & 1 else -1.0)
+            starts[start, k] = near[0, k] + (near[1, k] - near[0, k]) * (0.75 if (start >> k) & 1 else 0.25)
     _on_ground(ekf, pairs, anchors, prior, tuning, z, z_std, starts, cost, position, each)
     best = _mix(cost, position, each)
     ekf.late_as_known = best == 1 + ground.KNOWN
