@@ -67,6 +67,13 @@ def test_the_more_an_axis_vibrates_the_less_it_weighs_and_the_noisier_it_is():
     assert imu.accel_psd == pytest.approx([QUIET_NOISE**2] * 3)
 
 
+@pytest.mark.parametrize("force", [-UP, np.array([np.linalg.norm(UP), 0.0, 0.0])])
+def test_what_hangs_upside_down_or_lies_on_its_side_does_not_hover_however_it_shakes(force):
+    imu = after((np.zeros(3), 0.0), (force, np.array([5.0, 5.0, 5.0])))
+    weigh(imu, False, FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).tuning()[0])
+    assert imu.accel_weight.min() > 0.75
+
+
 def test_samples_are_averaged_with_the_last_one_unless_it_is_old():
     imu = fresh()
     for t, size, expected in ((0.0, 1.0, 1.0), (0.01, 3.0, 2.0), (1.0, 7.0, 7.0)):

@@ -11,6 +11,8 @@ PERSISTENCE = 0.2  # s over which the error of a vibrating accelerometer stays a
 QUIET_ACCEL, QUIET_GYRO = 0.05, 0.02  # m/s^2, rad/s, rms per axis: less is quiet; hovering has 0.1, 0.03, idling more
 RESTLESS = 0.002  # rad^2/s^2 that fades before a tag counts as quiet, about half a second after the first sample
 QUIET_TILT = 0.5  # m/s^2 by which the mean specific force may differ from gravity
+UPRIGHT = 0.5  # cosine of the angle between the specific force and the body's z axis, below which a tag does not hover
+CARRIED_STD = 20.0  # m/s^2, of the specific force of such a tag, about that of hovering
 QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
 
 
@@ -52,9 +54,12 @@ def weigh(imu, quiet, tuning):
     hovering, and the noise that is left.
 
     A vibrating axis rectifies: its error has vibration_gain times the variance of the vibration. The weight is that of
-    linear least squares of the measurement with this variance, and of hovering with accel_prior_std.
+    linear least squares of the measurement with this variance, and of hovering with accel_prior_std. What is carried, and lies on its
+    side or upside down, does not hover.
     """
-    prior = tuning.accel_prior_std**2
+    slow = imu.slow_accel
+    hovers = slow[2] > UPRIGHT * math.sqrt(slow[0] ** 2 + slow[1] ** 2 + slow[2] ** 2)
+    prior = tuning.accel_prior_std**2 if hovers else CARRIED_STD**2
     for k in range(3):
         error = tuning.vibration_gain * imu.vibration[k]
         weight = prior / (prior + error)

@@ -139,6 +139,7 @@ def _begin(ekf, tuning, t, x, covariance, yaw, yaw_std):
         _spread_attitude(hypothesis.P, tuning, yaw_std)
     ekf.best = 0
     ekf.t = ekf.last_tdoa = ekf.sure = t
+    ekf.sure_place[:] = x[:3]
     ekf.consistency = 1.0
     ekf.running = True
 
@@ -176,7 +177,7 @@ def recover(ekf, anchors, tuning, t, history):
     if tuning.use_imu and not ekf.distrusted and t - ekf.imu.t < tuning.imu_timeout:
         since, away = t - ekf.sure, 0.0
         for k in range(3):
-            away += (x[k] - ekf.hypotheses[ekf.best].x[k]) ** 2
+            away += (x[k] - ekf.sure_place[k]) ** 2
         if math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
             return
     for h in range(HYPOTHESES):
