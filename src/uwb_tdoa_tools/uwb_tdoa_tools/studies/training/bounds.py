@@ -48,7 +48,7 @@ def oracle(flight, window):
         return None
 
     return SimpleNamespace(
-        idle=False, lag=np.inf, effects=EffectSet(), correct=correct, add_pose=nothing, reset=nothing
+        idle=False, lag=np.inf, effects=EffectSet(), weighed=EffectSet(), correct=correct, add_pose=nothing, reset=nothing
     )
 
 
