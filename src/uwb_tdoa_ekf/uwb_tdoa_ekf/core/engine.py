@@ -141,7 +141,6 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
     ekf.last_tdoa = t
     if ekf.consistency > initialization.AGREE:
         ekf.sure = t
-        ekf.sure_place[:] = ekf.hypotheses[ekf.best].x[:3]
     if tuning.recover and ekf.consistency < INCONSISTENT and t >= ekf.next_search:
         initialization.recover(ekf, anchors, tuning, t, records)
 

@@ -139,7 +139,6 @@ def _begin(ekf, tuning, t, x, covariance, yaw, yaw_std):
         _spread_attitude(hypothesis.P, tuning, yaw_std)
     ekf.best = 0
     ekf.t = ekf.last_tdoa = ekf.sure = t
-    ekf.sure_place[:] = x[:3]
     ekf.consistency = 1.0
     ekf.running = True
 
@@ -161,8 +160,7 @@ def _turn(hypothesis, yaw, std):
 def recover(ekf, anchors, tuning, t, history):
     """If the window agrees on a position and the filter on another one, go there; attitude and biases stay.
 
-    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter was right, and no farther, from where it
-    was then or from where the filter has it now.
+    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter was right, and no farther.
     """
     window = recent(ekf, min(tuning.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:
@@ -176,11 +174,10 @@ def recover(ekf, anchors, tuning, t, history):
     if not workspace.contains(ekf.workspace, x) or share < AGREE_ANYHOW or share < CLEARLY_MORE + explained:
         return
     if tuning.use_imu and not ekf.distrusted and t - ekf.imu.t < tuning.imu_timeout:
-        since, away, drifted = t - ekf.sure, 0.0, 0.0
+        since, away = t - ekf.sure, 0.0
         for k in range(3):
-            away += (x[k] - ekf.sure_place[k]) ** 2
-            drifted += (x[k] - ekf.hypotheses[ekf.best].x[k]) ** 2
-        if math.sqrt(min(away, drifted)) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
+            away += (x[k] - ekf.hypotheses[ekf.best].x[k]) ** 2
+        if math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
             return
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]

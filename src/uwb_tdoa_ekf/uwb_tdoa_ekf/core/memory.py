@@ -139,8 +139,7 @@ EKF = _record(
     ("stills", int),  # but neither TDOAs nor inertial samples showed that it moves,
     ("shaking", float),  # m^2/s^4, power of the vibration of a tag that is not at rest, over some seconds
     ("lift", float, 3),  # m/s, that the inertial sensor has felt lately at rest, in the world
-    ("sure", float),  # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last,
-    ("sure_place", float, 3),  # m, and where that was
+    ("sure", float),  # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
     ("workspace", float, (2, 3)),  # m, lower and upper bounds, see workspace.py
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),

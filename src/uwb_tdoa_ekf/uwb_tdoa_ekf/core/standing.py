@@ -125,7 +125,8 @@ def is_near_ground(hypothesis, tuning):
 def land(ekf, pairs, anchors, tuning, still, stands, t, records):
     """If (k,) of PAIR tell at stamp t, s, that a tag is on the ground, go there. Returns whether.
 
-    still : TDOAs stay what they are; stands : it does not move; else it may also hover low, which it is told with care.
+    still : TDOAs stay what they are; stands : it does not move. A tag that does not stand may hover low: its place is then told to
+    HOVER_STD, of one that is not still the height alone.
     """
     best = ekf.hypotheses[ekf.best]
     if not is_near_ground(best, tuning) or not (still or np.sum(anchors["late"]) > FEWEST_LATE):
@@ -150,15 +151,14 @@ def land(ekf, pairs, anchors, tuning, still, stands, t, records):
     for h in range(HYPOTHESES):
         if not alive(ekf.hypotheses[h]):
             continue
-        for axis in range(0 if still else 2, 3):
-            P = ekf.hypotheses[h].P
-            P[axis, axis] = max(P[axis, axis], HOVER_STD**2)  # what is told again tells nothing new
-            update_state(ekf.hypotheses[h], ekf.innovation, axis, position[k, axis], HOVER_STD)
-            if h == ekf.best:
-                add_update(ekf, t, records)
-        for axis in range(3 if still else 0):
-            std = math.sqrt(ekf.still_covariance[axis, axis] + SPEED_STD**2)
-            update_state(ekf.hypotheses[h], ekf.innovation, 3 + axis, 0.0, std)
+        for state in range(0 if still else 2, 6 if still else 3):
+            value, std = 0.0, HOVER_STD
+            if state < 3:
+                value, P = position[k, state], ekf.hypotheses[h].P
+                P[state, state] = max(P[state, state], HOVER_STD**2)  # a place that is told again tells nothing new
+            else:
+                std = math.sqrt(ekf.still_covariance[state - 3, state - 3] + SPEED_STD**2)
+            update_state(ekf.hypotheses[h], ekf.innovation, state, value, std)
             if h == ekf.best:
                 add_update(ekf, t, records)
     return True
