@@ -19,7 +19,6 @@ setup(
         "setuptools",
         "numba>=0.57",
         "numpy>=1.26",
-        "onnxruntime>=1.17",
         "PyYAML>=6.0",
         "scipy>=1.11",
     ],

@@ -73,7 +73,7 @@ def test_refused_with_the_reason(read, content, said):
 
 
 def test_memory_is_not_taken_before_sizes_are_known(read, monkeypatch):
-    monkeypatch.setattr(arrays_file, "MOST_BYTES", 1_000_000)
+    monkeypatch.setattr(arrays_file, "ARRAYS_BYTES", 1_000_000)
     tracemalloc.start()
     with pytest.raises(InputError, match="more than 1000000 bytes"):
         read(forged("(20000000,)", body=bytes(160_000_000)), {"a": "f"})

@@ -7,7 +7,8 @@ import pytest
 import yaml
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.safe_yaml import MOST_BYTES, parse_yaml, read_yaml
+from uwb_tdoa_bias.foundation.limits import YAML_BYTES
+from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml, read_yaml
 
 SCALARS = st.one_of(
     st.none(),
@@ -83,7 +84,7 @@ def test_files(tmp_path):
     path = tmp_path / "f.yaml"
     path.write_bytes("\ufeffa: ü\n".encode())
     assert read_yaml(path) == {"a": "ü"}
-    path.write_text("a" * (MOST_BYTES + 1))
+    path.write_text("a" * (YAML_BYTES + 1))
     with pytest.raises(InputError, match="has 1000001 bytes"):
         read_yaml(path)
     with pytest.raises(InputError, match=r"f.yaml: cannot be read as YAML \(Is a directory|cannot be read"):

@@ -25,7 +25,8 @@ import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
-from .features import NAMES, everything, fill_all
+from ..foundation.foreign_text import harmless
+from .features import NAMES, fill_all
 from .onnx_file import Unreadable, read_graph
 from .tape import Tape, Unplayable, play
 
@@ -61,9 +62,11 @@ class Network:
         if not Path(path).is_file():
             raise InputError(f"model: {path} does not exist; give an .onnx file or leave the model empty.")
         try:
-            self._model = _load(path)
-        except Exception as error:  # onnxruntime raises its own family of exceptions, with no common public base
-            raise InputError(f"model: {path} cannot be loaded as ONNX ({_first_line(error)}).") from error
+            self._model = Tape(read_graph(path))
+        except (Unreadable, Unplayable) as error:
+            raise InputError(
+                f"model: {path} cannot be played as an ONNX model of dense layers ({error}); export it again, without what it names."
+            ) from error
         self.meta, inputs = self._model.meta, self._model.inputs
         try:
             self._read(self.meta)
@@ -72,10 +75,7 @@ class Network:
                 f"model: {path}: its metadata must hold features (names out of {', '.join(NAMES)}), offset, scale, "
                 f"clip and name, and may hold validity with fade_std, as JSON; the problem is {error!r}."
             ) from error
-        if len(inputs) != 1 or not inputs[0][1]:
-            raise InputError(f"model: {path}: has {len(inputs)} inputs; it must have one, of n rows of features.")
-        (name, shape), n = inputs[0], len(self._inputs)
-        width = shape[-1]
+        (name, (_, width)), n = inputs[0], len(self._inputs)
         if not (n == len(self._offset) == len(self._scale) == width) or (self._scale == 0).any():
             raise InputError(
                 f"model: {path}: input {name!r} has {width} columns, the metadata name {n} features, "
@@ -84,29 +84,23 @@ class Network:
         self._ask(path)
 
     def _ask(self, path):
-        """Ask it for the mean of all features. Raises InputError: a model may load and fail only when it is asked."""
-        for rows in (1, 3):
-            try:
-                out = self._model.run(np.zeros((rows, len(self._inputs))))
-            except Exception as error:  # as above
-                raise InputError(f"model: {path} cannot be run ({_first_line(error)}).") from error
-            shape = getattr(out, "shape", None)
-            if shape not in ((rows, 1), (rows, 2), (rows, 3)) or out.dtype.kind != "f" or not np.isfinite(out).all():
-                raise InputError(
-                    f"model: {path}: gives {shape} for {rows} rows of features, or no finite numbers; the output must "
-                    "be (n, 1), (n, 2) or (n, 3)."
-                )
+        """Ask it for the mean of all features. Raises InputError unless it gives up to three finite numbers for each row."""
+        out = self._model.run(np.zeros((1, len(self._inputs))))
+        if out.shape[1] > 3 or not np.isfinite(out).all():
+            raise InputError(
+                f"model: {path}: gives (n, {out.shape[1]}), or no finite numbers; the output must be (n, 1), (n, 2) or (n, 3)."
+            )
 
     def __reduce__(self):
-        """Pickled as the path of its file: a session cannot be."""
+        """Pickled as the path of its file."""
         return Network, (self._path,)
 
     def _read(self, meta):
         names, self._offset, self._scale = (json.loads(meta[key]) for key in ("features", "offset", "scale"))
         self._offset, self._scale = np.array(self._offset, dtype=float), np.array(self._scale, dtype=float)
         self.clip = float(json.loads(meta["clip"]))
-        self.name = str(json.loads(meta["name"]))
-        self.trained_with = tuple(map(str, json.loads(meta.get("trained_with", "[]"))))
+        self.name = harmless(json.loads(meta["name"]))
+        self.trained_with = tuple(map(harmless, json.loads(meta.get("trained_with", "[]"))))
         limits = json.loads(meta.get("validity", "{}"))
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
@@ -129,24 +123,9 @@ class Network:
         limits = self.clip, self._fade_std, self.share, self._largest_yaw_std
         judging, found = (self._judged, self._lower, self._upper, self._margin, limits, yaw_std), np.empty((3, len(samples)))
         anchors, scaling = samples.anchors, (self._inputs, self._offset, self._scale)
-        if isinstance(self._model, Tape):
-            at = samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, anchors.orientations
-            _predict(*at, *scaling, *self._model.playable, *judging, found)
-            return tuple(found)
-        table, x = everything(samples), np.empty((len(samples), len(self._inputs)))
-        _select(table, *scaling, x)
-        _judge(np.asarray(self._model.run(x), dtype=float), table, *judging, found)
+        at = samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, anchors.orientations
+        _predict(*at, *scaling, *self._model.playable, *judging, found)
         return tuple(found)
-
-
-def _load(path):
-    """What runs a model: a Tape, or where that cannot hold it, onnxruntime."""
-    try:
-        return Tape(read_graph(path))
-    except (Unreadable, Unplayable):
-        from .session import Session  # takes a third of a second
-
-        return Session(path)
 
 
 @compiled
@@ -196,7 +175,3 @@ def _judge(out, table, judged, lower, upper, margin, limits, yaw_std, found):
             std = math.hypot(std, bias)
             bias = known = 0.0
         found[0, i], found[1, i], found[2, i] = bias, std, known
-
-
-def _first_line(error):
-    return (str(error).splitlines() or [type(error).__name__])[0]

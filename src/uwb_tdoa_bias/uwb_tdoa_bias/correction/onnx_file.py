@@ -1,7 +1,8 @@
-"""What an ONNX file says, read without onnx or onnxruntime, which take longer to load than to run a small model.
+"""What an ONNX file says, of which only what a model of dense layers needs is read: no graph within a graph, no function, no numbers
+that are in other files. Sizes are bounded by `limits`.
 
-Of the protocol buffers of onnx.proto (https://github.com/onnx/onnx, version 1.14) only what a model of dense layers needs; the
-wire format is that of https://protobuf.dev/programming-guides/encoding.
+Protocol buffers as of onnx.proto (https://github.com/onnx/onnx, version 1.14); the wire format is that of
+https://protobuf.dev/programming-guides/encoding.
 """
 
 from collections import defaultdict
@@ -9,6 +10,10 @@ from dataclasses import dataclass
 import struct
 
 import numpy as np
+
+from ..foundation.errors import InputError
+from ..foundation.files import read_bytes
+from ..foundation.limits import MODEL_BYTES, MODEL_NODES
 
 VARINT, EIGHT_BYTES, BYTES, FOUR_BYTES = 0, 1, 2, 5  # wire types
 KINDS = {1: np.float32, 7: np.int64}  # of tensors, by TensorProto.DataType
@@ -20,7 +25,7 @@ class Unreadable(ValueError):
 
 @dataclass(frozen=True)
 class Node:
-    """kind : name of the operator; inputs, outputs : names of values; attributes : {name: number, (n,) ints or bytes}."""
+    """kind : name of the operator; inputs, outputs : names of values; attributes : {name: number, (n,) ints, bytes or array}."""
 
     kind: str
     inputs: list
@@ -41,11 +46,15 @@ class Graph:
 
 
 def read_graph(path):
-    """The Graph of a file; raises Unreadable."""
+    """The Graph of a file; raises Unreadable, and InputError for a file that is none or too large."""
     try:
-        with open(path, "rb") as file:
-            model = _message(file.read())
+        model = _message(read_bytes(path, MODEL_BYTES))
         graph = _message(model[7][0])
+        for part, where in (("nodes", graph[1]), ("constants", graph[5]), ("entries of metadata", model[14])):
+            if len(where) > MODEL_NODES:
+                raise Unreadable(f"more than {MODEL_NODES} {part}")
+        if model[25] or graph[15]:
+            raise Unreadable("functions or sparse constants")
         constants = dict(map(_tensor, graph[5]))
         inputs = [_value(data) for data in graph[11]]
         entries = [_message(data) for data in model[14]]
@@ -56,8 +65,10 @@ def read_graph(path):
             outputs=[_message(data)[1][0].decode() for data in graph[12]],
             meta={entry[1][0].decode(): entry[2][0].decode() for entry in entries},
         )
-    except (IndexError, KeyError, TypeError, AttributeError, ValueError, struct.error) as error:
-        raise Unreadable(f"{path}: {error!r}") from error
+    except (InputError, Unreadable):
+        raise
+    except (IndexError, KeyError, TypeError, AttributeError, ValueError, OverflowError, struct.error) as error:
+        raise Unreadable(f"no ONNX model, {error!r}") from error
 
 
 def _message(data):
@@ -85,6 +96,8 @@ def _varint(data, place):
         place += 1
         value |= (byte & 0x7F) << shift
         shift += 7
+        if shift > 70:
+            raise Unreadable("a number of more than 64 bits")
         if byte < 0x80:
             return (value - (1 << 64) if value >> 63 else value), place
 
@@ -113,7 +126,8 @@ def _tensor(data):
         values = np.frombuffer(fields[9][0], np.dtype(kind).newbyteorder("<"))
     else:
         values = np.array(_ints(fields[7])) if fields[7] else np.frombuffer(b"".join(fields[4]), "<f4")
-    return fields[8][0].decode(), values.astype(kind).reshape(_ints(fields[1]))
+    name = fields[8][0].decode() if fields[8] else ""
+    return name, values.astype(kind).reshape(_ints(fields[1]))
 
 
 def _node(data):
@@ -126,7 +140,11 @@ def _node(data):
 
 def _attribute(data):
     fields = _message(data)
-    if fields[2]:
+    if fields[6] or fields[11]:
+        raise Unreadable("a graph within a graph")
+    if fields[5]:
+        value = _tensor(fields[5][0])[1]
+    elif fields[2]:
         value = struct.unpack("<f", fields[2][0])[0]
     elif fields[3]:
         value = fields[3][0]

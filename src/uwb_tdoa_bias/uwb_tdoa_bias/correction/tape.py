@@ -1,7 +1,8 @@
 """A small ONNX graph as a tape of operations on rows of numbers, which one compiled function plays.
 
-onnxruntime takes 20 us to be asked anything, and as long for the 35 small operators of a model. Played from a tape, the same model
-takes a third of that for one row. What a tape cannot hold (Unplayable) is left to onnxruntime.
+A graph comes from anywhere. So the operators are those of a list, each row of the output follows from one row of the input, and what
+is held and done for a row is bounded (`limits`) before anything is played. What a tape cannot hold is Unplayable. onnxruntime takes
+three times as long for one row.
 """
 
 import math
@@ -9,14 +10,16 @@ import math
 import numpy as np
 
 from ..foundation.compiled import compiled, contracted
+from ..foundation.limits import MODEL_NODES, MODEL_NUMBERS, MODEL_WORK
 
 BATCH = 16  # rows of the input that are played together: what they need stays in the cache
 NOTHING_BELOW = np.float32(-40.0)  # exp of which is 0 here: numbers that float32 cannot hold well take a hundred times as long
-UNARY = "Identity", "Abs", "Neg", "Exp", "Log", "Sqrt", "Sin", "Cos", "Tanh", "Relu", "Sigmoid"
+UNARY = "Identity", "Abs", "Neg", "Exp", "Log", "Sqrt", "Sin", "Cos", "Tanh", "Relu", "Sigmoid", "Erf", "Softplus"
 BINARY = "Add", "Sub", "Mul", "Div", "Max", "Min"
 GATHER, ROW_SUM, ROW_MAX, MATMUL = range(len(UNARY) + len(BINARY), len(UNARY) + len(BINARY) + 4)
 CODES = {name: code for code, name in enumerate(UNARY + BINARY)}
-(IDENTITY, ABS, NEG, EXP, LOG, SQRT, SIN, COS, TANH, RELU, SIGMOID, ADD, SUB, MUL, DIV, MAX, MIN) = range(17)
+OTHERS = "Sum", "MatMul", "Gemm", "Gather", "Reshape", "Concat", "ReduceSum", "ReduceMax", "LeakyRelu", "Clip", "Constant"
+(IDENTITY, ABS, NEG, EXP, LOG, SQRT, SIN, COS, TANH, RELU, SIGMOID, ERF, SOFTPLUS, ADD, SUB, MUL, DIV, MAX, MIN) = range(19)
 
 # One operation. An operand lies at fixed + per_row * (rows of the input), its element (i, j) at + i * row + j * column.
 OPERATION = np.dtype(
@@ -32,7 +35,7 @@ OPERATION = np.dtype(
 
 
 class Unplayable(ValueError):
-    """The graph has an operator, or a use of one, that a tape does not know."""
+    """The graph has an operator, or a use of one, that a tape does not know, or is too large."""
 
 
 class Tape:
@@ -42,9 +45,9 @@ class Tape:
         """graph : onnx_file.Graph; raises Unplayable."""
         if len(graph.inputs) != 1 or len(graph.outputs) != 1 or len(graph.inputs[0][1]) != 2:
             raise Unplayable("more than one input or output")
-        self._constants, self._given = [], {}
+        self._constants, self._given, self._start, self._work = [], {}, 0, 0  # start : numbers of the constants, so far
         self.inputs, self.meta = graph.inputs, graph.meta
-        self._graph, self._operations, self._used = graph, [], 0  # used : numbers for each row of the input, so far
+        self._named, self._operations, self._used = dict(graph.constants), [], 0  # used : numbers for each row of the input, so far
         (name, (_, self.width)), self._values = graph.inputs[0], {}  # name: (place, columns, all numbers for each row)
         if not self.width:
             raise Unplayable("an input of unknown width")
@@ -55,7 +58,6 @@ class Tape:
         if numbers != self.outputs:
             raise Unplayable("an output with other rows than the input")
         constants = np.concatenate([np.empty(0, np.float32), *self._constants]).astype(np.float32)
-        self._start = len(constants)
         self._room_of_numbers = np.concatenate([constants, np.zeros(BATCH * self._used, np.float32)])
         self._operations = np.array(self._operations, OPERATION)
         for part in ("", "a_", "b_"):  # constants come first
@@ -76,6 +78,8 @@ class Tape:
         return self._operations, self._room_of_numbers, self._start, self._output, self.outputs
 
     def _room(self, columns, numbers):
+        if columns < 1 or self._used + numbers > MODEL_NUMBERS:
+            raise Unplayable(f"no column, or more than {MODEL_NUMBERS} numbers for each row")
         place, self._used = self._used, self._used + numbers
         return place, columns, numbers
 
@@ -85,34 +89,41 @@ class Tape:
         return self._values[name]
 
     def _constant(self, name):
-        if name not in self._graph.constants:
+        if name not in self._named:
             raise Unplayable(f"{name} is no constant")
-        return self._graph.constants[name]
+        return self._named[name]
 
-    def _place_constant(self, array):
-        key = array.tobytes(), array.shape
-        if key not in self._given:
-            self._given[key] = sum(map(len, self._constants))
+    def _place_constant(self, name, array, turned=False):
+        if (name, turned) not in self._given:
+            self._given[name, turned] = self._start
             self._constants.append(array.ravel())
-        return self._given[key]
+            self._start += array.size
+        return self._given[name, turned]
 
     def _operand(self, name, columns):
         """(fixed, per_row, row, column) of a value, or of a constant that is the same for all rows, of so many columns or one."""
-        if name in self._graph.constants:
+        if name in self._named:
             array = self._constant(name)
             if array.dtype != np.float32 or array.size not in (1, columns) or array.shape[:-1] not in ((), (1,)):
                 raise Unplayable("a constant that differs between rows")
-            return self._place_constant(array), 0, 0, int(array.size > 1)
+            return self._place_constant(name, array), 0, 0, int(array.size > 1)
         place, own, _ = self._value(name)
         if own not in (1, columns):
             raise Unplayable("columns that do not fit")
         return -1, place, own, int(own > 1)
 
-    def _append(self, code, columns, rows, a, b=(0, 0, 0, 0), inner=0, at=None):
-        """An operation; at : (place, columns) of what it is a part of. Returns its value."""
-        value = self._room(columns, columns * rows) if at is None else (at[0], at[1], 0)
-        self._operations.append((code, rows, columns, -1, value[0], value[1], *a, *b, inner))
+    def _append(self, code, columns, rows, a, b=(0, 0, 0, 0), inner=0):
+        """An operation. Returns its value."""
+        value = self._room(columns, columns * rows)
+        self._write((code, rows, columns, -1, value[0], value[1], *a, *b, inner))
         return value
+
+    def _write(self, operation):
+        code, rows, columns, *_, inner = operation
+        self._work += rows * columns * (inner if code in (ROW_SUM, ROW_MAX, MATMUL) else 1)
+        if self._work > MODEL_WORK or len(self._operations) >= MODEL_NODES:
+            raise Unplayable(f"more than {MODEL_WORK} additions and multiplications for each row, or {MODEL_NODES} operations")
+        self._operations.append(operation)
 
     def _add(self, node):
         kind, inputs = node.kind, node.inputs
@@ -123,12 +134,14 @@ class Tape:
             made = self._elementwise("Add" if kind == "Sum" else kind, inputs)
         elif kind in ("MatMul", "Gemm"):
             made = self._product(node)
+        elif kind == "Constant":
+            self._named[node.outputs[0]] = np.asarray(node.attributes["value"])
+            return
+        elif kind in OTHERS:
+            made = getattr(self, f"_{kind.lower()}")(node)
         else:
-            made = getattr(self, f"_{kind.lower()}", self._unknown)(node)
+            raise Unplayable(f"operator {kind[:40]!r} is none of {', '.join((*UNARY, *BINARY, *OTHERS))}")
         self._values[node.outputs[0]] = made
-
-    def _unknown(self, node):
-        raise Unplayable(f"no operator {node.kind}")
 
     def _elementwise(self, kind, inputs):
         if len(inputs) < 2:
@@ -152,12 +165,12 @@ class Tape:
         if (options.pop("alpha"), options.pop("beta"), options.pop("transA")) != (1.0, 1.0, 0) or {*options} - {"transB"}:
             raise Unplayable("a product that is scaled")
         _, inner, numbers = self._value(node.inputs[0])
-        weights = self._constant(node.inputs[1])
-        weights = np.ascontiguousarray(weights.T if options.get("transB") else weights)
+        weights, turned = self._constant(node.inputs[1]), bool(options.get("transB"))
+        weights = weights.T if turned else weights
         if weights.dtype != np.float32 or weights.ndim != 2 or len(weights) != inner:
             raise Unplayable("a product that does not fit")
         columns, rows = weights.shape[1], numbers // inner
-        b = (self._place_constant(weights), 0, columns, 1)
+        b = (self._place_constant(node.inputs[1], weights, turned), 0, columns, 1)
         made = self._append(MATMUL, columns, rows, self._operand(node.inputs[0], inner), b, inner)
         if len(node.inputs) > 2:
             self._values["\0"] = made
@@ -169,7 +182,7 @@ class Tape:
         columns = self._constant(node.inputs[1])
         if node.attributes.get("axis", 0) != 1 or columns.ndim != 1 or not ((0 <= columns) & (columns < own)).all():
             raise Unplayable("other than columns taken")
-        b = (self._place_constant(columns.astype(np.float32)), 0, 0, 1)
+        b = (self._place_constant(node.inputs[1], columns.astype(np.float32)), 0, 0, 1)
         return self._append(GATHER, len(columns), numbers // own, self._operand(node.inputs[0], own), b)
 
     def _reshape(self, node):
@@ -188,9 +201,27 @@ class Tape:
         place, *_ = made = self._room(total, total * rows)
         for name, (_, columns, _) in zip(node.inputs, parts):
             operation = (IDENTITY, rows, columns, -1, place, total, *self._operand(name, columns), 0, 0, 0, 0, first)
-            self._operations.append(operation)
+            self._write(operation)
             first += columns
         return made
+
+    def _leakyrelu(self, node):
+        slope = np.float32([node.attributes.get("alpha", 0.01)])
+        if not 0.0 <= slope <= 1.0:
+            raise Unplayable("a slope that is not between 0 and 1")
+        name = f"\0{len(self._operations)}"  # that none has
+        self._named[f"{name}s"] = slope
+        self._values[name] = self._elementwise("Mul", [node.inputs[0], f"{name}s"])
+        return self._elementwise("Max", [node.inputs[0], name])
+
+    def _clip(self, node):
+        name, *limits = node.inputs
+        for kind, limit in zip(("Max", "Min"), limits):
+            if limit:
+                made = self._elementwise(kind, [name, limit])
+                name = f"\0{len(self._operations)}"  # that none has
+                self._values[name] = made
+        return self._value(name)
 
     def _reducesum(self, node):
         return self._reduced(node, ROW_SUM)
@@ -356,6 +387,10 @@ def _unary(code, x):
         return abs(x)
     if code == SIGMOID:
         return np.float32(1.0) / (np.float32(1.0) + math.exp(-x))
+    if code == ERF:
+        return math.erf(x)
+    if code == SOFTPLUS:
+        return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
     return -x
 
 

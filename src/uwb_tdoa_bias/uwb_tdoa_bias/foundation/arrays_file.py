@@ -8,8 +8,7 @@ import zlib
 import numpy as np
 
 from .errors import InputError
-
-MOST_BYTES = 500_000_000  # of all arrays together, unpacked
+from .limits import ARRAYS_BYTES
 
 
 def read_arrays(path, kinds, what, remedy):
@@ -21,8 +20,8 @@ def read_arrays(path, kinds, what, remedy):
     try:
         with ZipFile(path) as file:
             members = {name: _member(file, f"{name}.npy") for name in kinds}
-            if sum(member.file_size for member in members.values()) > MOST_BYTES:
-                raise ValueError(f"its arrays take more than {MOST_BYTES} bytes")
+            if sum(member.file_size for member in members.values()) > ARRAYS_BYTES:
+                raise ValueError(f"its arrays take more than {ARRAYS_BYTES} bytes")
             return {name: _array(name, file, member, kinds[name]) for name, member in members.items()}
     except OSError as error:
         reason = error.strerror or str(error)

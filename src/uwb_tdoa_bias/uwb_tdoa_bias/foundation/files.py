@@ -1,15 +1,14 @@
 """Reading files whole, or their beginning, with a limit."""
 
 from .errors import InputError
+from .limits import RECORDING_BYTES
 
-MOST_BYTES = 1 << 30  # of a file; a flight of an hour has 300 MB
 
-
-def read_bytes(path, most=MOST_BYTES):
+def read_bytes(path, most=RECORDING_BYTES):
     """The content of a file; raises InputError if it cannot be read, is empty or has more than `most` bytes."""
     content = read_head(path, most + 1)
     if len(content) > most:
-        raise InputError(f"{path}: has more than {most} bytes, too many for one recording; is it the right file?")
+        raise InputError(f"{path}: has more than {most} bytes, more than are read of such a file; is it the right file?")
     return content
 
 

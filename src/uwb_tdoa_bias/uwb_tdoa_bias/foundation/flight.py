@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .anchors import Anchors
+from .foreign_text import harmless
 
 AIDS = "height", "pressure", "velocity"  # streams of a Flight that the filter can do without
 
@@ -93,7 +94,7 @@ class Velocity:
 class Flight:
     """One recording. All stamps are of one clock, in s; every stream keeps its own; within a stream stamps never fall.
 
-    name : short and unique, e.g. "0425-traj1"
+    name : short and unique, e.g. "0425-traj1"; whatever is given, it is `harmless`
     anchors : Anchors
     tdoa : Tdoas
     imu : Imu or None
@@ -115,6 +116,9 @@ class Flight:
     height: Height | None = None
     pressure: Pressure | None = None
     velocity: Velocity | None = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "name", harmless(self.name))
 
     def without(self, *streams):
         """The Flight without some of the streams that may be missing, by their names, e.g. AIDS."""

@@ -11,21 +11,19 @@ import re
 import yaml
 
 from .errors import InputError
-
-MOST_BYTES = 1_000_000  # ours have some kB
-MOST_NODES, DEEPEST = 100_000, 20
+from .limits import YAML_BYTES, YAML_DEPTH, YAML_NODES
 
 
 def read_yaml(path):
     """What a YAML file holds: dict, list, str, int, float, bool or None. Raises InputError that names file and line."""
     try:
         with open(path, "rb") as file:
-            data = file.read(MOST_BYTES + 1)
+            data = file.read(YAML_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: cannot be read as YAML ({error.strerror}); give the path of a YAML file.") from error
-    if len(data) > MOST_BYTES:
+    if len(data) > YAML_BYTES:
         size = Path(path).stat().st_size
-        raise InputError(f"{path}: has {size} bytes, at most {MOST_BYTES} are read as YAML; is it the right file?")
+        raise InputError(f"{path}: has {size} bytes, at most {YAML_BYTES} are read as YAML; is it the right file?")
     return parse_yaml(data, path)
 
 
@@ -72,8 +70,8 @@ class _Loader(yaml.SafeLoader):
             raise _Refused(event.start_mark, f"*{event.anchor} is an alias; write the value itself.")
         if event.tag is not None:
             raise _Refused(event.start_mark, f"{event.tag} is a tag; leave it out.")
-        if self._depth > DEEPEST or self._nodes > MOST_NODES:
-            limit = f"deeper than {DEEPEST} levels" if self._depth > DEEPEST else f"more than {MOST_NODES} entries"
+        if self._depth > YAML_DEPTH or self._nodes > YAML_NODES:
+            limit = f"deeper than {YAML_DEPTH} levels" if self._depth > YAML_DEPTH else f"more than {YAML_NODES} entries"
             raise _Refused(event.start_mark, f"it has {limit}; is it the right file?")
         node = super().compose_node(parent, index)
         self._depth -= 1

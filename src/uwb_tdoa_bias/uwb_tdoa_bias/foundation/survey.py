@@ -8,6 +8,7 @@ from .anchors import FARTHEST, Anchors
 from .errors import InputError
 from .files import read_bytes
 from .later import rotations
+from .limits import SURVEY_BYTES
 
 # The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z), arm 3 forward (x).
 # Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this makes a right-handed frame
@@ -16,8 +17,6 @@ from .later import rotations
 # 49 mm up of where the arms meet.)
 ARM_TIPS = np.array([[0.0, 0.0, 0.110], [0.0, -0.121, 0.0], [0.080, 0.0, 0.0]])
 MAX_TIP_RESIDUAL = 0.010  # metres RMS; measured: 0.5 ... 2.2 mm
-
-MOST_BYTES = 1_000_000
 
 _ANTENNA = re.compile(r"anchorAnt_?([0-9]{1,9})$")
 _TIP = re.compile(r"anchor_?([0-9]{1,9})_([123])$")
@@ -36,7 +35,7 @@ def read_survey(path):
     Positions stay in the frame of the survey. Raises InputError with the line.
     """
     try:
-        text = read_bytes(path, MOST_BYTES).decode("utf-8-sig")
+        text = read_bytes(path, SURVEY_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv or .yaml)."

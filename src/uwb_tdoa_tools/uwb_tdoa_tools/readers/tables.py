@@ -6,16 +6,14 @@ import math
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
-
-
-MOST_BYTES = 100_000_000
+from uwb_tdoa_bias.foundation.limits import TABLE_BYTES
 
 
 def read_table(path, columns=None):
     """[(line, {column: text})] of a CSV file that has at least the columns, others passed over; default: of all that it
     has. Raises InputError."""
     try:
-        text = read_bytes(path, MOST_BYTES).decode("utf-8-sig")
+        text = read_bytes(path, TABLE_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: byte {error.start} is not text; give a CSV file.") from error
     rows, found = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True), []

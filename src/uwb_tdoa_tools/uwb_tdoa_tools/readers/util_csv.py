@@ -9,11 +9,11 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
+from uwb_tdoa_bias.foundation.limits import CSV_BYTES, most_unpacked
 
 from .streams import SALVAGE, make_flight
 
 GZIP_MAGIC = b"\x1f\x8b"
-MOST_TEXT = 200_000_000  # bytes; ten minutes of the full schema, and some GB in memory
 _BLOCK = 1 << 24  # bytes that are unpacked at once
 # Each sensor has its own time column and its own length: they are only set side by side, a row is not one instant.
 # Units: the authors' converter writes the columns as the micro-SD log has them, so acc is in g and gyro in deg/s
@@ -80,11 +80,12 @@ def is_util_csv(line):
 
 
 def _text(path, remarks, salvage):
-    content = read_bytes(path)
+    content, most = read_bytes(path), CSV_BYTES
     if content.startswith(GZIP_MAGIC):
-        content = _unpacked(path, content, remarks, salvage)
-    if len(content) > MOST_TEXT:
-        raise InputError(f"{path}: has more than {MOST_TEXT} bytes of text, too many for one flight; split it.")
+        most = most_unpacked(len(content), CSV_BYTES)
+        content = _unpacked(path, content, most, remarks, salvage)
+    if len(content) > most:
+        raise InputError(f"{path}: has more than {most} bytes of text, too many for one flight; split it.")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -100,13 +101,13 @@ def _text(path, remarks, salvage):
     return text
 
 
-def _unpacked(path, content, remarks, salvage):
-    """What gzip holds, at most one byte more than MOST_TEXT: its header does not tell how much that is."""
+def _unpacked(path, content, most, remarks, salvage):
+    """What gzip holds, somewhat more than `most` bytes at most: its header does not tell how much that is."""
     parts, size, problem = [], 0, "it ends early"
     try:
-        while content and size <= MOST_TEXT:  # a file may have several members
+        while content and size <= most:  # a file may have several members
             unpacker = zlib.decompressobj(zlib.MAX_WBITS | 16)
-            while content and not unpacker.eof and size <= MOST_TEXT:
+            while content and not unpacker.eof and size <= most:
                 parts.append(unpacker.decompress(content, _BLOCK))
                 content = unpacker.unconsumed_tail
                 size += len(parts[-1])
@@ -116,7 +117,7 @@ def _unpacked(path, content, remarks, salvage):
             problem = None if not content else problem
     except zlib.error as error:
         problem = str(error)
-    if problem and size <= MOST_TEXT:
+    if problem and size <= most:
         if not salvage:
             raise InputError(
                 f"{path}: the gzip data is cut or damaged ({problem}); copy the file again, or {SALVAGE}."

@@ -1,0 +1,19 @@
+"""Text of others, out of files and off topics, before it reaches a terminal, Markdown, a page or a picture."""
+
+import re
+
+from .limits import NAME_LENGTH
+
+# Other characters may be a command to Markdown, HTML, a shell, a file system or the mathematics of matplotlib.
+_OTHERS = re.compile(r"[^\w .,:;+=()#-]")
+
+
+def printable(text):
+    """The text with what is no character to see (line ends, escape sequences, marks that turn the direction of writing, halves of
+    characters) written out, as \\x1b: a terminal shows it and does nothing else."""
+    return "".join(one if one.isprintable() else one.encode("unicode_escape", "surrogatepass").decode() for one in str(text))
+
+
+def harmless(text):
+    """A name that means nothing anywhere: what is no letter, digit, space or one of .,:;+=()#- becomes _, and its end is cut."""
+    return _OTHERS.sub("_", str(text))[:NAME_LENGTH]

@@ -1,0 +1,35 @@
+"""How much of a file is read at most, whoever wrote it: every limit of every reader.
+
+What a header claims is compared with these, and with the file, before memory is taken or work is done for it. Limits are far above
+what is needed: a flight of an hour has 300 MB as a log, our YAML files have some kB, the model that is shipped 60 kB.
+"""
+
+# Whole files, bytes.
+RECORDING_BYTES = 1 << 30  # micro-SD log, or CSV as it lies on the disc
+CSV_BYTES = 200_000_000  # text of a recording; ten minutes of the full UTIL schema
+TABLE_BYTES = 100_000_000  # CSV of few columns
+SURVEY_BYTES = YAML_BYTES = 1_000_000
+MODEL_BYTES = 4_000_000  # ONNX: a million weights
+ARRAYS_BYTES = 100_000_000  # of all arrays of an .npz file, unpacked; four million cells have 20 MB
+
+NAME_LENGTH = 100  # characters of a flight, a model, ...
+
+# YAML.
+YAML_NODES, YAML_DEPTH = 100_000, 20
+
+# ONNX.
+MODEL_NODES = 10_000  # operators, and as many constants
+MODEL_NUMBERS = 100_000  # float32 that are held for each row
+MODEL_WORK = 2_000_000  # multiplications and additions for each row: some milliseconds
+
+# Bags.
+CHUNK_BYTES = 256 << 20  # of MCAP, unpacked; rosbag2 makes chunks of 0.75 MB
+MESSAGE_BYTES = 64 << 20  # of any topic: an image, a cloud of points
+READ_BYTES = 2 << 20  # of a message that is taken apart: 10 000 anchors
+FILE_BYTES = 8 << 30  # of all data files that are unpacked
+UNPACKED_FREE, UNPACKED_RATIO = 16 << 20, 100  # see `most_unpacked`
+
+
+def most_unpacked(packed, most=FILE_BYTES):
+    """Bytes that so many packed ones may become, all together: recordings shrink to a third, bombs to a thousandth and less."""
+    return min(most, UNPACKED_FREE + UNPACKED_RATIO * packed)
