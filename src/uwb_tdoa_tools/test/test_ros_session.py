@@ -1,3 +1,5 @@
+import sys
+
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
@@ -85,3 +87,15 @@ def test_message_class():
     assert message_class("sensor_msgs/msg/Imu") is Imu
     assert message_class("sensor_msgs/msg/Nothing") is None
     assert message_class("nothing_msgs/msg/Nothing") is None
+
+
+def test_no_package_is_imported_because_a_stranger_names_it(tmp_path, monkeypatch):
+    """Whoever publishes tells a name, and an import runs what it finds."""
+    (tmp_path / "evil_msgs").mkdir()
+    (tmp_path / "evil_msgs" / "__init__.py").write_text("")
+    (tmp_path / "evil_msgs" / "msg.py").write_text("class Nice: pass")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("evil_msgs/msg/Nice", "evil_msgs/Nice", "antigravity/msg/Nice", "sensor_msgs/msg/__doc__/x", "sensor_msgs", "", "../x/msg/Y"):
+        assert message_class(name) is None
+    assert "evil_msgs" not in sys.modules and "antigravity" not in sys.modules
+    assert message_class("evil_msgs/msg/Nice", ["evil_msgs"]).__name__ == "Nice"

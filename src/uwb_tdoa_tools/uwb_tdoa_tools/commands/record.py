@@ -8,6 +8,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import cli
 from ..bags.files import STORAGES
 from ..live.record import record
+from ..live.session import PACKAGE
 
 DESCRIPTION = """Record ROS topics to a bag, like `ros2 bag record`, until SIGINT (Ctrl-C) or SIGTERM.
 
@@ -32,6 +33,7 @@ def parser():
     made.add_argument("topics", nargs="*", metavar="TOPIC", help="topics to record")
     made.add_argument("-a", "--all", action="store_true", help="record all topics, except hidden ones")
     made.add_argument("-o", "--output", required=True, metavar="BAG", help="the bag to write, a new directory")
+    made.add_argument("--package", **PACKAGE)
     made.add_argument("-s", "--storage", choices=STORAGES, default="mcap", help="default: mcap")
     return made
 
@@ -40,10 +42,10 @@ def _record(args):
     if bool(args.topics) == args.all:
         raise InputError("topics: name the topics to record, or give --all for all of them, not both.")
     say = partial(cli.say, "record")
-    recorded = record(args.topics, args.output, args.storage, args.ros_arguments, say)
+    recorded = record(args.topics, args.output, args.storage, args.ros_arguments, say, args.package)
     for topic, count in sorted(recorded.counts.items()):
-        print(f"{topic}: {count} messages")
-    print(f"{sum(recorded.counts.values())} messages -> {args.output}")
+        cli.show(f"{topic}: {count} messages")
+    cli.show(f"{sum(recorded.counts.values())} messages -> {args.output}")
     if recorded.error is not None:
         raise recorded.error
     if recorded.missing:

@@ -6,6 +6,7 @@ import sys
 
 from .. import cli
 from ..live.replay import ACKNOWLEDGE_LIMIT, Options, replay
+from ..live.session import PACKAGE
 
 DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 bag play`.
 
@@ -54,6 +55,7 @@ def parser():
         help="wait until somebody subscribes to each of these topics",
     )  # fmt: skip
     add("--follow", metavar="TOPIC", help="keep in step with this topic, e.g. odometry")
+    add("--package", **PACKAGE)
     return made
 
 
@@ -61,14 +63,14 @@ def _replay(args):
     say = partial(cli.say, "replay")
     done = replay(
         args.bag,
-        Options(args.rate, args.loop, args.clock, args.wait_matched, args.wait_topics, args.follow, args.ros_arguments),
+        Options(args.rate, args.loop, args.clock, args.wait_matched, args.wait_topics, args.follow, args.ros_arguments, args.package),
         say,
     )
     played = done.played
     for topic, count in sorted(played.counts.items()):
-        print(f"{topic}: {count} messages")
+        cli.show(f"{topic}: {count} messages")
     waited = f", waited {played.waited:.2f} s for {args.follow}" if args.follow else ""
-    print(
+    cli.show(
         f"{sum(played.counts.values())} messages in {done.took:.2f} s, at most {1e3 * played.behind:.1f} ms late, "
         f"stretched by {1e3 * played.stretched:.1f} ms{waited}"
     )

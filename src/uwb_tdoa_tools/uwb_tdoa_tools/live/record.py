@@ -11,6 +11,7 @@ from ..bags.files import new_bag
 from ..bags.message_types import add_type, typestore
 from .session import message_class, recorded_qos, session, subscription_qos
 
+REMEDY = "build and source the workspace that has it, and name the package with --package"
 DISCOVERY_PERIOD = 0.1  # s between two looks for new topics
 POLL_PERIOD = 0.005  # s between two looks for messages; the subscriptions hold what comes in between
 
@@ -25,16 +26,17 @@ class Recorded:
     error: Exception | None
 
 
-def record(topics, output, storage="mcap", ros_arguments=(), say=print):
+def record(topics, output, storage="mcap", ros_arguments=(), say=print, packages=()):
     """Record topics, or all that are not hidden if the list is empty, until SIGINT or SIGTERM. Returns Recorded.
 
-    output : path of the bag, which appears when the recording ends; say(sentence) : told what happens.
+    output : path of the bag, which appears when the recording ends; say(sentence) : told what happens; packages : of message types,
+        beside those that are known, that may be imported.
     Raises InputError, and Failure if no message came at all: then there is no bag.
     """
     with session("record", list(ros_arguments)) as (node, stop), new_bag(output, storage) as writer:
         wanted = {node.resolve_topic_name(topic) for topic in topics} if topics else None
         names = ", ".join(sorted(wanted)) if wanted else None
-        recorder = Recorder(node, writer, wanted, say)
+        recorder = Recorder(node, writer, wanted, say, packages)
         say(f"waiting for {names or 'all topics'}")
         error = None
         try:
@@ -61,11 +63,11 @@ def _take_until(stop, recorder, progress):
 class Recorder:
     """Subscriptions, and the connections of the bag that they write to.
 
-    wanted : set of absolute topic names, or None for all. counts : {topic: messages recorded so far}.
+    wanted : set of absolute topic names, or None for all; packages : see `record`. counts : {topic: messages recorded so far}.
     """
 
-    def __init__(self, node, writer, wanted, say):
-        self.counts = {}
+    def __init__(self, node, writer, wanted, say, packages=()):
+        self.counts, self._packages = {}, packages
         self._node, self._writer, self._wanted, self._say = node, writer, wanted, say
         self._pairs = []  # (subscription, connection)
         self._refused = set()
@@ -77,7 +79,8 @@ class Recorder:
                 continue
             publishers = self._node.get_publishers_info_by_topic(topic)
             if publishers:
-                self._subscribe(topic, types[0], [publisher.qos_profile for publisher in publishers])
+                msgtype = next(filter(self._class, types), types[0])  # others may tell other types of it
+                self._subscribe(topic, msgtype, [each.qos_profile for each in publishers if each.topic_type == msgtype])
 
     def take(self):
         """Move all messages that have arrived to the bag; returns how many."""
@@ -101,11 +104,14 @@ class Recorder:
             return topic in self._wanted
         return not any(part.startswith("_") for part in topic.split("/"))
 
+    def _class(self, msgtype):
+        return message_class(msgtype, self._packages)
+
     def _subscribe(self, topic, msgtype, offered):
-        cls = message_class(msgtype)
+        cls = self._class(msgtype)
         try:
             if cls is None:
-                raise InputError(f"{msgtype} is not installed; build and source the workspace that has it.")
+                raise InputError(f"{msgtype} is not installed, or of a package that is not known; {REMEDY}.")
             add_type(typestore(), msgtype)
         except InputError as error:
             if self._wanted is not None:

@@ -28,7 +28,8 @@ class Options:
 
     rate : times as fast as recorded; loop : start again at the end; clock_rate : Hz of /clock, None for none;
     wait : s until somebody must subscribe; wait_topics : to all of these; follow : topic that is kept in step with, or
-    None (the TDOAs of the bag are of the wait_topics then); ros_arguments : command line with --ros-args.
+    None (the TDOAs of the bag are of the wait_topics then); ros_arguments : command line with --ros-args; packages : of
+    message types, beside those that are known, that may be imported.
     """
 
     rate: float = 1.0
@@ -38,6 +39,7 @@ class Options:
     wait_topics: tuple = ()
     follow: str | None = None
     ros_arguments: tuple = ()
+    packages: tuple = ()
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class Replayed:
 def replay(bag, options=Options(), say=print):
     """Replay a bag. Returns Replayed. Raises InputError. say(sentence) : told what happens."""
     with open_bag(bag) as reader, session("replay", list(options.ros_arguments)) as (node, stop):
-        publishers = _publishers(node, bag, reader, say)
+        publishers = _publishers(node, bag, reader, say, options.packages)
         connections = [connection for connection in reader.connections if connection.topic in publishers]
         count = sum(connection.msgcount for connection in connections)
         if not count:
@@ -79,16 +81,16 @@ def replay(bag, options=Options(), say=print):
         return Replayed(player.played, took, acknowledged, stop.signal, wrong)
 
 
-def _publishers(node, bag, reader, say):
+def _publishers(node, bag, reader, say, packages):
     """{topic in the bag: publisher} of all topics whose type is installed, those that are latched last. What belongs to
     one robot is published in the namespace of the node (--ros-args -r __ns:=/tag1)."""
     made = []
     by_topic = itertools.groupby(sorted(reader.connections, key=lambda c: c.topic), key=lambda c: c.topic)
     for topic, connections in by_topic:
         connections = list(connections)
-        cls = message_class(connections[0].msgtype)
+        cls = message_class(connections[0].msgtype, packages)
         if cls is None:
-            say(f"leaving out {topic}: its type {connections[0].msgtype} is not installed")
+            say(f"leaving out {topic}: its type {connections[0].msgtype} is not installed, or of a package that is not known (--package)")
             continue
         recorded = [qos for connection in connections for qos in connection.ext.offered_qos_profiles]
         made.append((topic, cls, publisher_qos(recorded, sum(connection.msgcount for connection in connections))))

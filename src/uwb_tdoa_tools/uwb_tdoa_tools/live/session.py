@@ -12,6 +12,15 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+KNOWN = frozenset(  # packages of message types: those of ROS that robots speak, and ours
+    """actionlib_msgs action_msgs builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs nav_msgs rcl_interfaces rosgraph_msgs
+    sensor_msgs shape_msgs statistics_msgs std_msgs stereo_msgs tf2_msgs trajectory_msgs unique_identifier_msgs uwb_tdoa_msgs
+    visualization_msgs""".split()
+)
+PACKAGE = {  # the option by which others are allowed
+    "action": "append", "default": [], "metavar": "NAME",
+    "help": "import message types of this package, too; those of ROS that robots speak, and ours, are known; may be repeated",
+}  # fmt: skip
 READER_DEPTH = 10_000  # messages that a subscription holds until they are taken: 10 s of a 1 kHz stream
 
 
@@ -54,11 +63,14 @@ def session(name, arguments):
             signal.signal(number, handler)
 
 
-def message_class(msgtype):
-    """Class of a type like "pkg/msg/Name", or None if its package is not installed."""
-    package, kind, name = msgtype.split("/")
+def message_class(msgtype, packages=()):
+    """Class of a type like "pkg/msg/Name", or None if its package is not installed, or neither KNOWN nor one of `packages`: whoever
+    publishes, or made a bag, names the type, and importing a package runs it."""
+    package, _, name = msgtype.partition("/msg/")
+    if package not in KNOWN and package not in packages or not name.isidentifier():
+        return None
     try:
-        return getattr(import_module(f"{package}.{kind}"), name, None)
+        return getattr(import_module(f"{package}.msg"), name, None)
     except ImportError:
         return None
 
