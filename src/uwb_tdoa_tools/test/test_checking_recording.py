@@ -36,8 +36,8 @@ def test_the_truth_stays_closed(tmp_path, monkeypatch):
     from uwb_tdoa_tools.checking import recording
 
     opened = []
-    original = recording.deserialize
-    monkeypatch.setattr(recording, "deserialize", lambda p, c, d: opened.append(c.topic) or original(p, c, d))
+    original = recording.readable
+    monkeypatch.setattr(recording, "readable", lambda p, r, some: opened.extend(c.topic for c in some) or original(p, r, some))
     read_recording(Reading(), tmp_path / "f.bag")
     assert "/ground_truth/pose" not in opened and "/uwb/tdoa" in opened
 

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.flight import Imu
 from uwb_tdoa_ekf.imu_mount import ImuMount
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags import bag
-from uwb_tdoa_tools.bags.files import deserialize, messages, new_bag, open_bag
+from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.checking import labels
 from uwb_tdoa_tools.checking.check import fed
@@ -53,7 +53,7 @@ def mounted(flight, path, *static, robot=""):
             writer.write(to["/tf_static"], 0, message)
         for connection, stamp, data in messages(path, reader, reader.connections):
             if connection.topic in frames:
-                message = deserialize(path, connection, data)
+                message = store.deserialize_cdr(data, connection.msgtype)
                 message.header.frame_id = frames[connection.topic]
                 data = store.serialize_cdr(message, connection.msgtype)
             writer.write(to[connection.topic], stamp, data)
@@ -71,7 +71,8 @@ def test_sensors_are_taken_to_the_body(flight, tmp_path, robot):
     _, accel = ImuMount(TURN, ARM).in_body(flight.imu.t, *of_sensor)
     np.testing.assert_allclose(read.imu.gyro, flight.imu.gyro, atol=1e-9)
     np.testing.assert_allclose(read.imu.accel, accel, atol=1e-9)
-    assert read.meta["antenna"] == pytest.approx(ANTENNA) and "remarks" not in read.meta
+    assert read.meta["antenna"] == pytest.approx(ANTENNA)
+    assert ["(0.100, 0.000, -0.050) m" in read.meta["remarks"][0], "(0.000, 0.100, 0.200) m" in read.meta["remarks"][1]] == [True, True]
     checked = read_recording(Reading(), path)
     np.testing.assert_allclose(checked.imu.accel, read.imu.accel, atol=1e-9)
 

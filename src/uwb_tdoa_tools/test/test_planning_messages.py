@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
-from uwb_tdoa_tools.bags.files import deserialize, open_bag
+from uwb_tdoa_tools.bags.files import open_bag
+from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid, chart
 from uwb_tdoa_tools.planning.messages import TOPICS, messages, write
@@ -55,6 +56,6 @@ def test_a_bag_of_them(tmp_path):
             (qos,) = connection.ext.offered_qos_profiles
             assert qos.durability.name == "TRANSIENT_LOCAL"
         for connection, *_, data in reader.messages():
-            back = deserialize(tmp_path, connection, data)
+            back = typestore().deserialize_cdr(data, connection.msgtype)
             if connection.topic == "/plan/flyable":
                 np.testing.assert_array_equal(back.data, found["plan/flyable"].data)

@@ -16,7 +16,6 @@ The time of a message is its header stamp. `Flight.extra` has no message type an
 from collections import Counter
 import heapq
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,10 +26,11 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
+from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_bias.foundation.version import written_by
 
 from . import messages as bag_messages, placing
-from .files import check_output, deserialize, is_bag, messages, new_bag, open_bag
+from .files import check_output, is_bag, new_bag, open_bag, readable, remarks_of
 from .integrity import metadata
 from .mcap import Damaged
 from .message_types import check_type, typestore
@@ -55,6 +55,7 @@ _AIDS = {  # topic and field of Flight: its type, messages of it, a row of a mes
     ),
 }  # fmt: skip
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
+_TOLD = "source", "format", "protocol"  # of that meta: texts that are read again, to be told; nothing is computed with them
 
 
 def _qos(durability, depth):
@@ -76,7 +77,7 @@ class RecordedOdometry:
 
     t : (n,) s, header stamps; p : (n, 3) m and v : (n, 3) m/s in the world frame; q : (n, 4) x y z w, body to world;
     covariance : (n, 6, 6) of position (world) and rotation, m^2 and rad^2;
-    twist_covariance : (n, 6, 6) of linear and angular velocity in the body frame, as recorded.
+    twist_covariance : (n, 6, 6) of linear and angular velocity in the body frame, as recorded; remarks : what is missing, sentences.
     """
 
     t: np.ndarray
@@ -85,6 +86,7 @@ class RecordedOdometry:
     q: np.ndarray
     covariance: np.ndarray
     twist_covariance: np.ndarray
+    remarks: tuple = ()
 
     def __len__(self):
         return len(self.t)
@@ -104,6 +106,7 @@ def write_bag(flight, out, storage="mcap", force=False):
     if not starts:
         raise InputError(f"{flight.name}: holds no message; there is nothing to write.")
     first = int(min(starts))
+    antenna = flight.meta.get("antenna")
     topics = {  # at equal stamps this order holds: anchors before what needs them
         "/uwb/anchors": (
             "uwb_tdoa_msgs/msg/AnchorArray",
@@ -113,7 +116,7 @@ def write_bag(flight, out, storage="mcap", force=False):
         "/tf_static": (
             "tf2_msgs/msg/TFMessage",
             LATCHED_QOS,
-            [bag_messages.transforms_message(flight.anchors, first, store)],
+            [bag_messages.transforms_message(flight.anchors, first, store, antenna)],
         ),
     }
     if flight.imu is not None:
@@ -121,7 +124,7 @@ def write_bag(flight, out, storage="mcap", force=False):
     for name, (msgtype, outgoing, *_) in _AIDS.items():
         if getattr(flight, name) is not None:
             topics[f"/{name}"] = msgtype, _STREAM_QOS, outgoing(getattr(flight, name), store)
-    topics["/uwb/tdoa"] = "uwb_tdoa_msgs/msg/Tdoa", _STREAM_QOS, bag_messages.tdoa_messages(flight.tdoa, store)
+    topics["/uwb/tdoa"] = "uwb_tdoa_msgs/msg/Tdoa", _STREAM_QOS, bag_messages.tdoa_messages(flight.tdoa, store, antenna)
     if flight.truth is not None:
         poses = bag_messages.pose_messages(flight.truth, flight.anchors.frame, store)
         topics["/ground_truth/pose"] = "geometry_msgs/msg/PoseStamped", _STREAM_QOS, poses
@@ -165,7 +168,7 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, spare
         connections = _connections(reader)
         about = _about(path)
         meta = {**about["meta"], "bag": str(path)}
-        remarks, name_of, frames = list(reader.remarks), Names(namespace, topics), {}
+        remarks, name_of, frames = [], Names(namespace, topics), {}
 
         def stream(topic, msgtype, row, make, sound=np.isfinite):
             found = _find(path, connections, name_of(topic), msgtype)
@@ -182,7 +185,9 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, spare
 
         tdoa = stream("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of)
         if tdoa is None:
-            raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {_others(connections, namespace)}.")
+            count = reader.unreadable[name_of("uwb/tdoa")]
+            why = f"{count} that are there cannot be read" if count else _others(connections, namespace)
+            raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {why}.")
         if anchors is None:
             anchors = _read_anchors(path, reader, connections, name_of("uwb/anchors")) or (spare() if spare else None)
         if anchors is None:
@@ -192,6 +197,7 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, spare
         tree = placing.read_frames(path, reader)
         places = {topic: placing.placed(tree, topic, frames[topic]) for topic in ("imu/data", "uwb/tdoa")}
         remarks += [remark for _, remark in places.values() if remark]
+        remarks = [*remarks_of(reader), *remarks]
         pose = "geometry_msgs/msg/PoseStamped"
         truth = stream("ground_truth/pose", pose, bag_messages.pose_row, bag_messages.truth_of)
     if imu is not None and (place := places["imu/data"][0]):
@@ -214,6 +220,7 @@ def read_odometry(path, namespace="", salvage=False, topics=None):
         names = _connections(reader)
         found = _find(path, names, topic, "nav_msgs/msg/Odometry")
         t, rows, *_ = _table(path, reader, found, bag_messages.odometry_row)
+        remarks = tuple(remarks_of(reader))
     if not len(t):
         others = " or ".join(f"--topic odometry={name}" for name in names if name.endswith("/odometry"))
         remedy = f"say which to take ({others})" if others else "record the output of the filter"
@@ -221,7 +228,7 @@ def read_odometry(path, namespace="", salvage=False, topics=None):
     p, v, q = rows[:, 0:3], rows[:, 3:6], rows[:, 6:10]
     known = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0.0)
     v = np.where(known[:, None], Rotation.from_quat(np.where(known[:, None], q, [0.0, 0.0, 0.0, 1.0])).apply(v), np.nan)
-    return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6))
+    return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6), remarks)
 
 
 def late_tdoas(path, namespace="", salvage=False, topics=None):
@@ -231,8 +238,7 @@ def late_tdoas(path, namespace="", salvage=False, topics=None):
     beside = Names(namespace, topics)("odometry").rpartition("/")[0]
     with open_bag(path, salvage) as reader:
         found = _find(path, _connections(reader), f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual")
-        residuals = (deserialize(path, c, data) for c, _, data in messages(path, reader, found))
-        return sum(residual.verdict == residual.VERDICT_LATE for residual in residuals)
+        return sum(residual.verdict == residual.VERDICT_LATE for _, _, residual in readable(path, reader, found))
 
 
 def read_fields(path, topic, namespace=""):
@@ -246,7 +252,7 @@ def read_fields(path, topic, namespace=""):
         found = _find(path, _connections(reader), topic)
         if not found:
             raise InputError(f"{path}: has no topic {topic}; record it.")
-        recorded = [deserialize(path, c, data) for c, _, data in messages(path, reader, found)]
+        recorded = [message for _, _, message in readable(path, reader, found)]
     stamps = np.array([bag_messages.stamp_of(message.header) for message in recorded], dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
     columns = {"t": stamps[order] / 1e9}
@@ -263,8 +269,8 @@ def _connections(reader):
 
 
 def _about(path):
-    """{"name", "meta"} of the flight, as `write_bag` left them in the bag's custom data; of bags of others, and where
-    they cannot be read, the name of the file and nothing."""
+    """{"name", "meta"} of the flight, as `write_bag` left them in the bag's custom data, what is _TOLD of it; of bags of others, and
+    where they cannot be read, the name of the file and nothing."""
     out = {"name": Path(path).stem, "meta": {}}
     try:
         about = json.loads(metadata(Path(path))["custom_data"].get(_FLIGHT_KEY, "{}"))
@@ -272,10 +278,10 @@ def _about(path):
         return out
     if isinstance(about, dict):
         name, meta = about.get("name"), about.get("meta")
-        if isinstance(name, str) and re.fullmatch(r"[^/\0\n\r]{1,200}", name) and name not in (".", ".."):
+        if isinstance(name, str) and name:
             out["name"] = name
         if isinstance(meta, dict):
-            out["meta"] = meta
+            out["meta"] = {key: printable(meta[key])[:1000] for key in _TOLD if isinstance(meta.get(key), str)}
     return out
 
 
@@ -316,8 +322,7 @@ def _table(path, reader, connections, row):
     """Stamps (n,) s, the other columns (n, k) of row(message) in order of stamps, how often the stamps fell, and
     {frame_id: messages}."""
     rows, frames = [], Counter()
-    for connection, _, data in messages(path, reader, connections):
-        message = deserialize(path, connection, data)
+    for _, _, message in readable(path, reader, connections):
         rows.append(row(message))
         frames[message.header.frame_id] += 1
     if not rows:
@@ -335,8 +340,8 @@ def _read_anchors(path, reader, connections, topic):
     """The last Anchors of a topic, or None."""
     found = _find(path, connections, topic, "uwb_tdoa_msgs/msg/AnchorArray")
     last = None
-    for connection, _, data in messages(path, reader, found):
-        last = deserialize(path, connection, data)
+    for _, _, last in readable(path, reader, found):
+        pass
     if last is None:
         return None
     try:

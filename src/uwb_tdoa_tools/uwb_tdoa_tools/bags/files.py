@@ -1,5 +1,6 @@
 """Bags as files: opening them, going through their messages, and making new ones that are never half-written."""
 
+from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 import re
@@ -9,6 +10,7 @@ import tempfile
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.limits import READ_BYTES, most_unpacked
 
 from ..readers.streams import SALVAGE
 from .integrity import NO_SUM, SUM_KEY, check as check_whole, is_packed, metadata, seal, unpack
@@ -103,7 +105,8 @@ def _opened(path, folder, salvage):
         reader = Reader(readable)
         reader.open()
         _take_qos_of_metadata(reader)
-        reader.remarks = remarks
+        reader.remarks, reader.unreadable = remarks, Counter()
+        reader.most = most_unpacked(sum(file.stat().st_size for file in (path, *path.glob("*")) if file.is_file()))
         for connection in reader.connections:
             if not re.fullmatch(r"[/\w]+", connection.topic) or not re.fullmatch(r"\w+/\w+/\w+", connection.msgtype):
                 raise Damaged(f"topic {connection.topic!r} of type {connection.msgtype!r} is none")
@@ -124,23 +127,31 @@ def _take_qos_of_metadata(reader):
 
 
 def messages(path, reader, connections):
-    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order, as their types are now; raises
-    InputError, also if there are more or fewer than the bag says."""
+    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order, as their types are now, without those that
+    cannot be read as such, which are counted in `reader.unreadable`; raises InputError, also if there are more or fewer than the bag
+    says, or they hold more bytes than its files."""
     found = reader.messages(connections=connections) if connections else iter(())
     left = {(connection.topic, connection.msgtype): 0 for connection in connections}
     for connection in connections:
         left[connection.topic, connection.msgtype] += connection.msgcount
-    earlier = {connection.id: earlier_types(path, connection) for connection in connections}
+    earlier, room = {connection.id: earlier_types(path, connection) for connection in connections}, reader.most
     while True:
         try:
             connection, stamp, data = next(found)
-            if earlier[connection.id]:
-                data = upgraded(data, connection.msgtype, earlier[connection.id])
         except StopIteration:
             break
         except Exception as error:  # as in _opened
             raise _damaged(path, error) from error
         left[connection.topic, connection.msgtype] -= 1
+        room -= len(data)
+        if room < 0:
+            raise _damaged(path, f"its messages hold more than {reader.most} bytes")
+        if earlier[connection.id]:
+            try:
+                data = upgraded(data, connection.msgtype, earlier[connection.id])
+            except Exception:  # as in _opened
+                reader.unreadable[connection.topic] += 1
+                continue
         yield connection, stamp, data
     for (topic, _), count in left.items():
         if count:
@@ -148,12 +159,22 @@ def messages(path, reader, connections):
             raise _damaged(path, f"{what} on {topic}")
 
 
-def deserialize(path, connection, data):
-    """The message of (connection, bytes); raises InputError if the bytes are none."""
-    try:
-        return typestore().deserialize_cdr(data, connection.msgtype)
-    except Exception as error:  # as in open_bag
-        raise _damaged(path, error) from error
+def readable(path, reader, connections):
+    """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher sends them, is counted too."""
+    for connection, stamp, data in messages(path, reader, connections):
+        try:
+            if len(data) > READ_BYTES:
+                raise ValueError
+            message = typestore().deserialize_cdr(data, connection.msgtype)
+        except Exception:  # as in _opened
+            reader.unreadable[connection.topic] += 1
+            continue
+        yield connection, stamp, message
+
+
+def remarks_of(reader):
+    """Sentences on what is missing in what was read so far."""
+    return [*reader.remarks, *(f"{topic}: {count} messages left out, they cannot be read." for topic, count in reader.unreadable.items())]
 
 
 def _damaged(path, error):

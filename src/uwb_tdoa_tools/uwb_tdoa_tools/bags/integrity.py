@@ -8,6 +8,7 @@ import zlib
 
 import yaml
 
+from uwb_tdoa_bias.foundation.limits import MESSAGE_BYTES, most_unpacked
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 from . import mcap
@@ -15,9 +16,8 @@ from .mcap import Damaged, zstd
 
 SUM_KEY = "uwb_tdoa_tools.crc32"  # in the bag's custom data: CRC-32 of its data file, 8 hexadecimal digits
 NO_SUM = "--------"
-MOST_UNPACKED = 8 << 30  # bytes of a data file that was compressed
-MOST_MESSAGE = 64 << 20  # bytes of a message that was compressed
 _BLOCK = 1 << 20  # bytes that are read at once
+_PLAIN = re.compile(r"CREATE\s+(TABLE|INDEX)\s[^()]*\([\w\s,\"'`\[\]]*\)\s*", re.IGNORECASE)  # no bracket within: nothing is computed
 _TYPES = (  # columns of an SQLite bag and what they hold
     ("messages", {"timestamp": "integer", "topic_id": "integer", "data": "blob"}),
     ("topics", {"id": "integer", "name": "text", "type": "text", "serialization_format": "text"}),
@@ -57,16 +57,16 @@ def is_packed(information):
 def unpack(path, folder):
     """Write a bag whose files are compressed as a whole to an empty folder, unpacked. Raises Damaged, InputError."""
     information = metadata(path)
-    names = []
-    for file in data_files(path, information):
+    names, size, files = [], 0, data_files(path, information)
+    most = most_unpacked(sum(file.stat().st_size for file in files))
+    for file in files:
         names.append(file.stem)
-        size = 0
         try:
             with zstd.open(file, "rb") as source, open(folder / file.stem, "wb") as target:
                 while block := source.read(_BLOCK):
                     size += len(block)
-                    if size > MOST_UNPACKED:
-                        raise Damaged(f"{file.name} unpacks to more than {MOST_UNPACKED} bytes")
+                    if size > most:
+                        raise Damaged(f"its files unpack to more than {most} bytes")
                     target.write(block)
         except (zstd.ZstdError, EOFError) as error:
             raise Damaged(f"{file.name} cannot be unpacked ({error})") from error
@@ -95,9 +95,11 @@ def metadata(path):
     for name, kind in kinds.items():
         if type(information.get(name)) is not kind:
             raise Damaged(f"metadata.yaml: {name} is {information.get(name)!r}")
+    seen = set()
     for name in information["relative_file_paths"]:
-        if not isinstance(name, str) or not Path(name).name:
-            raise Damaged(f"metadata.yaml: relative_file_paths: {name!r} is no file")
+        if not isinstance(name, str) or not Path(name).name or Path(name).name in seen:
+            raise Damaged(f"metadata.yaml: relative_file_paths: {name!r} is no file, or is there twice")
+        seen.add(Path(name).name)
     for name, key in (("duration", "nanoseconds"), ("starting_time", "nanoseconds_since_epoch")):
         if type(information[name].get(key)) is not int:
             raise Damaged(f"metadata.yaml: {name} is {information[name]!r}")
@@ -121,12 +123,16 @@ def seal(path):
 
 
 def open_sqlite(file):
-    """A connection that only reads, a file that is cut as well. Raises Damaged."""
+    """A connection that only reads, a file that is cut as well, in which nothing is but tables and indexes of columns: what is
+    computed (views, virtual tables, checks, expressions) may take for ever. Raises Damaged."""
+    connection = sqlite3.connect(f"file:{quote(str(Path(file).absolute()))}?mode=ro&immutable=1", uri=True)
     try:
-        connection = sqlite3.connect(f"file:{quote(str(Path(file).absolute()))}?mode=ro&immutable=1", uri=True)
         connection.execute("PRAGMA writable_schema=ON")  # else not one page of a file that has fewer than it says
+        for name, text in connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"):
+            if not _PLAIN.fullmatch(text):
+                raise Damaged(f"{name} in it is no table and no index of columns")
         return connection
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
         raise Damaged(str(error)) from error
 
 
@@ -143,21 +149,29 @@ def _check_data(file, packed_messages=False):
     else:
         _check_sqlite(file)
         contents = (data for _, _, _, data in sqlite_messages(file))
+    left = most_unpacked(file.stat().st_size)
     for content in contents if packed_messages else ():
+        most = min(MESSAGE_BYTES, left)
         try:
-            size = len(zstd.ZstdDecompressor().decompress(content, MOST_MESSAGE + 1))
+            size = len(zstd.ZstdDecompressor().decompress(content, most + 1))
         except (zstd.ZstdError, TypeError) as error:
             raise Damaged(f"a message cannot be unpacked ({error})") from error
-        if size > MOST_MESSAGE:
-            raise Damaged(f"a message unpacks to more than {MOST_MESSAGE} bytes")
+        if size > most:
+            raise Damaged(f"its messages unpack to more than {MESSAGE_BYTES} bytes each, or are too many")
+        left -= size
 
 
 def sqlite_messages(file):
     """Yields (id, topic id, stamp, data) of an SQLite file in the order of the ids. Raises Damaged where it is."""
-    connection = open_sqlite(file)
+    connection, last = open_sqlite(file), None
+    query = f"SELECT id, topic_id, timestamp, iif(length(data) <= {MESSAGE_BYTES}, data, NULL) FROM messages ORDER BY id"
     try:
-        yield from connection.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id")
-    except (sqlite3.Error, UnicodeDecodeError) as error:
+        for row in connection.execute(query):
+            if last is not None and not row[0] > last:
+                raise Damaged("its messages go round in a circle")
+            last = row[0]
+            yield row
+    except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
         raise Damaged(str(error)) from error
     finally:
         connection.close()
@@ -172,9 +186,10 @@ def _check_sqlite(file):
             raise Damaged(" ".join(str(problems[0]).split()) if problems else "its integrity cannot be checked")
         for table, columns in _TYPES:
             wrong = " OR ".join(f"typeof({name}) <> '{kind}'" for name, kind in columns.items())
+            wrong += f" OR length({[*columns][-1]}) > {MESSAGE_BYTES}"
             count = connection.execute(f"SELECT count(*) FROM {table} WHERE {wrong}").fetchone()[0]
             if count:
-                raise Damaged(f"{count} rows of {table} hold text where numbers belong, or the other way round")
+                raise Damaged(f"{count} rows of {table} hold text where numbers belong, or the other way round, or are too long")
     except (sqlite3.Error, UnicodeDecodeError) as error:
         raise Damaged(str(error)) from error
     finally:

@@ -11,13 +11,14 @@ import zlib
 
 import lz4.frame
 
+from uwb_tdoa_bias.foundation.limits import CHUNK_BYTES, most_unpacked
+
 if sys.version_info >= (3, 14):
     from compression import zstd
 else:
     from backports import zstd
 
 MAGIC = b"\x89MCAP0\r\n"
-MOST_UNPACKED = 256 << 20  # bytes of a chunk; rosbag2 makes chunks of 0.75 MB
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F
 _BLOCK = 1 << 20  # bytes that are read at once
 
@@ -53,7 +54,7 @@ def check(path):
             raise Damaged("it does not start as MCAP does")
         if last < 16 or _at(file, last - 8, 8) != MAGIC:
             raise Damaged("it does not end as MCAP does: the recording was cut")
-        chunks, footer, begin = {}, None, (0, 8)
+        chunks, footer, begin, left = {}, None, (0, 8), most_unpacked(last)
         for record in records(file, 8, last - 8):
             if footer is not None:
                 raise Damaged(f"byte {record.start}: a record follows the footer")
@@ -61,7 +62,7 @@ def check(path):
                 begin = (0, 8, record.end)  # where the data begin is not the same to all who write these files
             elif record.kind == CHUNK:
                 chunks[record.start] = _described(file, record)
-                unpacked(file, record)
+                left -= len(unpacked(file, record, left))
             elif record.kind == CHUNK_INDEX:
                 _check_index(file, record, chunks)
             elif record.kind == DATA_END:
@@ -75,17 +76,23 @@ def check(path):
 
 
 def sound(path):
-    """What is left of a file: yields (kind, content) of the schemas, channels and messages up to the first damage, and
-    raises Damaged there."""
+    """What is left of a file: yields (kind, content) of the schemas, channels and messages, and (CHUNK, Damaged) for a chunk that is
+    damaged, up to where no record follows, and raises Damaged there."""
     with open(path, "rb") as file:
         last = _size(file)
+        left = most_unpacked(last)
         if _at(file, 0, min(8, last)) != MAGIC:
             raise Damaged("it does not start as MCAP does")
         for record in records(file, 8, last):
             if record.kind in (SCHEMA, CHANNEL, MESSAGE):
                 yield record.kind, _at(file, record.content, record.size)
             elif record.kind == CHUNK:
-                yield from inner(unpacked(file, record))
+                try:
+                    data = unpacked(file, record, left)
+                    left -= len(data)
+                    yield from inner(data)
+                except Damaged as damage:
+                    yield CHUNK, damage
             elif record.kind in (DATA_END, FOOTER):
                 return
         raise Damaged("it ends early")
@@ -118,11 +125,11 @@ def inner(data):
         at += size
 
 
-def unpacked(file, record):
-    """Content of a chunk, its size and checksum verified. Raises Damaged."""
+def unpacked(file, record, most=CHUNK_BYTES):
+    """Content of a chunk, at most so many bytes, its size and checksum verified. Raises Damaged."""
     size, crc, compression, packed_at, packed_size = _chunk(file, record)
-    if size > MOST_UNPACKED:
-        raise Damaged(f"byte {record.start}: a chunk claims {size} bytes, more than {MOST_UNPACKED}")
+    if size > min(most, CHUNK_BYTES):
+        raise Damaged(f"byte {record.start}: a chunk claims {size} bytes, more than {min(most, CHUNK_BYTES)}")
     data = _at(file, packed_at, packed_size)
     try:
         if compression == b"lz4":

@@ -12,7 +12,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Height, Imu, Pressure, Tdoas, Truth, Velocity
 
-BODY_FRAME = "base_link"
+BODY_FRAME, ANTENNA_FRAME = "base_link", "uwb_antenna"
 FIELD_OF_VIEW, LONGEST_RANGE = 0.47, 1000.0  # rad, m, of a sensor_msgs/Range: typical, and a bound that bounds nothing
 UNKNOWN_VARIANCE = 1e12  # of what is not measured: covariances of messages are to be finite
 
@@ -115,12 +115,12 @@ def velocity_of(stamps, rows):
     return Velocity(stamps, rows[:, 0:3], rows[:, 3:6])
 
 
-def tdoa_messages(tdoa, store):
-    """Yield (stamp ns, uwb_tdoa_msgs/Tdoa)."""
-    Message = store.types["uwb_tdoa_msgs/msg/Tdoa"]
+def tdoa_messages(tdoa, store, antenna=None):
+    """Yield (stamp ns, uwb_tdoa_msgs/Tdoa). antenna : where it is on the body, see `transforms_message`."""
+    Message, frame = store.types["uwb_tdoa_msgs/msg/Tdoa"], ANTENNA_FRAME if antenna else BODY_FRAME
     columns = (nanoseconds("tdoa", tdoa.t), tdoa.a, tdoa.b, tdoa.d, tdoa.variance)
     for stamp, *values in zip(*(column.tolist() for column in columns)):
-        yield stamp, Message(_header(store, stamp, BODY_FRAME), *values)
+        yield stamp, Message(_header(store, stamp, frame), *values)
 
 
 def tdoa_row(message):
@@ -159,22 +159,28 @@ def anchors_message(anchors, stamp, store):
     return stamp, store.types["uwb_tdoa_msgs/msg/AnchorArray"](_header(store, stamp, anchors.frame), array)
 
 
-def transforms_message(anchors, stamp, store):
-    """(stamp ns, tf2_msgs/TFMessage) with the anchors as frames anchor_<id>.
+def transforms_message(anchors, stamp, store, antenna=None):
+    """(stamp ns, tf2_msgs/TFMessage) with the anchors as frames anchor_<id>, and the antenna, (3,) m in the body frame.
 
     An unknown orientation is the identity here: tf has no word for "not known".
     """
     types = store.types
     q_or_identity = np.where(np.isfinite(anchors.orientations), anchors.orientations, [0.0, 0.0, 0.0, 1.0])
+    frames = [
+        (anchors.frame, f"anchor_{number}", p, q)
+        for number, p, q in zip(anchors.ids.tolist(), anchors.positions.tolist(), q_or_identity.tolist())
+    ]
+    if antenna:
+        frames.append((BODY_FRAME, ANTENNA_FRAME, antenna, (0.0, 0.0, 0.0, 1.0)))
     transforms = [
         types["geometry_msgs/msg/TransformStamped"](
-            _header(store, stamp, anchors.frame),
-            f"anchor_{number}",
+            _header(store, stamp, parent),
+            child,
             types["geometry_msgs/msg/Transform"](
                 types["geometry_msgs/msg/Vector3"](*p), types["geometry_msgs/msg/Quaternion"](*q)
             ),
         )
-        for number, p, q in zip(anchors.ids.tolist(), anchors.positions.tolist(), q_or_identity.tolist())
+        for parent, child, p, q in frames
     ]
     return stamp, types["tf2_msgs/msg/TFMessage"](transforms)
 

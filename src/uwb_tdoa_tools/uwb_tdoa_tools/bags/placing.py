@@ -6,7 +6,7 @@ from uwb_tdoa_bias.foundation.flight import Imu
 from uwb_tdoa_bias.foundation.transforms import Frames
 from uwb_tdoa_ekf.imu_mount import ImuMount
 
-from .files import deserialize, messages
+from .files import readable
 from .message_types import check_type
 from .messages import BODY_FRAME
 
@@ -24,8 +24,8 @@ def read_frames(path, reader):
     connections = [c for c in reader.connections if c.topic == TF_STATIC and c.msgtype == "tf2_msgs/msg/TFMessage"]
     for connection in connections:
         check_type(path, connection)
-    for connection, _, data in messages(path, reader, connections):
-        for each in deserialize(path, connection, data).transforms:
+    for _, _, message in readable(path, reader, connections):
+        for each in message.transforms:
             q, p = each.transform.rotation, each.transform.translation
             q, p = (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
             if any(q) and np.isfinite([*q, *p]).all():
@@ -48,12 +48,15 @@ def imu_in_body(imu, place):
 
 
 def placed(frames, topic, counts):
-    """(place or None, remark or None) of the one frame that the messages of a topic have. counts : {frame_id: messages}."""
+    """(place or None, remark or None) of the one frame that the messages of a topic have. counts : {frame_id: messages}. A place
+    changes the result, so it is remarked on, too."""
     others = sorted(frame for frame in counts if not is_body(frame))
     if not others:
         return None, None
     if len(counts) > 1:
         return None, f"{topic} comes in several frames ({', '.join(sorted(counts))}): taken as {BODY_FRAME}."
     place = place_of(frames, others[0])
-    unknown = f"{topic} is in frame '{others[0]}', which {TF_STATIC} does not connect with '{BODY_FRAME}': taken as that."
-    return place, None if place else unknown
+    if place is None:
+        return None, f"{topic} is in frame '{others[0]}', which {TF_STATIC} does not connect with '{BODY_FRAME}': taken as that."
+    at = ", ".join(f"{value:.3f}" for value in place[1])
+    return place, f"{topic} is taken from frame '{others[0]}', which {TF_STATIC} places at ({at}) m in '{BODY_FRAME}'."

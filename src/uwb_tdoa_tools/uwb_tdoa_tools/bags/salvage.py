@@ -1,5 +1,6 @@
 """What is sound of a cut or damaged bag, as another bag."""
 
+from collections import Counter
 from pathlib import Path
 import sqlite3
 import struct
@@ -13,6 +14,8 @@ from . import integrity, mcap
 from .mcap import Damaged
 from .message_types import check_type, earlier_types, typestore, upgraded
 
+MESSAGES = "messages"
+LATEST = 2**63  # ns
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 
 
@@ -23,7 +26,9 @@ def salvage(path, out):
     files = [path] if path.is_file() else _files(path, remarks)
     with Writer(out, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
         for file in files:
-            count, damage = _copy(path, file, writer, connections)
+            count, lost, damage = _copy(path, file, writer, connections)
+            if lost:
+                remarks.append(f"{file.name}: {' and '.join(f'{n} {what}' for what, n in lost.items())} cannot be read: left out.")
             if damage:
                 remarks.append(f"{file.name} is cut or damaged ({damage}): read up to there, {count} messages.")
         if not any(connections.values()):
@@ -40,22 +45,26 @@ def _files(path, remarks):
 
 
 def _copy(path, file, writer, connections):
-    """Copy the messages of a data file. Returns (how many, where they end, as text, or None). connections : {(topic,
-    type): Connection of the writer, or None}."""
-    count = 0
+    """Copy the messages of a data file. Returns (how many, {what cannot be read: how often}, where they end, as text, or None).
+    connections : {(topic, type): Connection of the writer, or None}."""
+    count, lost = 0, Counter()
     try:
-        for connection, stamp, data in (_from_mcap if integrity.is_mcap(file) else _from_sqlite)(file):
+        for connection, stamp, data in (_from_mcap if integrity.is_mcap(file) else _from_sqlite)(file, lost):
             key = connection.topic, connection.msgtype
             if key not in connections:
                 connections[key] = _added(path, connection, writer)
             if connections[key] is not None:
                 if earlier := earlier_types(path, connection):
-                    data = upgraded(data, connection.msgtype, earlier)
+                    try:
+                        data = upgraded(data, connection.msgtype, earlier)
+                    except Exception:  # rosbags raises whatever its parsers run into
+                        lost[MESSAGES] += 1
+                        continue
                 writer.write(connections[key], stamp, data)
                 count += 1
     except Damaged as damage:
-        return count, str(damage)
-    return count, None
+        return count, lost, str(damage)
+    return count, lost, None
 
 
 def _added(path, connection, writer):
@@ -68,9 +77,12 @@ def _added(path, connection, writer):
     return writer.add_connection(connection.topic, connection.msgtype, typestore=typestore())
 
 
-def _from_mcap(file):
+def _from_mcap(file, lost):
     schemas, channels = {}, {}
     for kind, content in mcap.sound(file):
+        if kind == mcap.CHUNK:
+            lost["chunks"] += 1
+            continue
         try:
             if kind == mcap.SCHEMA:
                 (number,), texts = struct.unpack_from("<H", content), _texts(content, 2, 3)
@@ -80,12 +92,17 @@ def _from_mcap(file):
                 channels[number] = _channel(number, *_texts(content, 4, 1), *schemas[schema])
             else:
                 number, _, stamp = struct.unpack_from("<HIQ", content)
-                yield channels[number], stamp, content[22:]
-        except (struct.error, KeyError, UnicodeDecodeError) as error:
-            raise Damaged(f"a record cannot be read ({error!r})") from error
+                if stamp >= LATEST:
+                    raise KeyError
+                message = channels[number], stamp, content[22:]
+        except (struct.error, KeyError, UnicodeDecodeError, Damaged):
+            lost[MESSAGES if kind == mcap.MESSAGE else "descriptions of topics"] += 1
+            continue
+        if kind == mcap.MESSAGE:
+            yield message
 
 
-def _from_sqlite(file):
+def _from_sqlite(file, lost):
     connection, topics = integrity.open_sqlite(file), {}
     try:
         definitions = _definitions(connection)
@@ -96,8 +113,9 @@ def _from_sqlite(file):
     finally:
         connection.close()
     for _, topic, stamp, data in integrity.sqlite_messages(file):
-        if topic not in topics or type(stamp) is not int or type(data) is not bytes or not 0 <= stamp < 2**63:
-            raise Damaged("a row of messages cannot be read")
+        if topic not in topics or type(stamp) is not int or type(data) is not bytes or not 0 <= stamp < LATEST:
+            lost[MESSAGES] += 1
+            continue
         yield topics[topic], stamp, data
 
 

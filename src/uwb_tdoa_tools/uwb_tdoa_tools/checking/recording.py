@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 
 from ..bags import messages as bag_messages, placing
 from ..bags.bag import Names, is_bag
-from ..bags.files import deserialize, messages, open_bag
+from ..bags.files import open_bag, readable, remarks_of
 from ..bags.message_types import check_type
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
@@ -96,7 +96,7 @@ def _read_bag(reading, path, survey):
         tdoa, imu = (_stream(path, reader, name_of(topic), *_ROWS[topic]) for topic in (TDOA, IMU))
         recorded = _last(path, reader, name_of("uwb/anchors"), Anchors.from_message)
         tree = placing.read_frames(path, reader)
-        remarks = tuple(reader.remarks)
+        remarks = tuple(remarks_of(reader))
     if not len(tdoa.stamps):
         there = sorted(topic for topic, kind in topics.items() if kind == _ROWS[TDOA][0])
         places = " or ".join(f"--topic {TDOA}={topic}" for topic in there)
@@ -139,8 +139,7 @@ def _stream(path, reader, topic, kind, row):
             raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {kind} is needed there.")
         check_type(path, connection)
     arrivals, rows, frames = [], [], Counter()
-    for connection, received, data in messages(path, reader, connections):
-        message = deserialize(path, connection, data)
+    for _, received, message in readable(path, reader, connections):
         arrivals.append(received)
         rows.append(row(message))
         frames[message.header.frame_id] += 1
@@ -153,10 +152,12 @@ def _stream(path, reader, topic, kind, row):
 def _last(path, reader, topic, make):
     """make(the last message of a topic), or None."""
     found = None
-    for connection, _, data in messages(path, reader, [c for c in reader.connections if c.topic == topic]):
+    connections = [c for c in reader.connections if c.topic == topic]
+    for connection in connections:
         check_type(path, connection)
+    for _, _, message in readable(path, reader, connections):
         try:
-            found = make(deserialize(path, connection, data))
+            found = make(message)
         except InputError as error:
             raise InputError(f"{path}: {topic}: {error}") from error
     return found

@@ -9,6 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.foreign_text import printable
 
 from .. import parallel
 from . import read_flight
@@ -52,6 +53,12 @@ def survey_for(path, survey):
     return keys[fitting[-1]]
 
 
+def tell(path, remarks):
+    """Tell sentences on a recording, on stderr, beside a progress bar."""
+    for remark in remarks:
+        tqdm.write(printable(f"{path}: {remark}"), file=sys.stderr)
+
+
 @dataclass(frozen=True)
 class Reading:
     """How recordings are read. Can be pickled.
@@ -74,8 +81,7 @@ class Reading:
         path, survey = recording
         spare = None if self.survey is None else partial(survey_for, path, self.survey)
         flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, spare)
-        for remark in flight.meta.get("remarks", ()):
-            tqdm.write(f"{path}: {remark}", file=sys.stderr)
+        tell(path, flight.meta.get("remarks", ()))
         return flight
 
     def one(self, path):

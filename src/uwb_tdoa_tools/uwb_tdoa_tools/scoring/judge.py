@@ -15,7 +15,7 @@ from uwb_tdoa_ekf.smoother import smooth
 from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
 from ..checking.remarks import survey_remarks
-from ..readers.inputs import Reading
+from ..readers.inputs import Reading, tell
 from ..results_file import ResultsFile, state_of
 from .evaluation import evaluate, need_truth
 from .metrics import Result, Score
@@ -45,10 +45,10 @@ class Judge:
     def __call__(self, recording):
         flight = self.reading.read(recording)
         need_truth(flight)
-        for remark in () if self.odometry else survey_remarks(flight):
-            tqdm.write(f"{flight.name}: {remark}", file=sys.stderr)
+        tell(flight.name, () if self.odometry else survey_remarks(flight))
         if self.odometry:
             odometry = read_odometry(self.odometry, *self._where)
+            tell(self.odometry, odometry.remarks)
             score = Score(flight.name, odometry, flight.truth, heard=flight.tdoa.t)
         else:
             engine = smooth if self.smoothed else run_offline

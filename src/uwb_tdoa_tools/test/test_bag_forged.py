@@ -1,0 +1,262 @@
+"""Bags that somebody made to hang, to fill or to mislead, and single messages that are none."""
+
+from dataclasses import replace
+import json
+import sqlite3
+import time
+
+import numpy as np
+import pytest
+from recordings import small_flight
+from rosbags.rosbag2 import StoragePlugin, Writer
+from test_bag_damage import chunked, data_file, forget_sum
+from uwb_tdoa_bias.foundation import limits
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.bags import integrity, mcap
+from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
+from uwb_tdoa_tools.bags.files import messages, open_bag
+from uwb_tdoa_tools.bags.message_types import typestore
+from uwb_tdoa_tools.checking.recording import read_recording
+from uwb_tdoa_tools.readers.inputs import Reading
+from uwb_tdoa_tools.scoring.evaluation import with_antenna
+
+BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+AT_ONCE = 2.0  # s of processor time
+ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
+
+
+@pytest.fixture
+def tables(tmp_path):
+    """A bag of SQLite, and what runs statements on its data file."""
+    write_bag(small_flight(0.1), tmp_path / "bag", "sqlite3")
+    forget_sum(tmp_path / "bag")
+
+    def run(*statements):
+        connection = sqlite3.connect(data_file(tmp_path / "bag"))
+        for statement in statements:
+            connection.execute(statement)
+        connection.commit()
+        connection.close()
+
+    return tmp_path / "bag", run
+
+
+@pytest.mark.parametrize("salvage", [False, True])
+@pytest.mark.parametrize(
+    "statements",
+    [
+        ("DROP TABLE messages", f"CREATE VIEW messages AS {ENDLESS} i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"),
+        ("ALTER TABLE topics RENAME TO other", f"CREATE VIEW topics AS {ENDLESS} * FROM other, n"),
+        ("CREATE VIRTUAL TABLE more USING fts5(x)",),
+        ("CREATE INDEX slow ON messages(hex(data))",),
+        ("CREATE TRIGGER t AFTER INSERT ON topics BEGIN DELETE FROM messages; END",),
+        ("DROP TABLE messages", "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob(900000000)))"),
+        ("DROP TABLE messages", f"CREATE TABLE messages(id, topic_id, timestamp, data CHECK (data LIKE '{'%a' * 40}'))"),
+    ],
+)  # fmt: skip
+def test_nothing_in_a_database_is_computed(tables, statements, salvage):
+    bag, run = tables
+    run(*statements)
+    began = time.process_time()
+    with pytest.raises(InputError, match="is no table and no index of columns|no message that can be read"):
+        read_bag(bag, salvage=salvage)
+    assert time.process_time() - began < AT_ONCE
+
+
+def test_a_row_that_fills_the_memory(tables, monkeypatch):
+    bag, run = tables
+    monkeypatch.setattr(integrity, "MESSAGE_BYTES", 1_000_000)
+    run("UPDATE messages SET data = zeroblob(1000001) WHERE id = 20")
+    with pytest.raises(InputError, match="1 rows of messages .* or are too long"):
+        read_bag(bag)
+    assert "1 messages cannot be read: left out" in read_bag(bag, salvage=True).meta["remarks"][0]
+
+
+@pytest.fixture
+def packed(tmp_path):
+    """A bag whose files are compressed as a whole, with files of our own: {name: bytes that are packed}."""
+    write_bag(small_flight(0.1), tmp_path / "plain")
+    forget_sum(tmp_path / "plain")
+
+    def make(files):
+        bag = tmp_path / "packed"
+        bag.mkdir()
+        for name, content in files.items():
+            (bag / name).write_bytes(content if isinstance(content, bytes) else mcap.zstd.compress(bytes(content)))
+        text = (tmp_path / "plain" / "metadata.yaml").read_text().replace("plain.mcap", ", ".join(files))
+        listed = f"  relative_file_paths: [{', '.join(files)}]\n  other:"
+        text = text.replace("  relative_file_paths:", listed).replace("compression_mode: ''", "compression_mode: file")
+        (bag / "metadata.yaml").write_text(text.replace("compression_format: ''", "compression_format: zstd"))
+        return bag
+
+    return make
+
+
+def test_several_files_may_not_unfold_to_more_than_all_of_them_may(packed, monkeypatch):
+    """Three files of 33 kB that became 3 GiB; here 32 MiB each, of which the limit is 16 MiB."""
+    bag = packed({f"{k}.mcap.zstd": 32 << 20 for k in range(3)})
+    assert sum(file.stat().st_size for file in bag.iterdir()) < 30_000
+    with pytest.raises(InputError, match="its files unpack to more than [12][0-9]{7} bytes"):
+        read_bag(bag)
+
+
+def test_a_file_is_unpacked_once(tmp_path):
+    write_bag(small_flight(0.1), tmp_path / "bag")
+    text = (tmp_path / "bag" / "metadata.yaml").read_text()
+    (tmp_path / "bag" / "metadata.yaml").write_text(text.replace("  - bag.mcap", "  - bag.mcap\n  - ./bag.mcap"))
+    with pytest.raises(InputError, match="is no file, or is there twice"):
+        read_bag(tmp_path / "bag")
+
+
+@pytest.mark.parametrize("salvage", [False, True])
+def test_chunks_may_not_unfold_to_more_than_all_of_them_may(tmp_path, monkeypatch, salvage):
+    chunk = chunked(b"zstd", mcap.zstd.compress(bytes(8 << 20)), 8 << 20)
+    head, body, end = chunk[:29], chunk[29:-50], chunk[-50:]
+    (tmp_path / "forged.mcap").write_bytes(head + 3 * body + end)
+    unfolded = []
+    original = mcap.unpacked
+    monkeypatch.setattr(mcap, "unpacked", lambda *given: unfolded.append(original(*given)) or unfolded[-1])
+    with pytest.raises(InputError, match="a chunk claims 8388608 bytes, more than|no message that can be read"):
+        read_bag(tmp_path / "forged.mcap", salvage=salvage)
+    assert sum(map(len, unfolded)) <= limits.most_unpacked(len(3 * body) + 200)
+
+
+def test_an_index_may_not_show_a_message_again_and_again(tmp_path, monkeypatch):
+    """What is read cannot be more than what is there."""
+    write_bag(small_flight(0.1), tmp_path / "bag")
+    with open_bag(tmp_path / "bag") as reader:
+        found = [message for message in reader.messages() for _ in range(1 << 14)]
+        monkeypatch.setattr(reader, "messages", lambda connections: iter(found))
+        with pytest.raises(InputError, match="its messages hold more than"):
+            list(messages("bag", reader, reader.connections))
+
+
+def with_bad_messages(path, storage, of, count=100, many=1, cut=5):
+    """A bag of `count` TDOAs, and as many of others; `many` messages of each topic of `of` are cut."""
+    plain = path.with_name("whole")
+    write_bag(small_flight(count / 500.0), plain)
+    seen, writer = dict.fromkeys(of, 0), Writer(path, version=9, storage_plugin={"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage])
+    with open_bag(plain) as reader, writer:
+        to = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=typestore()) for c in reader.connections}
+        for connection, stamp, data in messages(plain, reader, reader.connections):
+            if seen.get(connection.topic, many) < many:
+                seen[connection.topic] += 1
+                data = data[:cut]
+            writer.write(to[connection.topic], stamp, data)
+    return path
+
+
+@BOTH
+@pytest.mark.parametrize("salvage", [False, True])
+def test_a_message_that_cannot_be_read_is_counted_and_said(tmp_path, storage, salvage):
+    bag = with_bad_messages(tmp_path / "bag", storage, ["/uwb/tdoa", "/imu/data"], many=2)
+    flight = read_bag(bag, salvage=salvage)
+    assert (len(flight.tdoa), len(flight.imu), len(flight.truth)) == (98, 198, 50)
+    said = ["/uwb/tdoa: 2 messages left out, they cannot be read.", "/imu/data: 2 messages left out, they cannot be read."]
+    assert flight.meta["remarks"] == said
+    checked = read_recording(Reading(salvage=salvage), bag)
+    assert len(checked.tdoa) == 98 and list(checked.remarks) == said
+
+
+@pytest.mark.slow
+def test_one_bad_message_among_a_hundred_thousand_tdoas(tmp_path):
+    bag = with_bad_messages(tmp_path / "bag", "mcap", ["/uwb/tdoa"], count=100_000)
+    flight = read_bag(bag)
+    assert len(flight.tdoa) == 99_999 and flight.meta["remarks"] == ["/uwb/tdoa: 1 messages left out, they cannot be read."]
+
+
+def test_a_topic_of_nothing_but_bad_messages(tmp_path):
+    bag = with_bad_messages(tmp_path / "bag", "mcap", ["/uwb/tdoa"], many=1000)
+    with pytest.raises(InputError, match="has no message on /uwb/tdoa; 100 that are there cannot be read"):
+        read_bag(bag)
+
+
+def test_a_message_that_is_too_long_to_be_one_of_ours(tmp_path, monkeypatch):
+    bag = with_bad_messages(tmp_path / "bag", "mcap", ["/uwb/anchors"], cut=None)
+    monkeypatch.setattr("uwb_tdoa_tools.bags.files.READ_BYTES", 200)
+    with pytest.raises(InputError, match="has no message on /uwb/anchors"):
+        read_bag(bag)
+
+
+def test_recorded_odometry_says_what_is_missing(tmp_path):
+    store, zeros = typestore(), np.zeros(36)
+    types = store.types
+    pose = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](0, 0, 0), types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1))
+    twist = types["geometry_msgs/msg/Twist"](*(types["geometry_msgs/msg/Vector3"](0, 0, 0) for _ in range(2)))
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](1, 0), "map")
+    with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](pose, zeros), types["geometry_msgs/msg/TwistWithCovariance"](twist, zeros)
+    data = store.serialize_cdr(types["nav_msgs/msg/Odometry"](header, "base_link", *with_covariance), "nav_msgs/msg/Odometry")
+    with Writer(tmp_path / "bag", version=9) as writer:
+        connection = writer.add_connection("/odometry", "nav_msgs/msg/Odometry", typestore=store)
+        for stamp, content in enumerate((data, data[:30], data), start=1):
+            writer.write(connection, stamp, content)
+    odometry = read_odometry(tmp_path / "bag")
+    assert len(odometry) == 2 and odometry.remarks == ("/odometry: 1 messages left out, they cannot be read.",)
+
+
+def test_a_damaged_chunk_is_left_out_and_what_follows_is_read(tmp_path):
+    flight = small_flight(10.0)
+    write_bag(flight, tmp_path / "bag")
+    file = data_file(tmp_path / "bag")
+    with open(file, "rb") as opened:
+        chunks = [record for record in mcap.records(opened, 8, file.stat().st_size - 8) if record.kind == mcap.CHUNK]
+    content = bytearray(file.read_bytes())
+    content[chunks[1].content + 1000] ^= 1
+    file.write_bytes(content)
+    assert len(chunks) > 2
+    back = read_bag(tmp_path / "bag", salvage=True)
+    assert back.meta["remarks"][0] == "bag.mcap: 1 chunks cannot be read: left out."
+    assert back.imu.t[-1] == flight.imu.t[-1] and 0.3 < len(back.imu) / len(flight.imu) < 0.9
+
+
+@pytest.mark.parametrize("statement", ["timestamp = 'soon'", "data = 'text'", "topic_id = 77", "timestamp = -5"])
+def test_rows_that_are_none_are_left_out(tables, statement):
+    bag, run = tables
+    run(f"UPDATE messages SET {statement} WHERE id = 20")
+    flight = read_bag(bag, salvage=True)
+    assert "1 messages cannot be read: left out" in flight.meta["remarks"][0]
+    assert len(flight.tdoa) + len(flight.imu) + len(flight.truth) == 174
+
+
+def claiming(path, meta, name="flight"):
+    """A bag whose metadata claim something."""
+    write_bag(small_flight(0.1), path)
+    about, file = json.dumps({"name": name, "meta": meta}), path / "metadata.yaml"
+    lines = file.read_text().splitlines()
+    first = next(k for k, one in enumerate(lines) if "uwb_tdoa_tools.flight:" in one)
+    last = next(k for k in range(first + 1, len(lines)) if not lines[k].startswith("      "))
+    lines[first:last] = [f"    uwb_tdoa_tools.flight: {json.dumps(about)}"]
+    file.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    "meta",
+    [
+        {"antenna": [0.5, 0, 0]}, {"remarks": 5}, {"remarks": ["all is well"]}, {"reordered": {"tdoa": "x"}}, {"bag": "/etc/passwd"},
+        {"protocol": 7, "parameters": {}}, {"config": "x"},
+    ],
+)  # fmt: skip
+def test_what_a_bag_says_of_itself_is_not_believed(tmp_path, meta):
+    bag = claiming(tmp_path / "bag", meta)
+    flight = Reading().one(bag)
+    assert flight.meta == {"bag": str(bag)} and with_antenna(None, flight) is None
+
+
+def test_what_a_bag_says_of_itself_is_printable(tmp_path):
+    flight = read_bag(claiming(tmp_path / "bag", {"protocol": "tdoa2", "source": "\x1b[2Jx\n" + 10**5 * "y"}))
+    assert flight.meta["protocol"] == "tdoa2" and flight.meta["source"].startswith(r"\x1b[2Jx\nyyy")
+    assert len(flight.meta["source"]) == 1000
+
+
+@BOTH
+def test_the_place_of_the_antenna_is_written_where_nodes_look_for_it(tmp_path, storage):
+    flight = small_flight(0.1)
+    write_bag(replace(flight, meta={**flight.meta, "antenna": [0.5, 0.0, -0.1]}), tmp_path / "bag", storage)
+    back = read_bag(tmp_path / "bag")
+    assert back.meta["antenna"] == [0.5, 0.0, -0.1]
+    assert back.meta["remarks"] == [
+        "uwb/tdoa is taken from frame 'uwb_antenna', which /tf_static places at (0.500, 0.000, -0.100) m in 'base_link'."
+    ]
+    write_bag(back, tmp_path / "again", storage)
+    assert read_bag(tmp_path / "again").meta["antenna"] == [0.5, 0.0, -0.1]
