@@ -4,6 +4,7 @@ import json
 import numpy as np
 import pytest
 from scipy.stats import chi2
+import yaml
 
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
@@ -364,3 +365,23 @@ def test_a_bad_parameter_is_told(bag, text, capsys):
 def test_smoothing_is_better(bag, tmp_path):
     filtered, smoothed = report([bag], tmp_path), report([bag, "--smooth"], tmp_path)
     assert smoothed["runs"][0]["rmse_3d"] < 0.9 * filtered["runs"][0]["rmse_3d"]
+
+
+def test_a_name_is_no_command_to_picture_table_or_terminal(flight, tmp_path, capsys):
+    name, folder = "$\\frac$ <b>|\x1b[31m", tmp_path / "\x1b[2Jflights"
+    folder.mkdir()
+    write_bag(flight, folder / "bag")
+    file = folder / "bag" / "metadata.yaml"
+    content = yaml.safe_load(file.read_text())
+    content["rosbag2_bagfile_information"]["custom_data"]["uwb_tdoa_tools.flight"] = json.dumps({"name": name})
+    file.write_text(yaml.safe_dump(content))
+    peers = tmp_path / "peers.csv"
+    peers.write_text("flight,peer,mode,rmse_3d,diverged\nx,<script>,a|b,0.1,False\n")
+    options = ["--plot", tmp_path / "error.png", "--markdown", tmp_path / "table.md", "--beside", peers]
+    assert main([*map(str, [folder / "bag", *options])]) == 0
+    assert (tmp_path / "error.png").stat().st_size > 10_000
+    table = (tmp_path / "table.md").read_text()
+    assert "| __frac_ _b____31m |" in table and "| _script_ a_b |" in table and "<" not in table
+    assert main([str(folder / "none")]) == 2
+    said = capsys.readouterr()
+    assert "\x1b" not in said.out + said.err and r"\x1b[2Jflights" in said.err and "__frac_ _b____31m" in said.out

@@ -15,7 +15,10 @@ import os
 from pathlib import Path
 import sys
 
+from tqdm import tqdm
+
 from uwb_tdoa_bias.foundation.errors import Failure, InputError
+from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_bias.foundation.version import written_by
 
 
@@ -96,8 +99,14 @@ def write_json(path, content):
 
 
 def say(name, sentence):
-    """Tell what happens, on stderr: `name: sentence`."""
-    print(f"{name}: {sentence}", file=sys.stderr, flush=True)
+    """Tell what happens, on stderr: `name: sentence`, made `printable`."""
+    print(f"{name}: {printable(sentence)}", file=sys.stderr, flush=True)
+
+
+def show(*lines):
+    """Print a result on stdout, line by line, each made `printable`, beside a progress bar if there is one."""
+    tqdm.write("\n".join(printable(line) for text in lines for line in text.split("\n")))
+    sys.stdout.flush()
 
 
 def _fail(name, sentence, code):

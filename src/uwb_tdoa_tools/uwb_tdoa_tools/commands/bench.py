@@ -62,9 +62,9 @@ def _bench(args):
     cli.check_folders(args.json)
     other = None if args.peer is None else Peer(args.peer)
     machine, figures = measure(args.only, args.out, args.quick, args.model, other)
-    print(f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy {machine['numpy']}")
-    print(f"meanwhile others used {machine['others']:.0%} of its CPU time, its host {machine['stolen']:.0%}")
-    print("\n".join(table(figures)))
+    cli.show(f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy {machine['numpy']}")
+    cli.show(f"meanwhile others used {machine['others']:.0%} of its CPU time, its host {machine['stolen']:.0%}")
+    cli.show("\n".join(table(figures)))
     if args.json is not None:
         cli.write_json(args.json, {"machine": machine, "figures": as_json(figures)})
 

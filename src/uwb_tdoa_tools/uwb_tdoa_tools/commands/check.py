@@ -62,10 +62,10 @@ def _check(args):
     for recording in _recordings(args, reading, alone):
         recordings.append(recording)
         reports.append(check(recording, others))
-        tqdm.write(report.text(reports[-1]))
+        cli.show(report.text(reports[-1]))
     together = list(different_surveys(recordings))
     for finding in together:
-        print("\n".join(report.lines(finding)))
+        cli.show(*report.lines(finding))
     if args.json:
         cli.write_json(args.json, report.as_dict(reports, together))
     return int(any(one.faulty for one in reports))

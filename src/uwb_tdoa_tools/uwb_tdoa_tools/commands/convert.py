@@ -50,18 +50,18 @@ def parser():
 def _convert(args):
     made = convert(lambda: _read(args), args.out, args.storage, args.force)
     if args.json:
-        print(json.dumps(asdict(made), indent=2, default=str))
+        cli.show(json.dumps(asdict(made), indent=2, default=str))
         return
-    print(f"{made.flight}: {made.end - made.start:.1f} s, {made.meta.get('protocol', 'protocol unknown')}")
+    cli.show(f"{made.flight}: {made.end - made.start:.1f} s, {made.meta.get('protocol', 'protocol unknown')}")
     for topic, count in made.messages.items():
-        print(f"  {topic}: {count}")
+        cli.show(f"  {topic}: {count}")
     for name, count in made.left_out.items():
-        print(f"  {name}: {count} events left out, a bag has no place for them")
+        cli.show(f"  {name}: {count} events left out, a bag has no place for them")
     for topic, falls in made.meta.get("reordered", {}).items():
-        print(f"  {topic}: sorted, its stamps fell {falls} times")
+        cli.show(f"  {topic}: sorted, its stamps fell {falls} times")
     if made.tdoa_unknown_anchor:
-        print(f"  {made.tdoa_unknown_anchor} measurements name an anchor that the survey does not have")
-    print(f"  -> {args.out}")
+        cli.show(f"  {made.tdoa_unknown_anchor} measurements name an anchor that the survey does not have")
+    cli.show(f"  -> {args.out}")
 
 
 def _read(args):

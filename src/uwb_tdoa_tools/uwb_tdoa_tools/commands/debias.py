@@ -73,8 +73,8 @@ def _fit(args):
     made = fit_map(fitted, args.static, estimator, **settings)
     made = made.scaled(borne_out.share) if borne_out else made
     made.save(args.out)
-    print(f"wrote {args.out}: {report.about(made)}")
-    print(borne_out.as_text() if borne_out else "how much of it flights to come bear out is not known: give several flights")
+    cli.show(f"wrote {args.out}: {report.about(made)}")
+    cli.show(borne_out.as_text() if borne_out else "how much of it flights to come bear out is not known: give several flights")
     figures = {"map": report.about_figures(made), "fitted": report.rows(fitted, made, estimator.effects)}
     figures["borne_out"] = borne_out.as_dict() if borne_out else None
     report.say_rows("in sample", figures["fitted"])

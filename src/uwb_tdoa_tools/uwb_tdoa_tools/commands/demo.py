@@ -56,34 +56,34 @@ def _demo(args):
     if args.flight:
         case = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
     else:
-        print("flying     a simulated vehicle; the very first time it is compiled, which takes a minute", flush=True)
+        cli.show("flying     a simulated vehicle; the very first time it is compiled, which takes a minute")
         case = demo.simulated(args.out, args.effects, args.model)
     flight = case.flight
     length = flight.truth.t[-1] - flight.truth.t[0]
-    print(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
+    cli.show(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
     if case.became:
-        print(f"flown      by the estimate: {case.became}")
-    print(f"correction {case.corrector().model} ({', '.join(case.sources)})")
-    became, scores = demo.fly(case, args.out, args.rate, lambda text: print(f"nodes      {text}", flush=True))
+        cli.show(f"flown      by the estimate: {case.became}")
+    cli.show(f"correction {case.corrector().model} ({', '.join(case.sources)})")
+    became, scores = demo.fly(case, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
     in_time = _all_in_time(flight, became)
     if not in_time:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
-    print("\n".join(lines_of_errors(scores)))
+    cli.show(*lines_of_errors(scores))
     before, after = (score.row()["rmse_3d"] for score in scores[:2])
-    print(f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: {round(100.0 * (after - before) / before):+d} %")
+    cli.show(f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: {round(100.0 * (after - before) / before):+d} %")
     plot_comparison(flight, scores[:2], args.out / "error.png")
-    print(f"plot       {args.out / 'error.png'}")
-    print(f"took {time.monotonic() - started:.0f} s")
-    print("next       " + "\n           ".join(demo.next_steps(args.flight, args.survey)))
+    cli.show(f"plot       {args.out / 'error.png'}")
+    cli.show(f"took {time.monotonic() - started:.0f} s")
+    cli.show("next       " + "\n           ".join(demo.next_steps(args.flight, args.survey)))
     return int(scores[1].row()["diverged"] or not in_time)
 
 
 def _all_in_time(flight, became):
     """Print what became of every message. Returns whether all were there in time."""
     told = ", ".join(f"{count} {name}" for name, count in became.items() if not name.startswith("imu_"))
-    print(f"nodes      TDOAs {len(flight.tdoa)}: {told}")
+    cli.show(f"nodes      TDOAs {len(flight.tdoa)}: {told}")
     samples = 0 if flight.imu is None else len(flight.imu)
-    print(f"nodes      IMU samples {samples}: {became['imu_late']} late, {became['imu_lost']} lost")
+    cli.show(f"nodes      IMU samples {samples}: {became['imu_late']} late, {became['imu_lost']} lost")
     return not any(became[name] for name in ("lost", "late", "imu_late", "imu_lost"))
 
 

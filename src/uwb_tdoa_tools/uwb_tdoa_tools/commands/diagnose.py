@@ -102,8 +102,8 @@ def _diagnose(args):
     (out / "report.html").write_text(result.as_html())
     if tdoa_std is not None:
         write_parameters(out / "ekf_node.yaml", tdoa_std)
-    print(result.as_text())
-    print(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
+    cli.show(result.as_text())
+    cli.show(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
 
 
 def _noise(result, config, over):

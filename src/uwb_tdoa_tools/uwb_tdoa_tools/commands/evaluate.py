@@ -3,8 +3,6 @@
 from pathlib import Path
 import sys
 
-from tqdm import tqdm
-
 from uwb_tdoa_bias.correction.network import load_network, unasked
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.aids import STREAMS
@@ -95,20 +93,20 @@ def _evaluate(args):
         Path(args.tum).absolute() if args.tum else None,
     )  # fmt: skip
     if not args.odometry:
-        print(f"correcting with: {'+'.join(part.name for part in (judge.effects, judge.network) if part) or 'nothing'}")
-    print(table.head())
+        cli.show(f"correcting with: {'+'.join(part.name for part in (judge.effects, judge.network) if part) or 'nothing'}")
+    cli.show(table.head())
     told, pool = [], Pool()
     asked = asked_of(args, NO_MATTER, ("effects", "config", "model")) | {"version of the figures": FIGURES}
     for result in results(judge, found, args.resume, asked, args.jobs, args.dask):
         pool.add(result)
         told += [result] if args.json or args.markdown else []  # else nothing grows with the number of flights
-        tqdm.write(table.line(result.row))
+        cli.show(table.line(result.row))
     together = pool.figures()
     if len(found) > 1:
-        print(table.line(together))
-        print(f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
-              f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
-    print("", *table.lines_of_phases(together["phases"] if len(found) > 1 else result.phases), sep="\n")
+        cli.show(table.line(together))
+        cli.show(f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
+                 f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
+    cli.show("", *table.lines_of_phases(together["phases"] if len(found) > 1 else result.phases))
     if args.json:
         cli.write_json(args.json, {"runs": [one.as_json() for one in told], "pooled": as_json(together)})
     if args.markdown:

@@ -87,7 +87,7 @@ def _fly(args):
             verdicts.append(verdict)
             pictures.append(picture)
     summed = summary(verdicts)
-    print(text(summed))
+    cli.show(text(summed))
     if args.json is not None:
         cli.write_json(args.json, {"summary": summed, "flights": verdicts})
     if args.plot is not None:

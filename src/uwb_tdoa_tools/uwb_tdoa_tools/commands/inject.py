@@ -46,7 +46,7 @@ def parser():
 
 def _inject(args):
     if args.list:
-        print(catalogue())
+        cli.show(catalogue())
         return
     for option in ("flight", "effect", "value", "out"):
         if not getattr(args, option):
@@ -54,7 +54,7 @@ def _inject(args):
     effect = parse_effect(args.effect, args.value)
     name = inject(effect, args.flight, options.reading_of(args), args.out, args.seed, args.storage, args.force)
     added = ", ".join(f"{key} = {value:g}" for key, value in effect.values.items())
-    print(f"{name}: added {effect.name} ({added}, in {effect.unit}) -> {args.out}")
+    cli.show(f"{name}: added {effect.name} ({added}, in {effect.unit}) -> {args.out}")
 
 
 if __name__ == "__main__":

@@ -95,7 +95,7 @@ def _plan(args):
     aim = options.aim_of(args, installation, room, grid.axes[2][0]) if args.improve else None
 
     if not np.isfinite(anchors.orientations).all():
-        print("note: anchors without orientation are taken to radiate alike in all directions")
+        cli.show("note: anchors without orientation are taken to radiate alike in all directions")
     args.out.mkdir(parents=True, exist_ok=True)
     found = chart(installation, grid, args.flyable)
     figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
@@ -114,9 +114,9 @@ def _plan(args):
     for path in (args.out / "plan.json", args.json):
         if path is not None:
             cli.write_json(path, figures)
-    print(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
+    cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
     if args.publish:
-        print(f"publishing {', '.join(outgoing)} until Ctrl-C", flush=True)
+        cli.show(f"publishing {', '.join(outgoing)} until Ctrl-C")
         messages.publish(outgoing)
 
 

@@ -86,7 +86,7 @@ def parser():
 
 def _simulate(args):
     if args.list:
-        print(catalogue())
+        cli.show(catalogue())
         return
     if args.out is not None:
         check_output(args.out, args.force)  # before the work, not after it
@@ -95,21 +95,21 @@ def _simulate(args):
     cli.check_folders(args.json, args.plot)
     flight = simulate(_config(args))
     content = summary(flight)
-    print(f"{flight.name}: {content['tdoas']} TDOAs, {content['imu_samples']} IMU samples, {content['poses']} poses")
-    print(
+    cli.show(f"{flight.name}: {content['tdoas']} TDOAs, {content['imu_samples']} IMU samples, {content['poses']} poses")
+    cli.show(
         f"errors of the TDOAs, standard deviation: bias {content['bias_std']:.3f} m, "
         f"multipath {content['multipath_std']:.3f} m, noise {content['noise_std']:.3f} m; "
         f"{content['outliers']} outliers"
     )
     if args.out is not None:
         write_bag(flight, args.out, args.storage, args.force)
-        print(f"wrote {args.out}")
+        cli.show(f"wrote {args.out}")
     if args.json is not None:
         cli.write_json(args.json, content)
-        print(f"wrote {args.json}")
+        cli.show(f"wrote {args.json}")
     if args.plot is not None:
         plot(flight, args.plot)
-        print(f"wrote {args.plot}")
+        cli.show(f"wrote {args.plot}")
 
 
 def _config(args):

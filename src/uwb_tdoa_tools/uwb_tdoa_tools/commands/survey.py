@@ -75,10 +75,10 @@ def _survey(args):
     write_parameters(out / "ekf_node.yaml", result.surveyed.tdoa_std)
     cli.write_json(out / "survey.json", result.as_dict())
     result.picture(out / "survey.png")
-    print(result.as_text())
-    print(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")
+    cli.show(result.as_text())
+    cli.show(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")
     files = (("--survey", "anchors.yaml"), ("--effects", "effects.yaml"), ("--config", "ekf_node.yaml"))
-    print("next: evaluate FLIGHT", *(f"{option} {out / file}" for option, file in files))
+    cli.show("next: evaluate FLIGHT", *(f"{option} {out / file}" for option, file in files))
     return 0 if result.why_not is None else 1
 
 

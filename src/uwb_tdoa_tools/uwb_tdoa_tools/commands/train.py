@@ -5,8 +5,6 @@ from functools import partial
 from pathlib import Path
 import sys
 
-from tqdm import tqdm
-
 from .. import cli, options, parallel
 from ..results_file import ResultsFile, asked_of, resumed, state_of
 from ..training import labels as labelling, models, shrinking
@@ -78,21 +76,21 @@ def _write(args, several, over):
     flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):
-        print(f"{what:13s} {', '.join(some)}")
+        cli.show(f"{what:13s} {', '.join(some)}")
     training, validation = ([flights[name] for name in some] for some in names)
     name = args.name or args.model
-    result, borne_out = shrinking.train(args.model, training, validation, args.seed, name, progress=tqdm.write, over=over)
+    result, borne_out = shrinking.train(args.model, training, validation, args.seed, name, progress=cli.show, over=over)
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
     label, x, *errors = result.curve
     plot_curve(label, x, *errors, args.out / "training.png")
     for name, (before, after) in result.errors.items():
-        print(f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m (root mean square)")
+        cli.show(f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m (root mean square)")
     curve = {label: x, "training": errors[0], "validation": errors[1]}
-    print(borne_out.as_text())
+    cli.show(borne_out.as_text())
     content = {**result.meta, "curve": curve, "validation": result.errors, "borne_out": borne_out.as_dict()}
     cli.write_json(args.out / "training.json", content)
-    print(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
+    cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
+from uwb_tdoa_bias.foundation.foreign_text import harmless
 
 from .streams import SALVAGE, make_flight
 from .usd_scan import scan
@@ -141,7 +142,7 @@ def _read_header(path, data):
     def string(what):
         end = data.find(0, at)
         content = take((end if end >= 0 else len(data)) + 1 - at, what)[:-1]
-        if not content.isascii() or not content:
+        if not content or not content.isascii() or harmless(content.decode()) != content.decode():
             raise InputError(
                 f"{path}: byte {at - len(content) - 1}: expected {what}, found {content!r}; the file is damaged."
             )

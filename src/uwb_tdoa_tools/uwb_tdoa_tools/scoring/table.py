@@ -2,6 +2,8 @@
 
 import math
 
+from uwb_tdoa_bias.foundation.foreign_text import harmless
+
 from ..readers.tables import number, read_table
 from .phases import NEAR_THE_FLOOR, TITLES
 
@@ -95,7 +97,7 @@ def read_others(path):
     others = {}
     for line, row in read_table(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
         cell = "diverged" if row["diverged"] == "True" else f"{number(path, line, row, 'rmse_3d'):.3f}"
-        others.setdefault(f"{row['peer']} {row['mode']}", {})[row["flight"]] = cell
+        others.setdefault(harmless(f"{row['peer']} {row['mode']}"), {})[harmless(row["flight"])] = cell
     return others
 
 
