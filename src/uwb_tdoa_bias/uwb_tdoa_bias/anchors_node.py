@@ -15,12 +15,13 @@ from .foundation import ros
 from .foundation.errors import InputError
 from .foundation.ros_anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
 from .foundation.ros_frames import TF_STATIC_QOS
-from .foundation.ros_parameters import Parameter, declare_all, files_of, refuse_unknown, say_unused
+from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 from .foundation.survey import read_survey
 
 PARAMETERS = {  # in the order of config/anchors_node.yaml
     "anchors_file": Parameter(ANCHORS_FILE.default, "survey of the anchors, as the tools read it; must be given"),
     "marker_size": Parameter(0.12, "m; edge of the cube that shows an anchor, and height of its number", 0.001, 10.0),
+    "frozen": FROZEN,
 }
 LEVEL = Quaternion(w=1.0)  # of an anchor whose orientation was not surveyed
 

@@ -24,7 +24,7 @@ from .effects import EffectSet, LabelCorrector
 from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from .foundation.ros_frames import FramesInput, unknown_frame
-from .foundation.ros_parameters import Parameter, declare_all, files_of, refuse_unknown, say_unused
+from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 from .foundation.ros_streams import StreamOutput, Streams, Turns
 from .foundation.ros_wire import Wire
 from .correction.pose_queue import PoseQueue
@@ -51,6 +51,7 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
     "body_frame": Parameter(
         "base_link", "frame of the odometry's body; TDOAs in another frame are of an antenna that /tf_static places in it"
     ),
+    "frozen": FROZEN,
 }
 POSE = "pose", "twist"  # what is read of an Odometry, its numbers,
 POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36
@@ -59,7 +60,7 @@ CORRECTED = (  # what is written of a TdoaCorrected
     "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status", "bias_slope", "bias_state",
 )  # fmt: skip
 MOST_FRAMES = 100  # that are remembered: names on a topic may be anything
-EARLY, EARLY_POSES = 2000, 500  # TDOAs, and parts of the odometry, kept while there are no anchors
+EARLY, EARLY_POSES = 2000, 500  # TDOAs and poses kept while there are no anchors
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
@@ -84,7 +85,7 @@ class BiasNode(ros.StreamNode):
         self._idle = self._model[NETWORK] == "none"
         self._corrector = None
         self._epoch, self._counts, self._rate = ros.Epoch(), Counter(), ros.Rate()
-        self._early, self._early_poses, self._hold = deque(), deque(maxlen=EARLY_POSES), PoseQueue(self._limit)
+        self._early, self._early_poses, self._hold = deque(), deque(), PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
         self._wire, self._templates = Wire(TdoaCorrected, *CORRECTED), {}  # by frame and model, the latest
@@ -163,7 +164,9 @@ class BiasNode(ros.StreamNode):
         if self._idle:
             return
         if self._corrector is None:
-            self._early_poses.append((frame, t, rows))
+            self._early_poses.append((frame, t[-EARLY_POSES:], rows[-EARLY_POSES:]))
+            while sum(len(part[1]) for part in self._early_poses) > EARLY_POSES:
+                self._early_poses.popleft()
         else:
             self._take_poses(frame, t, rows)
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all, files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 
 from .debias import BiasMap, LayerConfig, Layers
 
@@ -35,6 +35,7 @@ PARAMETERS = {  # in the order of config/debias_node.yaml; the layers are those 
         [1.0, 1.0, 1.0], "m/s along x, y, z at which the prediction begins to count", constraint="three numbers above 0"
     ),
     "least_weight": Parameter(0.5, "share that the estimate keeps at high speed", 0.0, 1.0),
+    "frozen": FROZEN,
 }
 
 
@@ -46,9 +47,10 @@ class DebiasNode(ros.StreamNode):
     def __init__(self, arguments=()):
         """arguments : of the process."""
         super().__init__(self.NAME)
-        layers = declare_all(self, PARAMETERS)
+        own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
-        file = layers.pop("map")
+        layers = {name: value for name, value in own.items() if name not in ("map", "frozen")}
+        file = own["map"]
         if not file:
             raise InputError("map: is empty; give a file that `debias` wrote.")
         self._map, self._layers = BiasMap.load(file), Layers(LayerConfig(**layers))

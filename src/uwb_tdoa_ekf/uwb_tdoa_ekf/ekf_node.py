@@ -155,10 +155,12 @@ class EkfNode(ros.StreamNode):
             self._estimator.retune(config)
 
     def _on_reset(self, _, response):
-        response.success = self._estimator is not None
-        response.message = "starting over" if response.success else "there are no anchors yet: nothing has started"
+        response.success = self._estimator is not None and not self.frozen
         if response.success:
+            response.message = "starting over"
             self._start_over()
+        else:
+            response.message = self.refuse("a reset") if self.frozen else "there are no anchors yet: nothing has started"
         return response
 
     def _start_over(self):
@@ -166,6 +168,9 @@ class EkfNode(ros.StreamNode):
         self._watch.restart()
 
     def _on_pose(self, message):
+        if self.frozen and self.outputs.published:
+            self.refuse("a pose on initialpose after the first odometry")
+            return
         try:
             if self._estimator is None:
                 raise InputError("there are no anchors yet; give the pose again when there are.")

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_FILE
-from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare, declare_all
+from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare, declare_all
 
 from .core.config import CHOICES, RENAMED, FilterConfig, current_names
 
@@ -38,6 +38,7 @@ PARAMETERS = {  # in the order of config/ekf_node.yaml
         0.0,
         100.0,
     ),
+    "frozen": FROZEN,
 }  # fmt: skip
 
 

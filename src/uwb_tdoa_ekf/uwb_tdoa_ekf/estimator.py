@@ -29,6 +29,7 @@ STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
 RATE_SAMPLES = 10  # inertial samples from whose stamps their rate is known
+MOST_POSES = 100  # that were told and wait for their time
 SILENT = 1.0  # s of stamps after which height, pressure or velocity is not waited for any more, until it is back
 OF_AIDS = 0.5  # share of `lag` for which they are waited for: bias_node's `hold` must outlast that by far
 
@@ -191,7 +192,7 @@ class Estimator:
         """Take a pose that somebody tells: t s; p (3,) m, NaN where it is not known; covariance (3, 3) m^2; yaw and yaw_std rad,
         or NaN. It holds from its stamp on; if the filter has passed that, from the next measurement on.
 
-        Raises InputError for a stamp that is not of the time of the streams. One that is told before there is any measurement is
+        Raises InputError for a stamp that is not of the time of the streams, and when too many wait. One that is told before there is any measurement is
         judged by the first, and dropped if it is not of its time: `refused_pose`.
         """
         self.refused_pose = None
@@ -201,6 +202,8 @@ class Estimator:
                 f"pose: its stamp is {t - newest:+.3f} s from that of the newest measurement; give one from "
                 f"-{LARGEST_STEP_BACK:g} to {LARGEST_STEP_AHEAD:g} s."
             )
+        if len(self._poses) >= MOST_POSES:
+            raise InputError(f"pose: {MOST_POSES} wait for their time already; give fewer.")
         self._poses.append(np.array([(max(t, self._fed_until), p, covariance, yaw, yaw_std)], POSE))
         self._poses.sort(key=lambda pose: pose["t"][0])
 

@@ -1,18 +1,25 @@
 """localization_node: bias_node and ekf_node of one tag, or of several, in one process.
 
 Both are nodes of their own for each tag, with the names, parameters, topics and diagnostics that they have as processes, in the
-namespace of the tag. Corrected TDOAs and odometry are handed over in memory, and published for whoever else listens.
+namespace of the tag. Corrected TDOAs and odometry are handed over in memory, and published for whoever else listens. The nodes of a
+tag that fail do not take the others along: they are started again after 1 s, 2 s, 4 s ... 30 s.
+  -> /diagnostics (diagnostic_msgs/DiagnosticArray): which tags are not there, beside what their nodes say.
 Every parameter of this node itself is documented in config/localization_node.yaml; those of bias_node and ekf_node may be given
 too, for all tags, or in a parameter file for one: /tag1/ekf_node.
 """
 
+from functools import partial
+import math
 import sys
+import time
+import traceback
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_tdoa_bias import bias_node
 from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all, files_of, say_unused
+from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, say_unused
 from uwb_tdoa_bias.foundation.ros_streams import Turns
 
 from .core.config import RENAMED
@@ -21,8 +28,11 @@ from .ekf_parameters import names_of_parameters
 
 PARAMETERS = {
     "tags": Parameter([""], 'namespaces of the tags, below that of this node, e.g. ["tag1", "tag2"]; "" is its own'),
+    "frozen": FROZEN,
 }
 OF_PROCESS = "__ns", "__node", "__name"  # of this node, not of all
+FIRST, LONGEST = 1.0, 30.0  # s, until the nodes of a tag that have failed are started again: twice as long each time
+SOUND = 60.0  # s; nodes that lived for so long have failed for the first time again
 
 
 class LocalizationNode(ros.StreamNode):
@@ -36,19 +46,103 @@ class LocalizationNode(ros.StreamNode):
         tags = declare_all(self, PARAMETERS)["tags"]
         if not tags or len(set(tags)) < len(tags):
             raise InputError(f"tags: {list(tags)!r} must be a list of different namespaces, e.g. ['tag1', 'tag2'].")
-        pairs = [Pair(*self._start(tag, list(arguments))) for tag in tags]
-        self.members = [node for pair in pairs for node in (pair.bias, pair.ekf)]
+        self._tags = [Tag(self, tag, partial(self._start, tag, list(arguments))) for tag in tags]
+        for tag in self._tags:
+            tag.begin()
+        if all(tag.refused for tag in self._tags):
+            raise self._tags[0].refused
+        self.members = [node for tag in self._tags for node in tag.members]
         say_unused([self, *self.members], files_of(arguments))
-        self.turns = Turns(pairs)
+        self.turns = Turns(self._tags)
+        self._diagnostics = ros.Diagnostics(self, self._report)
         self.get_logger().info(f"ready; tags: {', '.join(tags) or 'one'}")
 
+    def _report(self):
+        troubles = [tag.trouble for tag in self._tags if tag.trouble]
+        level, text = (DiagnosticStatus.ERROR, troubles[0]) if troubles else (DiagnosticStatus.OK, "all tags are served")
+        return level, text, {"tags": len(self._tags), "not served": "; ".join(troubles) or "none"}
+
     def _start(self, tag, arguments):
-        """(BiasNode, EkfNode) of a tag."""
+        """Pair of a tag."""
         namespace = f"{self.get_namespace().rstrip('/')}/{tag}".rstrip("/") or "/"
         given = ["--ros-args", *(["-p", f"body_frame:={tag}/base_link"] if tag else []), "--", *_for_all(arguments)]
         options = {"namespace": namespace, "cli_args": given, "use_global_arguments": False}
         names = {*bias_node.PARAMETERS, *names_of_parameters(), *RENAMED, *PARAMETERS}
-        return tuple(kind(member=names, **options) for kind in (BiasNode, EkfNode))
+        bias = BiasNode(member=names, **options)
+        try:
+            return Pair(bias, EkfNode(member=names, **options))
+        except InputError:
+            bias.destroy_node()
+            raise
+
+
+class Tag:
+    """A tag, whose nodes are started again when they fail. refused : InputError with which they were not started at all; trouble : a
+    sentence while they are not there, or None."""
+
+    def __init__(self, node, name, start):
+        """node : LocalizationNode; start() : Pair of the tag, anew; raises InputError."""
+        self.refused = self.trouble = self._pair = self._failure = None
+        self._node, self._name, self._start = node, name, start
+        self._began, self._due, self._wait = 0.0, math.inf, 0.0  # s of time.monotonic(); s
+
+    @property
+    def members(self):
+        """Nodes that are there."""
+        return [] if self._pair is None else [self._pair.bias, self._pair.ekf]
+
+    def begin(self):
+        """Start its nodes. What they refuse at their first start is not tried again."""
+        try:
+            self._pair = self._start()
+        except InputError as error:
+            if not self._wait:
+                self.refused = error
+            self._again(error)
+            return
+        self.trouble, self._began = None, time.monotonic()
+        for node in self.members:
+            node.on_failure = self._fail
+
+    def take(self):
+        """A turn of its Pair, if it is there. Returns whether there was anything, or is."""
+        if self._failure is not None:
+            self._end()
+        if self._pair is None:
+            if time.monotonic() < self._due:
+                return False
+            self.begin()
+            self._node.spinner.replace([], self.members)
+            return False
+        try:
+            return self._pair.take()
+        except Exception as error:
+            self._fail(error)
+            return False
+
+    def _fail(self, error):
+        """Note what was raised; the nodes end with the next turn, when none of their callbacks is under way."""
+        self._failure = error
+
+    def _end(self):
+        error, gone, self._failure, self._pair = self._failure, self.members, None, None
+        self._node.get_logger().error("".join(traceback.format_exception(error)))
+        if time.monotonic() > self._began + SOUND:
+            self._wait = 0.0
+        self._again(error)
+        self._node.spinner.replace(gone, [])
+        for node in gone:
+            node.destroy_node()
+
+    def _again(self, error):
+        """Say why its nodes are not there, and until when."""
+        then = "is not started again"
+        if self.refused is None:
+            self._wait = min(LONGEST, 2.0 * self._wait) or FIRST
+            self._due = time.monotonic() + self._wait
+            then = f"is started again in {self._wait:g} s"
+        self.trouble = f"tag '{self._name}' has failed and {then}: {error or repr(error)}"
+        self._node.get_logger().error(self.trouble)
 
 
 class Pair:

@@ -6,6 +6,8 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+LARGEST = 1e16  # the square of what is far for an anchor, m^2
+
 
 def told_pose(message, world, epoch, newest):
     """(t s, p (3,) m, covariance (3, 3) m^2, yaw rad, its standard deviation rad) of a PoseWithCovarianceStamped.
@@ -20,8 +22,8 @@ def told_pose(message, world, epoch, newest):
     covariance = np.reshape(message.pose.covariance, (6, 6))
     variances = np.diag(covariance)
     numbers = [p.x, p.y, p.z, q.x, q.y, q.z, q.w, *covariance.ravel()]
-    if not np.isfinite(numbers).all() or (variances < 0.0).any():
-        raise InputError("it holds numbers that are not finite, or negative variances; give finite ones.")
+    if not (np.abs(numbers) <= LARGEST).all() or (variances < 0.0).any():
+        raise InputError(f"it holds numbers that are not finite or above {LARGEST:g}, or negative variances; give others.")
     if np.linalg.eigvalsh(0.5 * (covariance + covariance.T)[:3, :3]).min() < -1e-9:
         raise InputError("its covariance is none: the correlations are larger than 1; give a smaller off-diagonal.")
     at = np.where(variances[:3] > 0.0, [p.x, p.y, p.z], math.nan)

@@ -17,7 +17,7 @@ from std_msgs.msg import String
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
-from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all, files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 from uwb_tdoa_bias.foundation.ros_streams import Turns
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 
@@ -38,6 +38,7 @@ PARAMETERS = {  # in the order of config/vehicle_node.yaml
     "mission": Parameter(False, "fly the standard mission, say what became of it, and end, with exit code 1 unless it has landed"),
     "simulated_time": Parameter(False, "publish /clock, and go on when the odometry is there; else in real time"),
     "duration": Parameter(600.0, "s; how long it can be flown, without the mission", 10.0, 1800.0),
+    "frozen": FROZEN,
 }
 SETTLE = 1.0  # s from when somebody listens until what they say to each other is heard, too
 

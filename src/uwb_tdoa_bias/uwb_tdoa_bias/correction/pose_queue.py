@@ -3,11 +3,14 @@
 from collections import deque
 
 
+MOST = 10_000  # items: what has one stamp for ever would never have waited too long
+
+
 class PoseQueue:
     """A queue in order of arrival. Its first item leaves when it is ready, or when it has been waited for too long.
 
     What makes an item ready depends on the stamp of the item before it. Too long is counted in stamps: a newer item is
-    stamped more than `limit` seconds later.
+    stamped more than `limit` seconds later, or MOST wait.
     """
 
     def __init__(self, limit):
@@ -32,7 +35,7 @@ class PoseQueue:
         while self._items:
             t, before, item = self._items[0]
             is_ready = ready(before)
-            if not is_ready and self._newest - t <= self.limit:
+            if not is_ready and self._newest - t <= self.limit and len(self._items) <= MOST:
                 break
             out.append((t, item, is_ready))
             self._items.popleft()

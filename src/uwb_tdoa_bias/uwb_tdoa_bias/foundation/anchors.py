@@ -10,6 +10,7 @@ from .errors import InputError
 from .safe_yaml import read_yaml
 from .version import written_by
 
+MOST = 1000  # anchors; memory and time grow with their square
 FARTHEST = 1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
 
 
@@ -38,6 +39,8 @@ class Anchors:
         n = len(ids)
         if n == 0:
             raise InputError("anchors: the list is empty; give at least two anchors.")
+        if n > MOST:
+            raise InputError(f"anchors: there are {n}; give at most {MOST}, e.g. those of one hall.")
         if positions.shape != (n, 3) or orientations.shape != (n, 4):
             raise InputError(
                 f"anchors: {n} ids need positions of shape ({n}, 3) and orientations of shape ({n}, 4), "

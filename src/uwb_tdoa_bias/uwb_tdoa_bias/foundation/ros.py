@@ -2,6 +2,7 @@
 
 import argparse
 from copy import copy
+from functools import wraps
 import gc
 import signal
 import sys
@@ -24,7 +25,7 @@ from rosgraph_msgs.msg import Clock
 
 from .errors import InputError
 from .executable import interrupt
-from .ros_parameters import ParameterNode
+from .ros_parameters import SAY_AGAIN, ParameterNode
 from .ros_spinning import Spinner
 from .ros_wire import Unreadable, decode, name_of
 
@@ -37,7 +38,6 @@ LARGEST_LOSS = 0.01  # share of the messages of a second
 BEHIND = 0.5  # s that something may wait until this process serves it
 REPORT_PERIOD, LOOKS = 1.0, 5  # s from one report to the next, and looks in between at what is to be told at once
 PAUSED, SLOWEST_CLOCK = 0.5, 2.0  # s without a new time on /clock; s from one time to the next of a clock that runs
-SAY_AGAIN = 10.0  # s from one warning to the next of the same kind
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])  # written into the given profile
 
@@ -49,9 +49,31 @@ def publish_stream(node, kind, topic):
 
 class StreamNode(ParameterNode):
     """A node whose streams and /clock are not served by an executor (see Spinner). members : nodes that live and end with it;
-    spinner : the Spinner that serves it, once there is one."""
+    spinner : the Spinner that serves it, once there is one; on_failure(error) : is called with what a callback raises, instead of
+    raising it."""
 
-    members, spinner = (), None
+    members, spinner, on_failure = (), None, None
+
+    def create_subscription(self, msg_type, topic, callback, qos_profile, **options):
+        """Of rclpy."""
+        callback = callback if callback is unserved else self._contained(callback)
+        return super().create_subscription(msg_type, topic, callback, qos_profile, **options)
+
+    def create_timer(self, timer_period_sec, callback, **options):
+        """Of rclpy."""
+        return super().create_timer(timer_period_sec, self._contained(callback), **options)
+
+    def _contained(self, callback):
+        @wraps(callback)
+        def call(*arguments):
+            try:
+                callback(*arguments)
+            except Exception as error:
+                if self.on_failure is None:
+                    raise
+                self.on_failure(error)
+
+        return call
 
     @property
     def subscriptions(self):
@@ -284,6 +306,10 @@ class Diagnostics:
             values |= {"longest wait of a request": f"{late:.3f} s"}
             if late > BEHIND and level == DiagnosticStatus.OK:
                 level, text = DiagnosticStatus.WARN, f"this node answers up to {late:.1f} s late: check the load of this machine"
+        values |= {"frozen": "yes" if self._node.frozen else "no", "refused because frozen": self._node.refused}
+        refused = self._node.refused_lately()
+        if refused and level == DiagnosticStatus.OK:
+            level, text = DiagnosticStatus.WARN, refused
         level, text = self._judgement or (level, text)
         if text != self._said:
             logger = self._node.get_logger()
@@ -368,8 +394,6 @@ def run(node_class, description, argv=None):
         node = node_class(arguments)
         nodes = [node, *node.members]
         spinner = Spinner(nodes, getattr(node, "turns", None))
-        for each in nodes:
-            each.spinner = spinner
         gc.collect()
         gc.freeze()  # what numba holds is never garbage, and searching it takes a tenth of a second
         gc.enable()

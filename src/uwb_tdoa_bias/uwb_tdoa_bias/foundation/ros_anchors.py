@@ -82,6 +82,10 @@ class AnchorsInput:
         except InputError as error:
             self.refused = str(error)
             return
+        if self._node.frozen and self.anchors is not None:
+            if not same_anchors(anchors, self.anchors):
+                self._node.refuse("other anchors on uwb/anchors")
+            return
         if self._of_file is not None:
             if not same_anchors(anchors, self._of_file):
                 self.refused = f"uwb/anchors has other anchors than anchors_file, {self._file}, which counts: stop one"

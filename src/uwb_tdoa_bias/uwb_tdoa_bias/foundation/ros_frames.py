@@ -8,6 +8,7 @@ from tf2_msgs.msg import TFMessage
 
 from . import ros
 from .errors import InputError
+from .ros_parameters import LONGEST_NAME
 from .ros_wire import ENCAPSULATION, LENGTH, MOST_ELEMENTS, Unreadable, aligned, check_length, decode, read_text
 from .transforms import Frames
 
@@ -20,8 +21,8 @@ TF_STATIC_QOS = QoSProfile(
 
 
 class FramesInput:
-    """Frames of /tf_static, and of /tf if they may move: its messages wait until `catch_up`. trouble : a transform that is none, or
-    None; refusals : ros.Refusals."""
+    """Frames of /tf_static, and of /tf if they may move: its messages wait until `catch_up`. Of a node that is frozen, the first
+    constant transform of a frame counts. trouble : a transform that is none, or None; refusals : ros.Refusals."""
 
     def __init__(self, node, seconds, on_new, moving=False):
         """seconds(stamp) : s of a builtin_interfaces/Time; on_new() is called when a constant transform is new."""
@@ -37,9 +38,16 @@ class FramesInput:
             end.take_all()
 
     def _on_static(self, transforms):
-        new = [self._take("/tf_static", self.frames.set, *transform[2:]) for transform in transforms]
+        new = [self._take("/tf_static", self._set, *transform[2:]) for transform in transforms]
         if any(new):
             self._on_new()
+
+    def _set(self, parent, child, q, p):
+        if self._node.frozen and self.frames.knows(child):
+            if self.frames.differs(parent, child, q, p):
+                self._node.refuse(f"another transform of {child!r:.{LONGEST_NAME}} on /tf_static")
+            return False
+        return self.frames.set(parent, child, q, p)
 
     def _on_moving(self, transforms):
         for sec, nanosec, *transform in transforms:

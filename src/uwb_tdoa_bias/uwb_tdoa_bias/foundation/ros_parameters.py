@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import wraps
 from pathlib import Path
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -17,6 +18,8 @@ from .errors import InputError
 
 KINDS = {float: "a number with a decimal point, e.g. 1.0", int: "a whole number", bool: "true or false", list: "a list"}
 QOS = "qos_overrides."
+SAY_AGAIN = 10.0  # s from one warning to the next of the same kind
+LONGEST_NAME = 100  # letters of what a stranger wrote, in a sentence
 
 
 @dataclass(frozen=True)
@@ -45,19 +48,65 @@ class Parameter:
         return out
 
 
+FROZEN = Parameter(False, "refuse over ROS, once started, other parameters, anchors, static transforms and poses, and a reset (docs/security.md)")
+
+
 class ParameterNode(Node):
-    """A Node that takes a read-only parameter which is set to what it is: `ros2 param load` sets all that `ros2 param dump` wrote."""
+    """A Node that takes a read-only parameter which is set to what it is: `ros2 param load` sets all that `ros2 param dump` wrote. One
+    with the parameter FROZEN that is true takes no other. What asks for parameters in a way that rclpy cannot read ends nothing.
+
+    refused : how often something was refused because the node is frozen; frozen : whether it is.
+    """
+
+    refused, _refused_before, _refusal = 0, 0, ""
+
+    @property
+    def frozen(self):
+        """Whether nobody may change what was given at the start."""
+        return self.has_parameter("frozen") and self.get_parameter("frozen").value
+
+    def refuse(self, what):
+        """Count and say that something is refused because the node is frozen; returns the sentence. what : it, and who asked for it."""
+        self.refused += 1
+        self._refusal = f"{what}: refused, because this node is frozen; start it with frozen:=false to allow it"
+        self.get_logger().warning(self._refusal, throttle_duration_sec=SAY_AGAIN)
+        return self._refusal
+
+    def refused_lately(self):
+        """The sentence of the last that was refused since this was asked last, or None."""
+        new, self._refused_before = self.refused - self._refused_before, self.refused
+        return self._refusal if new else None
+
+    def create_service(self, srv_type, srv_name, callback, **options):
+        """Of rclpy, which makes those of the parameters by it and raises what they cannot read."""
+        if not srv_type.__module__.startswith("rcl_interfaces."):
+            return super().create_service(srv_type, srv_name, callback, **options)
+
+        @wraps(callback)
+        def answer(request, response):
+            try:
+                return callback(request, response)
+            except Exception as error:
+                text = f"{srv_name}: a request cannot be read and changes nothing more: {error!r:.{LONGEST_NAME}}"
+                self.get_logger().warning(text, throttle_duration_sec=SAY_AGAIN)
+                return response
+
+        return super().create_service(srv_type, srv_name, answer, **options)
 
     def set_parameters_atomically(self, parameter_list):
         """Of rclpy; what the parameter services of the node call."""
         others = [each for each in parameter_list if not self._is_so_for_good(each)]
-        return super().set_parameters_atomically(others) if others or not parameter_list else SetParametersResult(successful=True)
+        if not others and parameter_list:
+            return SetParametersResult(successful=True)
+        if others and self.frozen:
+            return SetParametersResult(successful=False, reason=self.refuse(f"parameter {others[0].name!r:.{LONGEST_NAME}}"))
+        return super().set_parameters_atomically(others)
 
     def _is_so_for_good(self, parameter):
         name = parameter.name
         return (
             self.has_parameter(name)
-            and self.describe_parameter(name).read_only
+            and (self.frozen or self.describe_parameter(name).read_only)
             and self.get_parameter(name).get_parameter_value() == parameter.get_parameter_value()
         )
 

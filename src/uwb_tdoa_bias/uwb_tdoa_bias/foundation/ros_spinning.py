@@ -29,13 +29,26 @@ class Spinner:
     """
 
     def __init__(self, nodes, turns=None):
-        """nodes : StreamNodes; turns : ros_streams.Turns."""
+        """nodes : StreamNodes, a list that is kept up to date; turns : ros_streams.Turns."""
         self.longest_wait = 0.0
         self._nodes, self._turns = nodes, turns
         self._executor = SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
         self._served = time.monotonic()
         for node in nodes:
-            self._executor.add_node(node)
+            self._serve_node(node)
+
+    def replace(self, gone, new):
+        """Leave some nodes, and serve others."""
+        for node in gone:
+            self._executor.remove_node(node)
+            self._nodes.remove(node)
+        for node in new:
+            self._nodes.append(node)
+            self._serve_node(node)
+
+    def _serve_node(self, node):
+        node.spinner = self
+        self._executor.add_node(node)
 
     def spin(self, stop):
         """Live until the future `stop` is done, or the context ends."""

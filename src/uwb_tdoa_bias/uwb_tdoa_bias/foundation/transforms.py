@@ -12,8 +12,9 @@ from .later import rotations
 KEPT = 1000  # transforms of a frame that moves
 HELD = 0.5  # s for which the last transform of a frame that moves holds
 DEEPEST = 100  # frames between a frame and its root
-MOST = 10_000  # frames
-SHORTEST = 1e-3  # of a quaternion, which should be 1
+MOST, MOST_MOVING = 1000, 200  # frames that do not move, and that do
+SHORTEST, LONGEST = 1e-3, 1e3  # of a quaternion, which should be 1
+FARTHEST = 1e8  # m; squares of what is off by more, and is turned by a gyroscope, may overflow
 
 
 class Frames:
@@ -25,18 +26,26 @@ class Frames:
     def set(self, parent, child, q, p):
         """A constant transform: x_parent = R(q) x_child + p; q (4,) x y z w, p (3,) m. Returns whether it is new. Raises
         InputError for what is no transform."""
-        self._check(self._static, parent, child, q, p)
-        before = self._static.get(child)
-        entry = parent, rotations.Rotation.from_quat(q), np.array(p, dtype=float)
-        self._static[child] = entry
-        if before is None or before[0] != parent:
+        new = self.differs(parent, child, q, p)
+        self._static[child] = parent, rotations.Rotation.from_quat(q), np.array(p, dtype=float)
+        return new
+
+    def knows(self, child):
+        """Whether a frame has a constant transform."""
+        return child in self._static
+
+    def differs(self, parent, child, q, p):
+        """Whether this is another transform than the constant one of that frame, or its first. Raises InputError as `set` does."""
+        self._check(self._static, MOST, parent, child, q, p)
+        before_parent, turn, before_p = self._static.get(child, (None, None, None))
+        if before_parent != parent or not np.array_equal(before_p, np.array(p, dtype=float)):
             return True
-        return not np.array_equal(before[2], entry[2]) or (before[1].inv() * entry[1]).magnitude() > 1e-9
+        return (turn.inv() * rotations.Rotation.from_quat(q)).magnitude() > 1e-9
 
     def move(self, parent, child, q, p, t):
         """The transform at stamp t, s. One that is not later than the last is passed over; another parent starts anew. Raises
         InputError for what is no transform."""
-        self._check(self._moving, parent, child, q, p)
+        self._check(self._moving, MOST_MOVING, parent, child, q, p)
         known = self._moving.get(child)
         if known is None or known[0] != parent:
             known = self._moving[child] = parent, deque(maxlen=KEPT)
@@ -46,13 +55,15 @@ class Frames:
         if not course or t > course[-1][0]:
             course.append((t, tuple(q), tuple(p)))
 
-    def _check(self, known, parent, child, q, p):
+    def _check(self, known, most, parent, child, q, p):
         if not all(map(math.isfinite, (*q, *p))):
             raise InputError(f"{parent} -> {child}: q = {tuple(q)}, p = {tuple(p)} must be finite numbers.")
-        if math.hypot(*q) < SHORTEST:
+        if max(map(abs, p)) > FARTHEST:
+            raise InputError(f"{parent} -> {child}: p = {tuple(p)} must be metres, at most {FARTHEST:g} along each axis.")
+        if not SHORTEST <= math.hypot(*q) <= LONGEST:
             raise InputError(f"{parent} -> {child}: {tuple(q)} is no rotation; give a quaternion x, y, z, w of length 1.")
-        if child not in known and len(known) >= MOST:
-            raise InputError(f"{parent} -> {child}: there are {MOST} frames already; publish fewer.")
+        if child not in known and len(known) >= most:
+            raise InputError(f"{parent} -> {child}: there are {most} frames already; publish fewer.")
 
     def between(self, target, source, t=None):
         """(Rotation, p (3,) m) with x_target = R x_source + p, at stamp t, s, for frames that move; None if not known."""
