@@ -30,6 +30,7 @@ setup(
         (f"share/{NAME}/foxglove", glob("foxglove/*.json")),
         (f"share/{NAME}/launch", glob("launch/*.py")),
         (f"share/{NAME}/rviz", glob("rviz/*.rviz")),
+        (f"share/{NAME}/sros2", glob("sros2/*.xml")),
     ],
     zip_safe=False,
     entry_points={

@@ -12,12 +12,13 @@ ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml processes:=2     # takes
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
-from uwb_tdoa_ekf.launching import RESPAWN, pooled, tags, typed
+from uwb_tdoa_ekf.launching import FROZEN, NETWORK, RESPAWN, pooled, tags, typed
 from uwb_tdoa_ekf.launching_actions import actions
 
 OTHERS = {
     "processes": ("", "localization_nodes that share the tags, e.g. one for each core; default: two nodes for each tag"),
     "use_sim_time": ("", "true for bags that are played with --clock"),
+    "frozen": ("", FROZEN),
     "log_level": ("info", "debug, info, warn, error"),
     "rviz": ("false", "true opens RViz with the frames and the anchors"),
 }
@@ -30,15 +31,15 @@ def generate_launch_description():
     ]
     arguments += [
         DeclareLaunchArgument(name, default_value="stay" if name == "on_exit" else default, description=text, choices=choices)
-        for name, (default, text, choices) in RESPAWN.items()
+        for name, (default, text, choices) in (RESPAWN | NETWORK).items()
     ]  # one tag does not take the others along
     file = DeclareLaunchArgument("tags", description="YAML file of the tags")
     return LaunchDescription([file, *arguments, OpaqueFunction(function=_nodes)])
 
 
 def _nodes(context):
-    given = {name: LaunchConfiguration(name).perform(context) for name in ("tags", *OTHERS, *RESPAWN)}
-    values = typed({"use_sim_time": given["use_sim_time"]})
+    given = {name: LaunchConfiguration(name).perform(context) for name in ("tags", *OTHERS, *RESPAWN, *NETWORK)}
+    values = typed({name: given[name] for name in ("use_sim_time", "frozen")})
     starts = tags(given["tags"], values, given["log_level"])
     starts = pooled(starts, given["processes"]) if given["processes"] else starts
-    return actions(starts, *(given[name] for name in (*RESPAWN, "rviz")), values.get("use_sim_time", False))
+    return actions(starts, *(given[name] for name in (*RESPAWN, *NETWORK, "rviz")), values.get("use_sim_time", False))

@@ -8,7 +8,7 @@ ros2 launch uwb_tdoa_ekf tdoa.launch.py --show-args
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
-from uwb_tdoa_ekf.launching import RESPAWN, start, tag, typed
+from uwb_tdoa_ekf.launching import FROZEN, NETWORK, RESPAWN, start, tag, typed
 from uwb_tdoa_ekf.launching_actions import actions
 
 VALUES = {  # parameters of the nodes; one that is not given is what the files say, or the node's default
@@ -21,6 +21,7 @@ VALUES = {  # parameters of the nodes; one that is not given is what the files s
     "publish_tf": "none, base (map -> base_link) or odom (map -> odom, REP 105)",
     "odom_frame": "frame of the robot's own odometry, for publish_tf odom",
     "use_sim_time": "true for bags that are played with --clock",
+    "frozen": FROZEN,
 }
 OTHERS = {
     "namespace": ("", "one per tag; the topics are relative to it"),
@@ -39,16 +40,16 @@ def generate_launch_description():
     ]
     arguments += [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
-        for name, (default, text, choices) in RESPAWN.items()
+        for name, (default, text, choices) in (RESPAWN | NETWORK).items()
     ]
     return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
 
 
 def _nodes(context):
     values = typed({name: LaunchConfiguration(name).perform(context) for name in VALUES})
-    given = {name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *RESPAWN)}
+    given = {name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *RESPAWN, *NETWORK)}
     files = {node: [given[key]] for node, key in (("bias_node", "bias_params"), ("ekf_node", "ekf_params")) if given[key]}
     starts = tag(given["namespace"], values, files, given["log_level"])
     if "anchors_file" in values:
         starts.append(start("anchors_node", given["namespace"], values, (), given["log_level"]))
-    return actions(starts, *(given[name] for name in (*RESPAWN, "rviz")), values.get("use_sim_time", False))
+    return actions(starts, *(given[name] for name in (*RESPAWN, *NETWORK, "rviz")), values.get("use_sim_time", False))

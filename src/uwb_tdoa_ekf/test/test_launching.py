@@ -16,7 +16,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from nav_msgs.msg import Odometry  # noqa: E402
 from real_launch import WHY_NOT  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_ekf.launching import NODES, Lives, network, pooled, start, tag, tags, typed  # noqa: E402
+from uwb_tdoa_ekf.launching import NODES, RANGE, Lives, discovery, network, pooled, start, tag, tags, typed  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -81,6 +81,11 @@ def test_what_ends_for_good_ends_all_if_it_is_to(on_exit, everything):
 )
 def test_who_hears_the_nodes_is_said(given, said):
     assert said in network(given)
+
+
+def test_only_this_machine_discovers_the_nodes_unless_the_user_says_otherwise():
+    assert discovery({}) == discovery({RANGE: ""}) == {RANGE: "LOCALHOST"}
+    assert discovery({RANGE: "SUBNET"}) == discovery({RANGE: "OFF"}, "SUBNET") == {RANGE: "SUBNET"}
 
 
 def test_texts_become_values():
@@ -176,6 +181,17 @@ def test_one_tag(launched):
     assert Path(rviz.arguments[1]).is_file() and rviz.ros_arguments == values[4:]
 
 
+@pytest.mark.parametrize("name", ["tdoa.launch.py", "tags.launch.py"])
+def test_nodes_are_discovered_by_this_machine_and_frozen_on_request(launched, tmp_path, monkeypatch, name):
+    (tmp_path / "tags.yaml").write_text("tags: {a: {}}")
+    file = {"tags": str(tmp_path / "tags.yaml")} if name.startswith("tags") else {}
+    monkeypatch.delenv(RANGE, raising=False)
+    nodes = launched(name, frozen="true", **file)
+    assert [node.additional_env for node in nodes] == [{RANGE: "LOCALHOST"}] * 2
+    assert all("frozen:=true" in node.ros_arguments for node in nodes)
+    assert all(node.additional_env == {RANGE: "SUBNET"} for node in launched(name, discovery_range="SUBNET", **file))
+
+
 def test_several_tags(launched, tmp_path):
     (tmp_path / "tags.yaml").write_text("tags: {a: {}, b: {}, c: {publish_tf: odom, odom_frame: c/odom}, d: {body_frame: drone}}")
     nodes = launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"))
@@ -189,6 +205,7 @@ def test_several_tags(launched, tmp_path):
 def test_several_tags_in_a_pool_of_processes(tmp_path):
     file = tmp_path / "tags.yaml"
     file.write_text("anchors_file: a.yaml\ntags: {a: {}, b: {tdoa_std: 0.3}, c: {map: map.npz}}")
+    assert [node.parameters[1].get("frozen") for node in pooled(tags(file, {"frozen": True}), 1)[2:]] == [True]
     nodes = pooled(tags(file, {}), "2")
     assert [node.executable for node in nodes] == ["debias_node", "anchors_node", "localization_node", "localization_node"]
     one, other = nodes[2:]

@@ -18,6 +18,7 @@ from . import debias_node
 from .ekf_parameters import names_of_parameters
 
 EVERYWHERE = {"use_sim_time"}
+FROZEN = "true: the nodes refuse over ROS, once started, other parameters, anchors, static transforms and poses, and a reset"
 NODES = {  # {executable: (package, names of its parameters)}
     "bias_node": ("uwb_tdoa_bias", {*bias_node.PARAMETERS} | EVERYWHERE),
     "ekf_node": ("uwb_tdoa_ekf", names_of_parameters() | EVERYWHERE),
@@ -36,6 +37,11 @@ RESPAWN = {  # arguments of the launch files: (default, text, choices)
     ),
 }
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+NETWORK = {  # another argument of the launch files
+    "discovery_range": (
+        "", f"who discovers the nodes; default: {RANGE}, or LOCALHOST where that is not set", ["", "OFF", "LOCALHOST", "SUBNET", "SYSTEM_DEFAULT"],
+    ),
+}  # fmt: skip
 WHO = {
     "OFF": "nobody, not even on this machine",
     "LOCALHOST": "nodes on this machine{}, and whoever names it in ROS_STATIC_PEERS; with SUBNET by those of other machines, too",
@@ -111,6 +117,12 @@ class Lives:
         return Ended(text=what, everything=self._on_exit == "shutdown")
 
 
+def discovery(environment, given=""):
+    """Variables with which nodes are started: this machine alone discovers them, unless the user says otherwise. environment :
+    variables; given : the argument discovery_range."""
+    return {RANGE: given or environment.get(RANGE) or "LOCALHOST"}
+
+
 def network(environment):
     """Who can hear the nodes, and command them, in a sentence. environment : variables."""
     found, peers = environment.get(RANGE) or "SUBNET", environment.get("ROS_STATIC_PEERS")
@@ -163,7 +175,7 @@ def tags(path, values, log_level="info"):
         raise InputError(f"{path}: {error}") from error
     anchors = {node.parameters[-1].get("anchors_file") for node in starts if node.parameters} - {None}
     if len(anchors) == 1:
-        shared = {"anchors_file": anchors.pop(), **{name: values[name] for name in EVERYWHERE if name in values}}
+        shared = {"anchors_file": anchors.pop(), **{name: values[name] for name in (*EVERYWHERE, "frozen") if name in values}}
         starts.append(start("anchors_node", "", shared, (), log_level))
     return starts
 
@@ -181,9 +193,11 @@ def pooled(starts, processes):
     atexit.register(shutil.rmtree, folder, ignore_errors=True)  # a node that is started again reads it again
     file = folder / "tags.yaml"
     file.write_text(yaml.safe_dump(told, allow_unicode=True), encoding="utf-8")
+    frozen = all(each.parameters and each.parameters[-1].get("frozen") for each in members)
     namespaces, out = list(dict.fromkeys(each.namespace for each in members)), [each for each in starts if each not in members]
     for k in range(min(int(processes), len(namespaces))):
-        parameters, name = [str(file), {"tags": namespaces[k :: int(processes)]}], f"localization_node_{k + 1}"
+        own = {"tags": namespaces[k :: int(processes)]} | ({"frozen": True} if frozen else {})
+        parameters, name = [str(file), own], f"localization_node_{k + 1}"
         out.append(Start("uwb_tdoa_ekf", "localization_node", "", parameters, members[0].log_level, name))
     return out
 

@@ -9,16 +9,17 @@ import launch.logging
 from launch_ros.actions import Node
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .launching import Lives, network
+from .launching import Lives, discovery, network
 
 
-def actions(starts, respawn, on_exit, rviz, use_sim_time=False):
+def actions(starts, respawn, on_exit, discovery_range, rviz, use_sim_time=False):
     """Of [Start]s, as texts of launch arguments say: what is told of the network, the nodes, and RViz if rviz is "true"."""
-    nodes = [_node(each, Lives(each.label, respawn == "true", on_exit)) for each in starts]
-    return [LogInfo(msg=network(os.environ)), *nodes, *([_rviz(use_sim_time)] if rviz == "true" else [])]
+    of_nodes = discovery(os.environ, discovery_range)
+    nodes = [_node(each, Lives(each.label, respawn == "true", on_exit), of_nodes) for each in starts]
+    return [LogInfo(msg=network({**os.environ, **of_nodes})), *nodes, *([_rviz(use_sim_time)] if rviz == "true" else [])]
 
 
-def _node(start, lives):
+def _node(start, lives, variables):
     """The action of a Start, which its Lives may have started again. Nothing is told to it by a file that launch_ros would leave."""
     began = time.monotonic()
 
@@ -30,7 +31,7 @@ def _node(start, lives):
             raise InputError(then.text)  # ends the launch, which then ends with code 1
         if then.text:
             launch.logging.get_logger("launch.user").error(then.text)
-        again = OpaqueFunction(function=lambda _: [_node(start, lives)])
+        again = OpaqueFunction(function=lambda _: [_node(start, lives, variables)])
         return None if then.again is None else TimerAction(period=then.again, actions=[again])
 
     return Node(
@@ -39,6 +40,7 @@ def _node(start, lives):
         name=start.name,
         namespace=start.namespace,
         ros_arguments=start.words,
+        additional_env=variables,
         output="screen",
         on_exit=on_exit,
     )

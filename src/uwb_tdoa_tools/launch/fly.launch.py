@@ -5,11 +5,13 @@ ros2 launch uwb_tdoa_tools fly.launch.py mission:=true seed:=7 simulated_time:=t
 ros2 launch uwb_tdoa_tools fly.launch.py --show-args
 """
 
+import os
+
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from uwb_tdoa_ekf.launching import Start, tag, typed
+from uwb_tdoa_ekf.launching import FROZEN, NETWORK, Start, discovery, tag, typed
 from uwb_tdoa_ekf.launching_actions import actions
 
 VALUES = {  # parameters of vehicle_node; one that is not given is its default
@@ -22,6 +24,7 @@ VALUES = {  # parameters of vehicle_node; one that is not given is its default
 }
 OTHERS = {
     "effects_file": ("", "effects.yaml that diagnose wrote"),
+    "frozen": ("", FROZEN),
     "namespace": ("", "of the vehicle; the topics are relative to it"),
     "log_level": ("info", "debug, info, warn, error"),
     "rviz": ("false", "true opens RViz with the estimate, the truth and the anchors"),
@@ -33,18 +36,25 @@ def generate_launch_description():
     """Arguments, and what follows from them."""
     arguments = [DeclareLaunchArgument(name, default_value="", description=text) for name, text in VALUES.items()]
     arguments += [DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()]
+    arguments += [
+        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
+        for name, (default, text, choices) in NETWORK.items()
+    ]
     return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
 
 
 def _nodes(context):
     values = typed({name: LaunchConfiguration(name).perform(context) for name in VALUES})
     values |= {name: _number(kind, values[name]) for name, kind in NUMBERS.items() if name in values}
-    given = {name: LaunchConfiguration(name).perform(context) for name in OTHERS}
+    given = {name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *NETWORK)}
     simulated = values.get("simulated_time", False)
-    of_nodes = {"use_sim_time": simulated, "model_file": ""} | typed({"effects_file": given["effects_file"]})  # the model is of another hall
+    of_nodes = {"use_sim_time": simulated, "model_file": ""} | typed({name: given[name] for name in ("effects_file", "frozen")})  # the model is of another hall
     starts = tag(given["namespace"], of_nodes, None, given["log_level"])
     vehicle = Start("uwb_tdoa_tools", "vehicle_node", given["namespace"], [values], given["log_level"])
-    return [*actions(starts, "false", "shutdown", given["rviz"], simulated), _vehicle(vehicle)]
+    return [
+        *actions(starts, "false", "shutdown", given["discovery_range"], given["rviz"], simulated),
+        _vehicle(vehicle, discovery(os.environ, given["discovery_range"])),
+    ]
 
 
 def _number(kind, text):
@@ -55,11 +65,11 @@ def _number(kind, text):
         return text
 
 
-def _vehicle(start):
+def _vehicle(start, variables):
     """The action of its Start; all ends with it."""
     return Node(
         package=start.package, executable=start.executable, namespace=start.namespace, ros_arguments=start.words,
-        output="screen", on_exit=_ended,
+        additional_env=variables, output="screen", on_exit=_ended,
     )  # fmt: skip
 
 

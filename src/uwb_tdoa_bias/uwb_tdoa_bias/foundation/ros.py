@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock
 
 from .errors import InputError
 from .executable import interrupt
-from .ros_parameters import SAY_AGAIN, ParameterNode
+from .ros_parameters import ParameterNode
 from .ros_spinning import Spinner
 from .ros_wire import Unreadable, decode, name_of
 
@@ -91,7 +91,7 @@ class StreamNode(ParameterNode):
             try:
                 clock.callback(decode(newest, Clock))
             except (ValueError, OverflowError) as error:  # no time at all, or before 1970
-                self.get_logger().warning(f"/clock: passed over: {error}", throttle_duration_sec=SAY_AGAIN)
+                self.warn_at_times("/clock", f"/clock: passed over: {error}")
 
 
 def unserved(_):
@@ -115,9 +115,7 @@ class Refusals:
     def add(self, error):
         """Count one. error : Unreadable."""
         self.count, self.reason = self.count + 1, str(error)
-        self._node.get_logger().warning(
-            f"{self.topic}: a message cannot be read and is not used: {error}", throttle_duration_sec=SAY_AGAIN
-        )
+        self._node.warn_at_times(f"unreadable {self.topic}", f"{self.topic}: a message cannot be read and is not used: {error}")
 
     def trouble(self):
         """The sentence for those since this was asked last, or None."""

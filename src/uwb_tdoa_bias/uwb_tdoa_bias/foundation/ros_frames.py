@@ -59,7 +59,7 @@ class FramesInput:
             return take(*transform)
         except InputError as error:
             self.trouble = f"{topic}: not taken: {error}"
-            self._node.get_logger().warning(self.trouble, throttle_duration_sec=ros.SAY_AGAIN)
+            self._node.warn_at_times(topic, self.trouble)
             return False
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
+import time
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import (
@@ -60,6 +61,18 @@ class ParameterNode(Node):
 
     refused, _refused_before, _refusal = 0, 0, ""
 
+    def __init__(self, *arguments, **options):
+        self._warned = {}  # {kind: s of time.monotonic() from which on it may be said again}
+        super().__init__(*arguments, **options)
+
+    def warn_at_times(self, kind, text):
+        """Log a warning, unless one of this kind was logged less than SAY_AGAIN ago. (rclpy's own throttle takes half a millisecond to
+        find out, which is more than most messages take.)"""
+        now = time.monotonic()
+        if now >= self._warned.get(kind, now):
+            self._warned[kind] = now + SAY_AGAIN
+            self.get_logger().warning(text)
+
     @property
     def frozen(self):
         """Whether nobody may change what was given at the start."""
@@ -69,7 +82,7 @@ class ParameterNode(Node):
         """Count and say that something is refused because the node is frozen; returns the sentence. what : it, and who asked for it."""
         self.refused += 1
         self._refusal = f"{what}: refused, because this node is frozen; start it with frozen:=false to allow it"
-        self.get_logger().warning(self._refusal, throttle_duration_sec=SAY_AGAIN)
+        self.warn_at_times("frozen", self._refusal)
         return self._refusal
 
     def refused_lately(self):
@@ -88,7 +101,7 @@ class ParameterNode(Node):
                 return callback(request, response)
             except Exception as error:
                 text = f"{srv_name}: a request cannot be read and changes nothing more: {error!r:.{LONGEST_NAME}}"
-                self.get_logger().warning(text, throttle_duration_sec=SAY_AGAIN)
+                self.warn_at_times(srv_name, text)
                 return response
 
         return super().create_service(srv_type, srv_name, answer, **options)

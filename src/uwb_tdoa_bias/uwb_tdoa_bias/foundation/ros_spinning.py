@@ -103,7 +103,7 @@ class Spinner:
         try:
             serve(**arguments)
         except implementation.RCLError as error:
-            self._nodes[0].get_logger().warning(f"passed over what could not be taken: {error}", throttle_duration_sec=10.0)
+            self._nodes[0].warn_at_times("request", f"passed over what could not be taken: {error}")
 
 
 def _nothing():

@@ -1,0 +1,88 @@
+"""What SROS2 lets each node do is what it does: sros2/policy.xml and the graph."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+
+from uwb_tdoa_bias.anchors_node import AnchorsNode  # noqa: E402
+from uwb_tdoa_bias.bias_node import BiasNode  # noqa: E402
+from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
+from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
+from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
+from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
+from uwb_tdoa_ekf.localization_node import LocalizationNode  # noqa: E402
+from uwb_tdoa_tools.vehicle_node import VehicleNode  # noqa: E402
+
+FILE = Path(__file__).resolve().parents[2] / "uwb_tdoa_ekf" / "sros2" / "policy.xml"
+ROLES = ("topic", "publish"), ("topic", "subscribe"), ("service", "reply"), ("service", "request")
+KINDS = {kind.NAME: kind for kind in (BiasNode, EkfNode, LocalizationNode, AnchorsNode, DebiasNode, VehicleNode)}
+OTHERS = {"robot", "operator"}  # who are not ours
+
+
+def allowed():
+    """{enclave: {node: {role: full names}}} of the policy."""
+    out = {}
+    for enclave in ElementTree.parse(FILE).iter("enclave"):
+        of_nodes = out[Path(enclave.get("path")).name] = {}
+        for profile in enclave.iter("profile"):
+            node, roles = f"/{profile.get('node')}", {role: set() for _, role in ROLES}
+            for kind, role in ROLES:
+                for entries in profile.findall(f"{kind}s[@{role}='ALLOW']"):
+                    names = [entry.text.replace("~", node) for entry in entries.findall(kind)]
+                    roles[role] |= {name if name.startswith("/") else f"/{name}" for name in names}
+            of_nodes[node] = roles
+    return out
+
+
+@pytest.fixture
+def arguments(tmp_path):
+    """What nodes are started with, so that they use all that they can."""
+    Anchors.from_positions(np.eye(3)).to_yaml(tmp_path / "anchors.yaml")
+    cell = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    bias = np.zeros((27, 3))
+    BiasMap(cell, 0.5 * cell, bias, bias + 0.05, np.full(27, 50), 0.01 * np.eye(3), 0.5).save(tmp_path / "map.npz")
+    own = {
+        "anchors_node": ["-p", f"anchors_file:={tmp_path / 'anchors.yaml'}"], "debias_node": ["-p", f"map:={tmp_path / 'map.npz'}"],
+        "ekf_node": ["-p", "publish_tf:=odom"], "localization_node": ["-p", "publish_tf:=odom"],
+        "vehicle_node": ["-p", "simulated_time:=true", "-p", "aids:=[height, pressure, velocity]"],
+    }  # fmt: skip
+    return {name: ["--ros-args", "-p", "use_sim_time:=true", *own.get(name, ())] for name in KINDS}
+
+
+def of_graph(observer, node):
+    """{role: full names} of a node, as another one sees it."""
+    asked = [node.get_name(), node.get_namespace()]
+    found = {
+        "publish": observer.get_publisher_names_and_types_by_node(*asked),
+        "subscribe": observer.get_subscriber_names_and_types_by_node(*asked),
+        "reply": observer.get_service_names_and_types_by_node(*asked),
+        "request": observer.get_client_names_and_types_by_node(*asked),
+    }
+    return {role: {name for name, _ in names} for role, names in found.items()}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_node_may_do_what_it_does_and_nothing_else(name, arguments):
+    rclpy.init(args=arguments[name])
+    try:
+        node = KINDS[name](arguments[name])
+        nodes, observer = [node, *node.members], rclpy.create_node("observer")
+        assert allowed()[name] == {each.get_fully_qualified_name(): of_graph(observer, each) for each in nodes}
+    finally:
+        rclpy.shutdown()
+
+
+def test_nobody_else_may_take_over():
+    policy = allowed()
+    assert policy.keys() == KINDS.keys() | OTHERS
+    (robot,), (operator,) = policy["robot"].values(), policy["operator"].values()
+    assert not robot["publish"] & {"/uwb/anchors", "/initialpose", "/odometry", "/uwb/tdoa_corrected", "/clock"} and not robot["request"]
+    offered = {name for nodes in policy.values() for roles in nodes.values() for name in roles["reply"]}
+    assert "/ekf_node/reset" in operator["request"] <= offered | {"/bias_node/set_parameters"}
+    told = {enclave for enclave, nodes in policy.items() for roles in nodes.values() if "/initialpose" in roles["publish"]}
+    assert told == {"operator", "vehicle_node"}
