@@ -12,6 +12,7 @@ from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import FluidPressure  # noqa: E402
 from uwb_tdoa_bias.foundation import ros, ros_spinning  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_streams import PERIOD, Streams, Turns  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_wire import Wire  # noqa: E402
@@ -163,4 +164,23 @@ def test_a_request_that_cannot_be_taken_ends_nothing(surroundings):
     spinner._guarded(refuse)
     with pytest.raises(ValueError):
         spinner._guarded(lambda: int("a defect of ours"))
+    spinner.close()
+
+
+def test_a_flood_of_requests_does_not_keep_streams_waiting(surroundings, monkeypatch):
+    node, other = surroundings
+    spinner, asked, given = Spinner([node]), [], node.get_parameter
+    monkeypatch.setattr(node, "get_parameter", lambda name: asked.append(name) or given(name))
+    client = other.create_client(GetParameters, "/ours/get_parameters", qos_profile=DEEP)
+    until(client.service_is_ready)
+    for _ in range(500):
+        client.call_async(GetParameters.Request(names=["use_sim_time"] * MOST_ASKED))
+    client.call_async(GetParameters.Request(names=["use_sim_time"] * (MOST_ASKED + 1)))
+    spin_until(spinner, lambda: asked)
+    counts = [len(asked)]
+    for _ in range(10):
+        spinner._serve()
+        counts.append(len(asked))
+    steps = [after - before for before, after in zip([0, *counts], counts)]
+    assert 0 < max(steps) <= MOST_REQUESTS * MOST_ASKED and not any(step % MOST_ASKED for step in steps)
     spinner.close()

@@ -108,6 +108,8 @@ def test_no_pose_and_no_parameter_ends_a_node_and_no_flood_of_poses_fills_it(mak
         service = "set_parameters" if kind is SetParameters else "set_parameters_atomically"
         stranger.call(kind, f"ekf_node/{service}", parameters=[Parameter(name="tdoa_std", value=ParameterValue(type=200))])
     assert any("set_parameters: a request cannot be read" in line for line in process.lines)
+    many = stranger.call(SetParameters, "ekf_node/set_parameters", parameters=[Parameter(name="nothing")] * 1000)
+    assert not many.results
     text = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="x" * 10_000_000)
     stranger.call(SetParameters, "ekf_node/set_parameters", parameters=[Parameter(name="tdoa_std", value=text)])
     assert stranger.alive("ekf_node") and not any("Traceback" in line for line in process.lines)

@@ -137,6 +137,36 @@ def test_an_address_that_is_none(monkeypatch):
         list(parallel.over(times_ten, [1, 2], dask="nowhere"))
 
 
+@pytest.mark.parametrize(("address", "said"), [("tcp://10.0.0.1:8786", 1), ("ucx://10.0.0.2:1", 1), ("tls://10.0.0.1:8786", 0)])
+def test_whom_a_connection_trusts_is_said_once(address, said, capsys):
+    parallel._say_whom_it_trusts.cache_clear()
+    for _ in range(2):
+        parallel._say_whom_it_trusts(address)
+    err = capsys.readouterr().err
+    assert err.count(f"--dask: {address} is not encrypted: whoever reaches it") == err.count("\n") == said
+
+
+@pytest.mark.parametrize("encrypted", [False, True])
+def test_a_cluster_is_asked_by_the_certificates_of_dask(importable, encrypted, monkeypatch, capsys):
+    distributed = pytest.importorskip("dask.distributed")
+    dask = pytest.importorskip("dask")
+    if encrypted:
+        pytest.importorskip("cryptography")
+    security = distributed.Security.temporary() if encrypted else None
+    parallel._say_whom_it_trusts.cache_clear()
+    with distributed.LocalCluster(1, threads_per_worker=1, dashboard_address=None, security=security) as cluster:
+        address = cluster.scheduler_address
+        if encrypted:
+            with pytest.raises(InputError, match="no scheduler answers"):  # a stranger without them
+                list(parallel.over(times_ten, range(3), dask=address))
+            tls = {"ca-file": security.tls_ca_file, "client.cert": security.tls_client_cert, "client.key": security.tls_client_key}
+            with dask.config.set({f"distributed.comm.tls.{name}": value for name, value in tls.items()}):
+                assert list(parallel.over(times_ten, range(3), dask=address)) == [0, 10, 20]
+        else:
+            assert list(parallel.over(times_ten, range(3), dask=address)) == [0, 10, 20]
+    assert ("is not encrypted" in capsys.readouterr().err) != encrypted
+
+
 def test_on_a_dask_cluster(importable):
     distributed = pytest.importorskip("dask.distributed")
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:

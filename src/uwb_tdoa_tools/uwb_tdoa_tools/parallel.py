@@ -8,8 +8,10 @@ Processes are kept from one call to the next, if each ends of itself: whoever st
 
 import argparse
 import signal
+import sys
 import warnings
 from contextlib import contextmanager
+from functools import lru_cache
 
 from joblib import Parallel, cpu_count, delayed, parallel_config
 from threadpoolctl import threadpool_limits
@@ -31,7 +33,7 @@ def add_options(parser):
     add(
         "--dask", metavar="ADDRESS",
         help="run on the Dask cluster whose scheduler is there, e.g. tcp://10.0.0.1:8786; its workers need these "
-        "packages, and the recordings at the same paths",
+        "packages, and the recordings at the same paths; tls://... takes the certificates of Dask's configuration",
     )  # fmt: skip
 
 
@@ -129,13 +131,25 @@ def _cluster(address):
     except ImportError as error:
         raise InputError("--dask: needs dask.distributed, which is not installed; pip install distributed.") from error
     try:
-        get_address_host_port(address)  # raises ValueError; Client would too, but not end well
+        get_address_host_port(address)  # raises ValueError; Client would too, but not end well; TypeError without certificates
         client = Client(address, timeout=CONNECT_LIMIT, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except (OSError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"--dask: no scheduler answers at {address} ({reason}); start one, or correct it.") from error
+    _say_whom_it_trusts(client.scheduler.address)
     with client:
         yield {"backend": "dask", "client": client}
+
+
+@lru_cache(maxsize=None)  # once
+def _say_whom_it_trusts(address):
+    """Say that a connection is not encrypted: what Dask sends are pickles, which run code where they are read."""
+    if not address.startswith(("tls://", "wss://")):
+        print(
+            f"--dask: {address} is not encrypted: whoever reaches it, or can change what is sent, runs code here and on its workers; use "
+            "tls:// with certificates, or a network of your own",
+            file=sys.stderr,
+        )
 
 
 def whole_number(text):

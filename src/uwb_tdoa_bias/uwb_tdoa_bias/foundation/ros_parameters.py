@@ -13,6 +13,7 @@ from rclpy.exceptions import (
     ParameterUninitializedException,
 )
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 import yaml
 
 from .errors import InputError
@@ -21,6 +22,7 @@ KINDS = {float: "a number with a decimal point, e.g. 1.0", int: "a whole number"
 QOS = "qos_overrides."
 SAY_AGAIN = 10.0  # s from one warning to the next of the same kind
 LONGEST_NAME = 100  # letters of what a stranger wrote, in a sentence
+MOST_ASKED, MOST_REQUESTS = 100, 20  # parameters in a request, 0.1 ms each, and requests that wait: streams wait for all of them
 
 
 @dataclass(frozen=True)
@@ -91,13 +93,18 @@ class ParameterNode(Node):
         return self._refusal if new else None
 
     def create_service(self, srv_type, srv_name, callback, **options):
-        """Of rclpy, which makes those of the parameters by it and raises what they cannot read."""
+        """Of rclpy, which makes those of the parameters by it; they raise what they cannot read, and take 1000 requests at a time."""
         if not srv_type.__module__.startswith("rcl_interfaces."):
             return super().create_service(srv_type, srv_name, callback, **options)
+
+        options["qos_profile"] = QoSProfile(depth=MOST_REQUESTS)
 
         @wraps(callback)
         def answer(request, response):
             try:
+                asked = len(getattr(request, "parameters", getattr(request, "names", ())))
+                if asked > MOST_ASKED:
+                    raise InputError(f"it has {asked} parameters; at most {MOST_ASKED} are read.")
                 return callback(request, response)
             except Exception as error:
                 text = f"{srv_name}: a request cannot be read and changes nothing more: {error!r:.{LONGEST_NAME}}"
