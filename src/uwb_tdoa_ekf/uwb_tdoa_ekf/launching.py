@@ -220,5 +220,7 @@ def typed(texts):
 
 
 def _beside(path, file):
-    """A path that a file names, relative to that file."""
+    """A path that a file names, relative to that file. Raises InputError."""
+    if not isinstance(file, str):
+        raise InputError(f"{file!r} is no path; write a text.")
     return str(Path(path).parent / file)

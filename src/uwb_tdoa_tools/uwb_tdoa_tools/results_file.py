@@ -63,7 +63,7 @@ class ResultsFile:
                 self._file.truncate(place)
                 break
             content = self._parsed(line)
-            if set(content) != {"key", "result"}:
+            if set(content) != {"key", "result"} or not isinstance(content["key"], str):
                 raise self._foreign()
             self._places[content["key"]] = place
 
@@ -93,7 +93,7 @@ class ResultsFile:
     def _parsed(self, line):
         try:
             content = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             content = None
         if not isinstance(content, dict):
             raise self._foreign()

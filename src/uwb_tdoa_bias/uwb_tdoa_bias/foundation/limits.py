@@ -7,10 +7,12 @@ what is needed: a flight of an hour has 300 MB as a log, our YAML files have som
 # Whole files, bytes.
 RECORDING_BYTES = 1 << 30  # micro-SD log, or CSV as it lies on the disc
 CSV_BYTES = 200_000_000  # text of a recording; ten minutes of the full UTIL schema
-TABLE_BYTES = 100_000_000  # CSV of few columns
+TABLE_BYTES = 50_000_000  # CSV of other tools
 SURVEY_BYTES = YAML_BYTES = 1_000_000
 MODEL_BYTES = 4_000_000  # ONNX: a million weights
 ARRAYS_BYTES = 100_000_000  # of all arrays of an .npz file, unpacked; four million cells have 20 MB
+
+MAP_MARKERS = 5_000  # of a position bias map: memory takes their number squared, time cubed
 
 NAME_LENGTH = 100  # characters of a flight, a model, ...
 

@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from uwb_tdoa_bias.foundation.arrays_file import read_arrays
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.limits import MAP_MARKERS
 
 from .network import AngularNetwork
 
@@ -17,7 +18,6 @@ UNITS = "metres, square metres for added, in the world frame named by frame; bia
 INTERPOLATORS = ("thin_plate", "network")
 SMOOTHING = 0.3  # of the thin plate, at a marker of median count; see docs/debiasing.md
 FADE = 1.0  # m beyond the known region over which the correction goes to nothing; see docs/debiasing.md
-MOST_MARKERS = 20_000  # the thin plate takes their number squared
 LARGEST = 1e5  # m; more is a mistake
 _ARRAYS = {"cell": int, "at": float, "bias": float, "std": float, "count": int, "added": float}
 
@@ -55,8 +55,8 @@ class BiasMap:
         shapes = (self.cell.shape, self.bias.shape, self.std.shape, self.count.shape, self.added.shape)
         if d not in (2, 3) or shapes != ((n, d), (n, d), (n, d), (n,), (d, d)):
             raise InputError("bias map: cell, at, bias, std, count and added do not fit together.")
-        if n > MOST_MARKERS:
-            raise InputError(f"bias map: {n} markers are more than {MOST_MARKERS}; map with a larger step.")
+        if n > MAP_MARKERS:
+            raise InputError(f"bias map: {n} markers are more than {MAP_MARKERS}; map with a larger step.")
         arrays = (self.at, self.bias, self.std, self.added)
         if not (all(np.isfinite(array).all() for array in arrays) and 0.0 < self.step < np.inf):
             raise InputError("bias map: it holds a number that is not finite, or a step that is not above 0.")

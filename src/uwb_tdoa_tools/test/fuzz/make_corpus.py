@@ -28,6 +28,12 @@ TEXTS = {
     "config": ["ekf_node:\n  ros__parameters: {tdoa_std: 0.2, robust: gate, adapt_noise: false, iterations: 3}\n"],
     "places": ["places: [[0, 0, 0, 4, 0, 3], [0, 0, 0, 0.5, 5, 0]]\n"],
     "antenna": ["azimuth: [0, -1, 0, -1]\nelevation_1: [0, -9, 0, -9]\nelevation_2: [-1, -9, -1, -9]\ngain_offset: 2\n"],
+    "marks": ["marks:\n- {flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], std: 0.05}\n"],
+    "distances": ["a,b,distance,std\n0,1,5.25,0.01\n1,5,6.5,0.02\n"],
+    "tags": ["anchors_file: anchors.yaml\ntdoa_std: 0.2\ntags:\n  tag1: {body_frame: one}\n  tag2: {robust: gate}\n"],
+    "peers": ["flight,peer,mode,rmse_3d,diverged\na,ours,raw,0.25,False\nb,theirs,raw,0.5,True\n"],
+    "results": ['{"asked": {"written_by": "WRITTEN_BY", "seed": 1}}\n{"key": "a", "result": {"x": 1.5}}\n{"key": "b", "result": [1, null]}\n'],
+    "columns": ["t,from,to,d,gx,gy,gz,ax,ay,az\n10,0,1,250,,,,,,\n11,,,,0.1,0,0,0,0,9.81\n12,1,5,-500,0,0,0,0,0.5,9.81\n"],
     "survey": [SURVEY, "\n".join(survey_lines()[0]) + "\nlandmark,1,2,3\n", "anchors: {0: {position: [1, 2, 3]}}\n"],
     "table": ["true_x,x\n0.5,0.6\n1,1.1\n", 'x,note,true_x\r\n1,"a, b",2\r\n'],
     "csv": [
@@ -81,6 +87,7 @@ def _bags(folder):
     write("bag_mcap", "plain", bag_of("/odometry", MESSAGES["/odometry"], b""))  # without chunks and QoS, which take long
     text = (folder / "small" / "metadata.yaml").read_text()
     write("bag_metadata", 0, text.replace(metadata(folder / "small")["custom_data"][SUM_KEY], NO_SUM))
+    write("bag_packed", "small", (folder / "small" / "small.mcap").read_bytes())
     write_bag(flight, folder / "tables", "sqlite3")
     write_bag(replace(small_flight(0.008), **AIDS), folder / "aided")
     with open_bag(folder / "aided") as reader:

@@ -21,19 +21,26 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
+from uwb_tdoa_bias.foundation.version import written_by
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import BiasMap
 from uwb_tdoa_tools.bags import mcap
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import tdoa_messages
+from uwb_tdoa_ekf import launching
 from uwb_tdoa_tools.planning.noise import antenna_from_yaml
 from uwb_tdoa_tools.planning.places import Places
 from uwb_tdoa_tools.readers import read_survey, read_usd_log, read_util_csv
+from uwb_tdoa_tools.readers.columns import parse_columns, read_columns
 from uwb_tdoa_tools.readers.tables import number, read_table
+from uwb_tdoa_tools.results_file import ResultsFile
+from uwb_tdoa_tools.scoring.table import read_others
+from uwb_tdoa_tools.surveying.distances import read_distances
+from uwb_tdoa_tools.surveying.marks import read_marks
 
 CORPUS = Path(__file__).parent / "corpus"
 ANCHORS = Anchors([0, 1, 5], [[0.1, 0.2, 0.3], [4.0, 0.0, 3.0], [4.0, 5.0, 0.2]], np.full((3, 4), np.nan))
@@ -159,6 +166,44 @@ def bag_message(data):
         _finite(read_bag(path, anchors=None if topic == "/uwb/anchors" else ANCHORS))
 
 
+def bag_packed(data):
+    """A bag whose file is compressed as a whole: what is in it, or if that is no MCAP, the compressed file itself."""
+    folder = FOLDER / "packed"
+    folder.mkdir(exist_ok=True)
+    (folder / "small.mcap.zstd").write_bytes(mcap.zstd.compress(data) if data.startswith(mcap.MAGIC) else data)
+    text = (CORPUS / "bag_metadata" / "0").read_text().replace("small.mcap", "small.mcap.zstd")
+    text = text.replace("compression_mode: ''", "compression_mode: FILE").replace("compression_format: ''", "compression_format: zstd")
+    (folder / "metadata.yaml").write_text(text)
+    _finite(read_bag(folder))
+
+
+def columns(data):
+    asked = parse_columns("time=t:ms,anchor_a=from,anchor_b=to,tdoa=d:mm,gyro_x=gx,gyro_y=gy,gyro_z=gz,accel_x=ax,accel_y=ay,accel_z=az")
+    _finite(read_columns([_file(data)], asked, ANCHORS))
+
+
+def marks(data):
+    read_marks(_file(data), [_flight()])
+
+
+def distances(data):
+    read_distances(_file(data), ANCHORS)
+
+
+def tags(data):
+    launching.tags(_file(data), {})
+
+
+def peers(data):
+    read_others(_file(data))
+
+
+def results(data):
+    with ResultsFile(_file(data.replace(b"WRITTEN_BY", written_by().encode())), {"seed": 1}) as done:
+        for key in list(done._places):
+            done[key]
+
+
 def flyable(data):
     FlyableVolume.load(_file(data))
 
@@ -209,6 +254,10 @@ def _repacked(data):
     return _file(out.getvalue())
 
 
+def _flight():
+    return Flight("monday", ANCHORS, Tdoas(np.array([0.0, 60.0]), np.zeros(2, int), np.ones(2, int), np.ones(2)))
+
+
 @lru_cache(maxsize=None)
 def _definition(msgtype):
     return typestore().generate_msgdef(msgtype, ros_version=2)[0]
@@ -245,6 +294,7 @@ TARGETS = {
     for function in (
         yaml, anchors, effects, config, antenna, places, survey, table, log, log_sealed, log_salvaged, csv,
         csv_salvaged, bag_mcap, bag_mcap_sealed, bag_mcap_salvaged, bag_sqlite, bag_sqlite_salvaged, bag_metadata, bag_message,
+        bag_packed, columns, marks, distances, tags, peers, results,
         flyable, flyable_sealed, bias_map, bias_map_sealed, model,
     )
 }  # fmt: skip

@@ -59,6 +59,6 @@ def _from_table(path, planar):
         raise InputError(f"{path}: holds no positions; give one row for each.")
     table = np.array([[number(path, line, row, name) for name in names] for line, row in rows])
     d = len(names) // 2
-    _, place = np.unique(table[:, :d], axis=0, return_inverse=True)
+    _, place, counts = np.unique(table[:, :d], axis=0, return_inverse=True, return_counts=True)
     true, measured = (np.pad(side, ((0, 0), (0, 3 - d))) for side in (table[:, :d], table[:, d:]))
-    return [Part(measured[rows], true[rows]) for rows in (place.ravel() == k for k in range(place.max() + 1))]
+    return [Part(measured[rows], true[rows]) for rows in np.split(np.argsort(place.ravel(), kind="stable"), np.cumsum(counts)[:-1])]

@@ -26,7 +26,7 @@ def _mark(where, entry, lengths):
     if not isinstance(entry, dict) or set(entry) != set(KEYS):
         raise InputError(f"{where}: must be as {EXAMPLE}.")
     flight, first, last, position, std = (entry[key] for key in KEYS)
-    if flight not in lengths:
+    if not isinstance(flight, str) or flight not in lengths:
         raise InputError(f"{where}: there is no flight {flight!r}; given are {', '.join(lengths)}.")
     try:
         first, last, std, position = float(first), float(last), float(std), tuple(map(float, position))
