@@ -131,6 +131,7 @@ def test_every_kind_of_line_end(read, end):
         (csv_text(TDOA, ["1,0,1,1", "2,0,1,nan", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
         (csv_text(TDOA, ["1,0,1,1", "2,0,1,one", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
         (csv_text(TDOA + ",t_baro,baro", ["1,0,1,1,1,99.5", "2,0,1,2,2,nan"]), 2, "baro: 1 of 2 records left out"),
+        (csv_text(TDOA + ",t_baro,baro", ["1,0,1,1e31,1,99.5", "2,0,1,2,2,99"]), 1, "tdoa: 1 of 2 records left out"),
         (csv_text(TDOA + ",t_tof,tof", ["1,0,1,1,1,31", "2,0,1,2,2,-1e12"]), 2, "tof: 1 of 2 records left out"),
     ],
 )

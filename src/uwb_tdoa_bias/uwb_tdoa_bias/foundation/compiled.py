@@ -31,6 +31,8 @@ with _hidden("scipy", "coverage"):
     from numba import config, njit
     import numba.np.arraymath  # noqa: F401
 
+config.CACHE_LOCATOR_CLASSES = ""  # numba would import those that a .numba_config.yaml in the present folder names
+
 
 def compiled(function):
     """Decorator: compile `function`, which may call others below its folder and of the foundation, and cache it."""

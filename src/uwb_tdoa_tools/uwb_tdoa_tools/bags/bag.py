@@ -29,6 +29,7 @@ from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_bias.foundation.version import written_by
 
+from ..readers.streams import LARGEST_NUMBER
 from . import messages as bag_messages, placing
 from .files import check_output, is_bag, new_bag, open_bag, readable, remarks_of
 from .integrity import metadata
@@ -46,7 +47,7 @@ _AIDS = {  # topic and field of Flight: its type, messages of it, a row of a mes
         bag_messages.height_of,
     ),
     "pressure": (
-        "sensor_msgs/msg/FluidPressure", bag_messages.pressure_messages, bag_messages.pressure_row, np.isfinite,
+        "sensor_msgs/msg/FluidPressure", bag_messages.pressure_messages, bag_messages.pressure_row, bag_messages.sound,
         bag_messages.pressure_of,
     ),
     "velocity": (
@@ -170,7 +171,7 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, spare
         meta = {**about["meta"], "bag": str(path)}
         remarks, name_of, frames = [], Names(namespace, topics), {}
 
-        def stream(topic, msgtype, row, make, sound=np.isfinite):
+        def stream(topic, msgtype, row, make, sound=bag_messages.sound):
             found = _find(path, connections, name_of(topic), msgtype)
             stamps, rows, falls, frames[topic] = _table(path, reader, found, row)
             if falls:
@@ -289,7 +290,7 @@ def _not_finite(path, topic, stamps, rows, sound):
     row, column = np.argwhere(~sound(rows))[0]
     return InputError(
         f"{path}: {topic}, message {row + 1} of {len(rows)} at {stamps[row]:.3f} s: its number {column + 1} is "
-        f"{rows[row, column]}; it must be finite: leave such messages out with --salvage."
+        f"{rows[row, column]}; it must be finite, within +-{LARGEST_NUMBER:g}: leave such messages out with --salvage."
     )
 
 

@@ -1,6 +1,6 @@
 """The arrays of a Flight as ROS messages (of a rosbags typestore), and back.
 
-`<stream>_sound` tells which numbers of rows (n, k) may be there: (n, k) bool; without it, those that are finite.
+`sound`, or `<stream>_sound`, tells which numbers of rows (n, k) may be there: (n, k) bool.
 What was not measured is marked as the messages say: an orientation of (0, 0, 0, 0), an orientation_covariance[0] of -1,
 covariances of 0 for unknown.
 """
@@ -11,6 +11,8 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Height, Imu, Pressure, Tdoas, Truth, Velocity
+
+from ..readers.streams import LARGEST_NUMBER
 
 BODY_FRAME, ANTENNA_FRAME = "base_link", "uwb_antenna"
 FIELD_OF_VIEW, LONGEST_RANGE = 0.47, 1000.0  # rad, m, of a sensor_msgs/Range: typical, and a bound that bounds nothing
@@ -28,6 +30,10 @@ def nanoseconds(name, t):
 def stamp_of(header):
     """Nanoseconds of a header's stamp. (Dividing them by 1e9 gives back the very float that was written.)"""
     return header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+def sound(rows):
+    return np.abs(rows) <= LARGEST_NUMBER  # NaN is not
 
 
 def imu_messages(imu, store):
@@ -108,7 +114,7 @@ def velocity_row(message):
 
 def velocity_sound(rows):
     unknown = np.isinf(rows[:, 3:6])
-    return np.hstack([np.isfinite(rows[:, 0:3]) | unknown, np.ones(unknown.shape, dtype=bool)])
+    return np.hstack([sound(rows[:, 0:3]) | unknown, np.ones(unknown.shape, dtype=bool)])
 
 
 def velocity_of(stamps, rows):

@@ -10,6 +10,7 @@ from .optical_flow import velocity_of
 
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
+LARGEST_NUMBER = 1e30  # of anything, in whatever unit: what is computed of it stays finite
 LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
 SALVAGE = "read what is sound of it with --salvage"
 DAY = 86400.0  # s
@@ -76,14 +77,13 @@ def _sound(key, columns, meta, salvage):
         judged = {name: values for name, values in columns.items() if not name.startswith("q")}  # not recorded
     bad = np.zeros(len(columns["t"]), dtype=bool)
     for name, values in judged.items():
-        values, largest = values.astype(float), LARGEST.get(name)
-        wrong = ~np.isfinite(values) if largest is None else ~(np.abs(values) <= largest)
+        values, largest = values.astype(float), LARGEST.get(name, LARGEST_NUMBER)
+        wrong = ~(np.abs(values) <= largest)
         if wrong.any() and not salvage:
             row = int(np.flatnonzero(wrong)[0])
-            wanted = "finite" if largest is None else f"within +-{largest:g}"
             raise InputError(
                 f"{meta['source']}: {key}, record {row + 1} of {len(bad)} at {columns['t'][row]:.3f} s: {name} is "
-                f"{columns[name][row]}; it must be {wanted}: leave such records out with --salvage."
+                f"{columns[name][row]}; it must be finite, within +-{largest:g}: leave such records out with --salvage."
             )
         bad |= wrong
     if salvage and not bad.all():
