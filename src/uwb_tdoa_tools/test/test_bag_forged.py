@@ -108,6 +108,16 @@ def test_a_file_is_unpacked_once(tmp_path):
         read_bag(tmp_path / "bag")
 
 
+def test_a_definition_that_takes_a_minute_to_read(tables):
+    bag, run = tables
+    fields = "".join(f"float64 x{k}\n" for k in range(20_000))
+    run(f"UPDATE message_definitions SET encoded_message_definition = '{fields}'", "UPDATE topics SET type_description_hash = ''")
+    began = time.process_time()
+    with pytest.raises(InputError, match="the definition of uwb_tdoa_msgs/msg/Tdoa in the bag has more than 65536 bytes"):
+        read_bag(data_file(bag))
+    assert time.process_time() - began < AT_ONCE
+
+
 @pytest.mark.parametrize("salvage", [False, True])
 def test_chunks_may_not_unfold_to_more_than_all_of_them_may(tmp_path, monkeypatch, salvage):
     chunk = chunked(b"zstd", mcap.zstd.compress(bytes(8 << 20)), 8 << 20)

@@ -28,6 +28,7 @@ MODEL_WORK = 2_000_000  # multiplications and additions for each row: some milli
 CHUNK_BYTES = 256 << 20  # of MCAP, unpacked; rosbag2 makes chunks of 0.75 MB
 MESSAGE_BYTES = 64 << 20  # of any topic: an image, a cloud of points
 READ_BYTES = 2 << 20  # of a message that is taken apart: 10 000 anchors
+DEFINITION_BYTES = 64 << 10  # of the text that defines a message type; those of ROS have up to 15 kB
 FILE_BYTES = 8 << 30  # of all data files that are unpacked
 UNPACKED_FREE, UNPACKED_RATIO = 16 << 20, 100  # see `most_unpacked`
 

@@ -9,6 +9,7 @@ from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.limits import DEFINITION_BYTES
 
 OUR_PACKAGE = "uwb_tdoa_msgs"
 OUR_TYPES = ("Tdoa", "TdoaCorrected", "TdoaResidual", "Anchor", "AnchorArray", "EstimatorStatus")
@@ -86,6 +87,8 @@ def _recorded_hash(path, connection):
     """Hash of the type that a topic was recorded with; empty where the bag does not say. Raises InputError."""
     recorded = connection.digest
     if not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG:  # a data file without metadata.yaml
+        if len(connection.msgdef.data) > DEFINITION_BYTES:
+            raise InputError(f"{path}: the definition of {connection.msgtype} in the bag has more than {DEFINITION_BYTES} bytes; record it again.")
         try:
             recorded = _hash_of(connection.msgdef.data, connection.msgtype)
         except Exception as error:  # rosbags raises whatever its parsers run into
