@@ -111,6 +111,7 @@ def test_tags_of_a_file(tmp_path):
     [
         ("{}", "expected a mapping 'tags'"), ("tags: {a: 1}", "a: 1 must be a mapping"), ("tags: {a: {gaet: 1}}", "gaet: .* write gate"),
         ("tags: {a: {gate: }}", "gate: None is no value"), ("tags: {a: {gate: {b: 1}}}", "gate: .* is no value"),
+        ("anchors_file: []\ntags: {a: {}}", ".. is no path"), ("tags: {a: {params_file: 3}}", "3 is no path"),
     ],
 )
 def test_a_bad_file_is_refused(tmp_path, text, named):

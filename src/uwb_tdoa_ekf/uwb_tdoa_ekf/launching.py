@@ -168,8 +168,8 @@ def tags(path, values, log_level="info"):
                 raise InputError(f"tags: {namespace}: {own!r} must be a mapping of parameters, or {{}}.")
             merged = {"body_frame": f"{namespace}/base_link", **content, **(own or {}), **values}
             file = merged.pop("params_file", None)
-            files = {name: [_beside(path, file)] for name in ("bias_node", "ekf_node")} if file else {}
-            merged |= {name: _beside(path, merged[name]) for name in PATHS if merged.get(name)}
+            files = {name: [_beside(path, file)] for name in ("bias_node", "ekf_node")} if file not in (None, "") else {}
+            merged |= {name: _beside(path, merged[name]) for name in PATHS if merged.get(name) not in (None, "")}
             starts += tag(str(namespace), merged, files, log_level)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -51,7 +51,7 @@ def test_what_was_asked_otherwise_is_not_mixed(tmp_path):
         fill(path, ["a"], {"seed": 2, "smooth": False, "effects": "1f"})
 
 
-@pytest.mark.parametrize("content", ["flight,rmse\n", "[1]\n", "not a result", '{"runs": []}\n', '{"asked": 1}\n', b"\xff\x00\n"])
+@pytest.mark.parametrize("content", ["flight,rmse\n", "[1]\n", "not a result", '{"runs": []}\n', '{"asked": 1}\n', b"\xff\x00\n", "[" * 100_000 + "\n"])
 def test_another_file_is_left_alone(tmp_path, content):
     path = tmp_path / "other"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())

@@ -132,6 +132,7 @@ def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
     "changes, words",
     [
         ({"flight": "tuesday"}, "no flight 'tuesday'"),
+        ({"flight": ["monday"]}, "no flight .'monday'."),
         ({"to": 1e4}, "must lie"),
         ({"position": [1.0, 2.0]}, "three coordinates"),
         ({"position": "here"}, "write it as"),

@@ -206,7 +206,7 @@ def of_sqlite(data, chance):
         try:
             connection.execute(chance.choice(STATEMENTS).format(**words))
             connection.commit()
-        except sqlite3.Error:  # it is damaged by now, or lacks that
+        except (sqlite3.Error, UnicodeDecodeError):  # it is damaged by now, or lacks that
             return of_bytes(data, chance)
         finally:
             connection.close()
