@@ -23,6 +23,8 @@ ROOT = Path(__file__).resolve().parents[1]
 VENV, BUILD, INSTALL, LOG = (ROOT / name for name in (".venv", "build", "install", "log"))
 PYTHON = VENV / "bin" / "python"
 STEPS = VENV / "steps.json"
+LOCK = ROOT / ".dev" / "requirements.lock"  # requirements.txt and what they need in turn, with hashes
+AS_LOCKED = "--only-binary", ":all:", "--no-binary", "empy", "--require-hashes", "-r"  # empy has no wheel; of the rest nothing is run
 MESSAGES = ["uwb_tdoa_msgs"]
 PACKAGES = ["uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools"]
 VERSION = f"{sys.version_info.major}.{sys.version_info.minor}"
@@ -54,7 +56,7 @@ def main(command):
 
 def prepare():
     done = read_steps()
-    inputs = [ROOT / "requirements.txt", ROOT / ".dev" / "constraints.txt", ROOT / ".dev" / "wheels.py"]
+    inputs = [ROOT / "requirements.txt", LOCK, ROOT / ".dev" / "wheels.py"]
     environment = digest(inputs, str(ROOT), BASE_PYTHON, VERSION, str(OWN_ROS))
     if done.get("environment") != environment:
         check_machine()
@@ -100,7 +102,7 @@ def make_environment():
             missing = missing_requirements()
             install(f"install what ROS 2 Jazzy lacks ({len(missing)} packages)", [*missing, *LIMITS])
         else:
-            install("install ROS 2 Jazzy and the Python packages", ["--no-compile", "-r", ROOT / "requirements.txt"])
+            install("install ROS 2 Jazzy and the Python packages", ["--no-compile", *AS_LOCKED, LOCK])
     except Failure as failure:
         output = (LOG / "dev_pip.log").read_text(errors="replace")
         if re.search(r"NewConnectionError|NameResolution|Timeout|ProxyError|from versions: none", output):

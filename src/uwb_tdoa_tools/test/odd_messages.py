@@ -1,8 +1,9 @@
 """What nodes do with messages that no driver should send: python src/uwb_tdoa_tools/test/odd_messages.py 10000
 
-Messages of every type that a node takes, so many on each topic, changed at random: cut off, longer, of a type without its last 8
-bytes, bits turned over, of another encoding, noise. In between come whole ones. No node may end; every message of a stream is
-received or counted as unreadable, every other one that cannot be read is counted; memory stays what it was.
+Messages of every type that a node takes, so many on each topic, changed at random: numbers that are none, huge, tiny or negative, ids
+and stamps of anything, long names; then, as bytes, cut off, longer, of a type without its last 8 bytes, bits turned over, of another
+encoding, noise. In between come whole ones. No node may end; every message of a stream is received or counted as unreadable, every
+other one that cannot be read is counted; memory stays what it was.
 """
 
 import argparse
@@ -39,6 +40,7 @@ ALIGNED = 4  # bytes; the middleware fills up to that, so that other lengths arr
 SHORTEST = 4  # bytes; after an empty message Fast DDS delivers nothing more of a reliable publisher, to whomever
 PATIENCE = 60.0  # s
 LATCHED = "uwb/anchors", "/tf_static"
+EXTREME = np.nan, np.inf, -np.inf, 1e308, -1e308, 1e150, 1e16, 1e-320, 0.0, -1.0
 STREAMS = {  # of each node: topic, type, and what counts those that could be read
     "ekf_node": {
         "imu/data": (Imu, "IMU samples received"), "uwb/tdoa_corrected": (TdoaCorrected, "TDOAs received"),
@@ -91,22 +93,48 @@ def changed(data, rng, step=1):
     return bytes(out)
 
 
-def whole(kind, k):
-    """A whole message, the k-th, as bytes."""
+def odd(message, rng):
+    """The same message with some values that are odd, but that its type may have."""
+    for name, kind in message.get_fields_and_field_types().items():
+        value = getattr(message, name)
+        parts = [value] if hasattr(value, "get_fields_and_field_types") else value if isinstance(value, list) else []
+        for part in parts:
+            odd(part, rng)
+        if parts or rng.random() > 0.2:
+            continue
+        if kind == "string":
+            setattr(message, name, "x" * int(rng.choice([0, 1, 200, 5000])))
+        elif isinstance(value, float):
+            setattr(message, name, float(np.clip(rng.choice(EXTREME), *([-3e38, 3e38] if kind == "float" else [-np.inf, np.inf]))))
+        elif isinstance(value, int) and not isinstance(value, bool):
+            signed, bits = not kind.startswith("u"), int("".join(filter(str.isdigit, kind)) or 8)
+            low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+            setattr(message, name, int(rng.choice([low, high, int(rng.integers(low, high))])))
+        elif isinstance(value, np.ndarray) and len(value):
+            value[rng.integers(len(value), size=3)] = rng.choice(EXTREME, size=3)
+    return message
+
+
+def whole(kind, k, change=lambda message: message):
+    """A whole message, the k-th, as bytes; change(message) : what is serialized instead."""
+    return serialize_message(change(_message(kind, k)))
+
+
+def _message(kind, k):
     if kind is AnchorArray:
-        return serialize_message(anchors_to_message(ANCHORS))
+        return anchors_to_message(ANCHORS)
     message = kind()
     if kind is TFMessage:
         message.transforms = [TransformStamped(child_frame_id=child) for child in ("base_link", "imu")]
         for transform in message.transforms:
             transform.header.frame_id = "odom"
             transform.header.stamp.sec = 100 + k // 100
-        return serialize_message(message)
+        return message
     message.header.frame_id = "map" if kind is PoseWithCovarianceStamped else "base_link"
     message.header.stamp.sec, message.header.stamp.nanosec = 100 + k // 100, k % 100 * 10_000_000
     if hasattr(message, "anchor_a"):
         message.anchor_a, message.anchor_b = k % 8, (k + 1) % 8
-    return serialize_message(message)
+    return message
 
 
 def ordeal(name, count, folder, seed=1):
@@ -157,7 +185,8 @@ def _send(node, processes, publishers, name, count, rng):
     for k in range(count):
         for topic, publisher in publishers.items():
             kind, single = publisher.msg_type, topic in SINGLE[name]
-            data = changed(whole(kind, k), rng, ALIGNED if single else 1)
+            data = whole(kind, k, (lambda message: odd(message, rng)) if rng.random() < 0.5 else (lambda message: message))
+            data = changed(data, rng, ALIGNED if single else 1)
             if single:
                 out.expected[topic] += not is_readable(data, kind)
             publisher.publish(data)
@@ -228,8 +257,11 @@ def main():
     args, bad = parser.parse_args(), False
     with tempfile.TemporaryDirectory() as folder:
         for name in STREAMS:
+            began = time.monotonic()
             account = ordeal(name, args.count, Path(folder), args.seed)
-            print(name, json.dumps({k: v for k, v in vars(account).items()}), wrong(account) or "all accounted for", flush=True)
+            took, total = time.monotonic() - began, sum(account.sent.values())
+            print(name, json.dumps({k: v for k, v in vars(account).items()}), wrong(account) or "all accounted for")
+            print(f"{name}: {total} messages in {took:.0f} s, {total / took:.0f} in a second", flush=True)
             bad |= bool(wrong(account))
         fine = clock_ordeal(args.count, Path(folder), args.seed)
         print("/clock:", "goes on" if fine else "ended")

@@ -1,9 +1,11 @@
 """What ./dev says without doing anything, and what it says is missing. Nothing here installs or builds."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -113,10 +115,36 @@ def test_a_jazzy_without_rclpy(workspace):
     assert err.startswith("dev: error: ROS_DISTRO is jazzy, but ") and "cannot import rclpy" in err
 
 
+def test_what_is_not_what_was_locked_is_not_installed(workspace, machine):
+    environment = machine(python3=BASE_PYTHON, **{"c++": script(workspace / "c++", "exit 1")})
+    other = workspace / "other-1.0-py3-none-any.whl"  # in the place of one of this name and version
+    with zipfile.ZipFile(other, "w") as wheel:
+        wheel.writestr("other-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+        wheel.writestr("other-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        wheel.writestr("other-1.0.dist-info/RECORD", "")
+    (workspace / ".dev" / "requirements.lock").write_text(f"other==1.0 --hash=sha256:{64 * '0'}\n")
+    code, _, err = dev(workspace, "build", PIP_NO_INDEX="1", PIP_FIND_LINKS=str(workspace), **environment)
+    assert code == 1 and "DO NOT MATCH THE HASHES" in (workspace / "log" / "dev_pip.log").read_text()
+    assert not (workspace / ".venv" / "steps.json").exists()
+
+
+@pytest.mark.parametrize(("asked", "lock"), [("requirements.txt", ".dev/requirements.lock"), (".ci/requirements.txt", ".ci/requirements.lock")])
+def test_all_that_is_installed_is_locked(asked, lock):
+    entry = re.compile(r"^(\S+)==(\S+)((?: \\\n    --hash=sha256:[0-9a-f]{64})*)$", re.MULTILINE)
+    locked = {(canonical(name), version): hashes for name, version, hashes in entry.findall((ROOT / lock).read_text())}
+    wanted = [line.split("==") for line in (ROOT / asked).read_text().splitlines() if "==" in line]
+    assert all(locked.values()) and {(canonical(name), version) for name, version in wanted} < locked.keys()
+
+
+def canonical(name):
+    """Of a distribution, as PyPA specifies."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
 def test_a_step_that_fails_shows_the_end_of_its_log(workspace, machine):
     compiler = script(workspace / "c++", "exit 1")
     environment = machine(python3=BASE_PYTHON, **{"c++": compiler})
-    (workspace / "requirements.txt").write_text("no package is named like this\n")
+    (workspace / ".dev" / "requirements.lock").write_text("no package is named like this\n")
     code, _, err = dev(workspace, "build", **environment)
     assert code == 1
     assert "  | ERROR: Invalid requirement" in err
