@@ -76,7 +76,7 @@ def container():
 def test_the_container_has_what_it_copies_and_calls():
     steps = container()
     assert steps[0] == ["FROM", "ros:jazzy"] and steps[1] == ["SHELL", '["/bin/bash", "-c"]']
-    assert {word for word, _ in steps} <= {"FROM", "SHELL", "WORKDIR", "COPY", "ENV", "RUN", "CMD"}
+    assert {word for word, _ in steps} <= {"FROM", "SHELL", "WORKDIR", "COPY", "ENV", "RUN", "USER", "CMD"}
     for word, rest in steps:
         if word == "COPY":
             assert all((ROOT / name).exists() for name in rest.split()[:-1])
@@ -99,6 +99,18 @@ def test_the_container_installs_what_is_declared():
     assert without_key == {"onnx"} and without_key <= pinned  # the only import without a rosdep key (test_layout.py)
     order = [word for word, _ in steps]
     assert order.index("COPY") < order.index("RUN") and order[-1] == "CMD"
+
+
+def test_the_container_runs_as_an_ordinary_user_beside_the_host_and_with_pins():
+    steps, first = container(), (ROOT / "Containerfile").read_text().splitlines()[0]
+    order = [word for word, _ in steps]
+    (user,) = (rest for word, rest in steps if word == "USER")
+    assert user != "root" and any(f"useradd --create-home {user}" in rest for word, rest in steps if word == "RUN")
+    after = steps[order.index("USER") + 1 :]
+    assert [word for word, _ in after] == ["RUN", "CMD"] and "compile_nodes" in after[0][1]  # what is compiled belongs to the user
+    assert "podman run" in first and "--net" not in first
+    chosen = next(re.search(r'grep -E "(.*?)" requirements.txt', rest)[1] for word, rest in steps if "pip_constraint.txt" in rest and word == "RUN")
+    assert [line.split("==")[0] for line in (ROOT / "requirements.txt").read_text().splitlines() if re.match(chosen, line)] == ["rosbags", "onnx"]
 
 
 @pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
