@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.core.verdicts import REPEATED
-from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.estimator import MOST_WAITING, Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
 BEGIN, END = 5.0, 9.0  # s, of a fault
@@ -61,3 +61,17 @@ def test_equal_values_of_other_pairs_or_stamps_are_no_repeats():
         estimator.add_tdoa(1.0, *pair, d)
     estimator.finish()
     assert estimator.counts["repeated"] == 1
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-9])
+def test_a_stream_whose_stamps_do_not_go_on_is_used_and_does_not_grow(step):
+    flight = fly(3, 3.0, imu_rate=100.0, tdoa_rate=100.0)
+    imu, tdoa, n = flight.imu, flight.tdoa, MOST_WAITING + 500
+    estimator = Estimator(flight.anchors)
+    estimator.add_imu(imu.t, imu.gyro, imu.accel)
+    estimator.add_tdoa(tdoa.t[[1, 0]], tdoa.a[:2], tdoa.b[:2], tdoa.d[:2])  # out of order: what is stamped alike is waited for
+    ids = flight.anchors.ids[np.arange(n) % len(flight.anchors)]
+    for k in range(3):
+        estimator.add_tdoa(100.0 + step * (k * n + np.arange(n)), ids, np.roll(ids, 1), np.zeros(n))
+        estimator.advance()
+        assert estimator.waiting[1] <= MOST_WAITING

@@ -30,6 +30,7 @@ KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
 RATE_SAMPLES = 10  # inertial samples from whose stamps their rate is known
 MOST_POSES = 100  # that were told and wait for their time
+MOST_WAITING = 2000  # messages of a stream: 2 s at 1 kHz; those of one stamp for ever, or a nanosecond apart, would never be passed
 SILENT = 1.0  # s of stamps after which height, pressure or velocity is not waited for any more, until it is back
 OF_AIDS = 0.5  # share of `lag` for which they are waited for: bias_node's `hold` must outlast that by far
 
@@ -222,7 +223,7 @@ class Estimator:
         return out
 
     def advance(self):
-        """Use every message that nothing earlier can precede any more. Returns (Odometry, Residuals), possibly empty."""
+        """Use every message that nothing earlier can precede any more, and of more than MOST_WAITING the first. Returns (Odometry, Residuals), possibly empty."""
         stamps = [gate.newest for gate in self._gates]
         newest = max(stamps[IMU_STREAM], stamps[TDOA_STREAM])
         passed = []  # by each stream that is waited for
@@ -232,7 +233,8 @@ class Estimator:
                     passed.append(order.passed(t, self.reorder))
             elif newest - SILENT < t < newest:
                 passed.append(max(order.passed(t, self.reorder), newest - OF_AIDS * self.lag))
-        return self._feed(max(min(passed), newest - self.lag))
+        too_many = (waiting.rows["t"][-MOST_WAITING] for waiting in self._waiting if len(waiting) > MOST_WAITING)
+        return self._feed(max(min(passed), newest - self.lag, *too_many))
 
     def finish(self):
         """Use everything that still waits. Returns (Odometry, Residuals)."""

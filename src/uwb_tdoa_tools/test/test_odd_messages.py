@@ -11,6 +11,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 
 FEW = 100
+GROWTH = 100e6  # bytes in the second half; an effect that is compiled takes 50 MB
 
 
 @pytest.mark.parametrize("name", ["ekf_node", pytest.param("bias_node", marks=pytest.mark.slow)])
@@ -19,6 +20,7 @@ def test_no_message_ends_a_node_and_each_is_accounted_for(name, tmp_path):
     assert not odd_messages.wrong(account)
     assert all(count > FEW // 4 for count in account.unreadable.values())  # they are odd enough
     assert all(count > FEW // 20 for count in account.received.values())
+    assert account.memory[-1] < account.memory[len(account.memory) // 2] + GROWTH
 
 
 @pytest.mark.slow
