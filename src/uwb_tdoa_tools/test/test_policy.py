@@ -69,11 +69,13 @@ def of_graph(observer, node):
 @pytest.mark.parametrize("name", KINDS)
 def test_a_node_may_do_what_it_does_and_nothing_else(name, arguments):
     rclpy.init(args=arguments[name])
+    node = KINDS[name](arguments[name])
+    nodes, observer = [node, *node.members], rclpy.create_node("observer")
     try:
-        node = KINDS[name](arguments[name])
-        nodes, observer = [node, *node.members], rclpy.create_node("observer")
         assert allowed()[name] == {each.get_fully_qualified_name(): of_graph(observer, each) for each in nodes}
     finally:
+        for each in (*nodes, observer):
+            each.destroy_node()  # or the next test sees it
         rclpy.shutdown()
 
 
