@@ -9,8 +9,8 @@ _OTHERS = re.compile(r"[^\w .,:;+=()#-]")
 
 
 def printable(text):
-    """The text with what is no character to see (line ends, escape sequences, marks that turn the direction of writing, halves of
-    characters) written out, as \\x1b: a terminal shows it and does nothing else."""
+    r"""The text with what is no character to see (line ends, escape sequences, marks that turn the direction of writing, halves of
+    characters) written out, as \x1b: a terminal shows it and does nothing else."""
     return "".join(one if one.isprintable() else one.encode("unicode_escape", "surrogatepass").decode() for one in str(text))
 
 

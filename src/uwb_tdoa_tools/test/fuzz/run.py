@@ -149,7 +149,7 @@ def blind(name, seconds, out, chance):
                     (out / "findings" / f"{name}-{re.sub('[^-.a-zA-Z0-9_]', '_', key)}").write_bytes(data)
             signal.setitimer(signal.ITIMER_PROF, 0.0)
             if count % 1000 == 0:
-                print(f"executions: 1000\n", end="", flush=True)
+                print("executions: 1000\n", end="", flush=True)
     finally:
         print(f"executions: {count % 1000}", flush=True)
         targets.clean_up()
