@@ -36,6 +36,7 @@ def test_a_parameter_that_is_none_is_told(capsys):
         (["--inject", "gremlins", "1=2"], "'gremlins' needs the name of an effect"),
         (["--inject", "anchor_delay", "3=x"], "anchor_delay"),
         (["--resume", "kept.jsonl", "--plot", "x.png"], "--resume: keeps verdicts alone"),
+        (["--model", "nowhere.onnx"], "nowhere.onnx"),
         (["--peer", "nowhere.so"], "nowhere.so cannot be loaded"),
         (["--json", "nowhere/x.json"], "its directory does not exist"),
     ],

@@ -5,6 +5,7 @@ import pytest
 from test_benchmark_peer import SOURCE, built, pytestmark  # noqa: F401
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.benchmark.peer import Peer
 from uwb_tdoa_tools.flying.path import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import judge
@@ -33,6 +34,13 @@ def test_it_is_flown_by_and_judged_like_ours(tmp_path):
 def test_one_that_nobody_told_where_it_is_has_no_place(tmp_path):
     flown = fly(Task(HALL, seed=2, peer=str(built(tmp_path, SOURCE + STATE)), path=Circles(turns=1, turn_time=4.0)))
     assert judge(flown)["why"] == "refused to arm"  # the start was NaN, and this one stays there
+
+
+def test_what_a_library_remembers_of_one_flight_is_not_in_the_next(tmp_path):
+    counting = "void tdoa_peer_state(double *at, double *v, double *q) { static int calls; at[0] = ++calls; }"
+    library = built(tmp_path, SOURCE + counting)
+    first, second = Peer(library, own=True), Peer(library, own=True)
+    assert [peer.state()[0][0] for peer in (first, first, second)] == [1.0, 2.0, 1.0]
 
 
 def test_one_that_does_not_tell_its_state_cannot_be_flown_by(tmp_path):

@@ -9,16 +9,19 @@ from uwb_tdoa_tools.flying.simulator import Measured
 from uwb_tdoa_tools.flying.transport import Transport
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
+from uwb_tdoa_bias.foundation.radio import arrival_bias
+from uwb_tdoa_tools.simulation.constellations import constellation
+from uwb_tdoa_tools.simulation.ranging import tag_link
 
 CLEAN = replace(HALL, floor_effect=False, noise=0.0, outlier_share=0.0, delay=0.0, bearing_bias=0.0)
-HIGH = np.array([0.5, 0.3, 1.2])
+HIGH, LEVEL = np.array([0.5, 0.3, 1.2]), np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def residual(world, p=HIGH, seed=0, duration=20.0, happens=(np.inf, np.inf)):
     """(Radio, what each TDOA has beside geometry (n,) m) at one place."""
     radio = Radio(world, seed, duration)
     radio.happens(*happens)
-    d = radio.measured(slice(0, len(radio.t)), np.tile(p, (len(radio.t), 1)))
+    d = radio.measured(slice(0, len(radio.t)), *(np.tile(one, (len(radio.t), 1)) for one in (p, LEVEL)))
     distance = np.linalg.norm(p - radio.positions, axis=1)
     return radio, d - (distance[radio.b] - distance[radio.a])
 
@@ -67,6 +70,16 @@ def test_an_installation_is_the_same_in_every_flight():
         first, second = Radio(world, 0, 5.0), Radio(world, 1, 5.0)
         assert np.array_equal(first.constants, second.constants) == alike and (first.floor.values == second.floor.values) == alike
         assert not np.array_equal(first.t[:100], second.t[:100])
+
+
+def test_antennas_make_late_what_they_make_late_in_simulate():
+    world = replace(CLEAN, layout=constellation("pillars"), antennas=True)
+    radio, rest = residual(world, seed=4)
+    late = arrival_bias(HIGH, LEVEL, world.anchors.positions, world.anchors.orientations, tag_link(4))
+    assert len(late) == 12 and np.ptp(late) > 0.03
+    np.testing.assert_allclose(rest, late[radio.b] - late[radio.a], atol=1e-12)
+    turned = replace(world, layout=replace(world.layout, orientations=world.layout.orientations[::-1]))
+    assert np.abs(residual(turned, seed=4)[1] - rest).max() > 0.01
 
 
 def test_a_silence_is_one():

@@ -97,6 +97,13 @@ def test_after_a_minute_it_flies_once_more_from_where_it_was_carried():
     assert position_at(np.array([truth.t[-1]]), truth)[0, 2] < 0.05
 
 
+def test_it_is_flown_by_what_a_network_corrects():
+    world, path = replace(PERFECT, antennas=True), Circles(turns=1, turn_time=4.0)
+    models = None, "default"
+    plain, corrected = (judge(fly(Task(world, seed=1, told="place", model=model, path=path))) for model in models)
+    assert corrected["landed"] and corrected["estimation"] < 0.9 * plain["estimation"]
+
+
 @pytest.mark.parametrize("name", ["table", "person", "three-kinds", "tdoa3", "jitter", "rectifying", "gusts"])
 def test_every_world_can_be_flown_in(name):
     world = replace(WORLDS[name], aids=("height", "pressure", "velocity"))

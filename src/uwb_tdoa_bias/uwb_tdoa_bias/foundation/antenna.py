@@ -113,5 +113,9 @@ class Antenna:
         and the rest, 1 - g, came over the board by a path that is `delay_span` longer; the centroid of the two is late
         by delay_span (1 - g). So the best direction is not delayed, and a null is late by nearly all of delay_span.
         """
-        amplitude = 10.0 ** ((self.gain(direction) - self.peak_gain) / 20.0)
+        return self.delay_at(self.gain(direction))
+
+    def delay_at(self, gain):
+        """`group_delay` of directions with gains (...), dBi: (...) metres."""
+        amplitude = 10.0 ** ((gain - self.peak_gain) / 20.0)
         return self.delay_span * np.maximum(1.0 - amplitude, 0.0)

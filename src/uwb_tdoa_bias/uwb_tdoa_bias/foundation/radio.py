@@ -45,6 +45,10 @@ class RadioLink:
         """Free-space loss over `distance` m (not nearer than 1 cm), dB."""
         return 20.0 * np.log10(4.0 * np.pi * self.frequency * np.maximum(distance, 0.01) / SPEED_OF_LIGHT)
 
+    def received_dbm(self, gains, distance):
+        """What arrives over `distance` m with the `gains` of both antennas together, dBi: dBm."""
+        return self.tx_power_dbm + gains - self.path_loss_db(distance)
+
 
 def received_power_dbm(p_tag, q_tag, p_anchor, q_anchor, link=RadioLink()):
     """Power that arrives at the tag, dBm, with the shape the arguments broadcast to.
@@ -54,9 +58,8 @@ def received_power_dbm(p_tag, q_tag, p_anchor, q_anchor, link=RadioLink()):
     Source: Friis, eq. 11 of Grasso et al. (Sensors 2022, 22, 9136), in dB, with the losses inside the gains.
     Polarisation is not modelled, and nearer than 1 cm the distance counts as 1 cm.
     """
-    seen_from_tag, seen_from_anchor = _directions(p_tag, q_tag, p_anchor, q_anchor, link)
-    gains = link.anchor_antenna.gain(seen_from_anchor) + link.tag_antenna.gain(seen_from_tag)
-    return link.tx_power_dbm + gains - link.path_loss_db(np.linalg.norm(seen_from_tag, axis=-1))
+    of_tag, of_anchor, distance = _gains(p_tag, q_tag, p_anchor, q_anchor, link)
+    return link.received_dbm(of_anchor + of_tag, distance)
 
 
 def power_bias(power_dbm):
@@ -69,16 +72,16 @@ def arrival_bias(p_tag, q_tag, p_anchor, q_anchor, link=RadioLink()):
 
     The sum of the chip's error over received power (APS011) and of the group delays of both antennas.
     """
-    seen_from_tag, seen_from_anchor = _directions(p_tag, q_tag, p_anchor, q_anchor, link)
-    delay = link.anchor_antenna.group_delay(seen_from_anchor) + link.tag_antenna.group_delay(seen_from_tag)
-    return power_bias(received_power_dbm(p_tag, q_tag, p_anchor, q_anchor, link)) + delay
+    of_tag, of_anchor, distance = _gains(p_tag, q_tag, p_anchor, q_anchor, link)
+    return power_bias(link.received_dbm(of_anchor + of_tag, distance)) + (link.anchor_antenna.delay_at(of_anchor) + link.tag_antenna.delay_at(of_tag))
 
 
-def _directions(p_tag, q_tag, p_anchor, q_anchor, link):
-    """The anchor seen in the frame of the tag's antenna, and the tag seen in the frame of the anchor's antenna."""
+def _gains(p_tag, q_tag, p_anchor, q_anchor, link):
+    """Gain of the tag's antenna towards the anchor, that of the anchor's towards the tag, dBi, and their distance, m."""
     to_anchor = np.asarray(p_anchor, dtype=float) - np.asarray(p_tag, dtype=float)
-    in_body = into_frame(q_tag, to_anchor)
-    return into_frame(link.tag_mount, in_body), into_frame(q_anchor, -to_anchor)
+    seen_from_tag = into_frame(link.tag_mount, into_frame(q_tag, to_anchor))
+    seen_from_anchor = into_frame(q_anchor, -to_anchor)
+    return link.tag_antenna.gain(seen_from_tag), link.anchor_antenna.gain(seen_from_anchor), np.linalg.norm(seen_from_tag, axis=-1)
 
 
 def into_frame(q, v):

@@ -19,6 +19,8 @@ There p is NaN at the start if nobody told it where it is, and what is told is s
 
 import ctypes
 from pathlib import Path
+import shutil
+from tempfile import TemporaryDirectory
 import time
 
 import numpy as np
@@ -39,10 +41,12 @@ REPEATS = 41
 class Peer:
     """The library at a path. name : of its file. Raises InputError if it cannot be loaded, or is not what this module says."""
 
-    def __init__(self, path):
+    def __init__(self, path, own=False):
+        """own : load a copy, whose static variables are as they are when a program starts, whatever was done with the library before."""
         self.name = Path(path).name
         try:
-            library = ctypes.CDLL(str(Path(path).absolute()))
+            with TemporaryDirectory() as folder:
+                library = ctypes.CDLL(shutil.copy(path, folder) if own else str(Path(path).absolute()))
         except OSError as error:
             raise InputError(f"--peer: {path} cannot be loaded as a shared library ({error}); build it anew on this machine.") from error
         functions = {name: getattr(library, f"tdoa_peer_{name}", None) for name in SYMBOLS}

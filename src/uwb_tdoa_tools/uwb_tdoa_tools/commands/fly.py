@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 import sys
 
+from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
@@ -58,6 +59,7 @@ def parser():
     add("--again", action="store_true", help="a minute later, carried by 2 m meanwhile, fly once more, without a restart")
     add("--inject", nargs="+", action="append", default=[], metavar=("EFFECT", "KEY=NUMBER"), help="an effect, as of inject")
     options.add_filter(made)
+    add("--model", metavar="FILE", help="ONNX bias network to correct with, e.g. one that train wrote (default: none)")
     add("--set", metavar="NAME:=VALUE", action="append", default=[], help="a filter parameter; may be repeated")
     add("--peer", metavar="LIBRARY", help="fly by this shared library of another filter (docs/flying.md), which is told its yaw")
     parallel.add_options(made)
@@ -76,13 +78,14 @@ def _fly(args):
     if args.resume and (args.plot or args.record):
         raise InputError("--resume: keeps verdicts alone; leave it out with --plot and --record, which need the flights themselves.")
     config, effects = options.filter_of(args)
+    load_network(args.model)  # or say what is wrong with it, before the first flight
     config = options.with_parameters(config, args.set)
     world = world_of(args.world, args.floor_effect, args.aid, args.silence, args.inject, args.installation)
     path = Circles(radius=0.0) if args.hover else Circles()
     seeds = range(args.seed, args.seed + args.flights)
-    tasks = [Task(world, seed, args.told, args.yaw, config, effects, args.again, args.peer, path) for seed in seeds]
+    tasks = [Task(world, seed, args.told, args.yaw, config, effects, args.model, args.again, args.peer, path) for seed in seeds]
     verdicts, pictures = [], []
-    with fleet.kept(args.resume, asked_of(args, NO_MATTER, ("config", "effects", "peer"))) as done:
+    with fleet.kept(args.resume, asked_of(args, NO_MATTER, ("config", "effects", "model", "peer"))) as done:
         for verdict, picture in fleet.flown(tasks, done, args.record, args.plot is not None, args.jobs, args.dask):
             verdicts.append(verdict)
             pictures.append(picture)

@@ -17,10 +17,10 @@ NOTHING = Odometry(np.empty(0), *(np.empty((0, n)) for n in (3, 3, 4, 3, 3)), np
 class OurFilter:
     """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs."""
 
-    def __init__(self, anchors, config, effects=None):
-        """anchors : Anchors; config : FilterConfig; effects : EffectSet to correct what was measured with, or None."""
+    def __init__(self, anchors, config, effects=None, network=None):
+        """anchors : Anchors; config : FilterConfig; effects : EffectSet, and network : Network, to correct what was measured with, or None."""
         effects = effects or EffectSet()
-        self._anchors, self._corrector = anchors, Corrector(anchors, effects)
+        self._anchors, self._corrector = anchors, Corrector(anchors, effects, network)
         self._labels, self._of_imu, self._of_aids = (kind(effects.effects) for kind in (LabelCorrector, ImuCorrector, AidCorrector))
         self._offset = effects.stamp_offset
         self._estimator = Estimator(anchors, config, functions=effects.sensor_functions, floor=effects.on_floor(anchors))
@@ -79,7 +79,7 @@ class TheirFilter:
 
     def __init__(self, library, anchors, yaw, place=None):
         """library : path; anchors : Anchors; yaw : rad; place : (3,) m, or None. Raises InputError."""
-        self._peer, self._anchors = Peer(library), anchors
+        self._peer, self._anchors = Peer(library, own=True), anchors
         q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
         self._peer.start(anchors.positions, np.full(3, np.nan) if place is None else place, q)
         self._states = []

@@ -23,7 +23,7 @@ def flown(tasks, done, record=None, draw=False, jobs=None, dask=None):
     record : folder for a bag of each, or None; draw : give what is drawn; jobs, dask : as of `parallel.over`.
     """
     missing = [task for task in tasks if str(task.seed) not in done]
-    made = parallel.over(partial(_one, record, draw), missing, jobs, dask)
+    made = parallel.over(partial(judged, record, draw), missing, jobs, dask)
     for task in tasks:
         key, picture = str(task.seed), None
         if key not in done:
@@ -32,8 +32,8 @@ def flown(tasks, done, record=None, draw=False, jobs=None, dask=None):
     next(made, None)  # to its end, so that its processes are kept
 
 
-def _one(record, draw, task):
-    """(verdict, Drawn or None) of a Task."""
+def judged(record, draw, task):
+    """(verdict, Drawn or None) of a Task that is flown; record, draw : as of `flown`."""
     one = fly(task)
     verdict = judge(one)
     if record is not None:

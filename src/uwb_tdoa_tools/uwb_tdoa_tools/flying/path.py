@@ -5,16 +5,22 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from ..simulation.config import SimulationConfig
+from ..simulation.room import Room
+from ..simulation.trajectories import sines
+
 KNOT, FINE = 0.02, 0.0025  # s, of the spline, and of the points at which it is looked up
 SPEED_UP = 1.5  # s, from hovering to the circle and back
 CLIMB = 0.4  # of the time up, and of that down, to get as fast as it climbs, and the same to stop
+AWAY = 6.0  # s, from the middle to the sines and back
 SETTLE = 0.4  # m above the ground from which it sinks slowly
 SINK = 0.2  # m/s
 
 
 @dataclass(frozen=True)
 class Circles:
-    """Up, circles, down to where it began. height, radius : m; rise, fall : s, up and down; turns; turn_time : s each."""
+    """Up, circles, down to where it began. height, radius : m; rise, fall : s, up and down; turns; turn_time : s each; swing : m, by which
+    the height goes up and down again in each turn."""
 
     height: float = 1.2
     radius: float = 1.0
@@ -22,6 +28,7 @@ class Circles:
     fall: float = 4.0
     turns: int = 2
     turn_time: float = 8.0
+    swing: float = 0.0
 
     @property
     def duration(self):
@@ -39,19 +46,53 @@ class Circles:
         p = np.empty((len(knots), 3))
         p[:, 0] = place[0] + self.radius * (np.cos(angle) - 1.0)
         p[:, 1] = place[1] + self.radius * np.sin(angle)
-        p[:, 2] = ground + self.height * up - (self.height - SETTLE) * down
+        p[:, 2] = ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
         return Reference(p)
+
+
+@dataclass(frozen=True)
+class Sines:
+    """Up, through a whole room in products of sines (`simulate`'s, those of the training flights of Zhao et al. 2021), back, and down.
+    room : Room; seed : of the sines; height, rise, fall : as of Circles; seconds : in the air; speed : m/s, root mean square; turning :
+    rad/s, all the while."""
+
+    room: Room
+    seed: int
+    height: float = 1.2
+    rise: float = 3.0
+    fall: float = 4.0
+    seconds: float = 60.0
+    speed: float = 0.7
+    turning: float = 0.3
+    radius = 0.0  # m: it begins in the middle
+
+    @property
+    def duration(self):
+        """As of Circles."""
+        return self.rise + self.seconds + self.fall
+
+    def along(self, place, ground):
+        """The Reference, as of Circles."""
+        knots = np.arange(0.0, self.duration + KNOT, KNOT)
+        up = _cruise(knots / self.rise, CLIMB)
+        down = _cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
+        p = np.empty((len(knots), 3))
+        p[:, :2], p[:, 2] = place, ground + self.height * up - (self.height - SETTLE) * down
+        away = _smooth((knots - self.rise) / AWAY) * _smooth((self.duration - self.fall - knots) / AWAY)
+        there = sines(knots, SimulationConfig(speed=self.speed), self.room, np.random.default_rng(self.seed))
+        return Reference(p + away[:, None] * (there - p), self.turning)
 
 
 class Reference:
     """Position, velocity and acceleration, (n, 3, 3), m and s, wanted since the rotors started; at its end it sinks, and no height is wanted.
     duration : s until then; end (2,) m, where."""
 
-    def __init__(self, p):
-        """p : (m, 3) m, each KNOT s, from the start on."""
+    def __init__(self, p, turning=0.0):
+        """p : (m, 3) m, each KNOT s, from the start on; turning : rad/s."""
         knots = KNOT * np.arange(len(p))
         spline = make_interp_spline(knots, p, k=5)
         self.duration, self.end, fine = knots[-1], p[-1, :2], np.arange(0.0, knots[-1], FINE)
+        self._turning = turning
         self._grid = np.stack([spline(fine), spline.derivative(1)(fine), spline.derivative(2)(fine)], axis=1)
 
     def at(self, t):
@@ -60,8 +101,8 @@ class Reference:
         return sinking(out, t > self.duration)
 
     def turned(self, t):
-        """rad by which it is to be turned t s after the start: it holds its yaw."""
-        return 0.0
+        """rad by which it is to be turned t s after the start."""
+        return self._turning * t
 
 
 def sinking(wanted, after):

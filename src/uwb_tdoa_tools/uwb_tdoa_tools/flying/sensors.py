@@ -8,9 +8,10 @@ from scipy.signal import butter, lfilter
 from uwb_tdoa_bias.effects import EFFECTS, Samples
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.pressure import pressure_at
+from uwb_tdoa_bias.foundation.radio import arrival_bias
 
 from ..simulation.aids import LEAST_STD, RATE, SITE
-from ..simulation.ranging import outliers, tdoa_noise
+from ..simulation.ranging import outliers, tag_link, tdoa_noise
 from ..simulation.schedule import make_schedule
 from .loop import IMU_RATE
 
@@ -48,6 +49,7 @@ class Radio:
         late, height = rng.uniform(*world.floor_delay, n), rng.uniform(*world.floor_height, n)
         low = anchors.ids[self.positions[:, 2] < LOW].tolist() if world.floor_effect else ()
         self.floor = FloorMultipath({f"{i}.{part}": of[anchors.index(i)] for i in low for part, of in (("delay", late), ("height", height))})
+        self._link = tag_link(seed) if world.antennas else None
         self._anchors, self._at_times = anchors, random(seed, "floor").random((len(self.t), 2))
         self._way = _walk(world, duration, random(seed, "person")) if world.person else np.empty((0, 2))
         self._blocked = random(seed, "blocked").uniform(*BLOCKED, (int(duration / BLOCK_TIME) + 1, n))
@@ -57,11 +59,15 @@ class Radio:
         self.silent = (silent, silent + self._world.silence[1]) if self._world.silence else NEVER
         self.changed = changed
 
-    def measured(self, rows, p):
-        """d (k,) m, NaN where nothing was heard, of the TDOAs in a slice of rows, taken by a tag at p (k, 3) m."""
+    def measured(self, rows, p, q):
+        """d (k,) m, NaN where nothing was heard, of the TDOAs in a slice of rows, taken by a tag at p (k, 3) m with q (k, 4)."""
         t, a, b, d = self.t[rows], self.a[rows], self.b[rows], np.empty(len(p))
         _measure(p, a, b, self.positions, self.constants, d)
         d += self._error[rows]
+        if self._link is not None:
+            both = np.stack([b, a])
+            late = arrival_bias(p, q, self.positions[both], self._anchors.orientations[both], self._link)
+            d += late[0] - late[1]
         if self.floor.values and p[:, 2].min(initial=NEAR_FLOOR) < NEAR_FLOOR:
             d += self._near_floor(rows, p)
         if len(self._way):

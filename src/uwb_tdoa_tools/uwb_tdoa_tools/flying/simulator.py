@@ -83,9 +83,9 @@ class Simulator:
             self._be_carried(rows)
         self.done += TICK
         imu = Imu(self.times[rows], self.samples[rows, :3], self.samples[rows, 3:])
-        new, p, _ = self._poses("tdoa", self.radio.t, lately)
+        new, p, q = self._poses("tdoa", self.radio.t, lately)
         radio, ids = self.radio, self.world.anchors.ids
-        d = radio.measured(new, p)
+        d = radio.measured(new, p, q)
         heard = np.isfinite(d)
         tdoa = Tdoas(radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard])
         aids = {name: self._felt(name, sensor, lately) for name, sensor in self._aids.items()}

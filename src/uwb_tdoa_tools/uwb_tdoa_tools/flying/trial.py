@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 
+from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -31,7 +32,7 @@ TOLD_AT, TOLD_STD = 0.3, 0.1  # s after switching on; m and rad, standard deviat
 @dataclass(frozen=True)
 class Task:
     """One flight. world : World; seed : of all that is random; told : "place" or "nothing"; yaw : "known", to 0.1 rad, or "unknown";
-    config : FilterConfig; effects : EffectSet, to correct what is measured with, or None; again : fly twice, carried by hand in between;
+    config : FilterConfig; effects : EffectSet, and model : path of a bias network, to correct what is measured with, or None; again : fly twice, carried by hand in between;
     peer : path of a library to fly by instead of our filter, always with a known yaw; path, rules, gains : of the vehicle."""
 
     world: World
@@ -40,6 +41,7 @@ class Task:
     yaw: str = "known"
     config: FilterConfig = field(default_factory=FilterConfig)
     effects: EffectSet | None = None
+    model: str | None = None
     again: bool = False
     peer: str | None = None
     path: Circles = Circles()
@@ -173,7 +175,7 @@ def _filter_of(task, place, yaw):
     if task.peer is not None:
         return TheirFilter(task.peer, anchors, yaw, place if task.told == "place" else None)
     known = {"initial_yaw": yaw, "initial_yaw_std": TOLD_STD} if task.yaw == "known" else {}
-    return OurFilter(anchors, replace(task.config, **known), task.effects)
+    return OurFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
 
 
 def _moment(silence, path, rules, rng):

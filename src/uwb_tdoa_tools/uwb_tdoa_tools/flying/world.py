@@ -25,7 +25,8 @@ class World:
     The radio
     ---------
     size : of the hall, whose low anchors are at 0.18 m
-    low_first : anchors 0 to 3 are the low ones; else low and high ones alternate, as in the measured flights, but for two
+    layout : Anchors that are there, None for a low and a high one in each corner
+    low_first : of those in corners, 0 to 3 are the low ones; else low and high ones alternate, as in the measured flights, but for two
     floor_effect : low anchors are late while the tag is near the floor, each by one of `floor_delay`, up to about one of `floor_height`, as
         the effect floor_multipath has it
     protocol, rate : of TDOAs
@@ -34,6 +35,7 @@ class World:
     installation : seed of what belongs to the hall (delays, biases, the floor), None for that of the flight: another hall each time
     delay : standard deviation of the anchors' constant delays
     bearing_bias : largest amplitude of a bias over the bearing, two waves per turn
+    antennas : received power and both antennas make signals late, as in `simulate`; each flight has another specimen of the tag
     silence : (one of MOMENTS, s) when and for how long nothing is heard; or None
     person : somebody walks through the hall and blocks what passes through him
     change : one of CHANGES, what one anchor, drawn by seed, is from the middle of the path on; or ""
@@ -55,6 +57,7 @@ class World:
     """
 
     size: tuple = (6.4, 6.2, 3.0)
+    layout: Anchors | None = None
     low_first: bool = False
     floor_effect: bool = True
     floor_delay: tuple = (3.0, 3.9)
@@ -67,6 +70,7 @@ class World:
     installation: int | None = None
     delay: float = 0.1
     bearing_bias: float = 0.12
+    antennas: bool = False
     silence: tuple | None = None
     person: bool = False
     change: str = ""
@@ -88,7 +92,9 @@ class World:
 
     @property
     def anchors(self) -> Anchors:
-        """A low and a high one in each corner."""
+        """Where they are."""
+        if self.layout is not None:
+            return self.layout
         made = corners(*self.size)
         if not self.low_first:
             return made
