@@ -6,6 +6,7 @@ import sys
 from .. import cli
 from ..studies import aids, crazyflie, noise, recalibrating, scale, situations, surveying
 from ..studies.checking import figures as checking, in_flight
+from ..studies.closed_loop import experiment
 from ..studies.debiasing import measured, set_up
 from ..studies.diagnosis import figures
 from ..studies.training import compare, default, spin, splits
@@ -13,6 +14,7 @@ from ..studies.training import compare, default, spin, splits
 STUDIES = {
     "aids": aids,
     "checking": checking,
+    "closed-loop": experiment,
     "compare-models": compare,
     "crazyflie": crazyflie,
     "debias-measured": measured,
@@ -33,6 +35,7 @@ of measured flights: flights/, util/, surveys/.
 
   aids             height, pressure and velocity on measured flights, and their faults (docs/aids.md)
   checking         mistakes put into flights, and what check says of them (docs/connect.md)
+  closed-loop      the flights of Zhao et al. by networks and by effects (docs/flying.md)
   compare-models   bias models side by side on flights that took no part in training (docs/bias.md)
   crazyflie        measured logs put through the radio link of a Crazyflie (docs/connect.md)
   debias-measured  bias maps of positions on measured flights (docs/debiasing.md)
@@ -62,6 +65,7 @@ def parser():
         DESCRIPTION,
         "study aids worth DATA/flights/0425 --survey DATA/surveys",
         "study checking DATA/flights DATA/util --survey DATA/surveys --only nothing",
+        "study closed-loop --out paper/",
         "study compare-models --train DATA/flights/0425 --test 0426 DATA/flights/0426 --survey DATA/surveys --out out/",
         "study compare-models --simulated 20 --out out/",
         "study crazyflie DATA/flights/0425/TDOA2 DATA/flights/0422 --survey DATA/surveys",

@@ -1,0 +1,1 @@
+"""Figures of docs/flying.md: the experiment of the paper."""
