@@ -51,8 +51,8 @@ def test_it_trains_flies_tells_and_draws(tmp_path, monkeypatch, capsys):
     assert len(rows) == 5 * 4 * 2 and all(len(row["flights"]) == 2 for row in rows)
     printed = capsys.readouterr().out
     assert "| not trained in, mean | 0.400 | 0.300 | 0.240 | 0.360 | 0.100 |" in printed
-    assert f"{WITH} against {BASELINE}: 40% less where it was trained, 40% less elsewhere (published: 42%)" in printed
-    assert f"{WITH} against {WITHOUT}: 20% less where it was trained, 20% less elsewhere (published: 20%)" in printed
+    assert f"| {WITH}: than {BASELINE} | 40% | 40% | 40% (12) | 42% |" in printed
+    assert f"| {WITH}: than {WITHOUT} | 20% | 20% | 20% (12) | 20% |" in printed
     assert "landed, all constellations | 16 of 16" in printed
     for name in ("rmse.png", "paths.png", "errors.png"):
         assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"

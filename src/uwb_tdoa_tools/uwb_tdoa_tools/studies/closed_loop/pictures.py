@@ -5,7 +5,7 @@ import numpy as np
 from ...scoring.plots import plt
 
 COLOURS = "0.55", "tab:red", "tab:cyan", "tab:olive", "tab:green"
-LONG = 45.0  # s of a flight that are drawn at most
+LONG = 35.0  # s of a flight that are drawn at most
 
 
 def draw_errors_by_kind(verdicts, path):
@@ -27,17 +27,17 @@ def draw_errors_by_kind(verdicts, path):
     _save(figure, path)
 
 
-def draw_paths(shown, anchors, path):
-    """Figure 8: where flights went, from above and from the side, beside where they were to go. shown : {estimator: [Drawn]}."""
+def draw_paths(shown, path):
+    """Figure 8: where flights went from their start, from above and from the side, beside where they were to go. shown : {estimator: [Drawn]}."""
     figure, axes = plt.subplots(2, len(shown), figsize=(3.2 * len(shown), 5.4), sharex=True, sharey="row", layout="constrained", height_ratios=(3, 1))
     for column, (name, flights), colour in zip(axes.T, shown.items(), COLOURS):
         for one in flights:
-            p = one.p - [*np.nanmean(one.wanted[:, :2], axis=0), 0.0]
-            wanted = one.wanted + (p - one.p)
+            start = np.array([*one.p[0, :2], 0.0])
+            p, wanted = one.p - start, one.wanted - start
             for ax, k in zip(column, (1, 2)):
                 ax.plot(p[:, 0], p[:, k], color=colour, lw=0.8, alpha=0.8)
                 ax.plot(wanted[:, 0], wanted[:, k], "k--", lw=0.6)
-        column[0].set(title=f"{name}\n{sum(one.verdict['landed'] for one in flights)} of {len(flights)} landed", aspect="equal", xlim=(-2, 2), ylim=(-2, 2))
+        column[0].set(title=f"{name}\n{sum(one.verdict['landed'] for one in flights)} of {len(flights)} landed", aspect="equal", xlim=(-2.7, 0.7), ylim=(-1.7, 1.7))
         column[1].set(xlabel="x, m", ylim=(0, 2))
         for ax in column:
             ax.grid(alpha=0.3)
