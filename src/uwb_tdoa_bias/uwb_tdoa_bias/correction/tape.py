@@ -53,7 +53,12 @@ class Tape:
             raise Unplayable("an input of unknown width")
         self._values[name] = self._room(self.width, self.width)
         for node in graph.nodes:
-            self._add(node)
+            try:
+                self._add(node)
+            except Unplayable:
+                raise
+            except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:  # an input or an attribute lacks or is none
+                raise Unplayable(f"{node.kind[:40]!r} cannot be used so, {error!r}") from error
         place, self.outputs, numbers = self._value(graph.outputs[0])
         if numbers != self.outputs:
             raise Unplayable("an output with other rows than the input")
