@@ -8,7 +8,7 @@ from uwb_tdoa_bias.effects.slope import N_STATES
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
-from . import aids, barometer, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, rest, robust, workspace
+from . import aids, barometer, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, rest, robust, systematic, workspace
 from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, Output
 from .sensor_functions import take_out
 from .startup import INLIER
@@ -23,7 +23,7 @@ MAX_STEP = 0.05  # s, longest single prediction
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 STRAIGHT = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
-RECORDS_OF_TDOA = 1 + 3 + 1 + 6 + 1  # in a history, at most: its update, workspace, fixed height, a place at rest, a start or a recovery
+RECORDS_OF_TDOA = 1 + 3 + 1 + 6 + 1 + 1  # in a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, a start or a recovery
 RECORDS_OF_REST = 3  # one per axis
 RECORDS_OF_AID = 3  # one per component of a velocity
 
@@ -133,7 +133,10 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
     if tuning.fixed_height_std > 0.0 and t >= ekf.next_floor:
         ekf.next_floor = t + rest.PERIOD
         _stay_on_floor(ekf, tuning, t, records)
+    followed = ekf.best
     hypotheses.select(ekf, t)
+    if ekf.best != followed:
+        history.add_reset(ekf, t, records)
     known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
     agrees = 1.0 if abs(residual.innovation - known) < INLIER else 0.0
     if not late:
@@ -239,6 +242,7 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
         innovation.repeated = rest.repetition(ekf, tdoa.t)
         _assimilate(ekf, h, tuning, tdoa.t, residual, records)
         if h == ekf.best:
+            systematic.observe(ekf.information, a, b, innovation, tdoa.t, ekf.last_tdoa)
             height.judge(ekf.height, tuning, innovation, tdoa.t)
             if tuning.adapt_noise:
                 noise.learn(a, b, tdoa.t, innovation, tuning)
@@ -313,6 +317,7 @@ def _report(ekf, t, row):
     row.x[:] = best.x
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
+    systematic.add(ekf.information, best.P, row.covariance)
 
 
 def feed(memory, tuning, measurements, records=None):

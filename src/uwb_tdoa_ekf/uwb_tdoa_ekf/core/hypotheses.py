@@ -1,7 +1,7 @@
-"""Several yaws at once, while nobody knows which is right.
+"""Several yaws and places at once, while nobody knows which is right.
 
-A tag that starts anywhere cannot see its yaw: only motion that its accelerometer feels and its TDOAs see tells. One
-filter per direction runs until the TDOAs have decided (multiple model estimation, e.g. Bar-Shalom et al., Estimation
+A tag that starts anywhere cannot see its yaw: only motion that its accelerometer feels and its TDOAs see tells. Anchors in a plane do
+not tell on which side of it a tag is. One filter per direction and place runs until the TDOAs have decided (multiple model estimation, e.g. Bar-Shalom et al., Estimation
 with Applications to Tracking and Navigation, 2001, section 11.6.2, static case).
 """
 
@@ -11,12 +11,12 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from .memory import HYPOTHESES
+from .memory import HYPOTHESES, YAWS
 from .state import difference
 
 YAW_STD = 0.6  # rad, of each hypothesis: they start 90 degrees apart
 PRUNED_BELOW = -8.0  # log probability relative to the best at which a hypothesis is pruned
-MERGED_BELOW = 0.1  # rad between two hypotheses that have become one
+MERGED_BELOW, MERGED_WITHIN = 0.1, 0.3  # rad and m between two hypotheses that have become one
 MERGE_PERIOD = 0.1  # s
 LARGEST_NIS = 9.0  # normalised innovation squared that one measurement counts as at most
 
@@ -24,7 +24,7 @@ LARGEST_NIS = 9.0  # normalised innovation squared that one measurement counts a
 @compiled
 def yaw_offset(h):
     """Angle of hypothesis h to initial_yaw, rad."""
-    return h * 2.0 * math.pi / HYPOTHESES
+    return h % YAWS * 2.0 * math.pi / YAWS
 
 
 @compiled
@@ -61,7 +61,8 @@ def select(ekf, t):
     for h in range(HYPOTHESES):
         if h != best and alive(ekf.hypotheses[h]):
             apart = difference(ekf.hypotheses[best].x, ekf.hypotheses[h].x)
-            if apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2 < MERGED_BELOW**2:
+            turned, away = apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2, apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2
+            if turned < MERGED_BELOW**2 and away < MERGED_WITHIN**2:
                 ekf.hypotheses[h].log_weight = -np.inf
 
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from . import ground, height, hypotheses, inertial, standing, workspace
+from . import ground, height, hypotheses, inertial, standing, systematic, workspace
 from .history import add_reset
-from .memory import HYPOTHESES, WINDOW
+from .memory import HYPOTHESES, PLACES, WINDOW, YAWS
 from .startup import SPEED, level, locate, share_of_inliers
 from .state import GRAVITY
 
@@ -56,24 +56,27 @@ def start(ekf, anchors, tuning, t, anyhow, history):
         return
     ekf.next_search = t + SEARCH_PERIOD
     workspace.set_bounds(anchors, tuning.workspace_margin, ekf.workspace)
-    x, covariance = np.empty(6), np.empty((6, 6))
+    x, covariance, cost = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES)
     accel = _mean_accel(ekf.imu, tuning)
     z, z_std = _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
-    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance)
+    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance, cost)
     near = np.empty((2, 3))
     workspace.set_bounds(anchors, standing.NEAR, near)  # beyond, a start is doubted if the ground explains the TDOAs better
+    standing.sort(x, covariance, cost, near)
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
-    at_rest, its = x.copy(), covariance.copy()
-    on_ground = standing.weigh(ekf, pairs, anchors, tuning, z, z_std, at_rest, its)
-    good = share >= AGREE and workspace.contains(ekf.workspace, x) and (workspace.contains(near, x) or not on_ground)
-    still = ground.is_still(pairs, anchors, at_rest, ekf.still_covariance)
-    if still or (anyhow and not good):
-        x, covariance, good = at_rest, its, good or on_ground
+    still = ground.is_still(pairs, anchors, x[0], ekf.still_covariance)
+    at_rest, its = x[0].copy(), covariance[0].copy()
+    on_ground = standing.weigh(ekf, pairs, anchors, tuning, z, z_std, at_rest, its) > (0.0 if still else standing.DECISIVE)
+    good = share >= AGREE and workspace.contains(ekf.workspace, x[0]) and (workspace.contains(near, x[0]) or not on_ground)
     if not (good or anyhow):
         return
-    if still:
-        standing.stop(x, covariance, ekf.still_covariance)
-    _begin(ekf, tuning, t, x, covariance, tuning.initial_yaw, tuning.initial_yaw_std)
+    if on_ground and (still or not good):
+        cost[1:] = np.inf
+    if still or (not good and cost[1] > -hypotheses.PRUNED_BELOW):
+        x[0], covariance[0] = at_rest, its
+    for place in range(PLACES if still else 0):
+        standing.stop(x[place], covariance[place], ekf.still_covariance)
+    _begin(ekf, tuning, t, x, covariance, cost, tuning.initial_yaw, tuning.initial_yaw_std)
     ekf.resting, ekf.rest_since = still and tuning.zero_velocity, t
     add_reset(ekf, t, history)
 
@@ -108,7 +111,7 @@ def place(ekf, anchors, tuning, t, pose, history):
     told = not math.isnan(pose.yaw)
     if not ekf.running:
         yaw, std = (pose.yaw, pose.yaw_std) if told else (tuning.initial_yaw, tuning.initial_yaw_std)
-        _begin(ekf, tuning, t, x, covariance, yaw, std)
+        _begin(ekf, tuning, t, x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1), yaw, std)
     else:
         for h in range(HYPOTHESES):
             hypothesis = ekf.hypotheses[h]
@@ -124,20 +127,26 @@ def place(ekf, anchors, tuning, t, pose, history):
 
 
 @compiled
-def _begin(ekf, tuning, t, x, covariance, yaw, yaw_std):
-    """Start every hypothesis at position and velocity x (6,), level, with the yaws that are possible."""
+def _begin(ekf, tuning, t, x, covariance, cost, yaw, yaw_std):
+    """Start hypotheses at positions and velocities x (k, 6), whose probabilities are exp(-cost) (k,), level, with the yaws that are possible."""
     accel = _mean_accel(ekf.imu, tuning)
     unknown = tuning.use_imu and yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):
         hypothesis, offset = ekf.hypotheses[h], hypotheses.yaw_offset(h)
         nearest = min(offset, 2.0 * math.pi - offset)
-        hypothesis.log_weight = -0.5 * (nearest / yaw_std) ** 2 if unknown or h == 0 else -np.inf
+        place = h // YAWS
+        hypothesis.log_weight = -np.inf
+        if place < len(x) and (unknown or offset == 0.0):
+            hypothesis.log_weight = -0.5 * (nearest / yaw_std) ** 2 - cost[place]
+        if not hypotheses.alive(hypothesis):
+            continue
         level(accel, yaw + offset, hypothesis.x)
         hypothesis.x[10:] = 0.0
         hypothesis.P[:] = 0.0
-        _put(hypothesis, x, covariance)
+        _put(hypothesis, x[place], covariance[place])
         _spread_attitude(hypothesis.P, tuning, yaw_std)
     ekf.best = 0
+    systematic.begin(ekf.information, ekf.hypotheses[0].P)
     ekf.t = ekf.last_tdoa = ekf.sure = t
     ekf.consistency = 1.0
     ekf.running = True
@@ -166,24 +175,24 @@ def recover(ekf, anchors, tuning, t, history):
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    x, covariance = np.empty(6), np.empty((6, 6))
+    x, covariance = np.empty((1, 6)), np.empty((1, 6, 6))
     q = ekf.hypotheses[ekf.best].x[6:10]
     z, z_std = _known_height(ekf, tuning, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
-    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance)
+    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance, np.empty(1))
     explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
-    if not workspace.contains(ekf.workspace, x) or share < AGREE_ANYHOW or share < CLEARLY_MORE + explained:
+    if not workspace.contains(ekf.workspace, x[0]) or share < AGREE_ANYHOW or share < CLEARLY_MORE + explained:
         return
     if tuning.use_imu and not ekf.distrusted and t - ekf.imu.t < tuning.imu_timeout:
         since, away = t - ekf.sure, 0.0
         for k in range(3):
-            away += (x[k] - ekf.hypotheses[ekf.best].x[k]) ** 2
+            away += (x[0, k] - ekf.hypotheses[ekf.best].x[k]) ** 2
         if math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
             return
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
-        _put(hypothesis, x, covariance)
+        _put(hypothesis, x[0], covariance[0])
     ekf.consistency, ekf.late_as_known = 1.0, False
     ekf.rest_since = t
     ekf.recoveries += 1
@@ -206,7 +215,8 @@ def level_anew(ekf, tuning, history):
     best = ekf.hypotheses[ekf.best]
     x, y, z, w = best.x[6], best.x[7], best.x[8], best.x[9]
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    _begin(ekf, tuning, ekf.t, best.x[:6].copy(), best.P[:6, :6].copy(), yaw, 2.0 * math.pi)
+    x, covariance = best.x[:6].copy().reshape(1, 6), best.P[:6, :6].copy().reshape(1, 6, 6)
+    _begin(ekf, tuning, ekf.t, x, covariance, np.zeros(1), yaw, 2.0 * math.pi)
     add_reset(ekf, ekf.t, history)
 
 

@@ -15,7 +15,8 @@ from .sensor_functions import rows_of
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
 from .update import INNOVATION, OFFSET_STATES
 
-HYPOTHESES = 4  # starts in as many directions while the yaw is unknown
+YAWS, PLACES = 4, 2  # directions and places that a start follows at once while it is not known which is right
+HYPOTHESES = YAWS * PLACES
 WINDOW = 512  # TDOAs kept for a start
 
 
@@ -79,6 +80,7 @@ ANCHOR = _record(
     ("position", float, 3),  # m
     ("excess_variance", float),  # m^2, of what is received of it beyond tdoa_std, see noise.py
     ("learned", float),  # s, stamp of the last change
+    ("heard", float),  # s, stamp of the last TDOA that was used
     ("delay", float),  # m, that it is found to have since it changed in flight,
     ("delay_variance", float),  # and its variance, m^2;
     ("late", float),  # probability that it is late because tag and anchor are near the ground, see ground.py, 0: it cannot be,
@@ -141,6 +143,7 @@ EKF = _record(
     ("lift", float, 3),  # m/s, that the inertial sensor has felt lately at rest, in the world
     ("sure", float),  # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
     ("workspace", float, (2, 3)),  # m, lower and upper bounds, see workspace.py
+    ("information", float, (3, 3)),  # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),
     ("first_tdoa", float),  # s, stamps: of the first TDOA since the filter stopped, and the last one
@@ -205,7 +208,9 @@ def new_memory(positions, functions=(), floor=None):
     """Memory of a filter that has seen nothing; positions : (N, 3) m, of the anchors; functions : SensorFunctions; floor : as of
     `EffectSet.on_floor`."""
     memory = Memory(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
-    memory.anchors["position"], memory.anchors["learned"], memory.anchors["judged"] = positions, -np.inf, -np.inf
+    memory.anchors["position"] = positions
+    for stamp in ("learned", "judged", "heard"):
+        memory.anchors[stamp] = -np.inf
     ekf = memory.record
     memory.anchors["floor_delay"], memory.anchors["floor_std"], ekf["floor_place"][:] = floor or (np.nan, 0.0, np.nan)
     for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge", "next_look", "sure"):

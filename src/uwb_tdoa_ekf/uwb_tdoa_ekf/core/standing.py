@@ -37,7 +37,7 @@ def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
     covariance (6, 6), and the ground, with each lateness of ground.explain.
 
     z, z_std : m, a height that is known and its standard deviation, NaN for none. The best one goes to x and covariance. Returns
-    whether it is on the ground.
+    the logarithm of how much more probable the ground is.
     """
     prior, bounds = np.zeros((4, 3)), ekf.workspace
     for k in range(3):
@@ -48,8 +48,7 @@ def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
     cost[0] = ground.explain(pairs, anchors, bounds, prior, tuning, z, z_std, ground.IN_TIME, position[0], each[0])
     starts, near = np.empty((4, 2)), np.empty((2, 3))
     set_bounds(anchors, NEAR, near)
-    if not near[0, 2] <= x[2] <= near[1, 2]:
-        cost[0] += ABSURD
+    cost[0] += _absurdity(near, x)
     position[0], each[0] = x[:3], covariance[:3, :3]
     for start in range(4):
         for k in range(2):
@@ -61,7 +60,23 @@ def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
     covariance[:3, :3] = each[best]
     covariance[:3, 3:] = 0.0
     covariance[3:, :3] = 0.0
-    return best > 0
+    return cost[0] - np.min(cost[1:])
+
+
+@compiled
+def sort(x, covariance, cost, near):
+    """Put the more probable of two places that explain TDOAs first: x (2, 6), covariance (2, 6, 6), cost (2,) as of `startup.locate`;
+    near : (2, 3) m, bounds of the anchors."""
+    for place in range(2):
+        cost[place] += _absurdity(near, x[place])
+    if cost[1] < cost[0]:
+        x[:], covariance[:], cost[:] = x[::-1].copy(), covariance[::-1].copy(), cost[::-1].copy()
+    cost -= cost[0]
+
+
+@compiled
+def _absurdity(near, x):
+    return 0.0 if near[0, 2] <= x[2] <= near[1, 2] else ABSURD
 
 
 @compiled
@@ -167,10 +182,10 @@ def land(ekf, pairs, anchors, tuning, still, stands, t, records):
 @compiled
 def find_again(ekf, pairs, window, anchors, tuning, t, records):
     """A tag lies still at stamp t, s, but inertial samples have told that it moves: they were wrong, and it may be anywhere."""
-    x, covariance = np.empty(6), np.empty((6, 6))
-    locate(window, anchors, ekf.workspace, tuning.tdoa_std, np.nan, np.nan, x, covariance)
-    weigh(ekf, pairs, anchors, tuning, np.nan, np.nan, x, covariance)
-    _put(ekf, x[:3], covariance[:3, :3], t, records)
+    x, covariance = np.empty((1, 6)), np.empty((1, 6, 6))
+    locate(window, anchors, ekf.workspace, tuning.tdoa_std, np.nan, np.nan, x, covariance, np.empty(1))
+    weigh(ekf, pairs, anchors, tuning, np.nan, np.nan, x[0], covariance[0])
+    _put(ekf, x[0, :3], covariance[0, :3, :3], t, records)
     ekf.resting, ekf.rest_since = True, t
     ekf.recoveries += 1
 

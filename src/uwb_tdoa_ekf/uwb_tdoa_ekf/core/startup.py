@@ -17,15 +17,18 @@ SPEED = 1.0  # m/s, standard deviation of the velocity before anything is known
 LONGEST_STEP = 2.0  # m
 INLIER = 0.75  # m, a residual below this does not contradict a position
 NO_SCALE = 1e6  # m, of a loss that is quadratic
+APART = 1.0  # m between two places
 
 
 @compiled
-def locate(window, anchors, workspace, std, z, z_std, x, covariance):
+def locate(window, anchors, workspace, std, z, z_std, x, covariance, cost):
     """Robust multilateration over a window, with constant velocity.
 
     window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see workspace.py; std : m, of
-    one TDOA; z, z_std : m, a height that is known otherwise and its standard deviation, or NaN. Writes position and velocity at the last stamp to x (6,) and their covariance to `covariance` (6, 6).
-    Returns the share of TDOAs that agree with it, 0 to 1.
+    one TDOA; z, z_std : m, a height that is known otherwise and its standard deviation, or NaN. Writes position and velocity at the last
+    stamp to x (k, 6), their covariance to `covariance` (k, 6, 6), and minus the logarithm of the probability of each place, less that of
+    the first, to cost (k,): the most probable one first, then others that are APART, with inf where there are none.
+    Returns the share of TDOAs that agree with the first, 0 to 1.
 
     Graduated Geman-McClure: Gauss-Newton from several starts while the loss narrows; the start with the least final
     loss wins. A tag is in its workspace and slow until proven otherwise: without that prior, the late arrivals on a
@@ -39,9 +42,9 @@ def locate(window, anchors, workspace, std, z, z_std, x, covariance):
         mean[2], prior_std[2], prior_std[5] = z, z_std, SPEED
     prior_information = 1.0 / prior_std**2
     correlation_length = _correlation_length(window, len(anchors))
-    least = np.inf
-    trial, residuals, system = np.zeros(6), np.zeros(len(window)), np.zeros((6, 7))
+    trials, losses, residuals, system = np.zeros((STARTS, 6)), np.zeros(STARTS), np.zeros(len(window)), np.zeros((6, 7))
     for start in range(STARTS):
+        trial = trials[start]
         trial[:] = mean
         for k in range(3):
             if start > 0:
@@ -52,18 +55,25 @@ def locate(window, anchors, workspace, std, z, z_std, x, covariance):
             _step(trial, system, correlation_length * max(std, 0.5 * scale) ** 2 * prior_information, mean)
         loss = _normal_equations(window, anchors, trial, FINE, system, residuals)
         far = np.sum(((trial - mean) / prior_std) ** 2)
-        loss += correlation_length / len(window) * far * (std / FINE) ** 2
-        if loss < least:
-            least = loss
-            x[:] = trial
-    _normal_equations(window, anchors, x, NO_SCALE, system, residuals)
-    variance = correlation_length * max(std, 1.5 * np.median(np.abs(residuals))) ** 2
-    for k in range(6):
-        system[k, k] += variance * prior_information[k]
-    both = np.concatenate((system[:, :6], np.eye(6)), axis=1)
-    solve(both)
-    covariance[:, :] = both[:, 6:] * variance
-    return np.mean(np.abs(residuals) < INLIER)
+        losses[start] = 0.5 * (len(window) / correlation_length * loss * (FINE / std) ** 2 + far)
+    share, least = 0.0, np.min(losses)
+    for place in range(len(x)):
+        start = np.argmin(losses)
+        cost[place] = losses[start] - least
+        x[place] = trials[start]
+        _normal_equations(window, anchors, x[place], NO_SCALE, system, residuals)
+        variance = correlation_length * max(std, 1.5 * np.median(np.abs(residuals))) ** 2
+        for k in range(6):
+            system[k, k] += variance * prior_information[k]
+        both = np.concatenate((system[:, :6], np.eye(6)), axis=1)
+        solve(both)
+        covariance[place] = both[:, 6:] * variance
+        if place == 0:
+            share = np.mean(np.abs(residuals) < INLIER)
+        for other in range(STARTS):
+            if np.sum((trials[other, :3] - x[place, :3]) ** 2) < APART**2:
+                losses[other] = np.inf
+    return share
 
 
 @compiled
