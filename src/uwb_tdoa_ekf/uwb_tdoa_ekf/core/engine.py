@@ -8,7 +8,7 @@ from uwb_tdoa_bias.effects.slope import N_STATES
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
-from . import aids, barometer, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, rest, robust, systematic, workspace
+from . import aids, barometer, curvature, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, rest, robust, systematic, workspace
 from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, Output
 from .sensor_functions import take_out
 from .startup import INLIER
@@ -269,6 +269,8 @@ def _compare(hypothesis, a, b, tdoa, known, innovation):
             innovation.row[k] += tdoa.slope[k]
             innovation.entries = max(innovation.entries, k + 1)
     project(hypothesis.P, innovation)
+    innovation.curvature = curvature.variance(hypothesis.x, hypothesis.P, a.position, b.position)
+    innovation.prior_variance += innovation.curvature
 
 
 @compiled

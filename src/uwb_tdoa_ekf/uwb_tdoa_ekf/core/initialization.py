@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from . import ground, height, hypotheses, inertial, standing, systematic, workspace
 from .history import add_reset
 from .memory import HYPOTHESES, PLACES, WINDOW, YAWS
-from .startup import SPEED, level, locate, share_of_inliers
+from .startup import SPEED, level, locate, share_of_inliers, split
 from .state import GRAVITY
 
 MINIMUM = 12  # TDOAs a search needs
@@ -62,6 +62,8 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance, cost)
     near = np.empty((2, 3))
     workspace.set_bounds(anchors, standing.NEAR, near)  # beyond, a start is doubted if the ground explains the TDOAs better
+    near[0, 2] = min(near[0, 2], tuning.ground_height)
+    split(x, covariance, cost)
     standing.sort(x, covariance, cost, near)
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     still = ground.is_still(pairs, anchors, x[0], ekf.still_covariance)

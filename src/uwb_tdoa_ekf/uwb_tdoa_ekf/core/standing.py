@@ -48,6 +48,7 @@ def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
     cost[0] = ground.explain(pairs, anchors, bounds, prior, tuning, z, z_std, ground.IN_TIME, position[0], each[0])
     starts, near = np.empty((4, 2)), np.empty((2, 3))
     set_bounds(anchors, NEAR, near)
+    near[0, 2] = min(near[0, 2], tuning.ground_height)
     cost[0] += _absurdity(near, x)
     position[0], each[0] = x[:3], covariance[:3, :3]
     for start in range(4):

@@ -17,7 +17,8 @@ SPEED = 1.0  # m/s, standard deviation of the velocity before anything is known
 LONGEST_STEP = 2.0  # m
 INLIER = 0.75  # m, a residual below this does not contradict a position
 NO_SCALE = 1e6  # m, of a loss that is quadratic
-APART = 1.0  # m between two places
+APART = 1.0  # m between two places, and standard deviation of a place that becomes two
+SPLIT = 0.8  # standard deviations from the middle of a place to each of two that it becomes
 
 
 @compiled
@@ -74,6 +75,28 @@ def locate(window, anchors, workspace, std, z, z_std, x, covariance, cost):
             if np.sum((trials[other, :3] - x[place, :3]) ** 2) < APART**2:
                 losses[other] = np.inf
     return share
+
+
+@compiled
+def split(x, covariance, cost):
+    """Where there is a single place, and it is less known than APART along any direction, fill in two of equal probability that have the
+    same mean and covariance together: TDOAs are as curved there as the anchors are far. x (2, 6), covariance (2, 6, 6), cost (2,) as of
+    `locate`.
+    """
+    axis, variance = np.ones(3), 0.0
+    for _ in range(30):  # power iteration
+        axis = np.array([np.sum(covariance[0, i, :3] * axis) for i in range(3)])
+        variance = math.sqrt(np.sum(axis**2))
+        axis /= variance
+    if cost[1] < np.inf or variance < APART**2:
+        return
+    step, cost[1] = SPLIT * math.sqrt(variance) * axis, cost[0]
+    for i in range(3):
+        for j in range(3):
+            covariance[0, i, j] -= step[i] * step[j]
+    x[1], covariance[1] = x[0], covariance[0]
+    x[0, :3] -= step
+    x[1, :3] += step
 
 
 @compiled

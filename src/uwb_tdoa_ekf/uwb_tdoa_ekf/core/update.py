@@ -21,7 +21,8 @@ INNOVATION = np.dtype(
         ("entries", np.int64),  # and how many there are
         ("value", float),  # measured minus predicted
         ("noise_variance", float),  # of one measurement
-        ("prior_variance", float),  # h P h'
+        ("prior_variance", float),  # h P h', and
+        ("curvature", float),  # what of it comes from a TDOA that is curved within P, see curvature.py
         (
             "cross_covariance",
             float,

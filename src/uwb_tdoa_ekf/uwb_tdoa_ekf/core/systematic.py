@@ -1,0 +1,49 @@
+"""Errors that persist: delays, antennas and surroundings make the same error of every TDOA for seconds, and it does not average out.
+
+The filter divides errors by how many TDOAs there are. What it states therefore has the covariance of errors that persist added to it
+(consider covariance, Tapley, Schutz and Born, Statistical Orbit Determination, 2004, ch. 6).
+"""
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+from .ground import solve
+
+SHARE = 0.3  # of the variance of a TDOA that persists
+MEMORY = 1.0  # s of TDOAs that are looked at: an anchor that was not heard for so long is not there
+LONGEST_STEP = 0.1  # s; what anchors tell is not forgotten in silence
+MOST = 400.0  # times the covariance of the filter is the most that is added: it does not hear anchors alone
+
+
+@compiled
+def begin(information, P):
+    """Fill in the information (3, 3), 1/m^2, of a start whose covariance P (15, 15) has counted each anchor once."""
+    both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
+    solve(both)
+    information[:, :] = both[:, 3:]
+
+
+@compiled
+def observe(information, a, b, innovation, t, last):
+    """Take a TDOA stamped t, s, between two of ANCHOR, an INNOVATION, into the information (3, 3), 1/m^2, of a position by a single
+    arrival from each anchor that is heard; last : s, stamp of the TDOA before."""
+    fades = min(t - last, LONGEST_STEP) / MEMORY
+    apart = 0.5 * (min(t - a.heard, MEMORY) + min(t - b.heard, MEMORY)) / MEMORY  # adds up to the number of anchors
+    a.heard = b.heard = t
+    gain = apart * innovation.weight / (SHARE * innovation.noise_variance + innovation.curvature)
+    for i in range(3):
+        for j in range(3):
+            information[i, j] += gain * innovation.row[i] * innovation.row[j] - fades * information[i, j]
+
+
+@compiled
+def add(information, P, covariance):
+    """Add to a (9, 9) covariance what errors that persist make of a position whose covariance in the filter is P (15, 15)."""
+    both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
+    if not solve(both):
+        return
+    both[:, :3] = information + both[:, 3:] / MOST
+    both[:, 3:] = np.eye(3)
+    if solve(both):
+        covariance[:3, :3] += both[:, 3:]
