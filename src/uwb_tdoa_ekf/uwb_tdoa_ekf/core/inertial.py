@@ -55,13 +55,15 @@ def weigh(imu, quiet, tuning):
 
     A vibrating axis rectifies: its error has vibration_gain times the variance of the vibration. The weight is that of
     linear least squares of the measurement with this variance, and of hovering with accel_prior_std. What is carried, and lies on its
-    side or upside down, does not hover.
+    side or upside down, does not hover; what is farther from hovering than both explain, hovers that much less.
     """
     slow = imu.slow_accel
     hovers = slow[2] > UPRIGHT * math.sqrt(slow[0] ** 2 + slow[1] ** 2 + slow[2] ** 2)
-    prior = tuning.accel_prior_std**2 if hovers else CARRIED_STD**2
+    usual = tuning.accel_prior_std**2 if hovers else CARRIED_STD**2
     for k in range(3):
         error = tuning.vibration_gain * imu.vibration[k]
+        apart = slow[k] - (GRAVITY if k == 2 else 0.0)
+        prior = max(usual, apart**2 - error)
         weight = prior / (prior + error)
         noise = tuning.accel_noise**2 + 2.0 * PERSISTENCE * (weight * error)
         imu.accel_weight[k], imu.accel_psd[k] = weight, QUIET_NOISE**2 if quiet else noise
