@@ -61,21 +61,24 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     z, z_std = _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
     share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance, cost)
     near = np.empty((2, 3))
-    workspace.set_bounds(anchors, standing.NEAR, near)  # beyond, a start is doubted if the ground explains the TDOAs better
+    workspace.set_bounds(anchors, standing.NEAR, near)
     near[0, 2] = min(near[0, 2], tuning.ground_height)
-    split(x, covariance, cost)
     standing.sort(x, covariance, cost, near)
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
-    still = ground.is_still(pairs, anchors, x[0], ekf.still_covariance)
     at_rest, its = x[0].copy(), covariance[0].copy()
-    on_ground = standing.weigh(ekf, pairs, anchors, tuning, z, z_std, at_rest, its) > (0.0 if still else standing.DECISIVE)
-    good = share >= AGREE and workspace.contains(ekf.workspace, x[0]) and (workspace.contains(near, x[0]) or not on_ground)
+    lead = standing.weigh(ekf, pairs, anchors, tuning, z, z_std, at_rest, its)
+    still = ground.is_still(pairs, anchors, at_rest, ekf.still_covariance)
+    on_ground = lead > (0.0 if still else standing.DECISIVE)
+    good = still if on_ground else share >= AGREE and workspace.contains(ekf.workspace, x[0])
     if not (good or anyhow):
         return
-    if on_ground and (still or not good):
-        cost[1:] = np.inf
-    if still or (not good and cost[1] > -hypotheses.PRUNED_BELOW):
+    if still or on_ground or not (good or cost[1] < np.inf):
         x[0], covariance[0] = at_rest, its
+    if on_ground:
+        cost[1] = np.inf
+    else:
+        split(x, covariance, cost)
+        standing.sort(x, covariance, cost, near)
     for place in range(PLACES if still else 0):
         standing.stop(x[place], covariance[place], ekf.still_covariance)
     _begin(ekf, tuning, t, x, covariance, cost, tuning.initial_yaw, tuning.initial_yaw_std)

@@ -18,6 +18,7 @@ LONGEST_STEP = 2.0  # m
 INLIER = 0.75  # m, a residual below this does not contradict a position
 NO_SCALE = 1e6  # m, of a loss that is quadratic
 APART = 1.0  # m between two places, and standard deviation of a place that becomes two
+IMPROBABLE = 8.0  # minus the logarithm of the probability of a place beside another, beyond which it is none
 SPLIT = 0.8  # standard deviations from the middle of a place to each of two that it becomes
 
 
@@ -60,7 +61,7 @@ def locate(window, anchors, workspace, std, z, z_std, x, covariance, cost):
     share, least = 0.0, np.min(losses)
     for place in range(len(x)):
         start = np.argmin(losses)
-        cost[place] = losses[start] - least
+        cost[place] = losses[start] - least if losses[start] - least < IMPROBABLE else np.inf
         x[place] = trials[start]
         _normal_equations(window, anchors, x[place], NO_SCALE, system, residuals)
         variance = correlation_length * max(std, 1.5 * np.median(np.abs(residuals))) ** 2
