@@ -10,7 +10,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .ground import solve
 
-SHARE = 0.3  # of the variance of a TDOA that persists
+SHARE = 0.4  # of the variance of a TDOA that persists: about that of delays and antennas in tdoa_std as it is by default
 MEMORY = 1.0  # s of TDOAs that are looked at: an anchor that was not heard for so long is not there
 LONGEST_STEP = 0.1  # s; what anchors tell is not forgotten in silence
 MOST = 400.0  # times the covariance of the filter is the most that is added: it does not hear anchors alone
