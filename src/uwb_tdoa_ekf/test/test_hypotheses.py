@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.hypotheses import (
-    LARGEST_NIS, PRUNED_BELOW, YAW_STD, add_log_likelihood, add_spread_of_means, select, yaw_offset,
+    LARGEST_NIS, MERGED_WITHIN, PRUNED_BELOW, YAW_STD, add_log_likelihood, add_spread_of_means, select, yaw_offset,
 )  # fmt: skip
-from uwb_tdoa_ekf.core.memory import HYPOTHESES, new_memory
+from uwb_tdoa_ekf.core.memory import HYPOTHESES, PLACES, YAWS, new_memory
 from uwb_tdoa_ekf.offline import run_offline
 
 NOISE = dict(accel_noise=0.01, gyro_noise=0.001)  # a common sensor that does not vibrate
@@ -23,14 +23,16 @@ def yaw_errors(flight, odometry):
 
 def ekf_with(yaws, log_weights):
     ekf = new_memory(np.zeros((4, 3))).record
-    ekf.hypotheses["log_weight"] = log_weights
+    ekf.hypotheses["log_weight"] = np.append(log_weights, np.full(HYPOTHESES - len(log_weights), -np.inf))
     for h, yaw in enumerate(yaws):
         ekf.hypotheses["x"][h, 6:10] = Rotation.from_euler("z", yaw).as_quat()
     return ekf
 
 
 def test_directions_share_the_circle():
-    np.testing.assert_allclose(np.diff([yaw_offset(h) for h in range(HYPOTHESES + 1)]), 2.0 * np.pi / HYPOTHESES)
+    for place in range(PLACES):
+        offsets = [yaw_offset(YAWS * place + k) for k in range(YAWS)]
+        np.testing.assert_allclose(offsets, np.arange(YAWS) * 2.0 * np.pi / YAWS)
 
 
 def test_log_likelihood_is_the_logarithm_of_the_gaussian_density_and_bounded():
@@ -48,7 +50,14 @@ def test_select_follows_the_best_and_prunes_the_improbable_and_the_same():
     ekf = ekf_with([0.0, 0.05, 2.0, 3.0], [-1.0, -2.0, -3.0, -1.0 + 1.1 * PRUNED_BELOW])
     select(ekf, 5.0)
     assert ekf.best == 0
-    np.testing.assert_array_equal(ekf.hypotheses["log_weight"], [0.0, -np.inf, -2.0, -np.inf])
+    np.testing.assert_array_equal(ekf.hypotheses["log_weight"][:4], [0.0, -np.inf, -2.0, -np.inf])
+
+
+def test_what_is_elsewhere_is_not_the_same_whichever_way_it_faces():
+    ekf = ekf_with([0.0, 0.0, 0.0], [0.0, -1.0, -1.0])
+    ekf.hypotheses["x"][1, 2], ekf.hypotheses["x"][2, 2] = 1.5 * MERGED_WITHIN, 0.5 * MERGED_WITHIN
+    select(ekf, 5.0)
+    np.testing.assert_array_equal(ekf.hypotheses["log_weight"][:3], [0.0, -1.0, -np.inf])
 
 
 def test_spread_of_means_is_the_distance_to_the_others():

@@ -84,3 +84,15 @@ def test_samples_are_averaged_with_the_last_one_unless_it_is_old():
         hold(imu, sample)
         np.testing.assert_allclose(imu.gyro, size)
     np.testing.assert_allclose(imu.mean_accel, 70.0)
+
+
+def test_what_is_far_from_hovering_is_taken_for_what_it_is_however_it_vibrates():
+    """A turn with 3 g; a vibrating sensor that is off by as much as vibration makes it stays between."""
+    tuning = FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).tuning()[0]
+    weights = {}
+    for force in (1.0, 1.2, 3.0):
+        imu = after((np.zeros(3), 0.0), (force * UP, 1.0))
+        weigh(imu, False, tuning)
+        weights[force] = imu.accel_weight[2]
+    assert weights[1.0] == pytest.approx(weights[1.2], rel=0.1) and weights[1.0] < 0.6
+    assert weights[3.0] > 0.95

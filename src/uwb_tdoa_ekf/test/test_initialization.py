@@ -82,3 +82,26 @@ def test_the_window_keeps_the_latest_tdoas_in_order():
         remember(ekf, structured(TDOA, *np.array([[0.01 * k], [k % 4], [0], [k], [0.0]]))[0], memory.anchors)
     assert WINDOW <= ekf.kept <= 2 * WINDOW
     np.testing.assert_array_equal(ekf.window["d"][: ekf.kept], np.arange(fed - ekf.kept, fed))
+
+
+def beside(flight, positions):
+    """The flight, heard by anchors at other positions (N, 3) m."""
+    a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
+    p = flight.meta["wave"].motion(flight.tdoa.t)[0]
+    d = tdoa(p, positions[a], positions[b]) + 0.1 * np.random.default_rng(0).standard_normal(len(p))
+    return replace(flight, anchors=replace(flight.anchors, positions=positions), tdoa=replace(flight.tdoa, d=d))
+
+
+def test_of_anchors_on_a_wall_both_sides_are_followed_until_motion_tells():
+    """The deviation is as large as the sides are apart; the accelerometer then decides."""
+    y, z = np.meshgrid([0.0, 2.7, 5.3, 8.0], [0.3, 3.0])
+    wall = np.column_stack([np.full(8, 0.5), y.ravel(), z.ravel()])
+    wrong = 0
+    for seed in range(6):
+        flight = beside(fly(seed, 15.0), wall)
+        odometry, _ = drive(flight)
+        off = errors(flight, odometry)
+        std = np.sqrt(np.trace(odometry.covariance[:, :3, :3], axis1=1, axis2=2))
+        wrong += (off > 1.5).any()
+        assert (off < 4.0 * std).all() and off[-1] < 1.0
+    assert wrong  # of some the other side is believed in for a while

@@ -70,6 +70,8 @@ def test_what_a_tag_may_do_is_no_fault():
     """It falls, is hit, spins, banks with its thrust (all that a multirotor feels), and is turned on its back for a while."""
     fall = np.where((T > 5.0) & (T < 5.2), -GRAVITY, 0.0) + np.where((T > 5.2) & (T < 5.25), 4.0 * GRAVITY, 0.0)
     bank = np.interp(T, [5.0, 5.5, 7.0, 7.5], np.deg2rad([0.0, 60.0, 60.0, 0.0]))
+    swing = np.where(np.sin(2.0 * np.pi * 0.6 * T) > 0.0, 0.3, 1.5) * GRAVITY  # as a controller that is pulled up and down
+    turn = np.interp(T, [5.0, 5.5, 9.0, 9.5], [1.0, 3.3, 3.3, 1.0]) * GRAVITY
     over = np.interp(T, [5.0, 6.0, 8.0, 9.0], [0.0, np.pi, np.pi, 0.0])
     thrust = (GRAVITY / np.cos(bank))[:, None] * [0.0, 0.0, 1.0]
     rest = Rotation.from_euler("X", 0.0 * T)
@@ -78,6 +80,8 @@ def test_what_a_tag_may_do_is_no_fault():
         sensed(Rotation.from_euler("X", over)), (sensed(Rotation.from_euler("X", bank))[0], thrust),
     ):  # fmt: skip
         assert left_out(gyro, accel) == []
+    for force in (swing, turn):
+        assert left_out(sensed(rest)[0], force[:, None] * [0.0, 0.0, 1.0]) == []
 
 
 def test_a_tag_that_lies_on_its_back_goes_without_after_some_seconds():

@@ -18,8 +18,8 @@ def placed(p, elsewhere, late=0.0, seed=0, memory=None):
     memory = memory or new_memory(POSITIONS)
     set_bounds(memory.anchors, 1.0, memory.record.workspace)
     x, covariance = np.array([*elsewhere, 0.0, 0.0, 0.0]), 0.04 * np.eye(6)
-    on_ground = weighed(memory.ekf, heard(p, late=late, seed=seed), memory.anchors, TUNING, x, covariance)
-    return x[:3], np.sqrt(np.diag(covariance)[:3]), on_ground
+    lead = weighed(memory.ekf, heard(p, late=late, seed=seed), memory.anchors, TUNING, x, covariance)
+    return x[:3], np.sqrt(np.diag(covariance)[:3]), lead > 0.0
 
 
 @pytest.mark.parametrize("seed", range(5))

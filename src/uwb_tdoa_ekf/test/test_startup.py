@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
-from uwb_tdoa_ekf.core.startup import INLIER, level, locate, share_of_inliers
+from uwb_tdoa_ekf.core.startup import APART, INLIER, level, locate, share_of_inliers, split
 from uwb_tdoa_ekf.core.workspace import set_bounds
 
 SIZE = np.array([7.0, 8.0, 3.0])
@@ -37,12 +37,18 @@ def window_of(t, a, b, d):
     return structured(TDOA, t, a, b, d, np.zeros(len(t)))
 
 
-def located(tdoas, positions, std=STD):
-    x, covariance, workspace = np.empty(6), np.empty((6, 6)), np.empty((2, 3))
+def places(tdoas, positions, count=2, std=STD):
+    """(x (count, 6), covariance (count, 6, 6), cost (count,), share) as of `locate`."""
+    x, covariance, cost, workspace = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count), np.empty((2, 3))
     anchors = new_memory(positions).anchors
     set_bounds(anchors, 1.0, workspace)
-    share = locate(window_of(*tdoas), anchors, workspace, std, np.nan, np.nan, x, covariance)
-    return x, covariance, share
+    share = locate(window_of(*tdoas), anchors, workspace, std, np.nan, np.nan, x, covariance, cost)
+    return x, covariance, cost, share
+
+
+def located(tdoas, positions):
+    x, covariance, _, share = places(tdoas, positions, count=1)
+    return x[0], covariance[0], share
 
 
 def errors(n, count, speed=0.0, seed=0, **kind):
@@ -93,6 +99,47 @@ def test_anchors_in_one_plane_tell_the_distance_from_it_but_not_the_side():
         p = rng.uniform(0.15, 0.85, 3) * SIZE
         x, _, _ = located(window(rng, positions, p, np.zeros(3)), positions)
         np.testing.assert_allclose([x[0], x[1], abs(x[2] - 3.0)], [p[0], p[1], abs(p[2] - 3.0)], atol=0.1)
+
+
+def test_anchors_on_a_wall_leave_two_places_and_no_others():
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        positions = constellation(16, rng)
+        positions[:, 0] = 0.0
+        p = np.array([2.0, 4.0, 1.5]) + rng.uniform(-0.5, 0.5, 3)
+        x, _, cost, _ = places(window(rng, positions, p, np.zeros(3)), positions, 3)
+        np.testing.assert_allclose(sorted(x[:2, 0]), [-p[0], p[0]], atol=0.1)
+        assert cost[0] == 0.0 and cost[1] < 0.1
+        if np.isfinite(cost[2]):  # on the wall between them
+            assert abs(x[2, 0]) < 0.1 and cost[2] > cost[1]
+
+
+def test_anchors_all_around_leave_one_place():
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        positions, p = constellation(8, rng), rng.uniform(0.15, 0.85, 3) * SIZE
+        assert places(window(rng, positions, p, np.zeros(3)), positions)[2][1] == np.inf
+
+
+def test_a_place_that_is_hardly_known_is_split_and_its_mean_and_covariance_stay():
+    rng = np.random.default_rng(5)
+    root = np.zeros((6, 6))
+    root[:3, :3] = rng.standard_normal((3, 3)) @ np.diag([3.0, 0.5, 0.3])
+    root[3:, 3:] = np.eye(3)
+    whole, mean = root @ root.T, rng.standard_normal(6)
+    x, covariance, cost = np.array([mean, mean]), np.array([whole, whole]), np.array([0.0, np.inf])
+    split(x, covariance, cost)
+    assert cost[1] == cost[0] and np.linalg.norm(x[0, :3] - x[1, :3]) > APART
+    np.testing.assert_allclose(x.mean(axis=0), mean, atol=1e-9)
+    apart = x - mean
+    np.testing.assert_allclose(covariance.mean(axis=0) + apart.T @ apart / 2.0, whole, atol=1e-6)
+    assert (np.linalg.eigvalsh(covariance[0]) > 0.0).all()
+
+
+def test_a_place_that_is_known_is_not_split():
+    x, covariance, cost = np.zeros((2, 6)), np.array([np.eye(6) * 0.5] * 2), np.array([0.0, np.inf])
+    split(x, covariance, cost)
+    assert cost[1] == np.inf and not x.any()
 
 
 def test_few_anchors_in_one_plane_say_how_little_they_tell():

@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_ekf.core import systematic
+from uwb_tdoa_ekf.core.memory import new_memory
+
+ANCHORS = np.array([[x, y, z] for x in (0.0, 7.0) for y in (0.0, 8.0) for z in (0.2, 3.0)])
+STD = 0.25
+
+
+@compiled
+def _observe(ekf, anchors, a, b, t, last):
+    systematic.observe(ekf[0].information, anchors[a], anchors[b], ekf[0].innovation, t, last)
+
+
+def informed(p, seconds=5.0, rate=400.0, heard=range(8), memory=None, begin=0.0):
+    """A Memory that has taken TDOAs round the ring of the anchors `heard` at a place p (3,)."""
+    memory, heard = memory or new_memory(ANCHORS), list(heard)
+    way = np.array(p) - ANCHORS
+    unit = way / np.linalg.norm(way, axis=1)[:, None]
+    for k in range(int(seconds * rate)):
+        a, b = heard[k % len(heard)], heard[(k + 1) % len(heard)]
+        innovation = memory.record.innovation
+        innovation.row[:3] = unit[b] - unit[a]
+        innovation.noise_variance, innovation.weight, innovation.curvature = STD**2, 1.0, 0.0
+        t = begin + k / rate
+        _observe(memory.ekf, memory.anchors, a, b, t, t - 1.0 / rate if k else -np.inf)
+    return memory
+
+
+def stated(memory, P):
+    covariance = np.zeros((9, 9))
+    whole = np.zeros((15, 15))
+    whole[:3, :3] = P
+    systematic.add(memory.record.information, whole, covariance)
+    return covariance[:3, :3]
+
+
+@pytest.mark.parametrize("p", [[3.0, 4.0, 1.5], [1.0, 6.0, 0.5]])
+def test_it_is_the_covariance_of_a_position_by_one_arrival_from_each_anchor(p):
+    """Least squares with an error of its own for each anchor, and a common one of the clock."""
+    way = np.array(p) - ANCHORS
+    unit = way / np.linalg.norm(way, axis=1)[:, None]
+    centred = unit - unit.mean(axis=0)
+    of_anchor = systematic.SHARE * STD**2 / 2.0
+    expected = np.linalg.inv(centred.T @ centred) * of_anchor
+    # a ring of neighbours weighs directions a little differently from all pairs
+    found = stated(informed(p), 1e3 * np.eye(3))
+    assert 0.4 < np.trace(found) / np.trace(expected) < 2.5
+
+
+def test_it_does_not_become_less_with_more_tdoas():
+    slow, quick = (np.trace(stated(informed([3.0, 4.0, 1.5], rate=rate), np.eye(3))) for rate in (50.0, 800.0))
+    assert slow == pytest.approx(quick, rel=0.2)
+
+
+def test_what_is_not_heard_any_more_is_forgotten_but_silence_is_not_taken_for_that():
+    memory, P = informed([3.0, 4.0, 1.5]), 0.01 * np.eye(3)
+    before = np.trace(stated(memory, P))
+    informed([3.0, 4.0, 1.5], 0.01, memory=memory, begin=30.0)
+    assert np.trace(stated(memory, P)) < 2.0 * before
+    informed([3.0, 4.0, 1.5], 5.0, heard=(0, 1), memory=memory, begin=31.0)
+    assert np.trace(stated(memory, P)) > 5.0 * before
+
+
+def test_it_is_bounded_by_what_the_filter_knows():
+    P = np.diag([0.01, 0.02, 0.03])
+    memory = new_memory(ANCHORS)
+    np.testing.assert_allclose(stated(memory, P), systematic.MOST * P, rtol=1e-9)
+    assert not stated(memory, np.zeros((3, 3))).any()
