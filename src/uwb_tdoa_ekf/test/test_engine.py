@@ -63,7 +63,7 @@ def test_odometry_comes_at_the_first_event_of_each_period():
 def test_residuals_are_innovation_and_its_variance():
     """Against the odometry: at 1 MHz every event gives one, so that the one before a TDOA holds the state it met."""
     flight = fly(7, 2.0, imu_rate=1000.0)
-    odometry, residuals = drive(flight, FilterConfig(odometry_rate=1e6, tdoa_std=0.2))
+    odometry, residuals = drive(flight, FilterConfig(odometry_rate=1e6, tdoa_std=0.2, tdoa_correlation_length=1.0))
     tested = 0
     for k in np.flatnonzero(residuals.verdict == USED)[50:150]:
         before = np.searchsorted(odometry.t, flight.tdoa.t[k]) - 1

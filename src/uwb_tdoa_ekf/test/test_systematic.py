@@ -29,11 +29,11 @@ def informed(p, seconds=5.0, rate=400.0, heard=range(8), memory=None, begin=0.0)
     return memory
 
 
-def stated(memory, P):
+def stated(memory, P, correlation_length=np.inf):
     covariance = np.zeros((9, 9))
     whole = np.zeros((15, 15))
     whole[:3, :3] = P
-    systematic.add(memory.record.information, whole, covariance)
+    systematic.add(memory.record.information, whole, correlation_length, covariance)
     return covariance[:3, :3]
 
 
@@ -62,6 +62,12 @@ def test_what_is_not_heard_any_more_is_forgotten_but_silence_is_not_taken_for_th
     assert np.trace(stated(memory, P)) < 2.0 * before
     informed([3.0, 4.0, 1.5], 5.0, heard=(0, 1), memory=memory, begin=31.0)
     assert np.trace(stated(memory, P)) > 5.0 * before
+
+
+def test_of_white_noise_nothing_persists():
+    memory, P = informed([3.0, 4.0, 1.5]), np.eye(3)
+    assert not stated(memory, P, 1.0).any()
+    assert 0.5 < np.trace(stated(memory, P, 6.0)) / np.trace(stated(memory, P)) < 1.0
 
 
 def test_it_is_bounded_by_what_the_filter_knows():

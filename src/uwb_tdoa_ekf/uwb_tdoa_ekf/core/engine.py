@@ -57,7 +57,7 @@ def run(memory, tuning, measurements, output):
             m += 1
         if ekf.running and t >= ekf.next_odometry:
             ekf.next_odometry = (math.floor(t * parameters.odometry_rate + 1e-6) + 1.0) / parameters.odometry_rate
-            _report(ekf, t, output.odometry[rows])
+            _report(ekf, parameters, t, output.odometry[rows])
             rows += 1
     return rows
 
@@ -312,14 +312,14 @@ def _stay_on_floor(ekf, tuning, t, records):
 
 
 @compiled
-def _report(ekf, t, row):
+def _report(ekf, tuning, t, row):
     """Write the best hypothesis to one of ODOMETRY."""
     best = ekf.hypotheses[ekf.best]
     row.t = t
     row.x[:] = best.x
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
-    systematic.add(ekf.information, best.P, row.covariance)
+    systematic.add(ekf.information, best.P, tuning.tdoa_correlation_length, row.covariance)
 
 
 def feed(memory, tuning, measurements, records=None):

@@ -10,7 +10,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .ground import solve
 
-SHARE = 0.4  # of the variance of a TDOA that persists: about that of delays and antennas in tdoa_std as it is by default
+SHARE = 0.5  # of the variance of a TDOA that persists where its errors are correlated: delays and antennas, as large as noise
 MEMORY = 1.0  # s of TDOAs that are looked at: an anchor that was not heard for so long is not there
 LONGEST_STEP = 0.1  # s; what anchors tell is not forgotten in silence
 MOST = 400.0  # times the covariance of the filter is the most that is added: it does not hear anchors alone
@@ -18,32 +18,34 @@ MOST = 400.0  # times the covariance of the filter is the most that is added: it
 
 @compiled
 def begin(information, P):
-    """Fill in the information (3, 3), 1/m^2, of a start whose covariance P (15, 15) has counted each anchor once."""
+    """Fill in the information (3, 3), 1/m^2, of a start whose covariance P (15, 15) has counted each anchor once, see `observe`."""
     both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
     solve(both)
-    information[:, :] = both[:, 3:]
+    information[:, :] = SHARE * both[:, 3:]
 
 
 @compiled
 def observe(information, a, b, innovation, t, last):
     """Take a TDOA stamped t, s, between two of ANCHOR, an INNOVATION, into the information (3, 3), 1/m^2, of a position by a single
-    arrival from each anchor that is heard; last : s, stamp of the TDOA before."""
+    TDOA of each anchor that is heard, as noisy as it is; last : s, stamp of the TDOA before."""
     fades = min(t - last, LONGEST_STEP) / MEMORY
     apart = 0.5 * (min(t - a.heard, MEMORY) + min(t - b.heard, MEMORY)) / MEMORY  # adds up to the number of anchors
     a.heard = b.heard = t
-    gain = apart * innovation.weight / (SHARE * innovation.noise_variance + innovation.curvature)
+    gain = apart * innovation.weight / (innovation.noise_variance + innovation.curvature / SHARE)
     for i in range(3):
         for j in range(3):
             information[i, j] += gain * innovation.row[i] * innovation.row[j] - fades * information[i, j]
 
 
 @compiled
-def add(information, P, covariance):
-    """Add to a (9, 9) covariance what errors that persist make of a position whose covariance in the filter is P (15, 15)."""
+def add(information, P, correlation_length, covariance):
+    """Add to a (9, 9) covariance what errors that persist make of a position whose covariance in the filter is P (15, 15). Of white noise,
+    of correlation_length 1, nothing persists."""
+    share = SHARE * (1.0 - 1.0 / max(correlation_length, 1.0))
     both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
-    if not solve(both):
+    if share == 0.0 or not solve(both):
         return
-    both[:, :3] = information + both[:, 3:] / MOST
+    both[:, :3] = information / share + both[:, 3:] / MOST
     both[:, 3:] = np.eye(3)
     if solve(both):
         covariance[:3, :3] += both[:, 3:]
