@@ -21,6 +21,7 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.messages import tdoa_messages
 from uwb_tdoa_tools.bags.message_types import typestore
+from uwb_tdoa_tools.readers.streams import LARGEST_NUMBER
 
 BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 
@@ -55,7 +56,7 @@ def flights(draw):
         return np.sort(np.array(ticks, dtype=np.int64)) / 1e6
 
     def values(*shape):
-        return draw(arrays(float, shape, elements=st.floats(allow_nan=False, allow_infinity=False)))
+        return draw(arrays(float, shape, elements=st.floats(-LARGEST_NUMBER, LARGEST_NUMBER)))
 
     ids = draw(st.lists(st.integers(0, 65535), min_size=1, max_size=4, unique=True))
     unit = st.sampled_from([[0.0, 0.0, 0.0, 1.0], [0.6, 0.0, -0.8, 0.0], [np.nan] * 4])
