@@ -144,6 +144,7 @@ def test_refused_at_once(tmp_path, made, said):
         (b"\x3a\x80\x80\x80\x80" + b"\xff" * 1_000_000, "a number of more than 64 bits"),
         (b"\x08\x01" * (MODEL_BYTES // 2), "no ONNX model"),
         (bytes(MODEL_BYTES + 1), "more than 4000000 bytes"),
+        (b"\x0a" + b"\xf5" + 8 * b"\xff" + b"\x01", "no protocol buffer"),  # a length of -11: backwards to itself
     ],
 )
 def test_bytes_without_end(tmp_path, content, said):

@@ -82,7 +82,7 @@ def _message(data):
             size = {EIGHT_BYTES: 8, FOUR_BYTES: 4}.get(key & 7)
             if key & 7 == BYTES:
                 size, place = _varint(data, place)
-            if size is None or place + size > len(data):
+            if size is None or not 0 <= size <= len(data) - place:
                 raise Unreadable("no protocol buffer")
             value, place = data[place : place + size], place + size
         out[key >> 3].append(value)
