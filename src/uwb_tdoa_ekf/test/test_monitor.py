@@ -27,7 +27,7 @@ def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=
         kept = heard(t, a, b)
         one = np.ones(kept.sum())
         zeros, bias = np.zeros((RATE, 3)), np.column_stack([np.zeros((RATE, 2)), [gyro(x) for x in t]])
-        odometry = Odometry(t, p, v, np.tile([0, 0, 0, 1.0], (RATE, 1)), zeros, bias, np.zeros((RATE, 9, 9)))
+        odometry = Odometry(t, p, v, np.tile([0, 0, 0, 1.0], (RATE, 1)), zeros, bias, np.zeros((RATE, 9, 9)), np.zeros((RATE, 3, 3)))
         verdict = np.full(len(one), USED)
         monitor.add(odometry, Residuals(t[kept], IDS[a][kept], IDS[b][kept], innovation[kept], noise**2 * one, one, verdict))
         monitor.judge(second + 1.0)
@@ -112,7 +112,7 @@ def test_what_makes_several_late_at_once_names_none(seed):
 
 def test_what_did_not_reach_the_filter_does_not_count():
     monitor, one = Monitor(ANCHORS), np.ones(1)
-    nothing = Odometry(*(np.empty((0, *shape)) for shape in ((), (3,), (3,), (4,), (3,), (3,), (9, 9))))
+    nothing = Odometry(*(np.empty((0, *shape)) for shape in ((), (3,), (3,), (4,), (3,), (3,), (9, 9), (3, 3))))
     monitor.add(nothing, Residuals(one, 3 * one, 99 * one, np.nan * one, np.nan * one, 0 * one, np.full(1, INVALID)))
     monitor.judge(np.inf)
     assert monitor.alarms == []
@@ -124,7 +124,7 @@ def test_remembers_no_more_of_odometry_without_tdoas_than_of_one_slice():
     for second in range(100):
         t = second + np.arange(RATE) / RATE
         still = np.zeros((RATE, 3))
-        odometry = Odometry(t, still, still, np.zeros((RATE, 4)), still, still, np.zeros((RATE, 9, 9)))
+        odometry = Odometry(t, still, still, np.zeros((RATE, 4)), still, still, np.zeros((RATE, 9, 9)), np.zeros((RATE, 3, 3)))
         some = Residuals(t, IDS[[0] * RATE], IDS[[1] * RATE], 0 * t, 1 + 0 * t, 1 + 0 * t, np.full(RATE, USED))
         monitor.add(odometry, some if second == 10 else none)
         monitor.judge(second + 1.0)
@@ -145,7 +145,7 @@ def test_does_not_depend_on_when_it_is_asked():
         monitor = Monitor(ANCHORS)
         for part in np.array_split(np.arange(3000), pieces):
             n = len(part)
-            state = p[part], np.ones((n, 3)), np.ones((n, 4)), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 9, 9))
+            state = p[part], np.ones((n, 3)), np.ones((n, 4)), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 9, 9)), np.zeros((n, 3, 3))
             rows = Residuals(t[part], IDS[a[part]], IDS[b[part]], innovation[part], np.ones(n), np.ones(n), np.full(n, USED))
             monitor.add(Odometry(t[part], *state), rows)
             monitor.judge(t[part][-1])

@@ -30,11 +30,11 @@ def informed(p, seconds=5.0, rate=400.0, heard=range(8), memory=None, begin=0.0)
 
 
 def stated(memory, P, correlation_length=np.inf):
-    covariance = np.zeros((9, 9))
+    covariance = np.full((3, 3), np.nan)
     whole = np.zeros((15, 15))
     whole[:3, :3] = P
-    systematic.add(memory.record.information, whole, correlation_length, covariance)
-    return covariance[:3, :3]
+    systematic.fill(memory.record.information, whole, correlation_length, covariance)
+    return covariance
 
 
 @pytest.mark.parametrize("p", [[3.0, 4.0, 1.5], [1.0, 6.0, 0.5]])

@@ -52,7 +52,8 @@ class Residuals:
 @dataclass(frozen=True)
 class Odometry:
     """Estimates. t (n,) s; p (n, 3) m; v (n, 3) m/s, world; q (n, 4) x y z w, body to world; accel_bias (n, 3) m/s^2
-    and gyro_bias (n, 3) rad/s, body; covariance (n, 9, 9) of [p, v, attitude], the attitude's in the body frame, rad."""
+    and gyro_bias (n, 3) rad/s, body; covariance (n, 9, 9) of [p, v, attitude], the attitude's in the body frame, rad;
+    persistent (n, 3, 3) m^2, what of the position's covariance errors that do not average out make."""
 
     t: np.ndarray
     p: np.ndarray
@@ -61,12 +62,13 @@ class Odometry:
     accel_bias: np.ndarray
     gyro_bias: np.ndarray
     covariance: np.ndarray
+    persistent: np.ndarray
 
     @classmethod
     def from_rows(cls, rows):
         """From (n,) of memory.ODOMETRY."""
         x = rows["x"]
-        return cls(rows["t"], x[:, :3], x[:, 3:6], x[:, 6:10], x[:, 10:13], x[:, 13:], rows["covariance"])
+        return cls(rows["t"], x[:, :3], x[:, 3:6], x[:, 6:10], x[:, 10:13], x[:, 13:], rows["covariance"], rows["persistent"])
 
     def __len__(self):
         return len(self.t)

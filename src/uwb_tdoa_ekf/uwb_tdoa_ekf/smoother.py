@@ -39,7 +39,7 @@ def smooth(flight, config=None, corrector=None):
     adjoint, information = np.zeros(ERROR_STATES), np.zeros((ERROR_STATES, ERROR_STATES))
     rows = [np.empty(0, ODOMETRY)]
     for k in reversed(range(len(records))):
-        room = np.empty(len(records[k]), ODOMETRY)
+        room = np.zeros(len(records[k]), ODOMETRY)
         count = _backward(records[k], before[k], config.odometry_rate, adjoint, information, room)
         rows.append(room[len(room) - count :])
     return replace(result, odometry=Odometry.from_rows(np.concatenate(rows[::-1])))

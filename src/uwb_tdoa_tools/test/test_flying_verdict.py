@@ -26,7 +26,7 @@ def made_up(z=None, xy=(0.0, 0.0), tilt=0.0, off=0.1, deviation=0.1, sink=0.2, c
     p = states[::2, :3] + off / np.sqrt(3.0)
     odometry = Odometry(
         t, p, np.zeros((len(t), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1)), *np.zeros((2, len(t), 3)),
-        np.tile(deviation**2 * np.eye(9), (len(t), 1, 1)),
+        np.tile(deviation**2 * np.eye(9), (len(t), 1, 1)), np.zeros((len(t), 3, 3)),
     )  # fmt: skip
     mission = SimpleNamespace(
         begin=0.0, started=started, ended=ended, lost=None, state=state, place=np.zeros(2), ground=0.0,

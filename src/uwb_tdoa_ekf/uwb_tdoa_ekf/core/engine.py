@@ -319,7 +319,8 @@ def _report(ekf, tuning, t, row):
     row.x[:] = best.x
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
-    systematic.add(ekf.information, best.P, tuning.tdoa_correlation_length, row.covariance)
+    systematic.fill(ekf.information, best.P, tuning.tdoa_correlation_length, row.persistent)
+    row.covariance[:3, :3] += row.persistent
 
 
 def feed(memory, tuning, measurements, records=None):

@@ -164,7 +164,10 @@ EKF = _record(
 )
 
 # What comes out.
-ODOMETRY = _record(("t", float), ("x", float, NOMINAL_STATES), ("covariance", float, (9, 9)))  # of [p, v, attitude]
+ODOMETRY = _record(
+    ("t", float), ("x", float, NOMINAL_STATES), ("covariance", float, (9, 9)),  # of [p, v, attitude]
+    ("persistent", float, (3, 3)),  # what of it errors that persist make, see systematic.py
+)  # fmt: skip
 RESIDUAL = _record(("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8))
 
 

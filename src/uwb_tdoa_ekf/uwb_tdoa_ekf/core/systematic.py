@@ -38,9 +38,10 @@ def observe(information, a, b, innovation, t, last):
 
 
 @compiled
-def add(information, P, correlation_length, covariance):
-    """Add to a (9, 9) covariance what errors that persist make of a position whose covariance in the filter is P (15, 15). Of white noise,
-    of correlation_length 1, nothing persists."""
+def fill(information, P, correlation_length, covariance):
+    """Fill in the covariance (3, 3), m^2, that errors which persist make of a position whose covariance in the filter is P (15, 15). Of white
+    noise, of correlation_length 1, nothing persists."""
+    covariance[:, :] = 0.0
     share = SHARE * (1.0 - 1.0 / max(correlation_length, 1.0))
     both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
     if share == 0.0 or not solve(both):
@@ -48,4 +49,4 @@ def add(information, P, correlation_length, covariance):
     both[:, :3] = information / share + both[:, 3:] / MOST
     both[:, 3:] = np.eye(3)
     if solve(both):
-        covariance[:3, :3] += both[:, 3:]
+        covariance[:, :] = both[:, 3:]

@@ -78,7 +78,7 @@ def _survey(args):
     cli.show(result.as_text())
     cli.show(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")
     files = (("--survey", "anchors.yaml"), ("--effects", "effects.yaml"), ("--config", "ekf_node.yaml"))
-    cli.show("next: evaluate FLIGHT", *(f"{option} {out / file}" for option, file in files))
+    cli.show(" ".join(["next: evaluate FLIGHT", *(f"{option} {out / file}" for option, file in files)]))
     return 0 if result.why_not is None else 1
 
 

@@ -282,7 +282,8 @@ def _known(constraints, stamps, moved, odometry):
         estimate = np.stack([np.interp(t, odometry.t, odometry.p[:, k]) for k in range(3)], axis=1)
         rows = np.minimum(np.searchsorted(odometry.t, t), len(odometry.t) - 1)
         here = moved[first : first + len(t)]
-        out.append(_Mark(*one.equations(t, estimate, odometry.covariance[rows, :3, :3], here), *one.off(estimate, here)))
+        covariance = odometry.covariance[rows, :3, :3] - odometry.persistent[rows]  # errors of anchors, which persist, are unknowns
+        out.append(_Mark(*one.equations(t, estimate, covariance, here), *one.off(estimate, here)))
         first += len(t)
     return out
 

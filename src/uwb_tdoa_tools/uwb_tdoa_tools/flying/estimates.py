@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.offline import poses_of
 
 from ..benchmark.peer import EVENT, Peer
 
-NOTHING = Odometry(np.empty(0), *(np.empty((0, n)) for n in (3, 3, 4, 3, 3)), np.empty((0, 9, 9)))
+NOTHING = Odometry(np.empty(0), *(np.empty((0, n)) for n in (3, 3, 4, 3, 3)), np.empty((0, 9, 9)), np.empty((0, 3, 3)))
 
 
 class OurFilter:
@@ -109,4 +109,4 @@ class TheirFilter:
         if not self._states:
             return NOTHING
         t, p, v, q = map(np.array, zip(*self._states))
-        return Odometry(t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), np.full((len(t), 9, 9), np.nan))
+        return Odometry(t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), np.full((len(t), 9, 9), np.nan), np.zeros((len(t), 3, 3)))

@@ -164,7 +164,7 @@ class OverTopics:
         t, p, v, q, covariance = map(np.array, zip(*self._rows))
         whole = np.zeros((len(t), 9, 9))
         whole[:, :3, :3] = covariance
-        return Odometry(t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), whole)
+        return Odometry(t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), whole, np.zeros((len(t), 3, 3)))
 
     def _parts(self, t):
         """Seconds and nanoseconds of the stamps, (n,) each, of t (n,) s."""
