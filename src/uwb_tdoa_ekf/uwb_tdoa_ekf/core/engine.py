@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
 from . import aids, barometer, curvature, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, rest, robust, systematic, workspace
-from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, Output
+from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, Output
 from .sensor_functions import take_out
 from .startup import INLIER
 from .state import coast, predict
@@ -135,7 +135,7 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
         _stay_on_floor(ekf, tuning, t, records)
     followed = ekf.best
     hypotheses.select(ekf, t)
-    if ekf.best != followed:
+    if ekf.best // YAWS != followed // YAWS:  # at another place
         history.add_reset(ekf, t, records)
     known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
     agrees = 1.0 if abs(residual.innovation - known) < INLIER else 0.0
