@@ -60,6 +60,12 @@ def test_what_is_elsewhere_is_not_the_same_whichever_way_it_faces():
     np.testing.assert_array_equal(ekf.hypotheses["log_weight"][:3], [0.0, -1.0, -np.inf])
 
 
+def test_two_that_have_become_the_same_are_one_though_neither_is_the_best():
+    ekf = ekf_with([0.0, 2.0, 2.0, -2.0], [0.0, -1.0, -1.0, -3.0])
+    select(ekf, 5.0)
+    np.testing.assert_array_equal(ekf.hypotheses["log_weight"][:4], [0.0, -1.0, -np.inf, -3.0])
+
+
 def test_spread_of_means_is_the_distance_to_the_others():
     ekf = ekf_with([0.0, np.pi / 2, 0.0, 0.0], [0.0, np.log(0.25), -np.inf, -np.inf])
     ekf.hypotheses["x"][1, 0] = 2.0

@@ -59,11 +59,14 @@ def select(ekf, t):
         return
     ekf.next_merge = t + MERGE_PERIOD
     for h in range(HYPOTHESES):
-        if h != best and alive(ekf.hypotheses[h]):
-            apart = difference(ekf.hypotheses[best].x, ekf.hypotheses[h].x)
+        for other in range(HYPOTHESES):
+            one, better = ekf.hypotheses[h], ekf.hypotheses[other]
+            if not alive(one) or (better.log_weight, -other) <= (one.log_weight, -h):
+                continue
+            apart = difference(better.x, one.x)
             turned, away = apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2, apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2
             if turned < MERGED_BELOW**2 and away < MERGED_WITHIN**2:
-                ekf.hypotheses[h].log_weight = -np.inf
+                one.log_weight = -np.inf
 
 
 @compiled

@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from . import ground, height, hypotheses, inertial, standing, systematic, workspace
 from .history import add_reset
 from .memory import HYPOTHESES, PLACES, WINDOW, YAWS
-from .startup import SPEED, level, locate, share_of_inliers, split
+from .startup import APART, SPEED, level, locate, share_of_inliers, split
 from .state import GRAVITY
 
 MINIMUM = 12  # TDOAs a search needs
@@ -66,6 +66,7 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     standing.sort(x, covariance, cost, near)
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     at_rest, its = x[0].copy(), covariance[0].copy()
+    wide = np.trace(its[:3, :3]) > APART**2  # before it holds other explanations
     lead = standing.weigh(ekf, pairs, anchors, tuning, z, z_std, at_rest, its)
     still = ground.is_still(pairs, anchors, at_rest, ekf.still_covariance)
     on_ground = lead > (0.0 if still else standing.DECISIVE)
@@ -76,7 +77,7 @@ def start(ekf, anchors, tuning, t, anyhow, history):
         x[0], covariance[0] = at_rest, its
     if on_ground:
         cost[1] = np.inf
-    else:
+    elif wide:
         split(x, covariance, cost)
         standing.sort(x, covariance, cost, near)
     for place in range(PLACES if still else 0):

@@ -7,7 +7,7 @@ import numpy as np
 from uwb_tdoa_ekf.aid_rows import rows_of
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import HYPOTHESES, IMU_SAMPLE, TDOA, Measurements, new_memory, structured
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, YAWS, Measurements, new_memory, structured
 
 from .figures import Figure
 from .flights import make_flight
@@ -36,7 +36,7 @@ def measure(progress, quick=False):
         progress(f"core, {robust}")
         yield from _pair(f"8 anchors, {robust}", 8, robust, 1, repeats)
     progress("core, yaw unknown")
-    yield from _pair(f"8 anchors, {ROBUST[0]}, while {HYPOTHESES} yaws are followed", 8, ROBUST[0], HYPOTHESES, repeats)
+    yield from _pair(f"8 anchors, {ROBUST[0]}, while {YAWS} yaws are followed", 8, ROBUST[0], YAWS, repeats)
     for aid in NOISES:
         progress(f"core, {aid}")
         yield Figure.of(SECTION, f"one {aid}", "us", per_aid(aid, repeats), OF_AID)
@@ -50,7 +50,7 @@ def _pair(name, anchors, robust, hypotheses, repeats, target=None):
 
 
 def per_event(anchors, robust, hypotheses, repeats):
-    """us per prediction and per update, two (repeats,) arrays, while 1 or HYPOTHESES yaws are followed."""
+    """us per prediction and per update, two (repeats,) arrays, while 1 or YAWS yaws are followed."""
     # A tag that hovers tells nothing about its yaw.
     path = {"trajectory": "hover" if hypotheses > 1 else "sines", "start_in_air": True, "multipath": False}
     flight = make_flight(BEFORE + MEASURED, anchors, **path)
