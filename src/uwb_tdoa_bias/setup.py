@@ -19,6 +19,7 @@ setup(
         "setuptools",
         "numba>=0.57",
         "numpy>=1.26",
+        "onnxruntime>=1.17",
         "PyYAML>=6.0",
         "scipy>=1.11",
     ],

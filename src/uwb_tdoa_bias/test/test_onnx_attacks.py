@@ -31,9 +31,9 @@ def model(*nodes, constants=(), width=2, meta=META, **more):
     return made
 
 
-def doubling():
-    """A kilobyte that becomes 2^30 columns."""
-    return model(*(NODE("Concat", [f"v{k}" if k else "x"] * 2, [f"v{k + 1}"], axis=1) for k in range(30)))
+def doubling(count=30, *before):
+    """A kilobyte that becomes 2^count columns."""
+    return model(*before, *(NODE("Concat", [f"v{k}" if k or before else "x"] * 2, [f"v{k + 1}"], axis=1) for k in range(count)))
 
 
 def looping():
@@ -97,6 +97,12 @@ def gathering(index):
     ("made", "said"),
     [
         (doubling(), "more than 100000 numbers for each row"),
+        (doubling(24, NODE("Elu", ["x"], ["v0"])), "more than 100000 numbers for each row"),
+        (model(NODE("Elu", ["x"], ["h"]), *looping().graph.node, constants=looping().graph.initializer), "a graph within a graph"),
+        (model(NODE("Elu", ["x"], ["h"]), NODE("Expand", ["h", "shape"], ["y"])), "operator 'Expand' is none of"),
+        (model(NODE("Elu", ["x"], ["h"]), read_elsewhere().graph.node[0], constants=read_elsewhere().graph.initializer), "numbers are elsewhere"),
+        (model(NODE("Softmax", ["x"], ["y"], axis=0)), "rows of the input that mix"),
+        (model(NODE("Elu", ["x"], ["y"], alpha="x")), "onnxruntime: "),
         (looping(), "a graph within a graph"),
         (branching(), "a graph within a graph"),
         (read_elsewhere(), "a tensor whose numbers are elsewhere"),
@@ -142,7 +148,7 @@ def test_refused_at_once(tmp_path, made, said):
     [
         (b"\xff" * 1_000_000, "a number of more than 64 bits"),
         (b"\x3a\x80\x80\x80\x80" + b"\xff" * 1_000_000, "a number of more than 64 bits"),
-        (b"\x08\x01" * (MODEL_BYTES // 2), "no ONNX model"),
+        (b"\x08\x01" * (MODEL_BYTES // 2), "a field twice"),
         (bytes(MODEL_BYTES + 1), "more than 4000000 bytes"),
         (b"\x0a" + b"\xf5" + 8 * b"\xff" + b"\x01", "no protocol buffer"),  # a length of -11: backwards to itself
     ],
@@ -153,6 +159,21 @@ def test_bytes_without_end(tmp_path, content, said):
     with pytest.raises(InputError, match=said):
         Network(tmp_path / "model.onnx")
     assert time.process_time() - began < AT_ONCE
+
+
+def test_what_one_reader_takes_for_another_operator_than_the_next_is_refused(tmp_path):
+    """Of a field that comes twice protobuf takes the last, and others the first: what is checked is not what is played."""
+    content = model(NODE("Elu", ["x"], ["y"])).SerializeToString()
+    node = NODE("Elu", ["x"], ["y"]).SerializeToString()
+    twice = node + NODE("Exp", [], []).SerializeToString()
+    graph = onnx.load_model_from_string(content).graph.SerializeToString()
+    forged = graph.replace(bytes([10, len(node)]) + node, bytes([10, len(twice)]) + twice)
+    size = lambda n: bytes([n & 127 | 128, n >> 7]) if n > 127 else bytes([n])  # noqa: E731
+    forged = content.replace(b"\x3a" + size(len(graph)) + graph, b"\x3a" + size(len(forged)) + forged)
+    assert onnx.load_model_from_string(forged).graph.node[0].op_type == "Exp"
+    (tmp_path / "model.onnx").write_bytes(forged)
+    with pytest.raises(InputError, match="a field twice"):
+        Network(tmp_path / "model.onnx")
 
 
 def test_a_name_goes_into_messages_and_tables(tmp_path):

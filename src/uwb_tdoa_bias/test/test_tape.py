@@ -1,4 +1,4 @@
-"""What a tape plays is what the reference of ONNX says; and what it refuses."""
+"""What a tape plays is what the reference of ONNX and onnxruntime say; and what it refuses."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,13 @@ import pytest
 onnx = pytest.importorskip("onnx")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 from onnx.reference import ReferenceEvaluator  # noqa: E402
+from random_samples import random_samples  # noqa: E402
 from uwb_tdoa_bias.correction import tape as tapes  # noqa: E402
-from uwb_tdoa_bias.correction.network import MODELS  # noqa: E402
+from uwb_tdoa_bias.correction.features import NAMES, everything  # noqa: E402
+from uwb_tdoa_bias.correction.network import MODELS, Network  # noqa: E402
 from uwb_tdoa_bias.correction.onnx_file import Unreadable, read_graph  # noqa: E402
-from uwb_tdoa_bias.correction.tape import BATCH, Tape, Unplayable  # noqa: E402
+from uwb_tdoa_bias.correction.session import Session  # noqa: E402
+from uwb_tdoa_bias.correction.tape import BATCH, OF_RUNTIME, Tape, Unplayable  # noqa: E402
 
 COLUMN = np.array([[0.5], [-1.0], [2.0], [0.25], [1.5]], np.float32)
 WEIGHTS = np.random.default_rng(1).normal(size=(5, 7)).astype(np.float32)
@@ -30,7 +33,10 @@ def model(path, nodes, width=5, **constants):
 
 
 def assert_plays(path, positive=False, atol=1e-6):
-    tape, reference = Tape(read_graph(path)), ReferenceEvaluator(str(path))
+    graph, reference = read_graph(path), ReferenceEvaluator(str(path))
+    tape = Tape(graph)
+    session = Session(graph.content, tape)
+    assert tape.complete
     assert tape.meta == {entry.key: entry.value for entry in onnx.load(path).metadata_props}
     assert [name for name, _ in tape.inputs] == list(reference.input_names)
     random = np.random.default_rng(0)
@@ -39,7 +45,8 @@ def assert_plays(path, positive=False, atol=1e-6):
         x = np.abs(x) + 0.1 if positive else x
         if n:
             (expected,) = reference.run(None, {tape.inputs[0][0]: x.astype(np.float32)})
-            np.testing.assert_allclose(tape.run(x), expected, rtol=2e-6, atol=atol)
+            for other in (expected, session.run(x)):
+                np.testing.assert_allclose(tape.run(x), other, rtol=2e-6, atol=atol)
         assert tape.run(x).shape == (n, tape.outputs)
     together = tape.run(x)
     np.testing.assert_array_equal(together, np.concatenate([tape.run(row[None]) for row in x]))  # to the bit
@@ -94,7 +101,7 @@ def test_what_models_are_made_of(tmp_path, nodes):
 @pytest.mark.parametrize(
     "nodes",
     [
-        [("Elu", ["x"], ["y"], {})],
+        [("Softmax", ["x"], ["y"], {"axis": 0})],
         [("LeakyRelu", ["x"], ["y"], {"alpha": 2.0})],
         [("Gemm", ["x", "W"], ["y"], {"alpha": 2.0})],
         [("Reshape", ["x", "s"], ["y"], {})],
@@ -116,6 +123,30 @@ def test_exponentials_are_those_of_float32():
     special = np.array([-np.inf, -50.0, np.nan], np.float32)
     tapes._exponentials(special, out[:3])
     np.testing.assert_array_equal(out[:3], [0.0, 0.0, np.nan])
+
+
+@pytest.mark.parametrize("kind", OF_RUNTIME)
+def test_operators_that_onnxruntime_plays(tmp_path, kind):
+    nodes = [("MatMul", ["x", "W"], ["h"], {}), (kind, ["h"], ["g"], {}), ("Concat", ["g", "x"], ["z"], {"axis": 1}), ("MatMul", ["z", "C"], ["y"], {})]
+    path = model(tmp_path / "model.onnx", nodes, W=WEIGHTS, C=np.ones((12, 2), np.float32))
+    graph, reference = read_graph(path), ReferenceEvaluator(str(path))
+    tape, x = Tape(graph), np.random.default_rng(0).normal(size=(2 * BATCH + 1, 5)).astype(np.float32)
+    assert not tape.complete and tape.outputs == 2
+    session = Session(graph.content, tape)
+    np.testing.assert_allclose(session.run(x), reference.run(None, {tape.inputs[0][0]: x})[0], rtol=1e-5, atol=1e-5)
+    assert session.run(x[:0]).shape == (0, 2)
+
+
+def test_a_network_of_such_an_operator_predicts(tmp_path):
+    meta = {"features": '["dx_a"]', "offset": "[0.0]", "scale": "[1.0]", "clip": "1.0", "name": '"elu"'}
+    path = model(tmp_path / "elu.onnx", [("Elu", ["x"], ["y"], {})], width=1)
+    whole = onnx.load(path)
+    helper.set_model_props(whole, meta)
+    path.write_bytes(whole.SerializeToString())
+    network, samples = Network(path), random_samples(50)
+    (column,) = [k for k, name in enumerate(NAMES) if name == "dx_a"]
+    feature = everything(samples)[:, column]
+    np.testing.assert_allclose(network.predict(samples)[0], np.clip(np.where(feature > 0.0, feature, np.expm1(feature)), -1.0, 1.0), atol=1e-6)
 
 
 @pytest.mark.parametrize("data", [b"\x00", b"no model", b"\x3a\xff\xff\xff\xff\x0f"])

@@ -44,6 +44,7 @@ KEYS = {
     "numba": ("python3-numba", "numba"),
     "numpy": ("python3-numpy", "numpy"),
     "onnx": (None, "onnx"),  # has no rosdep key: README
+    "onnxruntime": ("python3-onnxruntime-pip", "onnxruntime"),
     "pytest": ("python3-pytest", "pytest"),
     "rosbags": ("python3-rosbags-pip", "rosbags"),
     "rotorpy": (None, "rotorpy"),  # an oracle of tests, for who wants it

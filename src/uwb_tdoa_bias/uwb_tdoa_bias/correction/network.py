@@ -26,7 +26,7 @@ import numpy as np
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
 from ..foundation.foreign_text import harmless
-from .features import NAMES, fill_all
+from .features import NAMES, everything, fill_all
 from .onnx_file import Unreadable, read_graph
 from .tape import Tape, Unplayable, play
 
@@ -62,12 +62,14 @@ class Network:
         if not Path(path).is_file():
             raise InputError(f"model: {path} does not exist; give an .onnx file or leave the model empty.")
         try:
-            self._model = Tape(read_graph(path))
+            graph = read_graph(path)
+            tape = Tape(graph)
+            self._model = tape if tape.complete else _session(graph, tape)
         except (Unreadable, Unplayable) as error:
             raise InputError(
                 f"model: {path} cannot be played as an ONNX model of dense layers ({error}); export it again, without what it names."
             ) from error
-        self.meta, inputs = self._model.meta, self._model.inputs
+        self.meta, inputs = tape.meta, tape.inputs
         try:
             self._read(self.meta)
         except (KeyError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
@@ -92,7 +94,7 @@ class Network:
             )
 
     def __reduce__(self):
-        """Pickled as the path of its file."""
+        """Pickled as the path of its file: a session cannot be."""
         return Network, (self._path,)
 
     def _read(self, meta):
@@ -123,9 +125,20 @@ class Network:
         limits = self.clip, self._fade_std, self.share, self._largest_yaw_std
         judging, found = (self._judged, self._lower, self._upper, self._margin, limits, yaw_std), np.empty((3, len(samples)))
         anchors, scaling = samples.anchors, (self._inputs, self._offset, self._scale)
-        at = samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, anchors.orientations
-        _predict(*at, *scaling, *self._model.playable, *judging, found)
+        if isinstance(self._model, Tape):
+            at = samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, anchors.orientations
+            _predict(*at, *scaling, *self._model.playable, *judging, found)
+            return tuple(found)
+        table, x = everything(samples), np.empty((len(samples), len(self._inputs)))
+        _select(table, *scaling, x)
+        _judge(self._model.run(x), table, *judging, found)
         return tuple(found)
+
+
+def _session(graph, tape):
+    from .session import Session  # takes a third of a second
+
+    return Session(graph.content, tape)
 
 
 @compiled

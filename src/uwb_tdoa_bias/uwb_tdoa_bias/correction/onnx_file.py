@@ -36,20 +36,22 @@ class Node:
 @dataclass(frozen=True)
 class Graph:
     """nodes : in the order of their execution; constants : {name: array}; inputs : [(name, shape, with None for what is not
-    fixed)]; outputs : names; meta : {key: text}."""
+    fixed)]; outputs : names; meta : {key: text}; content : the bytes of the file."""
 
     nodes: list
     constants: dict
     inputs: list
     outputs: list
     meta: dict
+    content: bytes
 
 
 def read_graph(path):
     """The Graph of a file; raises Unreadable, and InputError for a file that is none or too large."""
     try:
-        model = _message(read_bytes(path, MODEL_BYTES))
-        graph = _message(model[7][0])
+        content = read_bytes(path, MODEL_BYTES)
+        model = _message(content, 8, 14, 20, 25, 26)
+        graph = _message(model[7][0], 1, 5, 11, 12, 13, 14, 15, 16)
         for part, where in (("nodes", graph[1]), ("constants", graph[5]), ("entries of metadata", model[14])):
             if len(where) > MODEL_NODES:
                 raise Unreadable(f"more than {MODEL_NODES} {part}")
@@ -64,6 +66,7 @@ def read_graph(path):
             inputs=[one for one in inputs if one[0] not in constants],
             outputs=[_message(data)[1][0].decode() for data in graph[12]],
             meta={entry[1][0].decode(): entry[2][0].decode() for entry in entries},
+            content=content,
         )
     except (InputError, Unreadable):
         raise
@@ -71,11 +74,14 @@ def read_graph(path):
         raise Unreadable(f"no ONNX model, {error!r}") from error
 
 
-def _message(data):
-    """{number of a field: its values in their order}: ints or bytes."""
+def _message(data, *repeated):
+    """{number of a field: its values in their order}: ints or bytes. Only fields that are `repeated` come twice: of others, one reader
+    takes the first, one the last, and one both."""
     out, place = defaultdict(list), 0
     while place < len(data):
         key, place = _varint(data, place)
+        if not 0 < key < 1 << 32:
+            raise Unreadable("no protocol buffer")
         if key & 7 == VARINT:
             value, place = _varint(data, place)
         else:
@@ -86,6 +92,8 @@ def _message(data):
                 raise Unreadable("no protocol buffer")
             value, place = data[place : place + size], place + size
         out[key >> 3].append(value)
+    if any(len(values) > 1 and field not in repeated for field, values in out.items()):
+        raise Unreadable("a field twice")
     return out
 
 
@@ -118,7 +126,7 @@ def _ints(values):
 
 def _tensor(data):
     """(name, array) of a TensorProto."""
-    fields = _message(data)
+    fields = _message(data, 1, 4, 5, 6, 7, 10, 11, 13, 16)
     kind = KINDS[fields[2][0]]
     if fields[13] or fields[14] or not (fields[4] or fields[7] or fields[9]):
         raise Unreadable("a tensor whose numbers are elsewhere")
@@ -131,7 +139,7 @@ def _tensor(data):
 
 
 def _node(data):
-    fields = _message(data)
+    fields = _message(data, 1, 2, 5, 9)
     if fields[7] and fields[7][0] not in (b"", b"ai.onnx"):
         raise Unreadable("an operator that is none of ONNX")
     inputs, outputs = ([name.decode() for name in fields[k]] for k in (1, 2))
@@ -139,9 +147,9 @@ def _node(data):
 
 
 def _attribute(data):
-    fields = _message(data)
-    if fields[6] or fields[11]:
-        raise Unreadable("a graph within a graph")
+    fields = _message(data, 7, 8, 9, 10, 11, 15, 23)
+    if any(fields[k] for k in (6, 10, 11, 22, 23)):
+        raise Unreadable("a graph within a graph, or a constant of another kind")
     if fields[5]:
         value = _tensor(fields[5][0])[1]
     elif fields[2]:
@@ -155,9 +163,9 @@ def _attribute(data):
 
 def _value(data):
     """(name, shape) of a ValueInfoProto of a float tensor."""
-    fields = _message(data)
+    fields = _message(data, 4)
     tensor = _message(_message(fields[2][0])[1][0])
     if tensor[1] != [1]:
         raise Unreadable("a value that is no float32")
-    dimensions = [_message(one) for one in _message(tensor[2][0])[1]]
+    dimensions = [_message(one) for one in _message(tensor[2][0], 1)[1]]
     return fields[1][0].decode(), [one[1][0] if one[1] else None for one in dimensions]

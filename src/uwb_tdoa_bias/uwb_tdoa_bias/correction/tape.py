@@ -1,8 +1,8 @@
 """A small ONNX graph as a tape of operations on rows of numbers, which one compiled function plays.
 
 A graph comes from anywhere. So the operators are those of a list, each row of the output follows from one row of the input, and what
-is held and done for a row is bounded (`limits`) before anything is played. What a tape cannot hold is Unplayable. onnxruntime takes
-three times as long for one row.
+is held and done for a row is bounded (`limits`) before anything is played. What a tape cannot hold is Unplayable. Where a model has
+an operator of OF_RUNTIME, the tape tells how large it is, and onnxruntime plays it, which takes three times as long for one row.
 """
 
 import math
@@ -19,6 +19,8 @@ BINARY = "Add", "Sub", "Mul", "Div", "Max", "Min"
 GATHER, ROW_SUM, ROW_MAX, MATMUL = range(len(UNARY) + len(BINARY), len(UNARY) + len(BINARY) + 4)
 CODES = {name: code for code, name in enumerate(UNARY + BINARY)}
 OTHERS = "Sum", "MatMul", "Gemm", "Gather", "Reshape", "Concat", "ReduceSum", "ReduceMax", "LeakyRelu", "Clip", "Constant"
+# Of each element, or of each row: as many numbers come out as go in. Their order among the columns is the only attribute with a say.
+OF_RUNTIME = "Elu", "Selu", "Celu", "HardSigmoid", "Softsign", "Softmax", "LogSoftmax", "Reciprocal", "Floor", "Ceil", "Sign"
 (IDENTITY, ABS, NEG, EXP, LOG, SQRT, SIN, COS, TANH, RELU, SIGMOID, ERF, SOFTPLUS, ADD, SUB, MUL, DIV, MAX, MIN) = range(19)
 
 # One operation. An operand lies at fixed + per_row * (rows of the input), its element (i, j) at + i * row + j * column.
@@ -39,14 +41,15 @@ class Unplayable(ValueError):
 
 
 class Tape:
-    """A model of small operators. inputs : [(name, shape)]; meta : {key: text}."""
+    """A model of small operators. inputs : [(name, shape)]; meta : {key: text}; complete : whether it can be played, or only tells how
+    large the model is, as there are operators of OF_RUNTIME."""
 
     def __init__(self, graph):
         """graph : onnx_file.Graph; raises Unplayable."""
         if len(graph.inputs) != 1 or len(graph.outputs) != 1 or len(graph.inputs[0][1]) != 2:
             raise Unplayable("more than one input or output")
         self._constants, self._given, self._start, self._work = [], {}, 0, 0  # start : numbers of the constants, so far
-        self.inputs, self.meta = graph.inputs, graph.meta
+        self.inputs, self.meta, self.complete = graph.inputs, graph.meta, True
         self._named, self._operations, self._used = dict(graph.constants), [], 0  # used : numbers for each row of the input, so far
         (name, (_, self.width)), self._values = graph.inputs[0], {}  # name: (place, columns, all numbers for each row)
         if not self.width:
@@ -132,9 +135,12 @@ class Tape:
 
     def _add(self, node):
         kind, inputs = node.kind, node.inputs
-        if kind in UNARY:
+        if kind in (*UNARY, *OF_RUNTIME):
+            if node.attributes.get("axis", -1) not in (-1, 1):
+                raise Unplayable("rows of the input that mix")
+            self.complete &= kind in UNARY
             _, columns, numbers = self._value(inputs[0])
-            made = self._append(CODES[kind], columns, numbers // columns, self._operand(inputs[0], columns))
+            made = self._append(CODES.get(kind, IDENTITY), columns, numbers // columns, self._operand(inputs[0], columns))
         elif kind in (*BINARY, "Sum"):
             made = self._elementwise("Add" if kind == "Sum" else kind, inputs)
         elif kind in ("MatMul", "Gemm"):
@@ -145,7 +151,7 @@ class Tape:
         elif kind in OTHERS:
             made = getattr(self, f"_{kind.lower()}")(node)
         else:
-            raise Unplayable(f"operator {kind[:40]!r} is none of {', '.join((*UNARY, *BINARY, *OTHERS))}")
+            raise Unplayable(f"operator {kind[:40]!r} is none of {', '.join((*UNARY, *BINARY, *OTHERS, *OF_RUNTIME))}")
         self._values[node.outputs[0]] = made
 
     def _elementwise(self, kind, inputs):
