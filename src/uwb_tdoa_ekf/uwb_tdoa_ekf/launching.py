@@ -1,6 +1,7 @@
 """What the launch files start: which node, in which namespace, with which of the values. Without launch itself."""
 
 import atexit
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 import json
@@ -117,7 +118,7 @@ class Lives:
         return Ended(text=what, everything=self._on_exit == "shutdown")
 
 
-def discovery(environment, given=""):
+def discovery(environment: Mapping[str, str], given: str = "") -> dict[str, str]:
     """Variables with which nodes are started: this machine alone discovers them, unless the user says otherwise. environment :
     variables; given : the argument discovery_range."""
     return {RANGE: given or environment.get(RANGE) or "LOCALHOST"}

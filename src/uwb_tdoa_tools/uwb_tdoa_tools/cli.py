@@ -103,7 +103,7 @@ def say(name, sentence):
     print(f"{name}: {printable(sentence)}", file=sys.stderr, flush=True)
 
 
-def show(*lines):
+def show(*lines: str) -> None:
     """Print a result on stdout, line by line, each made `printable`, beside a progress bar if there is one."""
     tqdm.write("\n".join(printable(line) for text in lines for line in text.split("\n")))
     sys.stdout.flush()

@@ -8,12 +8,12 @@ from .limits import NAME_LENGTH
 _OTHERS = re.compile(r"[^\w .,:;+=()#-]")
 
 
-def printable(text):
+def printable(text: object) -> str:
     r"""The text with what is no character to see (line ends, escape sequences, marks that turn the direction of writing, halves of
     characters) written out, as \x1b: a terminal shows it and does nothing else."""
     return "".join(one if one.isprintable() else one.encode("unicode_escape", "surrogatepass").decode() for one in str(text))
 
 
-def harmless(text):
+def harmless(text: object) -> str:
     """A name that means nothing anywhere: what is no letter, digit, space or one of .,:;+=()#- becomes _, and its end is cut."""
     return _OTHERS.sub("_", str(text))[:NAME_LENGTH]

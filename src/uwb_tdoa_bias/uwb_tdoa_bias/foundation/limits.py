@@ -33,6 +33,6 @@ FILE_BYTES = 8 << 30  # of all data files that are unpacked
 UNPACKED_FREE, UNPACKED_RATIO = 16 << 20, 100  # see `most_unpacked`
 
 
-def most_unpacked(packed, most=FILE_BYTES):
+def most_unpacked(packed: int, most: int = FILE_BYTES) -> int:
     """Bytes that so many packed ones may become, all together: recordings shrink to a third, bombs to a thousandth and less."""
     return min(most, UNPACKED_FREE + UNPACKED_RATIO * packed)

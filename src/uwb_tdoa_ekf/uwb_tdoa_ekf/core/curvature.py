@@ -15,7 +15,7 @@ NEAREST = 0.1  # m, of an anchor, for its curvature
 
 
 @compiled
-def variance(x, P, a, b):
+def variance(x: np.ndarray, P: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     """Mean square, m^2, of the second-order term of a TDOA between anchors at a and b (3,), of a tag at x (3,), m, with covariance P
     (15, 15)."""
     if P[0, 0] + P[1, 1] + P[2, 2] < SMALLEST**2:

@@ -65,7 +65,7 @@ def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
 
 
 @compiled
-def sort(x, covariance, cost, near):
+def sort(x: np.ndarray, covariance: np.ndarray, cost: np.ndarray, near: np.ndarray) -> None:
     """Put the more probable of two places that explain TDOAs first: x (2, 6), covariance (2, 6, 6), cost (2,) as of `startup.locate`;
     near : (2, 3) m, bounds of the anchors."""
     for place in range(2):
@@ -76,7 +76,7 @@ def sort(x, covariance, cost, near):
 
 
 @compiled
-def _absurdity(near, x):
+def _absurdity(near: np.ndarray, x: np.ndarray) -> float:
     return 0.0 if near[0, 2] <= x[2] <= near[1, 2] else ABSURD
 
 

@@ -79,7 +79,7 @@ def locate(window, anchors, workspace, std, z, z_std, x, covariance, cost):
 
 
 @compiled
-def split(x, covariance, cost):
+def split(x: np.ndarray, covariance: np.ndarray, cost: np.ndarray) -> None:
     """Where there is a single place, and it is less known than APART along any direction, fill in two of equal probability that have the
     same mean and covariance together: TDOAs are as curved there as the anchors are far. x (2, 6), covariance (2, 6, 6), cost (2,) as of
     `locate`.

@@ -17,7 +17,7 @@ MOST = 400.0  # times the covariance of the filter is the most that is added: it
 
 
 @compiled
-def begin(information, P):
+def begin(information: np.ndarray, P: np.ndarray) -> None:
     """Fill in the information (3, 3), 1/m^2, of a start whose covariance P (15, 15) has counted each anchor once, see `observe`."""
     both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
     solve(both)
@@ -25,7 +25,7 @@ def begin(information, P):
 
 
 @compiled
-def observe(information, a, b, innovation, t, last):
+def observe(information: np.ndarray, a: np.void, b: np.void, innovation: np.void, t: float, last: float) -> None:
     """Take a TDOA stamped t, s, between two of ANCHOR, an INNOVATION, into the information (3, 3), 1/m^2, of a position by a single
     TDOA of each anchor that is heard, as noisy as it is; last : s, stamp of the TDOA before."""
     fades = min(t - last, LONGEST_STEP) / MEMORY
@@ -38,7 +38,7 @@ def observe(information, a, b, innovation, t, last):
 
 
 @compiled
-def fill(information, P, correlation_length, covariance):
+def fill(information: np.ndarray, P: np.ndarray, correlation_length: float, covariance: np.ndarray) -> None:
     """Fill in the covariance (3, 3), m^2, that errors which persist make of a position whose covariance in the filter is P (15, 15). Of white
     noise, of correlation_length 1, nothing persists."""
     covariance[:, :] = 0.0

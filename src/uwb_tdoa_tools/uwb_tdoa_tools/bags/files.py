@@ -1,6 +1,7 @@
 """Bags as files: opening them, going through their messages, and making new ones that are never half-written."""
 
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 import re
@@ -159,7 +160,7 @@ def messages(path, reader, connections):
             raise _damaged(path, f"{what} on {topic}")
 
 
-def readable(path, reader, connections):
+def readable(path: Path, reader: Reader, connections: list) -> Iterator[tuple]:
     """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher sends them, is counted too."""
     for connection, stamp, data in messages(path, reader, connections):
         try:
@@ -172,7 +173,7 @@ def readable(path, reader, connections):
         yield connection, stamp, message
 
 
-def remarks_of(reader):
+def remarks_of(reader: Reader) -> list[str]:
     """Sentences on what is missing in what was read so far."""
     return [*reader.remarks, *(f"{topic}: {count} messages left out, they cannot be read." for topic, count in reader.unreadable.items())]
 

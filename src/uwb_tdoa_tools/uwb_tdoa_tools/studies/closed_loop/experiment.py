@@ -5,6 +5,8 @@ alone, with the paper's network without and with the orientations of the anchors
 The networks are trained on flights in three constellations, the effects are diagnosed from three of these flights, one of each. Writes to
 --out: trained/, flights.json, table.md, and the counterparts of figures 7 to 9: rmse.png, paths.png, errors.png."""
 
+from argparse import Namespace
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +17,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from ... import cli, parallel
@@ -58,7 +61,7 @@ ESTIMATORS = {
 }
 
 
-def add_options(add):
+def add_options(add: Callable) -> None:
     """add : add_argument of a parser."""
     add("--flights", type=parallel.whole_number, default=10, metavar="N", help="of each kind (default: 10)")
     add("--seed", type=parallel.whole_number, default=1001, metavar="S", help="of the first; the others have the next ones (default: 1001)")
@@ -68,7 +71,7 @@ def add_options(add):
     add("--out", type=Path, required=True, metavar="DIR", help="where to write; made if it is not there")
 
 
-def run(args):
+def run(args: Namespace) -> None:
     """Train, fly, print the table, and draw."""
     out = cli.output_folder(args.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -91,7 +94,7 @@ def run(args):
     print(f"wrote flights.json, table.md, rmse.png, paths.png and errors.png to {out}")
 
 
-def world_of(name):
+def world_of(name: str) -> World:
     """World with the anchors of a named constellation, each turned about the vertical by any angle and tilted a little: where an anchor
     stands then does not tell how it is turned."""
     anchors, rng = constellation(name), np.random.default_rng(list(name.encode()))
@@ -102,7 +105,7 @@ def world_of(name):
     return World((2.0 * x, 2.0 * y, z), anchors, delay=DELAY, bearing_bias=0.0, antennas=True, installation=INSTALLATION)
 
 
-def task(kind, seed, trained):
+def task(kind: tuple[str, str, str], seed: int, trained: Path) -> Task:
     """Task of a flight. kind : (name of an estimator, constellation, trajectory); trained : folder."""
     by, where, path = kind
     estimator = ESTIMATORS[by]
@@ -111,7 +114,7 @@ def task(kind, seed, trained):
     return Task(world_of(where), seed, "place", config=estimator.config, effects=effects, model=model, path=TRAJECTORIES[path])
 
 
-def train(count, folder, jobs=None):
+def train(count: int, folder: Path, jobs: int | None = None) -> Path:
     """Fly to train, `count` times in each of TRAINING, told their place; train the networks, and find the effects. Returns the folder,
     Path, to which they are written. Raises InputError."""
     if count < 2:
@@ -129,12 +132,12 @@ def train(count, folder, jobs=None):
     return folder
 
 
-def _flight(task):
+def _flight(task: Task) -> Flight:
     """The Flight of a Task."""
     return fly(task).flight
 
 
-def _train(parts, some, folder, name):
+def _train(parts: list[list[Flight]], some: list[Flight], folder: Path, name: str) -> str:
     """Write one of NETWORKS, trained and validated on parts, or EFFECTS, found in some flights, to a folder. Returns the name."""
     (folder / name if name in NETWORKS else folder).mkdir(parents=True, exist_ok=True)
     if name in NETWORKS:
@@ -144,7 +147,7 @@ def _train(parts, some, folder, name):
     return name
 
 
-def table(verdicts):
+def table(verdicts: dict[tuple[str, str, str], list[dict]]) -> Iterator[str]:
     """Lines of Markdown. verdicts : {(estimator, constellation, trajectory): [verdict]}."""
     yield "| RMSE of the estimate in the air, m | " + " | ".join(ESTIMATORS) + " |"
     yield "|---|" + "---:|" * len(ESTIMATORS)
@@ -168,11 +171,11 @@ def table(verdicts):
         yield f"| {by}: than {than} | {gains[0]:.0%} | {gains[1]:.0%} | {both:.0%} ({count}) | {published} |"
 
 
-def _row(title, values, digits=3):
+def _row(title: str, values: Iterable[float], digits: int = 3) -> str:
     return f"| {title} | " + " | ".join(f"{value:.{digits}f}" for value in values) + " |"
 
 
-def gain_of_landed(verdicts, by, than):
+def gain_of_landed(verdicts: dict, by: str, than: str) -> tuple[float, int]:
     """(Share by which the mean error is smaller by an estimator than by another one, number of flights): of those in UNSEEN that landed by
     both."""
     both = [
@@ -187,7 +190,7 @@ def gain_of_landed(verdicts, by, than):
     return float(1.0 - ours / theirs), len(both)
 
 
-def mean(verdicts, by, places, paths=tuple(TRAJECTORIES), figure="estimation"):
+def mean(verdicts: dict, by: str, places: Iterable[str], paths: Iterable[str] = tuple(TRAJECTORIES), figure: str = "estimation") -> float:
     """Mean of a figure over all flights by an estimator, in constellations and on trajectories, that took off."""
     some = [one for where in places for path in paths for one in verdicts[by, where, path] if one["took_off"]]
     values = [one["phases"]["air"]["nees"] if figure == "nees" else one[figure] for one in some]

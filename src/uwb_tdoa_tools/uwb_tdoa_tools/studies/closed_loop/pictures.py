@@ -1,5 +1,8 @@
 """Counterparts of figures 7 to 9 of Zhao et al. (RA-L 2021)."""
 
+from pathlib import Path
+
+from matplotlib.figure import Figure
 import numpy as np
 
 from ...scoring.plots import plt
@@ -8,7 +11,7 @@ COLOURS = "0.55", "tab:red", "tab:cyan", "tab:olive", "tab:green"
 LONG = 35.0  # s of a flight that are drawn at most
 
 
-def draw_errors_by_kind(verdicts, path):
+def draw_errors_by_kind(verdicts: dict[tuple[str, str, str], list[dict]], path: Path) -> None:
     """Figure 7: RMSE of the estimate in the air of each flight, and their mean as a bar. verdicts : {(estimator, constellation,
     trajectory): [verdict]}."""
     by = list(dict.fromkeys(kind[0] for kind in verdicts))
@@ -27,7 +30,7 @@ def draw_errors_by_kind(verdicts, path):
     _save(figure, path)
 
 
-def draw_paths(shown, path):
+def draw_paths(shown: dict[str, list], path: Path) -> None:
     """Figure 8: where flights went from their start, from above and from the side, beside where they were to go. shown : {estimator: [Drawn]}."""
     figure, axes = plt.subplots(2, len(shown), figsize=(3.2 * len(shown), 5.4), sharex=True, sharey="row", layout="constrained", height_ratios=(3, 1))
     for column, (name, flights), colour in zip(axes.T, shown.items(), COLOURS):
@@ -46,7 +49,7 @@ def draw_paths(shown, path):
     _save(figure, path)
 
 
-def draw_errors(shown, path):
+def draw_errors(shown: dict[str, list], path: Path) -> None:
     """Figure 9: errors of the estimate of the first flight by each estimator, with three of its deviations. shown : {estimator: [Drawn]}."""
     figure, axes = plt.subplots(3, len(shown), figsize=(3.2 * len(shown), 5.4), sharex=True, sharey=True, layout="constrained")
     for column, (name, flights) in zip(axes.T, shown.items()):
@@ -64,6 +67,6 @@ def draw_errors(shown, path):
     _save(figure, path)
 
 
-def _save(figure, path):
+def _save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=110)
     plt.close(figure)
