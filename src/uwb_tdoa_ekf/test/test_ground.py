@@ -7,7 +7,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import (
-    ALIKE, IN_TIME, KNOWN, MOST_PAIRS, NOT_USED, PAIR, explain, find_lateness, find_pairs, in_time, is_still, may_be_late,
+    ALIKE, BLUR_STD, BLURRED, IN_TIME, KNOWN, MOST_PAIRS, NOT_USED, PAIR, blur, explain, find_lateness, find_pairs, in_time, is_still, may_be_late,
 )  # fmt: skip
 from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
 from uwb_tdoa_ekf.core.workspace import set_bounds
@@ -20,6 +20,11 @@ TUNING = FilterConfig().tuning()
 @compiled
 def explained(pairs, anchors, bounds, prior, tuning, z, z_std, lateness, x, covariance):
     return explain(pairs, anchors, bounds, prior, tuning[0], z, z_std, lateness, x, covariance)
+
+
+@compiled
+def blurred(hypotheses, ground):
+    return blur(hypotheses[0], ground)
 
 
 @compiled
@@ -53,6 +58,13 @@ def test_anchors_may_be_late_where_both_antennas_are_low_and_far_apart():
     assert not may_be_late(low, np.array([0.3, 0.0, 0.03]), 0.0, 0.0)  # steep
     assert may_be_late(low, np.array([5.0, 0.0, 1.2]), 1.0, 0.0)  # it may be lower
     assert may_be_late(low + [0.0, 0.0, 2.0], np.array([5.0, 0.0, 2.03]), 0.0, 2.0)  # over another ground
+
+
+def test_tdoas_are_noisier_near_the_ground_and_nowhere_else():
+    hypotheses = new_memory(POSITIONS).ekf["hypotheses"][0]
+    for z, ground, share in ((-0.1, 0.0, 1.0), (0.0, 0.0, 1.0), (0.5 * BLURRED, 0.0, 0.5), (BLURRED, 0.0, 0.0), (3.0, 0.0, 0.0), (3.0, 3.0, 1.0)):
+        hypotheses["x"][0, 2] = z
+        assert blurred(hypotheses, ground) == pytest.approx((share * BLUR_STD) ** 2)
 
 
 @given(st.floats(0.0, 3.0), st.floats(0.0, 3.0), st.floats(0.5, 50.0), st.floats(0.0, 1.0))

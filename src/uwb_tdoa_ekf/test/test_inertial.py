@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.inertial import PERSISTENCE, QUIET_NOISE, hold, is_quiet, observe, weigh
+from uwb_tdoa_ekf.core.inertial import LEAST_RECTIFIED, PERSISTENCE, QUIET_NOISE, RECTIFYING_MEMORY, hold, is_quiet, observe, weigh
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, new_memory
 from uwb_tdoa_ekf.core.state import GRAVITY
 
@@ -55,8 +55,9 @@ def test_rest_is_not_believed_at_once_nor_after_a_gap():
     assert not is_quiet(after(**STILL, imu=imu, pause=1.0, seconds=0.3))
 
 
-def test_the_more_an_axis_vibrates_the_less_it_weighs_and_the_noisier_it_is():
-    imu = after((np.zeros(3), 0.0), (UP, np.array([0.0, 0.5, 5.0])))
+def test_the_more_an_axis_rectifies_the_less_it_weighs_and_the_noisier_it_is():
+    vibration = np.array([0.0, 0.5, 5.0])
+    imu = after((np.zeros(3), 0.0), (UP + vibration, vibration))
     weigh(imu, False, FilterConfig(accel_prior_std=1.5, vibration_gain=4.0, accel_noise=0.1).tuning()[0])
     one, two, three = imu.accel_weight
     assert one == pytest.approx(1.0, abs=1e-3) and one > two > 0.5 > 0.1 > three
@@ -65,6 +66,30 @@ def test_the_more_an_axis_vibrates_the_less_it_weighs_and_the_noisier_it_is():
     assert imu.accel_weight.tolist() == [1.0] * 3 and imu.accel_psd == pytest.approx([0.1**2] * 3)
     weigh(imu, True, FilterConfig().tuning()[0])
     assert imu.accel_psd == pytest.approx([QUIET_NOISE**2] * 3)
+
+
+def test_an_axis_whose_mean_is_that_of_hovering_does_not_rectify_however_it_vibrates():
+    tuning = FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).tuning()[0]
+    weights = {}
+    for offset in (0.0, 3.0):
+        imu = after((np.zeros(3), 0.0), (UP + [offset, 0.0, 0.0], 3.0), seconds=4.0 * RECTIFYING_MEMORY)
+        weigh(imu, False, tuning)
+        weights[offset] = imu.accel_weight
+    error = 4.0 * 3.0**2
+    assert weights[3.0][0] == pytest.approx(1.5**2 / (1.5**2 + error), rel=0.2)  # as if nothing were known of its mean
+    for weight in (weights[0.0][0], weights[3.0][1], weights[3.0][2]):
+        assert weight == pytest.approx(1.5**2 / (1.5**2 + LEAST_RECTIFIED * error), rel=0.1)
+
+
+def test_what_begins_to_vibrate_is_not_believed_before_it_was_seen_for_a_while():
+    tuning = FilterConfig(accel_prior_std=1.5, vibration_gain=4.0).tuning()[0]
+    imu = after(**STILL)
+    imu = after((np.zeros(3), 0.0), (UP, 1.0), imu=imu, seconds=0.5)
+    weigh(imu, False, tuning)
+    early = imu.accel_weight.copy()
+    imu = after((np.zeros(3), 0.0), (UP, 1.0), imu=imu, seconds=4.0 * RECTIFYING_MEMORY)
+    weigh(imu, False, tuning)
+    assert (early < 0.6).all() and (imu.accel_weight > 0.8).all()
 
 
 @pytest.mark.parametrize("force", [-UP, np.array([np.linalg.norm(UP), 0.0, 0.0])])
@@ -94,5 +119,4 @@ def test_what_is_far_from_hovering_is_taken_for_what_it_is_however_it_vibrates()
         imu = after((np.zeros(3), 0.0), (force * UP, 1.0))
         weigh(imu, False, tuning)
         weights[force] = imu.accel_weight[2]
-    assert weights[1.0] == pytest.approx(weights[1.2], rel=0.1) and weights[1.0] < 0.6
-    assert weights[3.0] > 0.95
+    assert weights[1.2] < 0.6 < weights[1.0] and weights[3.0] > 0.95

@@ -225,6 +225,7 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
         innovation.noise_variance += b.floor_std**2
     if tuning.adapt_noise:
         innovation.noise_variance += noise.excess_variance(a, b)
+    innovation.noise_variance += ground.blur(ekf.hypotheses[ekf.best], tuning.ground_height)
     if not on_floor and ground.find_lateness(a, b, ekf.hypotheses[ekf.best], tdoa.t, tuning.ground_height):
         _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
         in_time = ground.in_time(a, b, innovation)

@@ -21,6 +21,7 @@ RARE = 0.02  # probability that an anchor is late, and that it is not, at least,
 USUAL = 0.1  # and that it is late where nothing tells
 CHANGE_TIME = 2.0  # s after which what an anchor was does not tell what it is
 DEVIATIONS = 3.0  # standard deviations that a tag may be lower than the filter has it
+BLURRED, BLUR_STD = 0.8, 0.25  # m above the ground below which what it reflects blurs what arrives, and by how much at the ground
 NOT_USED = 0.2  # probability that both anchors of a TDOA are in time, below which it says nothing
 
 MOST_PAIRS, MOST_ANCHORS = 64, 24  # of a window that are looked at, those heard first
@@ -59,6 +60,14 @@ def may_be_late(position, x, lower, ground):
     tag, anchor = max(x[2] - ground - lower, 0.0), max(position[2] - ground, 0.0)
     distance = math.hypot(x[0] - position[0], x[1] - position[1])
     return tag + anchor < GRAZING * distance and 2.0 * tag * anchor < HALF_WAVE * distance
+
+
+@compiled
+def blur(hypothesis: np.void, ground: float) -> float:
+    """Variance, m^2, of a TDOA at a HYPOTHESIS over level ground beyond that in the air: the ray that the ground reflects comes within the
+    length of the pulse, and moves its leading edge."""
+    share = min(max(1.0 - (hypothesis.x[2] - ground) / BLURRED, 0.0), 1.0)
+    return (BLUR_STD * share) ** 2
 
 
 @compiled

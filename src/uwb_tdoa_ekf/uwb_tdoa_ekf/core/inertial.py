@@ -13,6 +13,8 @@ RESTLESS = 0.002  # rad^2/s^2 that fades before a tag counts as quiet, about hal
 QUIET_TILT = 0.5  # m/s^2 by which the mean specific force may differ from gravity
 UPRIGHT = 0.5  # cosine of the angle between the specific force and the body's z axis, below which a tag does not hover
 CARRIED_STD = 20.0  # m/s^2, of the specific force of such a tag, about that of hovering
+RECTIFYING_MEMORY = 2.0  # s over which it is seen how far an axis rectifies: a vehicle does not accelerate one way for longer
+LEAST_RECTIFIED = 0.1  # share of the power of a vibration that counts as rectified at least
 QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
 
 
@@ -28,6 +30,9 @@ def observe(imu, sample, timeout):
     for k in range(3):
         imu.mean_accel[k] = low_pass(imu.mean_accel[k], imu.slow_accel[k], dt, VIBRATION_AVERAGE)
         imu.gyro_power[k] = low_pass(imu.gyro_power[k], sample.gyro[k] ** 2, dt, VIBRATION_AVERAGE)
+        power, shakes = _from_hovering(imu.mean_accel, k) ** 2, imu.vibration[k] > QUIET_ACCEL**2
+        share = power / max(power, imu.vibration[k]) if shakes else 1.0  # what does not shake tells nothing
+        imu.rectified[k] = low_pass(imu.rectified[k], share, dt, RECTIFYING_MEMORY)
         imu.gyro[k], imu.accel[k] = 0.5 * (imu.gyro[k] + sample.gyro[k]), 0.5 * (imu.accel[k] + sample.accel[k])
     return True
 
@@ -37,7 +42,7 @@ def _restart(imu, sample):
     for k in range(3):
         imu.slow_accel[k] = imu.mean_accel[k] = imu.accel[k] = sample.accel[k]
         imu.gyro[k] = sample.gyro[k]
-        imu.vibration[k], imu.gyro_power[k] = 0.0, RESTLESS
+        imu.vibration[k], imu.gyro_power[k], imu.rectified[k] = 0.0, RESTLESS, 1.0
 
 
 @compiled
@@ -53,7 +58,8 @@ def weigh(imu, quiet, tuning):
     """Fill in accel_weight and accel_psd of an IMU_STATE: how far each axis of the accelerometer counts against
     hovering, and the noise that is left.
 
-    A vibrating axis rectifies: its error has vibration_gain times the variance of the vibration. The weight is that of
+    A vibrating axis may rectify: its error then has vibration_gain times the variance of the vibration. Whether it does shows in its mean: a
+    vehicle that hovers and moves about feels gravity alone in the mean. The weight is that of
     linear least squares of the measurement with this variance, and of hovering with accel_prior_std. What is carried, and lies on its
     side or upside down, does not hover; what is farther from hovering than both explain, hovers that much less.
     """
@@ -61,12 +67,18 @@ def weigh(imu, quiet, tuning):
     hovers = slow[2] > UPRIGHT * math.sqrt(slow[0] ** 2 + slow[1] ** 2 + slow[2] ** 2)
     usual = tuning.accel_prior_std**2 if hovers else CARRIED_STD**2
     for k in range(3):
-        error = tuning.vibration_gain * imu.vibration[k]
-        apart = slow[k] - (GRAVITY if k == 2 else 0.0)
+        error = tuning.vibration_gain * max(imu.rectified[k], LEAST_RECTIFIED) * imu.vibration[k]
+        apart = _from_hovering(slow, k)
         prior = max(usual, apart**2 - error)
         weight = prior / (prior + error)
         noise = tuning.accel_noise**2 + 2.0 * PERSISTENCE * (weight * error)
         imu.accel_weight[k], imu.accel_psd[k] = weight, QUIET_NOISE**2 if quiet else noise
+
+
+@compiled
+def _from_hovering(accel, axis):
+    """By how much a specific force accel (3,), m/s^2, differs along an axis from that of a body that hovers level."""
+    return accel[axis] - (GRAVITY if axis == 2 else 0.0)
 
 
 @compiled

@@ -50,6 +50,7 @@ IMU_STATE = _record(
     ("slow_accel", float, 3),  # m/s^2, low pass
     ("vibration", float, 3),  # m^2/s^4, power of what is faster
     ("mean_accel", float, 3),  # m/s^2, over a longer time
+    ("rectified", float, 3),  # 0 to 1: power of what of it does not hover, lately, beside that of the vibration
     ("gyro_power", float, 3),  # rad^2/s^2
     ("accel_weight", float, 3),  # of the measurement against hovering, 0 to 1, by inertial.weigh
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
