@@ -1,3 +1,5 @@
+import errno
+import sqlite3
 import subprocess
 import sys
 
@@ -12,11 +14,12 @@ def make_parser():
     return parser
 
 
-def test_help_keeps_line_breaks_and_shows_examples(capsys):
+def test_help_keeps_line_breaks_and_shows_examples_as_they_run(capsys, monkeypatch):
+    monkeypatch.setenv("UWB_TDOA_RUN", "./dev run")
     assert cli.run(None, make_parser(), ["--help"]) == 0
     out = capsys.readouterr().out
     assert "Weigh things.\n\nSecond paragraph." in out
-    assert "examples:\n  weigh 3\n  weigh 4 --twice\n" in out
+    assert "examples:\n  ./dev run uwb_tdoa_tools weigh 3\n  ./dev run uwb_tdoa_tools weigh 4 --twice\n" in out
 
 
 @pytest.mark.parametrize("returned, code", [(None, 0), (0, 0), (1, 1)])
@@ -64,6 +67,36 @@ def test_a_defect_keeps_its_traceback():
 
     with pytest.raises(OSError, match="not the user's"):
         cli.run(command, make_parser(), ["7"])
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, "No space left on device"),
+        OSError(errno.ENOSPC, "No space left on device", "out.csv"),
+        sqlite3.OperationalError("database or disk is full"),
+    ],
+)
+def test_a_full_disk_is_one_sentence(error, capsys):
+    def command(args):
+        raise error
+
+    assert cli.run(command, make_parser(), ["7"]) == 2
+    assert capsys.readouterr().err == "weigh: error: the disk is full: what was being written is not whole; make room, or write elsewhere.\n"
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(tmp_path):
+    for check in (cli.output_folder, cli.check_folders):
+        with pytest.raises(InputError, match="cannot be written .*: /proc"):  # for root, too
+            check("/proc/out")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file is a file, so that .* cannot be made"):
+        cli.output_folder(tmp_path / "file" / "out")
+    with pytest.raises(InputError, match="is a directory; give a file"):
+        cli.check_folders(tmp_path)
+    assert cli.output_folder(tmp_path / "new" / "deep") == tmp_path / "new" / "deep" and not (tmp_path / "new").exists()
+    cli.check_folders(None, tmp_path / "new.json", str(tmp_path / "file"))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_reader_that_goes_away_is_no_traceback():

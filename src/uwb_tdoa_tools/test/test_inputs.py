@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from recordings import ANCHORS, SURVEY, log_bytes, small_flight
+from recordings import ANCHORS, ROWS, SURVEY, log_bytes, small_flight
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
@@ -69,7 +69,7 @@ def test_folders_are_searched_in_order_and_hidden_files_left_out(tmp_path):
     assert [survey for _, survey in found] == [None] * 4
 
 
-def test_a_bag_is_one_recording_with_anchors_of_its_own(tmp_path, surveys):
+def test_a_bag_that_no_survey_of_a_folder_fits_keeps_its_own_anchors_and_says_so(tmp_path, surveys, capsys):
     make(tmp_path / "flights", "bag1/metadata.yaml", "bag1/bag1_0.mcap", "loose.mcap", "old.db3", "0422-log")
     found = find_flights([str(tmp_path / "flights")], surveys)
     assert [(path.name, survey and survey.name) for path, survey in found] == [
@@ -79,6 +79,10 @@ def test_a_bag_is_one_recording_with_anchors_of_its_own(tmp_path, surveys):
         ("old.db3", None),
     ]
     assert find_flights([tmp_path / "flights" / "bag1"]) == [(tmp_path / "flights" / "bag1", None)]
+    said = capsys.readouterr().err
+    assert said.count("fits; the anchors that it holds count") == 1 == len(said.splitlines())
+    make(tmp_path / "flights", "0422/bag/metadata.yaml")
+    assert find_flights([tmp_path / "flights" / "0422"], surveys)[0][1] == surveys / "anchor_0422.txt"
 
 
 def test_nothing_there_is_bad_input(tmp_path):
@@ -149,7 +153,44 @@ def test_a_bag_without_anchors_takes_the_survey_that_is_given(tmp_path):
     (recording,) = reading.find([tmp_path / "bag"])
     assert np.array_equal(reading.read(recording).anchors.positions, flight.anchors.positions)
     with pytest.raises(InputError, match="give a survey file"):
-        Reading().read(recording)
-    moved = SURVEY.replace("0.1,0.2,0.3", "0.5,0.2,0.3")  # counts for nothing where the bag has its own
-    (tmp_path / "survey.csv").write_text(moved)
-    assert reading.read((tmp_path / "whole", None)).anchors.positions[0, 0] == 0.1
+        Reading().read((tmp_path / "bag", None))
+
+
+def test_a_survey_that_is_given_counts_whatever_anchors_a_bag_holds_and_that_is_said_once(tmp_path, capsys):
+    for name in ("one", "two"):
+        write_bag(small_flight(), tmp_path / name)
+    survey = tmp_path / "survey.csv"
+    survey.write_text(SURVEY.replace("0.1,0.2,0.3", "0.5,0.2,0.3"))
+    bags, reading = [tmp_path / "one", tmp_path / "two"], Reading(survey)
+    assert [flight.anchors.positions[0, 0] for flight in reading.flights(bags)] == [0.5, 0.5]
+    assert [reading.one(bag).anchors.positions[0, 0] for bag in bags] == [0.5, 0.5]
+    assert [flight.anchors.positions[0, 0] for flight in Reading().flights(bags)] == [0.1, 0.1]
+    said = capsys.readouterr().err
+    assert said.count(f"the anchors of {survey} count here") == 1 == len(said.splitlines())
+
+
+@pytest.mark.parametrize("given", [{"namespace": "tag1"}, {"topics": {"uwb/tdoa": "/theirs"}}])
+def test_topics_of_bags_are_refused_where_there_is_no_bag(tmp_path, given):
+    (tmp_path / "log").write_bytes(log_bytes())
+    (tmp_path / "survey.csv").write_text(SURVEY)
+    reading = Reading(tmp_path / "survey.csv", **given)
+    for read in (reading.one, lambda path: reading.find([path])):
+        with pytest.raises(InputError, match="says where topics are in bags, and .*log is none; leave it out"):
+            read(tmp_path / "log")
+
+
+@pytest.mark.parametrize("kind", ["log", "bag"])
+def test_ground_truth_that_is_not_wanted_is_not_read(tmp_path, kind):
+    """Not even to say that it is damaged."""
+    (tmp_path / "survey.csv").write_text(SURVEY)
+    if kind == "bag":
+        flight = small_flight()
+        flight.truth.p[7] = np.nan
+        write_bag(flight, tmp_path / "flight")
+    else:
+        rows = [*ROWS, ("estPose", 1_000_800, (np.nan, 2.0, 0.5, 0.0, 0.0, 0.0, 1.0))]
+        (tmp_path / "flight").write_bytes(log_bytes(rows))
+    with pytest.raises(InputError, match="must be|not finite|nan"):
+        Reading(tmp_path / "survey.csv").one(tmp_path / "flight")
+    blind = Reading(tmp_path / "survey.csv", truth=False).one(tmp_path / "flight")
+    assert blind.truth is None and len(blind.tdoa) > 1

@@ -10,10 +10,13 @@
 """
 
 import argparse
+import errno
 import json
 import os
 from pathlib import Path
+import sqlite3
 import sys
+import tempfile
 
 from tqdm import tqdm
 
@@ -21,10 +24,15 @@ from uwb_tdoa_bias.foundation.errors import Failure, InputError
 from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_bias.foundation.version import written_by
 
+from . import command_lines
+
+FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up", errno.EFBIG: "the file may not become larger"}
+
 
 def parser(name, description, *examples):
     """An ArgumentParser that keeps line breaks, and ends its help with the given example command lines."""
-    epilog = "examples:\n" + "\n".join(f"  {example}" for example in examples) if examples else None
+    started = command_lines.started(name).removesuffix(name)
+    epilog = "examples:\n" + "\n".join(f"  {started}{example}" for example in examples) if examples else None
     made = argparse.ArgumentParser(
         prog=name, description=description, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -58,10 +66,19 @@ def run(command, parser, argv=None, ros=False):
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the flush at exit fails once more
         return 141
-    except OSError as error:
-        if error.filename is None:
+    except (OSError, sqlite3.OperationalError) as error:
+        if full := _full(error):
+            return _fail(parser.prog, f"{full}: what was being written is not whole; make room, or write elsewhere.", 2)
+        if getattr(error, "filename", None) is None:
             raise
         return _fail(parser.prog, f"{error.filename}: {error.strerror}.", 2)
+
+
+def _full(error):
+    """What of the disk has no room for what an OSError or an sqlite3.OperationalError was raised about: text, or None."""
+    if isinstance(error, OSError):
+        return FULL.get(error.errno)
+    return FULL[errno.ENOSPC] if "disk is full" in str(error) else None
 
 
 def without_ros_arguments(arguments):
@@ -78,18 +95,38 @@ def without_ros_arguments(arguments):
 
 
 def check_folders(*paths):
-    """Raise InputError, before the work, unless the folder of each file to write is there; None is passed over."""
-    for path in paths:
-        if path is not None and not Path(path).absolute().parent.is_dir():
+    """Raise InputError, before the work, unless the folder of each file to write is there, and can be written to; None is passed
+    over."""
+    for path in map(Path, filter(None, paths)):
+        if not path.absolute().parent.is_dir():
             raise InputError(f"{path}: its directory does not exist; make it first.")
+        if path.is_dir():
+            raise InputError(f"{path}: is a directory; give a file.")
+        if not path.exists() or not os.access(path, os.W_OK):
+            _check_writable(path, path.absolute().parent)
 
 
-def output_folder(text):
-    """Path of --out. Raises InputError, before the work, if it is a file."""
+def output_folder(text, option="--out"):
+    """Path of a folder to write to. Raises InputError, before the work, if it is a file, or cannot be made or written to."""
     out = Path(text)
     if out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is a file; give a directory.")
+        raise InputError(f"{option}: {out} is a file; give a directory.")
+    there = out.absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir():
+        raise InputError(f"{option}: {there} is a file, so that {out} cannot be made; give another directory.")
+    _check_writable(out, there)
     return out
+
+
+def _check_writable(path, folder):
+    """Raise InputError unless a file can be made in the folder, for the sake of path; leaves none."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}: {folder}); give another place.") from error
 
 
 def write_json(path, content):

@@ -2,6 +2,7 @@
 
     options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
     options.add_filter(parser)                      # --effects, --config
+    options.add_estimator(parser)                   # these, --model, --no-bias, -p, --without, --smooth
     options.add_most(parser, 10**6)                 # --most
     options.add_known(parser)                       # --marks, --distances
     reading, (config, effects) = options.reading_of(args), options.filter_of(args)
@@ -9,11 +10,14 @@
 
 from dataclasses import fields, replace
 
+from uwb_tdoa_bias.correction.network import load_network, unasked
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
+from uwb_tdoa_ekf.core.aids import STREAMS
 from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
+from .localizing.estimate import Estimator
 from .parallel import whole_number
 from .readers import inputs
 from .surveying.distances import read_distances
@@ -63,6 +67,55 @@ def filter_of(args):
     """(FilterConfig, EffectSet or None) that --config and --effects name. Raises InputError."""
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
+
+
+def add_estimator(parser):
+    """--effects, --config, --model, --no-bias, -p, --without and --smooth: how positions are estimated."""
+    add_filter(parser, "effects.yaml: systematic effects to correct for")
+    add = parser.add_argument
+    add(
+        "--model", metavar="FILE",
+        help='ONNX bias network to correct with; "default" is the one shipped, which is taken, as bias_node takes it, where '
+        "neither this nor --effects is given",
+    )  # fmt: skip
+    add("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
+    add(
+        "-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[],
+        help="one filter parameter, before --config",
+    )  # fmt: skip
+    add(
+        "--without", metavar="AID", action="append", default=[], choices=STREAMS,
+        help=f"not to be used though it is there: {', '.join(STREAMS)}; may be repeated",
+    )  # fmt: skip
+    add("--smooth", action="store_true", help="smooth: use what came after each estimate too")
+
+
+def estimator_of(args, say):
+    """The Estimator that those options ask for. say(sentence) : told what it lacks. Raises InputError."""
+    config, effects = filter_of(args)
+    config = with_parameters(config, args.parameters + [f"use_{aid}:=false" for aid in args.without])
+    if args.no_bias:
+        return Estimator(config, smoothed=args.smooth)
+    network = load_network(unasked(args.effects) if args.model is None else args.model)
+    given = {effect.name for effect in effects.effects} if effects else set()
+    if network and (lacking := sorted(set(network.trained_with) - given)):
+        say(f"{args.model} was trained with {', '.join(lacking)} taken out, which no --effects gives; give the effects.yaml that was "
+            "written beside it.")  # fmt: skip
+    return Estimator(config, effects, network, args.smooth)
+
+
+def given(args, name):
+    """Whether the option of that name is given."""
+    value = getattr(args, name)
+    return value is not False and value not in (None, "", [])
+
+
+def refuse(args, names, because):
+    """Raise InputError for the first of some options that is given and has no part in what is asked for, rather than pass it over."""
+    for name in names:
+        if given(args, name):
+            option = {"parameters": "-p", "topics": "--topic"}.get(name, f"--{name.replace('_', '-')}")
+            raise InputError(f"{option}: {because}; leave it out.")
 
 
 def add_most(parser, default):

@@ -10,14 +10,14 @@ import argparse
 import signal
 import sys
 import warnings
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import lru_cache
 
 from joblib import Parallel, cpu_count, delayed, parallel_config
 from threadpoolctl import threadpool_limits
-from tqdm import tqdm
-
 from uwb_tdoa_bias.foundation.errors import InputError
+
+from .progress import Progress
 
 CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
 
@@ -46,17 +46,18 @@ def asked(args, count, few):
 
 
 def over(function, items, jobs=None, dask=None, unit="flight"):
-    """Generator of function(item) for every item, in order, with a progress bar on a terminal.
+    """Generator of function(item) for every item, in order; tells meanwhile how many are done.
 
     To be called in the main thread. function, items, results : what pickle takes; jobs : processes, default one per
-    core, and no more than items; dask : address of a scheduler; unit : of the progress bar, None for no bar.
+    core, and no more than items; dask : address of a scheduler; unit : of what is told, None to tell nothing.
     The first item runs in this process, so that what has to be compiled is compiled once, and is in numba's cache when
     the others start. What the function raises is raised here. Raises InputError where there is no Dask.
     """
     items = list(items)
-    with tqdm(total=len(items), unit=unit or "", disable=None if unit else True, leave=False) as progress:
+    with Progress(total=len(items), unit=unit) if unit and items else nullcontext() as progress:
         for result in _results(function, items, jobs, dask):
-            progress.update()
+            if progress is not None:
+                progress.update()
             yield result
 
 

@@ -1,37 +1,76 @@
-"""Telling that long work goes on: on a terminal in one line, elsewhere in a line every few seconds."""
+"""Telling that long work goes on: on a terminal in one line, elsewhere in a line every few seconds.
+
+    with Progress("diagnose") as progress:                       # what is done is told by a thread of its own
+        progress("looking at ids")
+    with Progress("evaluate", total=22, unit="flight") as progress:
+        progress.update()                                        # one more is done
+"""
 
 import sys
+from threading import Event, Thread
 import time
 
-EVERY = 4.0  # s between two lines where there is no terminal
-OFTEN = 0.2  # s between two changes of the line on a terminal
+from tqdm import tqdm
+
+FIRST, EVERY = 1.0, 4.0  # s until the first line where there is no terminal, and between two
+OFTEN = 0.5  # s between two changes of the line on a terminal
 
 
 class Progress:
-    """Call it with what is being done, as often as you like; as a context it clears its line at the end."""
+    """As a context, says what is being done, how much of it is done, and for how long, until it ends; whatever takes shorter than
+    FIRST says nothing. Call it with what is being done, as often as you like."""
 
-    def __init__(self, name, stream=None):
-        """name : what the lines begin with; stream : where to, default stderr."""
-        self._name, self._stream = name, stream or sys.stderr
-        self._live = self._stream.isatty()
-        self._start = self._last = time.monotonic()
-        self._width = 0
+    def __init__(self, name="", total=None, unit="", stream=None):
+        """name : what the lines begin with; total : of what is to be done, in `unit`, or None; stream : where to, default stderr."""
+        self._name, self._total, self._unit, self._stream = name, total, unit, stream
+        self._what, self._done, self._ended = "", 0, Event()
 
     def __call__(self, what):
-        now = time.monotonic()
-        if now - self._last < (OFTEN if self._live else EVERY):
-            return
-        self._last = now
-        line = f"{self._name}: {what}, {now - self._start:.0f} s"
-        if self._live:
-            print("\r" + line.ljust(self._width), end="", file=self._stream, flush=True)
-            self._width = len(line)
-        else:
-            print(line, file=self._stream, flush=True)
+        self._what = what
+
+    def update(self):
+        """Count another unit as done."""
+        self._done += 1
+        if self._bar is not None and self._total is not None:
+            self._bar.update()
+
+    def over(self, items, what):
+        """Generator of items, which tells how many of them are done."""
+        items = list(items)
+        for done, item in enumerate(items):
+            self(f"{what}, {done} of {len(items)} done")
+            yield item
+        self(f"{what} done, finishing")
 
     def __enter__(self):
+        stream = self._stream or sys.stderr
+        self._start, self._bar = time.monotonic(), None
+        if stream.isatty():
+            form = {"bar_format": "{desc}"} if self._total is None else {"desc": self._name or None, "unit": self._unit}
+            self._bar = tqdm(total=self._total, file=stream, leave=False, **form)
+        self._thread = Thread(target=self._tell, args=(stream,), daemon=True)
+        self._thread.start()
         return self
 
     def __exit__(self, *_):
-        if self._live and self._width:
-            print("\r" + " " * self._width + "\r", end="", file=self._stream, flush=True)
+        self._ended.set()
+        self._thread.join()
+        if self._bar is not None:
+            self._bar.close()
+
+    def _tell(self, stream):
+        """Until the end, in a thread of its own."""
+        pause = FIRST if self._bar is None else OFTEN
+        while not self._ended.wait(pause):
+            if self._bar is None:
+                pause = EVERY
+                print(self._line(), file=stream, flush=True)
+            elif self._total is None:
+                self._bar.set_description_str(self._line())
+            else:
+                self._bar.refresh()
+
+    def _line(self):
+        share = f"{self._done} of {self._total} {self._unit}s done" if self._total else ""
+        parts = filter(None, (self._what, share, f"{time.monotonic() - self._start:.0f} s"))
+        return f"{self._name}: " * bool(self._name) + ", ".join(parts)

@@ -38,7 +38,7 @@ from .message_types import check_type, typestore
 
 __all__ = [
     "Names", "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry",
-    "write_bag",
+    "write_bag", "write_odometry",
 ]  # fmt: skip
 
 _AIDS = {  # topic and field of Flight: its type, messages of it, a row of a message, what may be in rows, it of rows
@@ -108,18 +108,7 @@ def write_bag(flight, out, storage="mcap", force=False):
         raise InputError(f"{flight.name}: holds no message; there is nothing to write.")
     first = int(min(starts))
     antenna = flight.meta.get("antenna")
-    topics = {  # at equal stamps this order holds: anchors before what needs them
-        "/uwb/anchors": (
-            "uwb_tdoa_msgs/msg/AnchorArray",
-            LATCHED_QOS,
-            [bag_messages.anchors_message(flight.anchors, first, store)],
-        ),
-        "/tf_static": (
-            "tf2_msgs/msg/TFMessage",
-            LATCHED_QOS,
-            [bag_messages.transforms_message(flight.anchors, first, store, antenna)],
-        ),
-    }
+    topics = _of_anchors(flight.anchors, first, store, antenna)
     if flight.imu is not None:
         topics["/imu/data"] = "sensor_msgs/msg/Imu", _STREAM_QOS, bag_messages.imu_messages(flight.imu, store)
     for name, (msgtype, outgoing, *_) in _AIDS.items():
@@ -130,16 +119,41 @@ def write_bag(flight, out, storage="mcap", force=False):
         poses = bag_messages.pose_messages(flight.truth, flight.anchors.frame, store)
         topics["/ground_truth/pose"] = "geometry_msgs/msg/PoseStamped", _STREAM_QOS, poses
 
-    counts = dict.fromkeys(topics, 0)
     with new_bag(out, storage, force) as writer:
         writer.set_custom_data(_FLIGHT_KEY, _about_flight(flight))
-        streams = []
-        for topic, (msgtype, qos, outgoing) in topics.items():
-            connection = writer.add_connection(topic, msgtype, typestore=store, offered_qos_profiles=[qos])
-            streams.append(_serialized(connection, outgoing, store))
-        for stamp, connection, data in heapq.merge(*streams, key=lambda message: message[0]):
-            writer.write(connection, stamp, data)
-            counts[connection.topic] += 1
+        return _write(writer, topics, store)
+
+
+def write_odometry(odometry, anchors, out, storage="mcap", force=False):
+    """Write an Odometry among Anchors as a bag with odometry, uwb/anchors and /tf_static; see `write_bag`."""
+    store = typestore()
+    if not len(odometry):
+        raise InputError(f"{out}: there is no odometry to write.")
+    topics = _of_anchors(anchors, int(bag_messages.nanoseconds("odometry", odometry.t[:1])[0]), store)
+    topics["/odometry"] = "nav_msgs/msg/Odometry", _STREAM_QOS, bag_messages.odometry_messages(odometry, anchors.frame, store)
+    with new_bag(out, storage, force) as writer:
+        return _write(writer, topics, store)
+
+
+def _of_anchors(anchors, first, store, antenna=None):
+    """{topic: (type, QoS, [(stamp ns, message)])} of Anchors, to be written before anything else. first : ns, of the bag; antenna : (3,) m."""
+    array = bag_messages.anchors_message(anchors, first, store)  # at equal stamps this order holds: anchors before what needs them
+    frames = bag_messages.transforms_message(anchors, first, store, antenna)
+    return {
+        "/uwb/anchors": ("uwb_tdoa_msgs/msg/AnchorArray", LATCHED_QOS, [array]),
+        "/tf_static": ("tf2_msgs/msg/TFMessage", LATCHED_QOS, [frames]),
+    }
+
+
+def _write(writer, topics, store):
+    """Write {topic: (type, QoS, (stamp ns, message) in order)} to an open bag, in order of stamps. Returns {topic: number of messages}."""
+    counts, streams = dict.fromkeys(topics, 0), []
+    for topic, (msgtype, qos, outgoing) in topics.items():
+        connection = writer.add_connection(topic, msgtype, typestore=store, offered_qos_profiles=[qos])
+        streams.append(_serialized(connection, outgoing, store))
+    for stamp, connection, data in heapq.merge(*streams, key=lambda message: message[0]):
+        writer.write(connection, stamp, data)
+        counts[connection.topic] += 1
     return counts
 
 
@@ -152,14 +166,14 @@ def _about_flight(flight):
     return json.dumps({"name": flight.name, "meta": flight.meta, "written_by": written_by()}, default=str)
 
 
-def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, spare=None):
+def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth=True):
     """Flight of a bag that was written here, by `ros2 bag record` or by our `record`; other topics are ignored.
 
     namespace : where the tag's topics are in the bag, e.g. "tag1" for /tag1/uwb/tdoa.
     topics : {our name of a topic: its name in the bag}, e.g. {"uwb/tdoa": "/my/tdoa"}; not absolute: in the namespace.
-    anchors : Anchors to use instead of the recorded uwb/anchors; spare : callable that gives those to use where none were
-        recorded, or None.
+    anchors : Anchors to use instead of the recorded uwb/anchors, or None.
     salvage : read a cut or damaged bag up to there, and without messages that are no numbers; `meta["remarks"]` tells.
+    truth : read ground_truth/pose, where it is.
     Stamps are header stamps; messages that were recorded out of their order are sorted (`meta["reordered"]`). An IMU in
     a frame of its own is taken to the body as /tf_static says; `meta["antenna"]` is the place of an antenna on it, (3,) m.
     Raises InputError for a bag that is damaged, has no uwb/tdoa, or neither anchors nor uwb/anchors, and for messages
@@ -190,7 +204,7 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, spare
             why = f"{count} that are there cannot be read" if count else _others(connections, namespace)
             raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {why}.")
         if anchors is None:
-            anchors = _read_anchors(path, reader, connections, name_of("uwb/anchors")) or (spare() if spare else None)
+            anchors = _read_anchors(path, reader, connections, name_of("uwb/anchors"))
         if anchors is None:
             raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
         imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
@@ -200,14 +214,14 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, spare
         remarks += [remark for _, remark in places.values() if remark]
         remarks = [*remarks_of(reader), *remarks]
         pose = "geometry_msgs/msg/PoseStamped"
-        truth = stream("ground_truth/pose", pose, bag_messages.pose_row, bag_messages.truth_of)
+        poses = stream("ground_truth/pose", pose, bag_messages.pose_row, bag_messages.truth_of) if truth else None
     if imu is not None and (place := places["imu/data"][0]):
         imu = placing.imu_in_body(imu, place)
     if place := places["uwb/tdoa"][0]:
         meta["antenna"] = place[1].tolist()
     if remarks:
         meta["remarks"] = remarks
-    return Flight(about["name"], anchors, tdoa, imu, truth, {}, meta, **aids)
+    return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, **aids)
 
 
 def read_odometry(path, namespace="", salvage=False, topics=None):

@@ -11,6 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Height, Imu, Pressure, Tdoas, Truth, Velocity
+from uwb_tdoa_ekf.frames import to_odometry
 
 from ..readers.streams import LARGEST_NUMBER
 
@@ -189,6 +190,21 @@ def transforms_message(anchors, stamp, store, antenna=None):
         for parent, child, p, q in frames
     ]
     return stamp, types["tf2_msgs/msg/TFMessage"](transforms)
+
+
+def odometry_messages(odometry, frame, store):
+    """Yield (stamp ns, nav_msgs/Odometry) of an Odometry: its twist is in the body frame, and rates are not known."""
+    types = store.types
+    Message, Vector3 = types["nav_msgs/msg/Odometry"], types["geometry_msgs/msg/Vector3"]
+    Pose, Twist = types["geometry_msgs/msg/PoseWithCovariance"], types["geometry_msgs/msg/TwistWithCovariance"]
+    velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
+    of_twist = np.tile(np.diag([0.0] * 3 + [UNKNOWN_VARIANCE] * 3), (len(odometry.t), 1, 1))
+    of_twist[:, :3, :3] = covariance[:, 6:, 6:]
+    columns = nanoseconds("odometry", odometry.t).tolist(), odometry.p.tolist(), odometry.q.tolist(), velocity.tolist()
+    for stamp, p, q, v, of_pose, its in zip(*columns, covariance[:, :6, :6], of_twist):
+        twist = types["geometry_msgs/msg/Twist"](Vector3(*v), Vector3(0.0, 0.0, 0.0))
+        pose = Pose(_pose(store, p, q), of_pose.ravel())
+        yield stamp, Message(_header(store, stamp, frame), BODY_FRAME, pose, Twist(twist, its.ravel()))
 
 
 def odometry_row(message):

@@ -5,13 +5,13 @@ import math
 from pathlib import Path
 import sys
 
-from tqdm import tqdm
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
 from ..checking import report
 from ..checking.check import check, different_surveys
 from ..checking.recording import read_live, read_recording
+from ..progress import Progress
 from ..readers import read_survey
 
 DESCRIPTION = """Check recordings, or live topics, against a survey, before anything else.
@@ -57,7 +57,7 @@ def _check(args):
     reading = options.reading_of(args)
     surveys = Path(args.survey) if args.survey else None
     others = _surveys(surveys) if surveys and surveys.is_dir() else []
-    alone = None if others else surveys  # one survey is for bags too, which bring their own otherwise
+    alone = None if others else surveys
     reports, recordings = [], []
     for recording in _recordings(args, reading, alone):
         recordings.append(recording)
@@ -75,11 +75,14 @@ def _recordings(args, reading, survey):
     """Yield the Recording of each, or of what is live. survey : path of the one survey, or None."""
     if args.live is not None:
         yield read_live(reading, args.live, survey, partial(cli.say, "check"))
-    for path, its_survey in tqdm(reading.find(args.flights), desc="checking", unit="flight", disable=None, leave=False):
-        recording = read_recording(reading, path, its_survey or survey)
-        for remark in recording.remarks:
-            cli.say("check", f"{path}: {remark}")
-        yield recording
+    found = reading.find(args.flights)
+    with Progress("check", len(found), "flight") as progress:
+        for path, its_survey in found:
+            recording = read_recording(reading, path, its_survey)
+            for remark in recording.remarks:
+                cli.say("check", f"{path}: {remark}")
+            yield recording
+            progress.update()
 
 
 def _surveys(folder):

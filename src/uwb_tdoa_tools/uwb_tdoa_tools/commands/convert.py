@@ -71,6 +71,7 @@ def _read(args):
         if len(args.input) > 1:
             raise InputError(f"IN: {len(args.input)} recordings are given; convert one by one, or name --columns.")
         return reading.one(args.input[0])
+    options.refuse(args, ("namespace", "topics"), "says where topics are in bags, and --columns is of CSV files")
     if not args.survey:
         raise InputError("--columns: CSV files do not say where the anchors are; give a survey file (--survey FILE).")
     return columns.read_columns(args.input, columns.parse_columns(args.columns), read_survey(args.survey), args.salvage)

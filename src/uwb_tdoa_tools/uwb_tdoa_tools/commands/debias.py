@@ -58,6 +58,7 @@ def parser():
 
 
 def _fit(args):
+    cli.check_folders(args.out, args.json)
     if not (args.flights or args.static):
         raise InputError("FLIGHT: there is none; give flights with ground truth, or --static points.")
     if not 0.01 <= args.step <= 10.0:
@@ -85,6 +86,7 @@ def _fit(args):
 
 
 def _judge(args):
+    cli.check_folders(args.json)
     estimator, made = Estimator(options.reading_of(args), *options.filter_of(args)), BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     report.say_rows("flight", rows)

@@ -72,6 +72,8 @@ def parser():
 
 def _diagnose(args):
     out = cli.output_folder(args.out)
+    if args.reference in ("truth", "heights"):
+        options.refuse(args, ("marks", "distances", "odometry"), f"no part of it is used with --reference {args.reference}")
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
     jobs, dask = parallel.asked(args, len(reading.find(args.flights)), FEW)

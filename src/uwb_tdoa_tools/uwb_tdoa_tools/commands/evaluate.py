@@ -1,11 +1,11 @@
 """How good is the estimate? Errors against ground truth, of the filter run here or of a recorded odometry."""
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 import sys
 
-from uwb_tdoa_bias.correction.network import load_network, unasked
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.core.aids import STREAMS
 
 from .. import cli, options, parallel
 from ..results_file import asked_of
@@ -14,6 +14,7 @@ from ..scoring.judge import Judge, results
 from ..scoring.metrics import FIGURES, Pool, as_json
 
 NO_MATTER = ("flights", "survey", "json", "markdown", "beside", "resume", "jobs", "dask")  # to what is kept of a flight
+NOT_OF_ODOMETRY = "effects", "config", "model", "no_bias", "parameters", "without", "smooth"
 
 
 def main(argv=None):
@@ -41,22 +42,7 @@ def parser():
     )
     add = made.add_argument
     options.add_recordings(made)
-    options.add_filter(made, "effects.yaml: systematic effects to correct for")
-    add(
-        "--model", metavar="FILE",
-        help='ONNX bias network to correct with; "default" is the one shipped, which is taken, as bias_node takes it, where '
-        "neither this nor --effects is given",
-    )  # fmt: skip
-    add("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
-    add(
-        "-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[],
-        help="one filter parameter, before --config",
-    )  # fmt: skip
-    add(
-        "--without", metavar="AID", action="append", default=[], choices=STREAMS,
-        help=f"not to be used though it is there: {', '.join(STREAMS)}; may be repeated",
-    )  # fmt: skip
-    add("--smooth", action="store_true", help="smooth: use what came after each estimate too")
+    options.add_estimator(made)
     add("--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT")
     add("--json", metavar="FILE", help="write all figures: runs, pooled")
     add("--markdown", metavar="FILE", help="write the table as Markdown")
@@ -75,25 +61,19 @@ def parser():
 
 
 def _evaluate(args):
-    config, effects = options.filter_of(args)
-    without = [f"use_{aid}:=false" for aid in args.without]
-    config = options.with_parameters(config, args.parameters + without)
-    network = None if args.no_bias else load_network(unasked(args.effects) if args.model is None else args.model)
-    given = {effect.name for effect in effects.effects} if effects else set()
-    if network and (lacking := sorted(set(network.trained_with) - given)):
-        cli.say("evaluate", f"{args.model} was trained with {', '.join(lacking)} taken out, which no --effects gives; "
-                "give the effects.yaml that was written beside it.")  # fmt: skip
+    cli.check_folders(args.json, args.markdown, args.plot)
+    if args.odometry:
+        options.refuse(args, NOT_OF_ODOMETRY, "has no part in an odometry that was recorded, which is judged as it is (--odometry)")
+    estimator = options.estimator_of(args, partial(cli.say, "evaluate"))
     reading = options.reading_of(args)
-    found = reading.find(args.flights, bool(args.dask))
+    found = (replace(reading, topics={}, namespace="") if args.odometry else reading).find(args.flights, bool(args.dask))
     for option in ("odometry", "plot"):
         if getattr(args, option) and len(found) != 1:
             raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
-    judge = Judge(
-        reading, config, None if args.no_bias else effects, network, args.smooth, args.odometry, args.plot,
-        Path(args.tum).absolute() if args.tum else None,
-    )  # fmt: skip
+    trajectories = cli.output_folder(args.tum, "--tum").absolute() if args.tum else None
+    judge = Judge(reading, estimator, args.odometry, args.plot, trajectories)
     if not args.odometry:
-        cli.show(f"correcting with: {'+'.join(part.name for part in (judge.effects, judge.network) if part) or 'nothing'}")
+        cli.show(f"correcting with: {estimator.correction}")
     cli.show(table.head())
     told, pool = [], Pool()
     asked = asked_of(args, NO_MATTER, ("effects", "config", "model")) | {"version of the figures": FIGURES}

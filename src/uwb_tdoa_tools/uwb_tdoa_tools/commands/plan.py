@@ -14,6 +14,7 @@ from ..planning.goal import OBJECTIVES
 from ..planning.maps import FLYABLE, chart
 from ..planning.noise import RadioNoise
 from ..planning.pairing import OF_PROTOCOL, PAIRINGS
+from ..progress import Progress
 from ..readers import inputs, read_survey
 
 
@@ -52,17 +53,14 @@ def parser():
 
     add, radio = made.add_argument_group("measurements").add_argument, RadioNoise
     add("--protocol", choices=OF_PROTOCOL, default="tdoa2", help="which TDOAs a round holds (default: tdoa2)")
-    shared = "the TDOAs of a round and what they share (default: ring for tdoa2, all_pairs for tdoa3)"
-    add("--covariance", choices=PAIRINGS, help=shared)
+    add("--covariance", choices=PAIRINGS, help="the TDOAs of a round and what they share (default: ring for tdoa2, all_pairs for tdoa3)")
     add("--antenna", metavar="FILE", help="pattern, YAML: azimuth, elevation_1, elevation_2, gain_offset, in dBi")
     add("--tx-power", metavar="DBM", **number, default=radio.tx_power_dbm, help=f"at 25 C, 3.3 V {default}")
     add("--temperature", metavar="C", **number, default=radio.temperature, help=f"of the anchors {default}")
     add("--voltage", metavar="V", **number, default=radio.voltage, help=f"supply of the anchors {default}")
     add("--noise", metavar="M", **number, help="standard deviation of every reception, instead of the radio's")
-    own = "error that every TDOA has of its own besides (default: 0)"
-    add("--link-noise", metavar="M", **number, default=0.0, help=own)
-    felt = "what the tag measures besides, as with a range finder that looks down"
-    add("--with", dest="aids", action="append", default=[], choices=["height"], help=felt)
+    add("--link-noise", metavar="M", **number, default=0.0, help="error that every TDOA has of its own besides (default: 0)")
+    add("--with", dest="aids", action="append", default=[], choices=["height"], help="what the tag measures besides: a range finder that looks down")
     add("--height-std", metavar="M", **number, default=FilterConfig().height_std, help=f"of that height {default}")
     unique = "one solution by every pairing alone or by a whole round (default: pairings)"
     add("--flyable", choices=FLYABLE, default="pairings", help=unique)
@@ -84,6 +82,7 @@ def parser():
 
 
 def _plan(args):
+    cli.check_folders(args.json)
     anchors = read_survey(args.anchors)
     installation = options.installation_of(args, anchors)
     room = options.room_for(args, anchors)
@@ -96,8 +95,10 @@ def _plan(args):
 
     if not np.isfinite(anchors.orientations).all():
         cli.show("note: anchors without orientation are taken to radiate alike in all directions")
-    args.out.mkdir(parents=True, exist_ok=True)
-    found = chart(installation, grid, args.flyable)
+    cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
+    with Progress("plan") as progress:
+        progress("mapping")
+        found = chart(installation, grid, args.flyable)
     figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
     report.say_summary(figures["map"])
     outgoing = run.draw_map(found, installation, args.out)

@@ -26,6 +26,8 @@ to --out.
 
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
 
+OF_TAPE = "std", "height_std", "trusted", "trusted_std"  # fields of Tape, for which the covariance of the last calibration stands
+
 
 def main(argv=None):
     """The executable. Returns the exit code."""
@@ -46,10 +48,10 @@ def parser():
     options.add_recordings(made)
     options.add_filter(made, "effects.yaml: what is in the model already; that of a survey is its prior, and tells what changed")
     add = made.add_argument
-    add("--std", type=float, default=0.1, metavar="M", help="m, standard deviation of a coordinate as given (default 0.1)")
+    add("--std", type=float, metavar="M", help=f"m, standard deviation of a coordinate as given (default {Tape.std:g})")
     add("--height-std", type=float, metavar="M", help="m, the same of heights, which are easier to measure")
     add("--trusted", nargs="+", default=[], metavar="A", help="anchors (3) or coordinates (3.z) that are known well")
-    add("--trusted-std", type=float, default=0.01, metavar="M", help="m, how well those are known (default 0.01)")
+    add("--trusted-std", type=float, metavar="M", help=f"m, how well those are known (default {Tape.trusted_std:g})")
     add("--unknown", nargs="+", default=[], metavar="A", help="anchors whose position is not known at all")
     options.add_known(made)
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
@@ -58,9 +60,12 @@ def parser():
 
 def _survey(args):
     out = cli.output_folder(args.out)
-    tape = Tape(args.std, args.height_std, tuple(args.trusted), args.trusted_std, tuple(args.unknown))
     config, effects = options.filter_of(args)
     base = effects or EffectSet()
+    if base.covariance is not None:
+        options.refuse(args, OF_TAPE, f"{args.effects} says how well each anchor is known, by its last calibration")
+    told = {name: getattr(args, name) for name in OF_TAPE if options.given(args, name)}
+    tape = Tape(**told, unknown=tuple(args.unknown))
     flights = options.reading_of(args).flights(args.flights)
     known = options.known_of(args, flights)
     with Progress("survey") as progress:

@@ -6,6 +6,7 @@ from pathlib import Path
 import sys
 
 from .. import cli, options, parallel
+from ..progress import Progress
 from ..results_file import ResultsFile, asked_of, resumed, state_of
 from ..training import labels as labelling, models, shrinking
 from ..training.plots import plot_curve
@@ -56,11 +57,14 @@ def parser():
 
 
 def _train(args):
+    cli.output_folder(args.out)
     reading = options.reading_of(args)
     jobs, dask = parallel.asked(args, len(reading.find(args.flights)), 2)  # as many for folds as for flights: else all start anew
     with _kept(args, reading) as done:
-        over = partial(parallel.over, jobs=jobs, dask=dask, unit="part")
-        _write(args, reading.flights(args.flights, args.most, jobs, dask), resumed(over, args.resume, done) if done else over)
+        over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # no line beside that of Progress
+        flights = reading.flights(args.flights, args.most, jobs, dask)
+        with Progress("train") as progress:
+            _write(args, flights, resumed(over, args.resume, done) if done else over, progress)
 
 
 def _kept(args, reading):
@@ -71,14 +75,15 @@ def _kept(args, reading):
     return ResultsFile(args.resume, {**asked_of(args, NO_MATTER), "flights": recordings})
 
 
-def _write(args, several, over):
-    """Train on several Flights, and write all of it. over : as of `shrinking.train`."""
+def _write(args, several, over, progress):
+    """Train on several Flights, and write all of it. over : as of `shrinking.train`; progress : Progress."""
     flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):
         cli.show(f"{what:13s} {', '.join(some)}")
     training, validation = ([flights[name] for name in some] for some in names)
     name = args.name or args.model
+    progress(f"training on {len(training)} flights, then without each")
     result, borne_out = shrinking.train(args.model, training, validation, args.seed, name, progress=cli.show, over=over)
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)

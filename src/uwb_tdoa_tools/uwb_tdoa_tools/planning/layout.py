@@ -104,7 +104,7 @@ def optimise(goal, places, count, fixed=None, start=None, starts=16, seed=0, pro
     """Anchors at the `count` best places, turned in the best directions; after those of `fixed`, which stay.
 
     goal : Goal; places : Places; start : (count, 3) m, a layout to begin with besides the quasi-random ones;
-    progress : wraps the starts, e.g. tqdm. Descents from all starts at a few of the goal's points; the best of what
+    progress : wraps the starts. Descents from all starts at a few of the goal's points; the best of what
     they lead to descend again, with the points that turn out to be the worst. The best score at all points wins."""
     layout = Layout(places, count, fixed, goal.points.mean(axis=0))
     rows = _some(goal, ROUGH, seed)

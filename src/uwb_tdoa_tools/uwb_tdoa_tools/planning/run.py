@@ -4,16 +4,14 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+from ..progress import Progress
 from ..readers.inputs import Reading
 from . import accuracy, layout, messages, plots
 from .check import brute_force
 from .maps import Grid, chart
-
-_watched = partial(tqdm, disable=None, leave=False)
 
 
 def draw_map(found, installation, out):
@@ -28,7 +26,8 @@ def draw_map(found, installation, out):
 
 def check(installation, grid, out):
     """The failure map against a solver that is started from many places."""
-    unique, agrees, points, arrows = brute_force(installation, grid, partial(_watched, desc="solving"))
+    with Progress("plan") as progress:
+        unique, agrees, points, arrows = brute_force(installation, grid, partial(progress.over, what="solving"))
     plots.plot_flips(installation, points, unique, agrees, arrows, out / "flips.png")
     return {"places": len(points), "agreement": float(np.mean(agrees)), "unique_share": float(np.mean(unique))}
 
@@ -66,16 +65,18 @@ def improve(before, aim, how, starts, criterion, out):
     """Better places for the anchors, improved.yaml. before : Chart as it is; aim : options.Aim; how : "move" or "add";
     criterion : of what is flyable."""
     goal, places, installation, candidates = aim.goal, aim.places, aim.goal.installation, None
-    anchors, search = installation.anchors, {"starts": starts, "progress": partial(_watched, desc="layouts")}
-    if how == "add":
-        candidates = layout.one_more(goal, anchors, places)
-        start = candidates[0][[np.argmin(candidates[1])]]
-        better = layout.optimise(goal, places, 1, anchors, start, **search)
-    else:
-        start = anchors.positions if aim.count == len(anchors) else None
-        better = layout.optimise(goal, places, aim.count, None, start, **search)
-    better.to_yaml(out / "improved.yaml")
-    after = goal.installed(better)
-    charts = [("before, ", installation, before), ("after, ", after, chart(after, before.grid, criterion))]
+    anchors = installation.anchors
+    with Progress("plan") as progress:
+        search = {"starts": starts, "progress": partial(progress.over, what="layouts")}
+        if how == "add":
+            candidates = layout.one_more(goal, anchors, places)
+            start = candidates[0][[np.argmin(candidates[1])]]
+            better = layout.optimise(goal, places, 1, anchors, start, **search)
+        else:
+            start = anchors.positions if aim.count == len(anchors) else None
+            better = layout.optimise(goal, places, aim.count, None, start, **search)
+        better.to_yaml(out / "improved.yaml")
+        after = goal.installed(better)
+        charts = [("before, ", installation, before), ("after, ", after, chart(after, before.grid, criterion))]
     plots.plot_layouts(charts, out / "layout.png", candidates)
     return {"points": len(aim.judge.points), "before": aim.judge.judge(anchors), "after": aim.judge.judge(better)}

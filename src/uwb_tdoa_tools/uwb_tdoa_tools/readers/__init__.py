@@ -13,16 +13,16 @@ from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
 __all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
 
 
-def read_flight(path, survey=None, namespace="", salvage=False, topics=None, spare=None):
+def read_flight(path, survey=None, namespace="", salvage=False, topics=None, truth=True):
     """Flight of a recording of any known kind, told apart by content, not by name.
 
     path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (its directory or its .mcap or .db3 file).
     survey : path of a survey file (see `read_survey`) or Anchors. Logs and CSV files need it; a bag brings its own
         anchors, and a survey given with it replaces them.
     namespace, topics : where the tag's topics are in a bag, see `read_bag`.
-    spare : callable that gives the path of a survey for a bag that brings no anchors, or None.
     salvage : read a cut or damaged recording up to there, without records that are no numbers; the Flight's
         `meta["remarks"]` tell what is missing. Otherwise it is refused.
+    truth : read the ground truth, where there is one.
     Raises InputError.
     """
     from ..bags.bag import is_bag, read_bag  # here, because bags need the rosbags library and the others do not
@@ -31,13 +31,13 @@ def read_flight(path, survey=None, namespace="", salvage=False, topics=None, spa
     if not path.exists():
         raise InputError(f"{path}: does not exist; give a micro-SD log, a UTIL CSV file or a bag.")
     if is_bag(path):
-        return read_bag(path, namespace, _anchors(survey), salvage, topics, spare and (lambda: _anchors(spare())))
+        return read_bag(path, namespace, _anchors(survey), salvage, topics, truth)
     if path.is_dir():
         raise InputError(f"{path}: is a directory without metadata.yaml; give a bag directory or a file.")
     reader = _reader(path)
     if survey is None:
         raise InputError(f"{path}: does not say where the anchors are; give a survey file (--survey FILE).")
-    return reader(path, _anchors(survey), salvage)
+    return reader(path, _anchors(survey), salvage, truth)
 
 
 def _anchors(survey):

@@ -1,7 +1,6 @@
 """From the paths on a command line to flights: files or folders of recordings, one survey or a folder of them."""
 
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 import sys
 
@@ -17,14 +16,17 @@ from . import read_flight
 HELP = "recordings: raw logs, UTIL CSV files, bags, or folders that hold them"
 SURVEY_HELP = (
     "anchor survey (total station .txt, const .csv or anchors .yaml), or a folder of them: then anchor_KEY.* serves "
-    "the recordings whose path contains KEY; bags carry their own, and take this only where they do not"
+    "the recordings whose path contains KEY; counts in place of the anchors that bags hold, which keep their own where no KEY fits"
 )
+
+_TOLD = set()  # surveys of which has been told that they count for bags
 
 
 def find_flights(paths, survey=None, absolute=False):
     """Pairs (recording, survey or None), sorted within each folder. Raises InputError where nothing, or no one survey,
     fits.
 
+    A bag takes the survey that is given, whatever anchors it holds, and says so once; out of a folder the one that fits, or its own.
     absolute : make them absolute paths, for processes that may have another working directory.
     """
     found = []
@@ -35,10 +37,30 @@ def find_flights(paths, survey=None, absolute=False):
         if not inside:
             raise InputError(f"{path}: holds no recording; expected logs, CSV files or bags.")
         found += inside
-    pairs = [(path, None if _is_bag(path) else survey_for(path, survey)) for path in found]
+    pairs = [(path, _survey_of(path, survey)) for path in found]
     if absolute:
         pairs = [(path.absolute(), its_survey and Path(its_survey).absolute()) for path, its_survey in pairs]
     return pairs
+
+
+def _survey_of(path, survey):
+    """The survey of a recording, or None for a bag whose own anchors count; what counts for a bag is told once."""
+    if survey is None or not _is_bag(path):
+        return survey_for(path, survey)
+    try:
+        its_survey = survey_for(path, survey)
+    except InputError:
+        _tell_once(f"{path}: no survey in {survey} fits; the anchors that it holds count, as in other bags that none fits.")
+        return None
+    _tell_once(f"{path}: the anchors of {its_survey} count here, whatever anchors the bag holds; so in every bag that is read with it.", its_survey)
+    return its_survey
+
+
+def _tell_once(sentence, about=None):
+    """Tell a sentence on stderr, and nothing more about the same survey, or about surveys that do not fit (None), in this process."""
+    if about not in _TOLD:
+        _TOLD.add(about)
+        tqdm.write(printable(sentence), file=sys.stderr)
 
 
 def survey_for(path, survey):
@@ -64,29 +86,42 @@ class Reading:
     """How recordings are read. Can be pickled.
 
     survey : path of a survey or of a folder of them, or None; namespace : of the tag's topics in bags; topics : {our
-    name of a topic: its name in the bags}; salvage : read cut and damaged recordings as far as they are sound.
+    name of a topic: its name in the bags}; salvage : read cut and damaged recordings as far as they are sound; truth : read the ground
+    truth, where there is one.
     """
 
     survey: str | Path | None = None
     namespace: str = ""
     topics: dict = field(default_factory=dict)
     salvage: bool = False
+    truth: bool = True
 
     def find(self, paths, absolute=False):
-        """Pairs (recording, survey or None), see `find_flights`; none of no paths."""
-        return find_flights(paths, self.survey, absolute)
+        """Pairs (recording, survey or None), see `find_flights`; none of no paths. Raises InputError where topics of bags are named, and
+        there is no bag."""
+        found = find_flights(paths, self.survey, absolute)
+        if found and not any(_is_bag(path) for path, _ in found):
+            self._refuse_topics(found[0][0])
+        return found
+
+    def _refuse_topics(self, path):
+        for option, given in (("--namespace", self.namespace), ("--topic", self.topics)):
+            if given:
+                raise InputError(f"{option}: says where topics are in bags, and {path} is none; leave it out.")
 
     def read(self, recording):
         """Flight of a pair (recording, survey or None); tells on stderr what is missing in it. Raises InputError."""
         path, survey = recording
-        spare = None if self.survey is None else partial(survey_for, path, self.survey)
-        flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, spare)
+        flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, self.truth)
         tell(path, flight.meta.get("remarks", ()))
         return flight
 
     def one(self, path):
         """Flight of one recording."""
-        return self.read((path, survey_for(path, self.survey)))
+        path = Path(path)
+        if not _is_bag(path):
+            self._refuse_topics(path)
+        return self.read((path, _survey_of(path, self.survey)))
 
     def flights(self, paths, most=None, jobs=1, dask=None):
         """Flights of recordings and folders, with a progress bar: list. jobs, dask : as of `parallel.over`.

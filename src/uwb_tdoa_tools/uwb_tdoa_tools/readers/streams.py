@@ -16,7 +16,7 @@ SALVAGE = "read what is sound of it with --salvage"
 DAY = 86400.0  # s
 
 
-def make_flight(name, anchors, streams, extra, meta, salvage=False):
+def make_flight(name, anchors, streams, extra, meta, salvage=False, truth=True):
     """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams left out.
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
@@ -26,10 +26,12 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
     meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps
         of each stream fell before they were sorted), "imu_accel_interpolated" and "remarks" (list of sentences).
     salvage : leave out records that are not finite, or whose stamps are a day away from the others, with a remark.
+    truth : take "pose" as the ground truth; it is not looked at otherwise.
     Raises InputError; without salvage for such records too.
     """
     meta = {"remarks": [], **meta}
-    streams = {key: _sound(key, columns, meta, salvage) for key, columns in streams.items() if len(columns["t"])}
+    wanted = {key: columns for key, columns in streams.items() if len(columns["t"]) and (truth or key != "pose")}
+    streams = {key: _sound(key, columns, meta, salvage) for key, columns in wanted.items()}
     streams = {key: columns for key, columns in streams.items() if len(columns["t"])}
     extra = {key: columns for key, columns in extra.items() if len(columns["t"])}
     reordered = {}
@@ -47,12 +49,12 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
         raise InputError(f"{meta['source']}: holds no TDOA measurement; record the tag's TDOAs with the flight.")
     tdoas = Tdoas(tdoa["t"], tdoa["a"], tdoa["b"], tdoa["d"], tdoa["std"] ** 2 if "std" in tdoa else None)
     meta["protocol"] = protocol(tdoas)
-    imu = truth = None
+    imu = poses = None
     if "gyro" in streams and "acc" in streams:
         imu = _imu(streams["gyro"], streams["acc"], meta)
     if "pose" in streams:
         pose = streams["pose"]
-        truth = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
+        poses = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
     height = pressure = velocity = None
     if "tof" in streams:
         tof = streams["tof"]
@@ -66,7 +68,7 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False):
         velocity = velocity if len(velocity.t) else None
     if not meta["remarks"]:
         del meta["remarks"]
-    return Flight(name, anchors, tdoas, imu, truth, extra, meta, height, pressure, velocity)
+    return Flight(name, anchors, tdoas, imu, poses, extra, meta, height, pressure, velocity)
 
 
 def _sound(key, columns, meta, salvage):

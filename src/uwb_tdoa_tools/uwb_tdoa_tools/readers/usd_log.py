@@ -33,7 +33,7 @@ _STREAMS = {  # event name: our stream, {column in the log: column of the stream
 }
 
 
-def read_usd_log(path, anchors, salvage=False):
+def read_usd_log(path, anchors, salvage=False, truth=True):
     """Flight of a micro-SD event log.
 
     TDOAs come from estTDOA (d_B - d_A), or where there is none from the selected ones of estTdoaCand (d_A - d_B), the
@@ -90,7 +90,7 @@ def read_usd_log(path, anchors, salvage=False):
         streams[stream] = {"t": columns["t"], **{rename[field]: columns[field] for field in rename}}
     if "tdoa" in streams:
         streams["tdoa"] = _tdoa(path, streams["tdoa"])
-    return make_flight(Path(path).name, anchors, streams, extra, meta, salvage)
+    return make_flight(Path(path).name, anchors, streams, extra, meta, salvage, truth)
 
 
 def _gather(raw, at, dtype):

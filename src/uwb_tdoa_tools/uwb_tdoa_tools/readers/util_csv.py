@@ -31,7 +31,7 @@ _QUATERNION = {"pose_qx": "qx", "pose_qy": "qy", "pose_qz": "qz", "pose_qw": "qw
 TDOA_COLUMNS = tuple(_STREAMS["tdoa"])
 
 
-def read_util_csv(path, anchors, salvage=False):
+def read_util_csv(path, anchors, salvage=False, truth=True):
     """Flight of a CSV file in the UTIL schema; it must hold at least t_tdoa, idA, idB and tdoa_meas.
 
     Acceleration g to m/s^2, rates deg/s to rad/s, tof mm to m, baro m of altitude to Pa, flow (pixel
@@ -71,7 +71,7 @@ def read_util_csv(path, anchors, salvage=False):
     if ignored := [name for name in header if name not in known]:
         meta["ignored_columns"] = ignored
     name = Path(path).name.removesuffix(".gz").removesuffix(".csv")
-    return make_flight(name, anchors, streams, {}, meta, salvage)
+    return make_flight(name, anchors, streams, {}, meta, salvage, truth)
 
 
 def is_util_csv(line):

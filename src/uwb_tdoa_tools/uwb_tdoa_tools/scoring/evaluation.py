@@ -2,30 +2,22 @@
 
 from dataclasses import replace
 
-from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.offline import run_offline
 
+from ..localizing.estimate import Estimator
 from .metrics import Score
 
 
-def evaluate(flight, config=None, effects=None, network=None, engine=run_offline):
-    """Run the filter over a Flight with ground truth. Returns (Score, Run). Raises InputError if there is no truth.
+def evaluate(flight, config=None, effects=None, network=None):
+    """Run the filter over a Flight with ground truth. Returns (Score, Run). Raises InputError if there is no truth."""
+    return score_of(flight, Estimator(config, effects, network))
 
-    engine : run_offline, or smooth, which uses what came after each estimate too."""
+
+def score_of(flight, estimator):
+    """(Score, Run) of a Flight with ground truth, by an Estimator. Raises InputError if there is no truth."""
     need_truth(flight)
-    result = engine(flight, config, Corrector(flight.anchors, with_antenna(effects, flight), network))
-    return Score(flight.name, result.odometry, judging_truth(flight, effects), result.residuals, flight.tdoa.t), result
-
-
-def with_antenna(effects, flight):
-    """An EffectSet, or None, and the lever arm of the antenna that the recording of a Flight has told, unless it holds one."""
-    arm, known = flight.meta.get("antenna"), effects.effects if effects else ()
-    if not arm or not any(arm) or any(effect.name == TagLeverArm.name for effect in known):
-        return effects
-    return EffectSet((*known, TagLeverArm(values=dict(zip("xyz", arm)))))
+    run = estimator(flight)
+    return Score(flight.name, run.odometry, judging_truth(flight, estimator.effects), run.residuals, flight.tdoa.t), run
 
 
 def judging_truth(flight, effects=None):

@@ -6,18 +6,13 @@ import sys
 
 from tqdm import tqdm
 
-from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.smoother import smooth
-
 from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
 from ..checking.remarks import survey_remarks
+from ..localizing.estimate import Estimator
 from ..readers.inputs import Reading, tell
 from ..results_file import ResultsFile, state_of
-from .evaluation import evaluate, need_truth
+from .evaluation import need_truth, score_of
 from .metrics import Result, Score
 from .plots import plot_error
 from .tum import write_tum
@@ -27,17 +22,13 @@ from .tum import write_tum
 class Judge:
     """judge((path, survey)) is the Result of a recording: of the filter run over it, or of the odometry in a bag.
 
-    reading : Reading; config : FilterConfig; effects, network : what the TDOAs are corrected with, or None; smoothed :
-    use what came after each estimate too; odometry : path of a bag whose odometry is judged instead, or None; picture :
+    reading : Reading; estimator : Estimator; odometry : path of a bag whose odometry is judged instead, or None; picture :
     file to draw the errors to, or None; trajectories : folder for TUM files, or None.
     Raises InputError. Can be pickled.
     """
 
     reading: Reading = Reading()
-    config: FilterConfig | None = None
-    effects: EffectSet | None = None
-    network: Network | None = None
-    smoothed: bool = False
+    estimator: Estimator = Estimator()
     odometry: str | None = None
     picture: str | None = None
     trajectories: Path | None = None
@@ -51,8 +42,7 @@ class Judge:
             tell(self.odometry, odometry.remarks)
             score = Score(flight.name, odometry, flight.truth, heard=flight.tdoa.t)
         else:
-            engine = smooth if self.smoothed else run_offline
-            score, run = evaluate(flight, self.config, self.effects, self.network, engine)
+            score, run = score_of(flight, self.estimator)
             odometry = run.odometry
         if self.picture:
             plot_error(score, odometry, flight.truth, self.picture)

@@ -1,0 +1,27 @@
+"""Command lines that are told to be copied, as they run where the user is.
+
+    tool("check", "flight.bag")                          # ./dev run uwb_tdoa_tools check flight.bag, or ros2 run ...
+    node("ekf_node", {"effects_file": "effects.yaml"})
+"""
+
+import os
+import shlex
+
+RUN = "UWB_TDOA_RUN"  # variable of the environment in which ./dev says how the user started it
+PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf", "debias_node": "uwb_tdoa_ekf", "compile_nodes": "uwb_tdoa_ekf"}
+
+
+def tool(name, *words):
+    """The line that starts an executable with words, which are quoted where a shell needs it."""
+    return " ".join([started(name), *([shlex.join(map(str, words))] if words else [])])
+
+
+def started(name):
+    """How an executable is started: the beginning of its line."""
+    return f"{os.environ.get(RUN, 'ros2 run')} {PACKAGES.get(name, 'uwb_tdoa_tools')} {name}"
+
+
+def node(name, parameters, files=()):
+    """The line that starts a node. parameters : {name: value}; files : paths of parameter files."""
+    words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
+    return tool(name, "--ros-args", *words, *(word for file in files for word in ("--params-file", file)))

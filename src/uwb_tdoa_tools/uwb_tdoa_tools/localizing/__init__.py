@@ -1,0 +1,1 @@
+"""Where the tag was: recordings to trajectories, without ground truth."""

@@ -1,0 +1,93 @@
+"""What is left of each TDOA after the estimate: a table, sums per pair of anchors, a picture."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
+from uwb_tdoa_ekf.estimator import VERDICTS, Residuals
+
+COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
+SHOWN = 20  # pairs in the picture, those with the most TDOAs
+
+
+@dataclass(frozen=True)
+class OfPair:
+    """Residuals of the TDOAs between two anchors, a before b. t (n,) s; value, std (n,) m, of d_ab; explained (n,) bool, within three
+    standard deviations."""
+
+    a: int
+    b: int
+    t: np.ndarray
+    value: np.ndarray
+    std: np.ndarray
+    explained: np.ndarray
+
+    def as_dict(self) -> dict:
+        """For JSON."""
+        return {
+            "a": self.a, "b": self.b, "tdoas": len(self.t), "mean": float(self.value.mean()), "std": float(self.value.std()),
+            "explained": float(self.explained.mean()),
+        }  # fmt: skip
+
+
+def reached(residuals: Residuals) -> np.ndarray:
+    """Which TDOAs had a residual in the filter: (n,) bool."""
+    return np.isin(residuals.verdict, (USED, REJECTED, COMPENSATED))
+
+
+def explained(residuals: Residuals) -> np.ndarray:
+    """Which TDOAs were within three of the standard deviations that the filter expected: (n,) bool."""
+    with np.errstate(invalid="ignore"):  # NaN, of those without a residual, is not
+        return reached(residuals) & (residuals.innovation**2 <= 9.0 * residuals.variance)
+
+
+def by_pair(residuals: Residuals) -> list[OfPair]:
+    """Residuals of each pair of anchors, in the order of their ids."""
+    there, fits = reached(residuals), explained(residuals)
+    low, high = np.minimum(residuals.a, residuals.b), np.maximum(residuals.a, residuals.b)
+    sign = np.where(residuals.a <= residuals.b, 1.0, -1.0)
+    pairs = []
+    for a, b in np.unique(np.column_stack([low, high])[there].astype(int), axis=0).tolist():
+        rows = there & (low == a) & (high == b)
+        value, std = (sign * residuals.innovation)[rows], np.sqrt(residuals.variance[rows])
+        pairs.append(OfPair(a, b, residuals.t[rows], value, std, fits[rows]))
+    return pairs
+
+
+def write_csv(path: Path, residuals: Residuals) -> None:
+    """Write a line for each TDOA: s, ids of the anchors, m, m, 0 to 1, and what became of it. Empty where the filter had no residual."""
+    with open(path, "w") as file:
+        file.write(",".join(COLUMNS) + "\n")
+        std = np.sqrt(residuals.variance)
+        rows = zip(residuals.t, residuals.a, residuals.b, residuals.innovation, std, residuals.weight, residuals.verdict)
+        for t, a, b, value, its_std, weight, verdict in rows:
+            numbers = f"{value:.4f},{its_std:.4f},{weight:.3f}" if np.isfinite(value) else ",,"
+            file.write(f"{t:.6f},{int(a)},{int(b)},{numbers},{VERDICTS[int(verdict)]}\n")
+
+
+def picture(path: Path, residuals: Residuals, title: str) -> None:
+    """Residuals of each pair over time, a row each, those that the estimate does not explain in red, with their mean beside it."""
+    from matplotlib.figure import Figure  # takes a second to import
+
+    pairs = sorted(sorted(by_pair(residuals), key=lambda one: -len(one.t))[:SHOWN], key=lambda one: (one.a, one.b))
+    if not pairs:
+        return
+    figure = Figure(figsize=(11.0, 1.2 + 0.62 * len(pairs)), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(len(pairs), 1, sharex=True, sharey=True))
+    begin = min(one.t[0] for one in pairs)
+    limit = max(0.3, 1.3 * float(np.quantile(np.abs(np.concatenate([one.value for one in pairs])), 0.98)))
+    for ax, one in zip(axes, pairs):
+        shown = np.clip(one.value, -limit, limit)
+        ax.axhline(0.0, color="0.8", lw=0.8)
+        ax.plot(one.t - begin, shown, ".", ms=2.0, color="tab:blue")
+        ax.plot((one.t - begin)[~one.explained], shown[~one.explained], ".", ms=3.0, color="tab:red")
+        ax.set(ylim=(-limit, limit), yticks=(-0.8 * limit, 0.0, 0.8 * limit))
+        ax.set_yticklabels([f"{-80 * limit:.0f}", "0", f"{80 * limit:.0f}"], fontsize=7)
+        ax.set_ylabel(f"{one.a} - {one.b}", rotation=0, ha="right", va="center", fontsize=9)
+        told = f"{100 * one.value.mean():+.0f} cm, {one.explained.mean():.0%} explained"
+        ax.text(1.005, 0.5, told, transform=ax.transAxes, fontsize=8, va="center")
+    axes[-1].set_xlabel("time of the recording [s]")
+    figure.suptitle(f"{title}: residuals of each pair of anchors [cm]; red: more than three standard deviations", fontsize=10)
+    figure.savefig(path, dpi=110)
