@@ -55,6 +55,7 @@ setup(
             "evaluate = uwb_tdoa_tools.executables:evaluate",
             "fly = uwb_tdoa_tools.executables:fly",
             "inject = uwb_tdoa_tools.executables:inject",
+            "localize = uwb_tdoa_tools.executables:localize",
             "plan = uwb_tdoa_tools.executables:plan",
             "record = uwb_tdoa_tools.executables:record",
             "replay = uwb_tdoa_tools.executables:replay",

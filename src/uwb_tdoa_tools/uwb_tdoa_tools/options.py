@@ -46,15 +46,15 @@ def add_reading(parser):
     add("--salvage", action="store_true", help="read cut or damaged recordings as far as they are sound, with a remark")
 
 
-def reading_of(args):
-    """The Reading that those options ask for. Raises InputError."""
+def reading_of(args, truth=True):
+    """The Reading that those options ask for. truth : as of Reading. Raises InputError."""
     topics = {}
     for text in args.topics:
         ours, given, theirs = text.partition("=")
         if not given or ours not in TOPICS or not theirs.strip("/") or ours in topics:
             raise InputError(f"--topic: {text!r} is not OURS=THEIRS, where OURS, once, is one of {', '.join(TOPICS)}.")
         topics[ours] = theirs
-    return inputs.Reading(args.survey, args.namespace, topics, args.salvage)
+    return inputs.Reading(args.survey, args.namespace, topics, args.salvage, truth)
 
 
 def add_filter(parser, effects="effects.yaml to correct the TDOAs with, before the filter"):

@@ -9,7 +9,8 @@ from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.estimator import VERDICTS, Residuals
 
 COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
-SHOWN = 20  # pairs in the picture, those with the most TDOAs
+SHOWN, FEWEST = 20, 20  # pairs in the picture at most, those with the most TDOAs; TDOAs of a pair that is shown at least
+SPREAD = 6.0  # robust standard deviations that the picture reaches; what is farther off is drawn at its edge
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class OfPair:
     def as_dict(self) -> dict:
         """For JSON."""
         return {
-            "a": self.a, "b": self.b, "tdoas": len(self.t), "mean": float(self.value.mean()), "std": float(self.value.std()),
+            "a": self.a, "b": self.b, "tdoas": len(self.t), "median": float(np.median(self.value)), "std": float(self.value.std()),
             "explained": float(self.explained.mean()),
         }  # fmt: skip
 
@@ -68,16 +69,18 @@ def write_csv(path: Path, residuals: Residuals) -> None:
 
 
 def picture(path: Path, residuals: Residuals, title: str) -> None:
-    """Residuals of each pair over time, a row each, those that the estimate does not explain in red, with their mean beside it."""
+    """Residuals of each pair over time, a row each, those that the estimate does not explain in red, with their median beside it."""
     from matplotlib.figure import Figure  # takes a second to import
 
-    pairs = sorted(sorted(by_pair(residuals), key=lambda one: -len(one.t))[:SHOWN], key=lambda one: (one.a, one.b))
+    found = by_pair(residuals)
+    pairs = sorted((one for one in found if len(one.t) >= FEWEST), key=lambda one: -len(one.t))[:SHOWN]
+    pairs = sorted(pairs, key=lambda one: (one.a, one.b))
     if not pairs:
         return
     figure = Figure(figsize=(11.0, 1.2 + 0.62 * len(pairs)), layout="constrained")
     axes = np.atleast_1d(figure.subplots(len(pairs), 1, sharex=True, sharey=True))
     begin = min(one.t[0] for one in pairs)
-    limit = max(0.3, 1.3 * float(np.quantile(np.abs(np.concatenate([one.value for one in pairs])), 0.98)))
+    limit = max(0.3, SPREAD * 1.4826 * float(np.median(np.abs(np.concatenate([one.value for one in pairs])))))
     for ax, one in zip(axes, pairs):
         shown = np.clip(one.value, -limit, limit)
         ax.axhline(0.0, color="0.8", lw=0.8)
@@ -86,8 +89,9 @@ def picture(path: Path, residuals: Residuals, title: str) -> None:
         ax.set(ylim=(-limit, limit), yticks=(-0.8 * limit, 0.0, 0.8 * limit))
         ax.set_yticklabels([f"{-80 * limit:.0f}", "0", f"{80 * limit:.0f}"], fontsize=7)
         ax.set_ylabel(f"{one.a} - {one.b}", rotation=0, ha="right", va="center", fontsize=9)
-        told = f"{100 * one.value.mean():+.0f} cm, {one.explained.mean():.0%} explained"
+        told = f"{100 * np.median(one.value):+.0f} cm, {one.explained.mean():.0%} explained"
         ax.text(1.005, 0.5, told, transform=ax.transAxes, fontsize=8, va="center")
     axes[-1].set_xlabel("time of the recording [s]")
-    figure.suptitle(f"{title}: residuals of each pair of anchors [cm]; red: more than three standard deviations", fontsize=10)
+    left_out = f"; {len(found) - len(pairs)} pairs with fewer TDOAs are not shown" if len(pairs) < len(found) else ""
+    figure.suptitle(f"{title}: residuals of each pair of anchors [cm]; red: more than three standard deviations{left_out}", fontsize=10)
     figure.savefig(path, dpi=110)

@@ -1,0 +1,78 @@
+"""localize: where the tag was, and how far that is to be believed."""
+
+from functools import partial
+from pathlib import Path
+import sys
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from .. import cli, options, parallel
+from ..localizing import rerun_file
+from ..localizing.localize import Localizer, all_good, check_names
+
+DESCRIPTION = """Where the tag was: trajectories of recordings, without ground truth, which is not read.
+
+Runs bias correction and filter as the nodes would, or smooths. Writes for each recording to --out: NAME.tum (for evo), NAME.csv (with
+velocities and standard deviations) and NAME.png (from above, from the side, over time, with three standard deviations); with --bag
+NAME.bag (nav_msgs/Odometry), with --residuals what is left of each TDOA, as a table and as a picture per pair of anchors.
+
+It says how far each trajectory is to be believed, and what would make it better. good: the position is within what is stated for 95 %
+of the time; doubtful: the filter was lost, or began anew, or many TDOAs speak against it; bad: check finds an error, or there is none.
+
+Exit code: 0 all are good, 1 some are not, 2 bad input."""
+
+
+def main(argv=None):
+    """The executable. Returns the exit code."""
+    return cli.run(_localize, parser(), argv)
+
+
+def parser():
+    """Its options."""
+    made = cli.parser(
+        "localize",
+        DESCRIPTION,
+        "localize flight.bag --out out/",
+        "localize flight.log --survey anchors.yaml --smooth --residuals --out out/",
+        "localize flights/ --survey calibrated/anchors.yaml --effects calibrated/effects.yaml --config calibrated/ekf_node.yaml --out out/",
+        "localize flight.bag --bag --json located.json --out out/",
+        "localize flight.bag --rerun flight.rrd --out out/",
+    )
+    options.add_recordings(made)
+    options.add_estimator(made)
+    add = made.add_argument
+    add("--bag", action="store_true", help="write the odometry as a bag, too")
+    add("--residuals", action="store_true", help="write what is left of each TDOA, too: a table, and a picture")
+    add("--rerun", metavar="FILE", help=rerun_file.HELP)
+    add("--json", metavar="FILE", help="write all figures")
+    parallel.add_options(made)
+    add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
+    return made
+
+
+def _localize(args):
+    out = cli.output_folder(args.out)
+    cli.check_folders(args.json, args.rerun)
+    say = partial(cli.say, "localize")
+    estimator = options.estimator_of(args, say)
+    reading = options.reading_of(args, truth=False)
+    found = reading.find(args.flights, bool(args.dask))
+    check_names(found)
+    if args.rerun and len(found) != 1:
+        raise InputError(f"--rerun: needs exactly one flight, got {len(found)}.")
+    rerun = Path(args.rerun) if args.rerun and rerun_file.is_there(say) else None
+    out.mkdir(parents=True, exist_ok=True)
+    cli.show(f"correcting with: {estimator.correction}")
+    localizer, located = Localizer(reading, estimator, out.absolute() if args.dask else out, args.bag, args.residuals, rerun), []
+    for one in parallel.over(localizer, found, args.jobs, args.dask):
+        located.append(one)
+        first, *others = one.belief.sentences()
+        cli.show(f"{one.flight}: {first}", *(f"  {sentence}" for sentence in others))
+        cli.show(f"  wrote {', '.join(path.name for path in one.written)} to {out}")
+    if args.json:
+        cli.write_json(args.json, {"flights": [one.as_dict() for one in located]})
+    return int(not all_good(located))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,131 @@
+"""How far an estimate can be believed, from the recording and the run themselves: no ground truth."""
+
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.flight import Flight
+from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_ekf.frames import rotation_std
+from uwb_tdoa_ekf.monitoring.status import YAW_KNOWN
+from uwb_tdoa_ekf.offline import Run
+from uwb_tdoa_ekf.streams import ERROR
+
+from ..checking.check import check
+from ..checking.recording import of_flight
+from ..scoring.metrics import LOST
+from . import residuals
+
+GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
+SIGMAS = 2.0  # standard deviations of the 3D position within which it is for 95 % of the time, or longer: whatever the shape, 1.6 to 2.0
+GAP = 1.0  # s without an estimate, as long as which the tag is lost
+LONG = 0.05  # share of the time that the tag may be lost in an estimate that is good
+FEW = 0.9  # share of TDOAs that are explained, below which an estimate is not good
+TALL = 1.5  # times the deviations of x and y, beyond which the height is what is known worst
+LASTING = 0.5  # share of the variance that errors which last make, above which a calibration is what helps
+
+
+@dataclass(frozen=True)
+class Belief:
+    """level : GOOD, DOUBTFUL or BAD; figures : {name: number}; lost : [(begin, end)] s, spans in which the tag was lost; reasons :
+    sentences on why it is not good; remedies : sentences on what would make it better."""
+
+    level: str
+    figures: dict
+    lost: list = field(default_factory=list)
+    reasons: tuple = ()
+    remedies: tuple = ()
+
+    def sentences(self) -> list[str]:
+        """The verdict for people."""
+        told = self.figures
+        if not told["estimates"]:
+            return [f"{self.level}: there is no estimate", *self.reasons, *self.remedies]
+        spread = ", ".join(f"{axis} {100 * told[f'std_{axis}']:.0f}" for axis in "xyz")
+        within = f"standard deviation {100 * told['std']:.0f} cm ({spread}): it is within {100 * told['within']:.0f} cm for 95 % of the time"
+        fits = f"{told['explained']:.1%} of {told['tdoas']} TDOAs fit it within three standard deviations (NIS {told['nis']:.2f}, 1 or less is sound)"
+        return [f"{self.level}: {within}; {fits}", *self.reasons, *self.remedies]
+
+
+def believe(flight: Flight, run: Run, corrected: bool = False) -> Belief:
+    """Belief in a Run over a Flight, whose ground truth is not used. corrected : by effects that somebody calibrated."""
+    odometry, there = run.odometry, residuals.reached(run.residuals)
+    figures = {"seconds": _length(flight), "estimates": len(odometry), "tdoas": len(flight.tdoa), "recoveries": run.recoveries}
+    faults = [finding for finding in check(of_flight(flight)).findings if finding.severity == ERROR]
+    reasons = [f"check: {finding.cause} ({finding.evidence})" for finding in faults]
+    remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults]
+    if not len(odometry) or not there.any():
+        reasons.append("the filter found no place that explains the TDOAs")
+        return Belief(BAD, figures, [], tuple(reasons), tuple(remedies))
+    figures |= _deviation(odometry)
+    normalised = (run.residuals.innovation**2 / run.residuals.variance)[there]
+    figures["explained"] = float(residuals.explained(run.residuals)[there].mean())
+    figures["nis"] = float(np.mean(np.minimum(normalised, 9.0)))
+    lost = lost_spans(flight, odometry)
+    figures["lost"] = float(sum(end - begin for begin, end in lost))
+    worse = BAD if faults or figures["lost"] > 0.5 * figures["seconds"] else GOOD
+    for reason in _doubts(flight, figures, lost):
+        reasons.append(reason)
+        worse = BAD if worse == BAD else DOUBTFUL
+    return Belief(worse, figures, lost, tuple(reasons), tuple([*remedies, *_remedies(flight, run, figures, corrected)]))
+
+
+def lost_spans(flight: Flight, odometry: Odometry) -> list[tuple[float, float]]:
+    """[(begin, end)] s, between the first estimate and the last TDOA, in which there is no estimate for GAP, or one whose deviation is
+    more than LOST; spans that are less than GAP apart are one."""
+    t, std = odometry.t, np.sqrt(np.einsum("nii->n", odometry.covariance[:, :3, :3]))
+    ends = np.append(t[1:], max(t[-1], flight.tdoa.t.max(initial=-math.inf)))
+    wide = (std > LOST) | (ends - t > GAP)
+    spans = []
+    for begin, end in zip(t[wide].tolist(), ends[wide].tolist()):
+        if spans and begin - spans[-1][1] < GAP:
+            spans[-1] = spans[-1][0], end
+        else:
+            spans.append((begin, end))
+    return [(begin, end) for begin, end in spans if end > begin]
+
+
+def _length(flight):
+    return float(np.ptp(flight.tdoa.t)) if len(flight.tdoa) else 0.0
+
+
+def _deviation(odometry):
+    """{name: m, or rad} of what an Odometry says that it may be off by, and what of it lasts."""
+    known = np.einsum("nii->n", odometry.covariance[:, :3, :3]) <= LOST**2
+    rows = known if known.any() else np.ones(len(known), bool)
+    variance = np.einsum("nii->ni", odometry.covariance[rows, :3, :3]).mean(axis=0)
+    lasting = float(np.einsum("nii->n", odometry.persistent[rows]).mean() / max(variance.sum(), 1e-12))
+    yaw = rotation_std(odometry.q[-1:], odometry.covariance[-1:])[0, 2]
+    out = {f"std_{axis}": float(math.sqrt(value)) for axis, value in zip("xyz", variance)}
+    std = float(math.sqrt(variance.sum()))
+    return out | {"std": std, "within": SIGMAS * std, "lasting": lasting, "yaw_std": float(yaw)}
+
+
+def _doubts(flight, figures, lost):
+    """Yield sentences."""
+    if figures["lost"] > LONG * figures["seconds"]:
+        spans = ", ".join(f"{begin - flight.tdoa.t[0]:.0f} - {end - flight.tdoa.t[0]:.0f} s" for begin, end in lost[:5])
+        yield f"the tag was lost for {figures['lost']:.0f} s of {figures['seconds']:.0f} s ({spans}{', ...' * (len(lost) > 5)})"
+    if figures["recoveries"]:
+        yield f"the filter found that it had been wrong, and began anew at another place, {figures['recoveries']} times"
+    if figures["explained"] < FEW:
+        yield f"{1.0 - figures['explained']:.0%} of the TDOAs speak against it"
+    if figures["std"] > LOST:
+        yield f"the position is stated to no better than {figures['std']:.1f} m"
+    if flight.imu is not None and figures["yaw_std"] > YAW_KNOWN:
+        yield f"the yaw is not known in the end: +-{math.degrees(figures['yaw_std']):.0f} degrees"
+
+
+def _remedies(flight, run, figures, corrected):
+    """Yield sentences."""
+    ids = np.unique(np.concatenate([flight.tdoa.a, flight.tdoa.b]))
+    lacking = ids[flight.anchors.index(ids) < 0]
+    if len(lacking):
+        yield f"survey anchor {', '.join(map(str, lacking.tolist()))}, which the tag hears: its TDOAs are not used"
+    if flight.imu is None:
+        yield "record the inertial sensor, too: the filter then knows the attitude, and bridges gaps"
+    if figures["std_z"] > TALL * max(figures["std_x"], figures["std_y"]) and not len(run.aids.get("height", ())):
+        yield "the height is what is known worst: add a range finder that looks down, or put anchors further apart in height (plan says where)"
+    if not corrected and figures["lasting"] > LASTING:
+        yield f"{figures['lasting']:.0%} of the variance is of errors that last, as of delays and places of anchors: calibrate them"

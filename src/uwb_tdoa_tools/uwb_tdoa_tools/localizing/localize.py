@@ -1,0 +1,86 @@
+"""Recordings to trajectories, one by one."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from ..bags.bag import write_odometry
+from ..readers.inputs import Reading
+from ..scoring.tum import write_tum
+from . import files, pictures, rerun_file, residuals
+from .belief import GOOD, Belief, believe
+from .estimate import Estimator
+
+
+@dataclass(frozen=True)
+class Located:
+    """What became of a recording: its name, how far it is to be believed, and the files that were written."""
+
+    flight: str
+    belief: Belief
+    written: tuple
+
+    def as_dict(self) -> dict:
+        """For JSON."""
+        told = self.belief
+        return {
+            "flight": self.flight, "verdict": told.level, **told.figures, "lost_spans": told.lost, "reasons": list(told.reasons),
+            "remedies": list(told.remedies), "files": [str(path) for path in self.written],
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Localizer:
+    """localizer((path, survey)) is the Located of a recording, whose ground truth is not read. Can be pickled.
+
+    reading : Reading; estimator : Estimator; folder : where to write; bag : write a bag, too; left : write residuals, too; rerun :
+    file for Rerun, or None. Raises InputError.
+    """
+
+    reading: Reading
+    estimator: Estimator
+    folder: Path
+    bag: bool = False
+    left: bool = False
+    rerun: Path | None = None
+
+    def __call__(self, recording) -> Located:
+        flight = self.reading.read(recording)
+        run = self.estimator(flight)
+        belief = believe(flight, run, self.estimator.effects is not None)
+        place, written = self.folder / flight.name, []
+
+        def path(end):
+            written.append(place.with_name(f"{place.name}{end}"))
+            return written[-1]
+
+        odometry = run.odometry
+        write_tum(path(".tum"), odometry.t, odometry.p, odometry.q)
+        files.write_csv(path(".csv"), odometry)
+        title = f"{flight.name}: {belief.sentences()[0].partition(';')[0]}"
+        pictures.draw(path(".png"), odometry, flight.anchors, belief.lost, title)
+        if self.bag and len(odometry):
+            write_odometry(odometry, flight.anchors, path(".bag"), force=True)
+        if self.left:
+            residuals.write_csv(path("_residuals.csv"), run.residuals)
+            residuals.picture(path("_residuals.png"), run.residuals, flight.name)
+        if self.rerun is not None:
+            rerun_file.write_rerun(self.rerun, flight, odometry, run.residuals, belief.sentences())
+            written.append(self.rerun)
+        return Located(flight.name, belief, tuple(written))
+
+
+def check_names(recordings: list) -> None:
+    """Raise InputError if two of some recordings, (path, survey), would be written to the same files."""
+    seen = {}
+    for path, _ in recordings:
+        name = Path(path).name.partition(".")[0]
+        if name in seen:
+            raise InputError(f"{path}: {seen[name]} has the same name, so that one would replace the other; localize them to two directories.")
+        seen[name] = path
+
+
+def all_good(located: list) -> bool:
+    """Whether all of some Located are good."""
+    return all(one.belief.level == GOOD for one in located)
