@@ -34,6 +34,7 @@ setup(
     ],
     extras_require={
         "dask": ["distributed>=2024.1"],  # for --dask
+        "rerun": ["rerun-sdk>=0.23"],  # for --rerun; needs numpy 2
         "oracle": ["rotorpy>=3.0"],  # beside which a test flies the vehicle of `fly`
         "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
     },
@@ -47,6 +48,7 @@ setup(
     entry_points={
         "console_scripts": [
             "bench = uwb_tdoa_tools.executables:bench",
+            "calibrate = uwb_tdoa_tools.executables:calibrate",
             "check = uwb_tdoa_tools.executables:check",
             "convert = uwb_tdoa_tools.executables:convert",
             "debias = uwb_tdoa_tools.executables:debias",

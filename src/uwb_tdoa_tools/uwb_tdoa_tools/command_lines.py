@@ -25,3 +25,15 @@ def node(name, parameters, files=()):
     """The line that starts a node. parameters : {name: value}; files : paths of parameter files."""
     words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
     return tool(name, "--ros-args", *words, *(word for file in files for word in ("--params-file", file)))
+
+
+def judging(recordings, survey=None, effects=None, config=None):
+    """The line that judges an estimate on recordings with the files of a calibration; None for those that there are not."""
+    options = {"--survey": survey, "--effects": effects, "--config": config}
+    return tool("evaluate", *recordings, *(word for option, file in options.items() if file for word in (option, file)))
+
+
+def nodes(anchors=None, effects=None, config=None):
+    """The two lines that start the nodes with the files of a calibration; None for those that there are not."""
+    parameters = {name: file for name, file in (("anchors_file", anchors), ("effects_file", effects)) if file}
+    return node("bias_node", parameters), node("ekf_node", parameters, [config] if config else ())

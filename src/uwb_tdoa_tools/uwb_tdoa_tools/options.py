@@ -5,6 +5,7 @@
     options.add_estimator(parser)                   # these, --model, --no-bias, -p, --without, --smooth
     options.add_most(parser, 10**6)                 # --most
     options.add_known(parser)                       # --marks, --distances
+    options.add_tape(parser)                        # --std, --height-std, --trusted, --trusted-std, --unknown
     reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
@@ -22,6 +23,7 @@ from .parallel import whole_number
 from .readers import inputs
 from .surveying.distances import read_distances
 from .surveying.marks import read_marks
+from .surveying.tape import Tape
 
 TOPICS = (  # that are read from bags
     "uwb/tdoa", "uwb/anchors", "imu/data", "height", "pressure", "velocity", "ground_truth/pose", "odometry",
@@ -124,6 +126,27 @@ def add_most(parser, default):
         "--most", metavar="N", type=whole_number, default=default,
         help="TDOAs to hold at most, by which memory and time are bounded: of flights with more, some are drawn (default %(default)s)",
     )  # fmt: skip
+
+
+OF_TAPE = "std", "height_std", "trusted", "trusted_std"  # fields of Tape, for which the covariance of the last calibration stands
+
+
+def add_tape(parser):
+    """--std, --height-std, --trusted, --trusted-std and --unknown: how well anchors are known."""
+    add = parser.add_argument
+    add("--std", type=float, metavar="M", help=f"m, standard deviation of a coordinate as given (default {Tape.std:g})")
+    add("--height-std", type=float, metavar="M", help="m, the same of heights, which are easier to measure")
+    add("--trusted", nargs="+", default=[], metavar="A", help="anchors (3) or coordinates (3.z) that are known well")
+    add("--trusted-std", type=float, metavar="M", help=f"m, how well those are known (default {Tape.trusted_std:g})")
+    add("--unknown", nargs="+", default=[], metavar="A", help="anchors whose position is not known at all")
+
+
+def tape_of(args, effects):
+    """The Tape that those options speak of. effects : EffectSet of --effects, or None: what its covariance says of all anchors stands
+    against no option. Raises InputError."""
+    if effects is not None and effects.covariance is not None:
+        refuse(args, OF_TAPE, f"{args.effects} says how well each anchor is known, by its last calibration")
+    return Tape(**{name: getattr(args, name) for name in OF_TAPE if given(args, name)}, unknown=tuple(args.unknown))
 
 
 def add_known(parser):

@@ -1,5 +1,6 @@
 """diagnose: from a residual to the missing effect to a smaller error."""
 
+from dataclasses import replace
 from functools import partial
 import sys
 
@@ -12,6 +13,7 @@ from ..checking.remarks import survey_remarks
 from ..diagnosis import diagnose
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
+from ..diagnosis.report.apply import applying
 from ..diagnosis.self_survey import tdoa_std_of
 from ..progress import Progress
 from ..surveying.paths import DRIFT, read_paths
@@ -99,6 +101,8 @@ def _diagnose(args):
         progress("measuring the noise")
         tdoa_std = _noise(result, config, over)
     out.mkdir(parents=True, exist_ok=True)
+    (_, its_survey), *_ = reading.find(args.flights)
+    result = replace(result, applying=applying(out, args.holdout or args.flights, args.survey, its_survey, tdoa_std is not None))
     cli.write_json(out / "diagnosis.json", result.as_json())
     result.effects.to_yaml(out / "effects.yaml")
     (out / "report.html").write_text(result.as_html())

@@ -4,12 +4,11 @@ import sys
 
 from uwb_tdoa_bias.effects import EffectSet
 
-from .. import cli, options
+from .. import cli, command_lines, options
 from ..diagnosis.noise import write_parameters
 from ..progress import Progress
 from ..surveying.blocked import with_blocked
 from ..surveying.survey import survey
-from ..surveying.tape import Tape
 
 DESCRIPTION = """Make a tape-measured survey better, from flights alone.
 
@@ -25,9 +24,6 @@ anchors, and how well all is known), ekf_node.yaml (noise that the filter should
 to --out.
 
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
-
-OF_TAPE = "std", "height_std", "trusted", "trusted_std"  # fields of Tape, for which the covariance of the last calibration stands
-
 
 def main(argv=None):
     """The executable. Returns the exit code."""
@@ -48,11 +44,7 @@ def parser():
     options.add_recordings(made)
     options.add_filter(made, "effects.yaml: what is in the model already; that of a survey is its prior, and tells what changed")
     add = made.add_argument
-    add("--std", type=float, metavar="M", help=f"m, standard deviation of a coordinate as given (default {Tape.std:g})")
-    add("--height-std", type=float, metavar="M", help="m, the same of heights, which are easier to measure")
-    add("--trusted", nargs="+", default=[], metavar="A", help="anchors (3) or coordinates (3.z) that are known well")
-    add("--trusted-std", type=float, metavar="M", help=f"m, how well those are known (default {Tape.trusted_std:g})")
-    add("--unknown", nargs="+", default=[], metavar="A", help="anchors whose position is not known at all")
+    options.add_tape(made)
     options.add_known(made)
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
@@ -61,11 +53,7 @@ def parser():
 def _survey(args):
     out = cli.output_folder(args.out)
     config, effects = options.filter_of(args)
-    base = effects or EffectSet()
-    if base.covariance is not None:
-        options.refuse(args, OF_TAPE, f"{args.effects} says how well each anchor is known, by its last calibration")
-    told = {name: getattr(args, name) for name in OF_TAPE if options.given(args, name)}
-    tape = Tape(**told, unknown=tuple(args.unknown))
+    base, tape = effects or EffectSet(), options.tape_of(args, effects)
     flights = options.reading_of(args).flights(args.flights)
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
@@ -82,8 +70,9 @@ def _survey(args):
     result.picture(out / "survey.png")
     cli.show(result.as_text())
     cli.show(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")
-    files = (("--survey", "anchors.yaml"), ("--effects", "effects.yaml"), ("--config", "ekf_node.yaml"))
-    cli.show(" ".join(["next: evaluate FLIGHT", *(f"{option} {out / file}" for option, file in files)]))
+    if result.why_not is None:
+        files = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
+        cli.show(f"next: {command_lines.judging(args.flights, *files)}")
     return 0 if result.why_not is None else 1
 
 

@@ -28,7 +28,8 @@ class Diagnosis:
     flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [Finding]; effects :
     EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
     `judging.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
-    ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes : sentences, what is not as in the last calibration.
+    ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes : sentences, what is not as in the last calibration;
+    applying : ((command line, what it does), ...), how the effects are put to use.
     """
 
     flights: tuple
@@ -45,6 +46,7 @@ class Diagnosis:
     remaining: list
     numbers: dict
     changes: tuple = ()
+    applying: tuple = ()
 
     def as_json(self):
         """What diagnosis.json holds."""

@@ -7,7 +7,6 @@ import numpy as np
 from uwb_tdoa_bias.effects.wording import listed
 
 from .over_flights import course
-from .report.apply import APPLY
 from .report.entries import doubt_in_words, entries, worth_in_words
 from .report.unclear import by_remedy, untold
 from .report.verdict import faults_in_words, verdict
@@ -61,7 +60,7 @@ def as_text(diagnosis):
     for told_by, what in by_remedy(untold(diagnosis)).items():
         lines.append(("not told", f"{listed(what)}; what would tell: {told_by}."))
     if any(entry.added for entry in found):
-        lines += [("apply", command) for command, _ in APPLY]
+        lines += [("apply", command) for command, _ in diagnosis.applying]
     return "\n".join(_wrapped(*line) for line in lines)
 
 

@@ -116,6 +116,14 @@ def tdoa_std_of(flights, effects, config=None, over=map):
     return _Runs(flights, effects, config).equations(anchors, np.zeros(len(anchors)), loose, over=over).tdoa_std(config)
 
 
+@in_one_thread
+def slow_innovations(flights, effects, config=None):
+    """m, scale of the innovations of Flights that are slow, averaged over half a second, beside the EffectSet `effects`: what anchors
+    that are elsewhere or late make. Their ground truth is not used. Raises InputError for a flight that is too short."""
+    runs, none = _Runs(flights, effects, config or FilterConfig()), np.zeros(len(flights[0].anchors))
+    return student_scale(np.concatenate([_slow(runs.residual(flight, flight.anchors, none)) for flight in runs.flights]))
+
+
 @dataclass(frozen=True, eq=False)
 class _Equations:
     """Normal equations of all flights: gram (k, k), vector (k,); marks : [_Mark] that are in them; slow : m, scale of the slow

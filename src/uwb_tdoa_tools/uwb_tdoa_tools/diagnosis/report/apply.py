@@ -1,10 +1,15 @@
 """How effects.yaml is put to use."""
 
-APPLY = (  # command, what it does
-    (
-        "ros2 run uwb_tdoa_tools evaluate FLIGHT --effects effects.yaml",
-        "judges it on another flight; give --survey as for diagnose",
-    ),
-    ("ros2 run uwb_tdoa_bias bias_node --ros-args -p effects_file:=effects.yaml", "in flight: takes it out of TDOAs"),
-    ("ros2 run uwb_tdoa_ekf ekf_node --ros-args -p effects_file:=effects.yaml", "in flight: takes it out of the IMU"),
-)
+from ... import command_lines
+
+
+def applying(folder, recordings, survey=None, anchors=None, parameters=False):
+    """((command line, what it does), ...) of the files in a folder. recordings : paths to judge on; survey, anchors : files of anchors
+    that were given, for evaluate and for the nodes, or None; parameters : whether there is an ekf_node.yaml."""
+    effects, config = folder / "effects.yaml", folder / "ekf_node.yaml" if parameters else None
+    bias, ekf = command_lines.nodes(anchors, effects, config)
+    return (
+        (command_lines.judging(recordings, survey, effects, config), "judges it"),
+        (bias, "in flight: takes it out of TDOAs"),
+        (ekf, "in flight: takes it out of the IMU, and assumes the noise that is left"),
+    )

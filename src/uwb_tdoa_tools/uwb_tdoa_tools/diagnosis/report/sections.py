@@ -4,7 +4,6 @@ from html import escape
 
 from uwb_tdoa_bias.effects.wording import listed
 
-from .apply import APPLY
 from .entries import certainty_in_words, doubt_in_words, undecided_in_words, worth_in_words
 from .markup import bar, folded, listing, paragraphs, section, stacked, table
 from .unclear import by_remedy, untold
@@ -45,7 +44,7 @@ def to_do(found):
             "note",
         )
         parts.append(listing([(entry.advice, ()) for entry in rest]))
-    return section("What to do in the hall", *parts, _apply() if added else "")
+    return section("What to do in the hall", *parts, _apply(diagnosis.applying) if added else "")
 
 
 def _known_with(entry):
@@ -59,9 +58,9 @@ def _known_with(entry):
     return worth + ([f"Make sure first: this {doubt[0].lower()}{doubt[1:]}"] if doubt else [])
 
 
-def _apply():
+def _apply(applying):
     lines = "".join(
-        f"<dt><code>{escape(command)}</code></dt><dd class='note'>{escape(what)}</dd>" for command, what in APPLY
+        f"<dt><code>{escape(command)}</code></dt><dd class='note'>{escape(what)}</dd>" for command, what in applying
     )
     text = (
         "effects.yaml, beside this page, takes out what the model lacked, whether or not anything is done in the "

@@ -1,0 +1,1 @@
+"""From recordings to a calibrated tag: check, diagnose or survey, judge, write."""

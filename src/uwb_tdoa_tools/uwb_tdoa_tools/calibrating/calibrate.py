@@ -1,0 +1,120 @@
+"""A calibration of a tag and its anchors, and what it is worth where it took no part."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.config import FilterConfig
+
+from ..diagnosis import diagnose
+from ..diagnosis.self_survey import slow_innovations, tdoa_std_of
+from ..localizing.estimate import Estimator
+from ..scoring.evaluation import score_of
+from ..surveying.survey import survey
+from ..surveying.tape import Tape
+from .parts import split
+
+FITTED = 2.0 / 3.0  # of the time of a single flight without ground truth; the rest judges
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """anchors : Anchors; effects : EffectSet; tdoa_std : m, for the filter, or None; before, after : m, of what `measure` says, on what
+    `judged_on` says; why_not : a sentence on why it is not to be used, or None; text : what the step that found it says."""
+
+    anchors: Anchors
+    effects: EffectSet
+    tdoa_std: float | None
+    measure: str
+    before: float
+    after: float
+    judged_on: str
+    why_not: str | None
+    text: str
+
+    def as_dict(self) -> dict:
+        """For JSON."""
+        return {
+            "offered": self.why_not is None, "why_not": self.why_not, "measure": self.measure, "before": self.before, "after": self.after,
+            "judged_on": self.judged_on, "tdoa_std": self.tdoa_std,
+        }  # fmt: skip
+
+    def as_text(self) -> str:
+        """What it is worth, in a line."""
+        ratio = self.after / self.before if self.before else np.nan
+        return f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm ({ratio - 1.0:+.0%}) on {self.judged_on}"
+
+
+def with_truth(flights, holdout, base=EffectSet(), config=None, progress=lambda what: None) -> Calibration:
+    """Calibration of Flights with ground truth, by `diagnose`, judged on Flights of `holdout`, or on halves of a single flight."""
+    found = diagnose(flights, holdout, base, config, None, progress)
+    progress("measuring the noise")
+    std = _noise(found.flights, found.effects, config)
+    calibration = Calibration(
+        flights[0].anchors, found.effects, std, "3D RMSE", found.before["pooled"]["rmse_3d"], found.after["pooled"]["rmse_3d"],
+        found.judged_on, None, found.as_text(),
+    )  # fmt: skip
+    if holdout:
+        progress("judging")
+        before, after = (_rmse(holdout, *side) for side in ((base, config), (found.effects, _with_noise(config, std))))
+        calibration = replace(calibration, before=before, after=after, judged_on=_names(holdout))
+    return _judged(calibration, len(found.effects) > len(base))
+
+
+def without_truth(flights, holdout, tape=Tape(), base=EffectSet(), config=None, progress=lambda what: None) -> Calibration:
+    """Calibration of Flights, whose ground truth is not used, by `survey`, judged on Flights of `holdout`, or on the end of a single
+    flight: by how much of the innovations is slow, as anchors that are wrong make them."""
+    judges, fitted, on = holdout, flights, _names(holdout)
+    if not holdout:
+        *fitted, last = flights
+        first, rest = split(last, FITTED)
+        judges, fitted, on = [rest], [*fitted, first], f"the last third of {last.name}"
+    said = partial(progress, "solving")
+    found = survey(fitted, tape, base, config, (), said)
+    progress("judging")
+    before = slow_innovations(judges, base, config)
+    after = slow_innovations([replace(one, anchors=found.anchors) for one in judges], found.effects, config)
+    if not holdout and found.why_not is None and after <= before:
+        found = survey(flights, tape, base, config, (), said)  # what was judged, of all of it
+    std = found.surveyed.tdoa_std
+    calibration = Calibration(found.anchors, found.effects, std, "slow innovations", before, after, on, found.why_not, found.as_text())
+    return _judged(calibration, True)
+
+
+def _judged(calibration, something):
+    """The Calibration with why it is not to be used; something : whether there is anything to use."""
+    if calibration.why_not is not None:
+        return calibration
+    if not something:
+        return replace(calibration, why_not="nothing was found that makes the error smaller where it took no part")
+    if not calibration.after <= calibration.before:
+        return replace(calibration, why_not=f"it makes things worse where it took no part: {calibration.as_text()}")
+    return calibration
+
+
+def _rmse(flights, effects, config):
+    """m, 3D RMSE of all Flights together, by an estimate with an EffectSet."""
+    errors = [score_of(flight, Estimator(config, effects))[0].error for flight in flights]
+    return float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1))))
+
+
+def _with_noise(config, std):
+    """FilterConfig with tdoa_std, m, unless that is None."""
+    config = config or FilterConfig()
+    return config if std is None else replace(config, tdoa_std=round(std, 3))
+
+
+def _noise(flights, effects, config):
+    """tdoa_std, m; None where the flights are too short to tell."""
+    try:
+        return tdoa_std_of(flights, effects, config)
+    except InputError:
+        return None
+
+
+def _names(flights):
+    return ", ".join(flight.name for flight in flights)

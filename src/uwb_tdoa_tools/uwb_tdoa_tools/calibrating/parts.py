@@ -1,0 +1,27 @@
+"""A recording in parts by time."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.flight import Flight
+
+STREAMS = "tdoa", "imu", "truth", "height", "pressure", "velocity"
+
+
+def between(flight: Flight, first: float, last: float) -> Flight:
+    """What of a Flight is stamped from `first` on and before `last`, s."""
+    cut = {}
+    for name in STREAMS:
+        stream = getattr(flight, name)
+        if stream is not None:
+            inside = (stream.t >= first) & (stream.t < last)
+            cut[name] = type(stream)(*(column[inside] for column in vars(stream).values()))
+    return replace(flight, extra={}, **cut)
+
+
+def split(flight: Flight, share: float) -> tuple[Flight, Flight]:
+    """A Flight until a share of its TDOAs' time, and from there on."""
+    begin, end = float(flight.tdoa.t[0]), float(flight.tdoa.t[-1])
+    middle = begin + share * (end - begin)
+    return between(flight, -np.inf, middle), between(flight, middle, np.inf)

@@ -1,0 +1,91 @@
+"""What a calibration is likely to bring, from a part of the flights."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects.wording import listed
+
+from ..diagnosis.prior import Prior
+from ..localizing.estimate import Estimator
+from ..surveying.result import IMPROVED
+from ..surveying.survey import survey
+from ..surveying.tape import Tape
+from .parts import between
+
+SECONDS = 60.0  # of a flight that are looked at
+MOVES = 0.25  # of the extent of the anchors that a path must have along an axis to tell much of them
+ENOUGH = 0.5  # of the coordinates that must become known better
+
+
+@dataclass(frozen=True, eq=False)
+class Prospect:
+    """seconds : s in the air that were looked at, and `total` that there are; given, expected : (N, 3) m, standard deviations of the
+    anchors before, and as they are to be expected of all flights; before, left : m, of the slow innovations; path : (3,) m, its extent; hall : (3,) m, of the anchors;
+    ids : of the anchors; why_not : what keeps a survey from being applied so far, or None."""
+
+    seconds: float
+    total: float
+    given: np.ndarray
+    expected: np.ndarray
+    before: float
+    left: float
+    path: np.ndarray
+    hall: np.ndarray
+    ids: tuple
+    why_not: str | None
+
+    @property
+    def better(self) -> np.ndarray:
+        """(N, 3) bool: coordinates that are to become known better."""
+        return self.expected < IMPROVED * self.given
+
+    @property
+    def exciting(self) -> bool:
+        """Whether the flights tell enough."""
+        return bool(self.better.mean() >= ENOUGH)
+
+    def sentences(self) -> list[str]:
+        """For people."""
+        told = [
+            f"from {self.seconds:.0f} s of {self.total:.0f} s in the air: of the innovations {100 * self.before:.1f} cm are slow with the anchors as "
+            f"given, and {100 * self.left:.1f} cm with others",
+            f"all flights are likely to tell {int(self.better.sum())} of {self.better.size} coordinates better: "
+            f"{100 * np.median(self.expected):.0f} cm in the median instead of {100 * np.median(self.given):.0f} cm",
+        ]
+        if self.why_not:
+            told.append(f"so far nothing would be applied: {self.why_not}")
+        unseen = [str(i) for i, row in zip(self.ids, self.better) if not row.any()]
+        if unseen:
+            told.append(f"nothing is told of anchors {listed(unseen)}: fly closer to them, on all sides, high and low")
+        for axis, size, room in zip("xyz", self.path, self.hall):
+            if size < MOVES * room:
+                told.append(f"along {axis} the tag moves by {size:.1f} m among anchors that are {room:.1f} m apart: fly more of it")
+        told.append("the flights are exciting enough" if self.exciting else "the flights are not exciting enough: fly more, and elsewhere")
+        return told
+
+
+def prospect(flights, tape=Tape(), base=EffectSet(), config=None, progress=lambda: None) -> Prospect:
+    """Prospect of a calibration of Flights without their ground truth. Raises InputError where they are too short to say."""
+    longest = max(flights, key=lambda one: np.ptp(one.tdoa.t))
+    middle = 0.5 * float(longest.tdoa.t[0] + longest.tdoa.t[-1])
+    part = between(longest, middle - 0.5 * SECONDS, middle + 0.5 * SECONDS)
+    found = survey([part], tape, base, config, (), progress)
+    seconds = found.surveyed.seconds
+    total = max(seconds, sum(float(np.ptp(one.tdoa.t)) for one in flights) * seconds / max(float(np.ptp(part.tdoa.t)), 1e-9))
+    path = np.quantile(Estimator(config, base)(part).odometry.p, [0.02, 0.98], axis=0)
+    anchors = longest.anchors
+    return Prospect(
+        seconds, total, found.given_std, _expected(anchors, found, base, total / seconds), found.surveyed.before, found.surveyed.left,
+        np.ptp(path, axis=0), np.ptp(anchors.positions, axis=0), tuple(anchors.ids.tolist()), found.why_not,
+    )  # fmt: skip
+
+
+def _expected(anchors, found, base, more):
+    """(N, 3) m: standard deviations after `more` times what was looked at for a survey, as its information adds up."""
+    prior = np.linalg.inv(Prior.of(anchors, found.given_std, base.covariance).covariance)
+    values, vectors = np.linalg.eigh(np.linalg.inv(found.surveyed.covariance) - prior)
+    told = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    covariance = np.linalg.inv(prior + more * told)
+    return np.sqrt(np.diag(covariance))[: 3 * len(anchors)].reshape(-1, 3)

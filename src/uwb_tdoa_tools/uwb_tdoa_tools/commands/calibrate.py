@@ -1,0 +1,123 @@
+"""calibrate: from a recording to a calibrated tag, in one command."""
+
+import sys
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from .. import cli, command_lines, options
+from ..calibrating.calibrate import with_truth, without_truth
+from ..calibrating.quick import prospect
+from ..checking import report
+from ..checking.check import check, different_surveys
+from ..checking.recording import read_recording
+from ..diagnosis.noise import write_parameters
+from ..progress import Progress
+
+DESCRIPTION = """From recordings to a calibrated tag: check, find what is wrong, judge that where it took no part, write it.
+
+With ground truth in every FLIGHT `diagnose` finds what is wrong; without it, or with --no-truth, which leaves it unread, `survey` finds
+better anchors and delays from the flights alone. It is judged on --holdout; else on the last of several flights, which then takes no part, or on
+parts of a single one. Stops where a step says so, and says why. A calibration that makes things worse where it took no part is not written.
+
+Writes to --out: anchors.yaml, effects.yaml and ekf_node.yaml, for evaluate and for both nodes, and calibration.json; prints the two
+lines that start the nodes. --quick says within a minute what that is likely to bring, and writes nothing.
+
+Exit code: 0 calibrated (--quick: worth it), 1 stopped, 2 bad input."""
+
+
+def main(argv=None):
+    """The executable. Returns the exit code."""
+    return cli.run(_calibrate, parser(), argv)
+
+
+def parser():
+    """Its options."""
+    made = cli.parser(
+        "calibrate",
+        DESCRIPTION,
+        "calibrate flight.bag --out calibrated/",
+        "calibrate first.bag second.bag --survey tape.yaml --no-truth --std 0.1 --trusted 0 6 --out calibrated/",
+        "calibrate flight.log --survey anchors.yaml --holdout other.log --out calibrated/",
+        "calibrate flight.bag --no-truth --quick",
+        "calibrate today.bag --no-truth --survey calibrated/anchors.yaml --effects calibrated/effects.yaml --out today/",
+    )
+    options.add_recordings(made)
+    options.add_filter(made, "effects.yaml: what is in the model already; without ground truth its covariance is the prior")
+    add = made.add_argument
+    add("--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit")
+    add("--no-truth", action="store_true", help="do without ground truth, and leave it unread")
+    options.add_tape(made)
+    add("--quick", action="store_true", help="say within a minute what to expect, and whether the flights are exciting enough")
+    add("--out", metavar="DIR", help="where to write; made if it is not there")
+    return made
+
+
+def _calibrate(args):
+    if not (args.out or args.quick):
+        raise InputError("--out: is missing; say where to write, or ask for --quick.")
+    out = cli.output_folder(args.out) if args.out else None
+    config, effects = options.filter_of(args)
+    base, tape = effects or EffectSet(), options.tape_of(args, effects)
+    reading = options.reading_of(args, truth=not args.no_truth)
+    found, held = reading.find(args.flights), reading.find(args.holdout)
+    if shared := {path.resolve() for path, _ in found} & {path.resolve() for path, _ in held}:
+        raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
+    if not _checked(reading, found + held):
+        return _stop("check finds an error: put it right first, as said above")
+    flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)
+    known = [flight.truth is not None for flight in flights + holdout]
+    if any(known) and not all(known):
+        raise InputError(f"{(flights + holdout)[known.index(False)].name}: holds no ground truth, and others do; leave it out, or give --no-truth.")
+    if args.quick:
+        with Progress("calibrate") as progress:
+            told = prospect(flights, tape, base, config, lambda: progress("looking at a part of the flights"))
+        cli.show(*told.sentences())
+        return int(not told.exciting)
+    if not holdout and len(flights) > 1:
+        flights, holdout = flights[:-1], flights[-1:]
+    with Progress("calibrate") as progress:
+        if all(known):
+            options.refuse(args, options.OF_TAPE, "says how well anchors are known, and ground truth is there to tell; give --no-truth, too")
+            made = with_truth(flights, holdout, base, config, progress)
+        else:
+            made = without_truth(flights, holdout, tape, base, config, progress)
+    cli.show(made.text, made.as_text())
+    out.mkdir(parents=True, exist_ok=True)
+    cli.write_json(out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()})
+    return _stop(made.why_not) if made.why_not is not None else _write(made, out, args.holdout or args.flights)
+
+
+def _checked(reading, recordings):
+    """Whether check finds no error in recordings; says what it finds."""
+    checked, sound = [], True
+    with Progress("calibrate", len(recordings), "recording") as progress:
+        for path, survey in recordings:
+            checked.append(read_recording(reading, path, survey))
+            told = check(checked[-1])
+            cli.show(report.text(told))
+            sound = sound and not told.faulty
+            progress.update()
+    for finding in different_surveys(checked):
+        cli.show(*report.lines(finding))
+        sound = False
+    return sound
+
+
+def _stop(why):
+    cli.say("calibrate", f"stopped, and nothing to use is written: {why}.")
+    return 1
+
+
+def _write(made, out, recordings):
+    files = anchors, effects, config = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
+    made.anchors.to_yaml(anchors)
+    made.effects.to_yaml(effects)
+    write_parameters(config, made.tdoa_std) if made.tdoa_std is not None else config.unlink(missing_ok=True)
+    there = [file if file.exists() else None for file in files]
+    cli.show(f"wrote {', '.join(file.name for file in there if file)} and calibration.json to {out}")
+    cli.show(f"judge it:   {command_lines.judging(recordings, *there)}", "fly by it:", *command_lines.nodes(*there))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
