@@ -46,6 +46,7 @@ KEYS = {
     "onnx": (None, "onnx"),  # has no rosdep key: README
     "onnxruntime": ("python3-onnxruntime-pip", "onnxruntime"),
     "pytest": ("python3-pytest", "pytest"),
+    "rerun": (None, "rerun-sdk"),  # for --rerun
     "rosbags": ("python3-rosbags-pip", "rosbags"),
     "rotorpy": (None, "rotorpy"),  # an oracle of tests, for who wants it
     "scipy": ("python3-scipy", "scipy"),

@@ -12,10 +12,12 @@ from . import files, pictures, rerun_file, residuals
 from .belief import GOOD, Belief, believe
 from .estimate import Estimator
 
+SUFFIXES = ".gz", ".csv", ".bag", ".mcap", ".db3", ".log"
+
 
 @dataclass(frozen=True)
 class Located:
-    """What became of a recording: its name, how far it is to be believed, and the files that were written."""
+    """What became of a recording: what its files are called, how far it is to be believed, and the files that were written."""
 
     flight: str
     belief: Belief
@@ -46,39 +48,46 @@ class Localizer:
     rerun: Path | None = None
 
     def __call__(self, recording) -> Located:
-        flight = self.reading.read(recording)
+        flight, name = self.reading.read(recording), name_of(recording[0])
         run = self.estimator(flight)
         belief = believe(flight, run, self.estimator.effects is not None)
-        place, written = self.folder / flight.name, []
+        written = []
 
         def path(end):
-            written.append(place.with_name(f"{place.name}{end}"))
+            written.append(self.folder / f"{name}{end}")
             return written[-1]
 
         odometry = run.odometry
         write_tum(path(".tum"), odometry.t, odometry.p, odometry.q)
         files.write_csv(path(".csv"), odometry)
-        title = f"{flight.name}: {belief.sentences()[0].partition(';')[0]}"
+        title = f"{name}: {belief.sentences()[0].partition(';')[0]}"
         pictures.draw(path(".png"), odometry, flight.anchors, belief.lost, title)
         if self.bag and len(odometry):
             write_odometry(odometry, flight.anchors, path(".bag"), force=True)
         if self.left:
             residuals.write_csv(path("_residuals.csv"), run.residuals)
-            residuals.picture(path("_residuals.png"), run.residuals, flight.name)
+            residuals.picture(path("_residuals.png"), run.residuals, name)
         if self.rerun is not None:
             rerun_file.write_rerun(self.rerun, flight, odometry, run.residuals, belief.sentences())
             written.append(self.rerun)
-        return Located(flight.name, belief, tuple(written))
+        return Located(name, belief, tuple(written))
+
+
+def name_of(path) -> str:
+    """What the files of a recording are called: its own name without what says of which kind it is."""
+    name = Path(path).name
+    while Path(name).suffix in SUFFIXES:
+        name = Path(name).stem
+    return name
 
 
 def check_names(recordings: list) -> None:
     """Raise InputError if two of some recordings, (path, survey), would be written to the same files."""
     seen = {}
     for path, _ in recordings:
-        name = Path(path).name.partition(".")[0]
-        if name in seen:
-            raise InputError(f"{path}: {seen[name]} has the same name, so that one would replace the other; localize them to two directories.")
-        seen[name] = path
+        other = seen.setdefault(name_of(path), path)
+        if other is not path:
+            raise InputError(f"{path}: {other} has the same name, so that one would replace the other; localize them to two directories.")
 
 
 def all_good(located: list) -> bool:

@@ -10,6 +10,7 @@ from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
 from ..checking.remarks import survey_remarks
 from ..localizing.estimate import Estimator
+from ..localizing.rerun_file import write_rerun
 from ..readers.inputs import Reading, tell
 from ..results_file import ResultsFile, state_of
 from .evaluation import need_truth, score_of
@@ -23,7 +24,7 @@ class Judge:
     """judge((path, survey)) is the Result of a recording: of the filter run over it, or of the odometry in a bag.
 
     reading : Reading; estimator : Estimator; odometry : path of a bag whose odometry is judged instead, or None; picture :
-    file to draw the errors to, or None; trajectories : folder for TUM files, or None.
+    file to draw the errors to, or None; trajectories : folder for TUM files, or None; rerun : file for Rerun, or None.
     Raises InputError. Can be pickled.
     """
 
@@ -32,6 +33,7 @@ class Judge:
     odometry: str | None = None
     picture: str | None = None
     trajectories: Path | None = None
+    rerun: str | None = None
 
     def __call__(self, recording):
         flight = self.reading.read(recording)
@@ -40,16 +42,19 @@ class Judge:
         if self.odometry:
             odometry = read_odometry(self.odometry, *self._where)
             tell(self.odometry, odometry.remarks)
-            score = Score(flight.name, odometry, flight.truth, heard=flight.tdoa.t)
+            score, residuals = Score(flight.name, odometry, flight.truth, heard=flight.tdoa.t), None
         else:
             score, run = score_of(flight, self.estimator)
-            odometry = run.odometry
+            odometry, residuals = run.odometry, run.residuals
         if self.picture:
             plot_error(score, odometry, flight.truth, self.picture)
         if self.trajectories:
             truth, folder = flight.truth, self.trajectories
             write_tum(folder / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
             write_tum(folder / f"{flight.name}_truth.tum", truth.t, truth.p, truth.q)
+        if self.rerun:
+            told = [f"{name}: {value}" for name, value in score.row().items()]
+            write_rerun(self.rerun, flight, odometry, residuals, told, flight.truth)
         return score.result()
 
     def late_tdoas(self):

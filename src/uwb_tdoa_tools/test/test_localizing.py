@@ -1,0 +1,171 @@
+"""localize: trajectories without ground truth, and how far they are to be believed."""
+
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
+from uwb_tdoa_ekf.estimator import Residuals
+from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
+from uwb_tdoa_tools.commands import evaluate, localize
+from uwb_tdoa_tools.localizing import belief, rerun_file, residuals
+from uwb_tdoa_tools.localizing.estimate import Estimator
+from uwb_tdoa_tools.localizing.localize import check_names, name_of
+from uwb_tdoa_tools.readers.inputs import Reading
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+
+CLEAN = dict(duration=14.0, floor_time=1.0, imu_rate=200.0, bias=False, multipath=False, outlier_probability=0.0)
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return simulate(SimulationConfig(seed=1, **CLEAN))
+
+
+@pytest.fixture(scope="module")
+def bags(flight, tmp_path_factory):
+    """The same flight with its truth, without any, and with one that is somewhere else and no number once."""
+    folder = tmp_path_factory.mktemp("localize")
+    wrong = replace(flight.truth, p=flight.truth.p + 3.0)
+    wrong.p[9] = np.nan
+    for name, truth in (("true", flight.truth), ("none", None), ("wrong", wrong)):
+        write_bag(replace(flight, truth=truth), folder / name / "flight.bag")
+    return folder
+
+
+def run(arguments, code=0):
+    assert localize.main([*map(str, arguments)]) == code
+
+
+# --- the trajectory ---
+
+
+@pytest.mark.parametrize("more", [(), ("--smooth",)])
+def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_bit(bags, tmp_path, more):
+    for name in ("true", "none", "wrong"):
+        run([bags / name / "flight.bag", "--out", tmp_path / name, "--residuals", *more])
+    for file in ("flight.tum", "flight.csv", "flight_residuals.csv"):
+        one = (tmp_path / "true" / file).read_bytes()
+        assert one.count(b"\n") > 100
+        assert one == (tmp_path / "none" / file).read_bytes() == (tmp_path / "wrong" / file).read_bytes()
+    assert evaluate.main([str(bags / "true" / "flight.bag"), "--tum", str(tmp_path / "judged"), *more]) == 0
+    (judged,) = [path for path in (tmp_path / "judged").glob("*.tum") if not path.stem.endswith("_truth")]
+    assert judged.read_bytes() == (tmp_path / "true" / "flight.tum").read_bytes()
+
+
+def test_what_is_written_says_the_same(bags, flight, tmp_path, capsys):
+    run([bags / "none" / "flight.bag", "--out", tmp_path, "--bag", "--residuals", "--json", tmp_path / "all.json", "--no-bias"])
+    odometry = Estimator()(read_bag(bags / "none" / "flight.bag")).odometry
+    table = np.genfromtxt(tmp_path / "flight.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(np.column_stack([table[name] for name in "xyz"]), odometry.p, atol=1e-6)
+    np.testing.assert_allclose(table["std_z"], np.sqrt(odometry.covariance[:, 2, 2]), atol=1e-6)
+    recorded = read_odometry(tmp_path / "flight.bag")
+    np.testing.assert_allclose(recorded.p, odometry.p, atol=1e-12)
+    np.testing.assert_allclose(recorded.v, odometry.v, atol=1e-9)
+    np.testing.assert_allclose(recorded.covariance[:, :3, :3], odometry.covariance[:, :3, :3], atol=1e-12)
+    lines = (tmp_path / "flight_residuals.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(flight.tdoa) and lines[0] == "t,a,b,residual,std,weight,verdict"
+    for picture in ("flight.png", "flight_residuals.png"):
+        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+    (told,) = json.loads((tmp_path / "all.json").read_text())["flights"]
+    assert told["verdict"] == "good" and told["explained"] > 0.95 and told["estimates"] == len(odometry)
+    assert "flight: good: standard deviation" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_trajectory_of_every_shared_recording_is_that_of_evaluate_to_the_bit(shared_data, tmp_path):
+    folders = [str(shared_data / name) for name in ("flights", "util")]
+    survey = ["--survey", str(shared_data / "surveys")]
+    assert evaluate.main([*folders, *survey, "--tum", str(tmp_path / "judged")]) == 0
+    assert localize.main([*folders, *survey, "--out", str(tmp_path / "located")]) in (0, 1)
+    judged = sorted(path for path in (tmp_path / "judged").glob("*.tum") if not path.stem.endswith("_truth"))
+    assert len(judged) == 37
+    for path in judged:
+        assert path.read_bytes() == (tmp_path / "located" / path.name).read_bytes(), path.name
+
+
+def test_a_reading_without_truth_gives_a_flight_without_it(bags):
+    assert Reading(truth=False).one(bags / "true" / "flight.bag").truth is None
+    assert Reading().one(bags / "true" / "flight.bag").truth is not None
+
+
+# --- how far it is to be believed ---
+
+
+def believed(flight):
+    return belief.believe(flight, Estimator()(flight))
+
+
+def test_a_clean_flight_is_good_and_within_what_is_stated(flight):
+    told = believed(replace(flight, truth=None))
+    assert told.level == belief.GOOD and not told.reasons and not told.lost
+    odometry = Estimator()(flight).odometry
+    true = np.stack([np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
+    assert np.mean(np.linalg.norm(odometry.p - true, axis=1) <= told.figures["within"]) >= 0.95
+
+
+def test_an_error_that_check_finds_is_bad_with_its_remedy(flight):
+    told = believed(replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d)))
+    assert told.level == belief.BAD and "sign" in " ".join(told.reasons) and told.remedies
+
+
+def test_a_recording_without_an_estimate_is_bad(flight):
+    told = believed(replace(flight, tdoa=replace(flight.tdoa, d=1000.0 * flight.tdoa.d)))
+    assert told.level == belief.BAD and told.sentences()[0].startswith("bad: ")
+
+
+def test_silence_is_where_the_tag_was_lost(flight):
+    """The filter says nothing while nobody tells it anything."""
+    begin, end = flight.tdoa.t[0] + 6.0, flight.tdoa.t[0] + 10.0
+    heard = (flight.tdoa.t < begin) | (flight.tdoa.t > end)
+    quiet = replace(flight, imu=None, tdoa=type(flight.tdoa)(*(column[heard] for column in vars(flight.tdoa).values())))
+    told = believed(quiet)
+    assert told.level != belief.GOOD and "the tag was lost for" in " ".join(told.reasons)
+    assert told.lost[0][0] == pytest.approx(begin, abs=2.1) and told.lost[-1][1] == pytest.approx(end, abs=1.0)
+    assert any("inertial" in sentence for sentence in told.remedies)
+
+
+def test_residuals_of_a_pair_are_of_one_sign_of_it():
+    n = 4
+    some = Residuals(
+        np.arange(n), np.array([1, 2, 1, 3]), np.array([2, 1, 2, 1]), np.array([0.1, -0.2, 5.0, 0.3]), np.full(n, 0.01),
+        np.ones(n), np.array([USED, USED, REJECTED, USED], np.uint8),
+    )  # fmt: skip
+    first, second = residuals.by_pair(some)
+    assert (first.a, first.b, second.a, second.b) == (1, 2, 1, 3)
+    np.testing.assert_allclose(first.value, [0.1, 0.2, 5.0])
+    np.testing.assert_allclose(second.value, [-0.3])
+    assert first.explained.tolist() == [True, True, False]
+
+
+# --- the command ---
+
+
+def test_names_of_files_are_those_of_recordings_and_must_differ():
+    assert [name_of(path) for path in ("a/const1-tdoa2.csv.gz", "b/flight.bag", "0425-traj1")] == ["const1-tdoa2", "flight", "0425-traj1"]
+    with pytest.raises(InputError, match="b/x.csv: a/x.bag has the same name"):
+        check_names([("a/x.bag", None), ("b/x.csv", None)])
+
+
+def test_what_is_not_good_is_told_by_the_exit_code(flight, tmp_path, capsys):
+    write_bag(replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d)), tmp_path / "flight.bag")
+    run([tmp_path / "flight.bag", "--out", tmp_path / "out"], 1)
+    assert "flight: bad: " in capsys.readouterr().out
+
+
+def test_rerun_is_left_out_with_a_sentence_where_it_is_not_installed(bags, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(rerun_file, "find_spec", lambda name: None)
+    run([bags / "none" / "flight.bag", "--out", tmp_path, "--rerun", tmp_path / "flight.rrd"])
+    assert capsys.readouterr().err.count("pip install rerun-sdk") == 1 and not (tmp_path / "flight.rrd").exists()
+    run([bags / "none" / "flight.bag", bags / "true", "--out", tmp_path, "--rerun", tmp_path / "flight.rrd"], 2)
+
+
+def test_rerun_gets_a_recording(bags, tmp_path):
+    pytest.importorskip("rerun")
+    run([bags / "none" / "flight.bag", "--out", tmp_path, "--rerun", tmp_path / "flight.rrd"])
+    assert (tmp_path / "flight.rrd").read_bytes().startswith(b"RRF")
+    assert evaluate.main([str(bags / "true" / "flight.bag"), "--rerun", str(tmp_path / "judged.rrd")]) == 0
+    assert (tmp_path / "judged.rrd").stat().st_size > 10_000
