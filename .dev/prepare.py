@@ -1,8 +1,8 @@
 """Bring the workspace up to date: environment, message package, Python packages. What is up to date is not touched.
 
 Called by ./dev with a Python 3.10 - 3.12 of the system; uses nothing but its standard library. Each step is remembered
-by a hash of what it depends on, in .venv/steps.json, so that doing nothing takes milliseconds. Calls that find nothing to do
-do not wait for each other; of those that do, one does it and the others wait.
+by a hash of what it depends on, in .venv/steps.json, so that doing nothing takes milliseconds. Two calls at once wait
+for each other.
 """
 
 import fcntl
@@ -25,7 +25,6 @@ PYTHON = VENV / "bin" / "python"
 STEPS = VENV / "steps.json"
 LOCK = ROOT / ".dev" / "requirements.lock"  # requirements.txt and what they need in turn, with hashes
 AS_LOCKED = "--only-binary", ":all:", "--no-binary", "empy", "--require-hashes", "-r"  # empy has no wheel; of the rest nothing is run
-EVERY = 4.0  # s between two lines of a step where there is no terminal
 MESSAGES = ["uwb_tdoa_msgs"]
 PACKAGES = ["uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools"]
 VERSION = f"{sys.version_info.major}.{sys.version_info.minor}"
@@ -45,48 +44,20 @@ class Failure(Exception):
 def main(command):
     LOG.mkdir(exist_ok=True)
     with open(LOG / "dev.lock", "w") as lock:
-        take(lock, fcntl.LOCK_SH)  # nobody is at it
-        if up_to_date(command):
-            return
-        take(lock, fcntl.LOCK_EX)  # lets go of the other one first: what is to be done is looked at once more
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            say("waiting for another ./dev to finish its set-up")
+            fcntl.flock(lock, fcntl.LOCK_EX)
         prepare()
         if command == "build":
             compile_nodes()
 
 
-def take(lock, kind):
-    """Take a lock of the file, shared or for this call alone; say so if another one has it."""
-    try:
-        fcntl.flock(lock, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        say("waiting for another ./dev to finish its set-up")
-        fcntl.flock(lock, kind)
-
-
-def up_to_date(command):
-    """Whether a command finds all that it needs."""
-    done, wanted = read_steps(), {"environment": environment_wanted(), **sources_wanted()}
-    if command == "build":
-        wanted["compiled"] = wanted["packages"]
-    return (INSTALL / "setup.bash").exists() and all(done.get(step) == value for step, value in wanted.items())
-
-
-def environment_wanted():
-    """Hash of what the environment depends on."""
-    inputs = [ROOT / "requirements.txt", LOCK, ROOT / ".dev" / "wheels.py"]
-    return digest(inputs, str(ROOT), BASE_PYTHON, VERSION, str(OWN_ROS))
-
-
-def sources_wanted():
-    """{step: hash of the sources that it builds}."""
-    return {
-        "messages": digest([ROOT / "colcon.meta", ROOT / ".dev" / "tf2_msgs", ROOT / "src" / "uwb_tdoa_msgs"]),
-        "packages": digest([ROOT / "src" / name for name in PACKAGES]),
-    }
-
-
 def prepare():
-    done, environment = read_steps(), environment_wanted()
+    done = read_steps()
+    inputs = [ROOT / "requirements.txt", LOCK, ROOT / ".dev" / "wheels.py"]
+    environment = digest(inputs, str(ROOT), BASE_PYTHON, VERSION, str(OWN_ROS))
     if done.get("environment") != environment:
         check_machine()
         make_environment()
@@ -157,7 +128,11 @@ def missing_requirements():
 
 def build(done):
     own_tf2 = [] if OWN_ROS else ["tf2_msgs"]  # the wheels lack it
-    sources, selected = sources_wanted(), []
+    sources = {
+        "messages": digest([ROOT / "colcon.meta", ROOT / ".dev" / "tf2_msgs", ROOT / "src" / "uwb_tdoa_msgs"]),
+        "packages": digest([ROOT / "src" / name for name in PACKAGES]),
+    }
+    selected = []
     if done.get("messages") != sources["messages"]:
         selected += own_tf2 + MESSAGES
     if done.get("packages") != sources["packages"]:
@@ -223,7 +198,6 @@ def run(title, log_name, command, **variables):
     live = sys.stderr.isatty()
     if not live:
         say(f"{title} ...")
-    told = started
     with open(log, "wb") as output:
         step = subprocess.Popen(
             list(map(str, command)),
@@ -234,10 +208,8 @@ def run(title, log_name, command, **variables):
                 code = step.wait(timeout=1.0)
                 break
             except subprocess.TimeoutExpired:
-                now = time.monotonic()
-                if live or now - told >= EVERY:
-                    say(f"{title} ... {now - started:.0f} s", end="\r" if live else "\n")
-                    told = now
+                if live:
+                    say(f"{title} ... {time.monotonic() - started:.0f} s", end="\r")
     if code != 0:
         tail = "".join(f"  | {line}\n" for line in log.read_text(errors="replace").splitlines()[-15:])
         print(tail, end="", file=sys.stderr)

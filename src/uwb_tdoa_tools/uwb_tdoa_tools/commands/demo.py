@@ -74,7 +74,7 @@ def _demo(args):
     plot_comparison(flight, scores[:2], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
-    cli.show("next       " + "\n           ".join(demo.next_steps(args.flight, args.survey)))
+    cli.show("next       " + "\n           ".join(demo.next_steps(args.flight or args.out / "flight.bag", args.survey)))
     return int(scores[1].row()["diverged"] or not in_time)
 
 

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-import shlex
-import shutil
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network, unasked
@@ -12,6 +10,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.offline import run_offline
 
+from .. import command_lines
 from ..bags.bag import read_odometry, write_bag
 from ..flying import trial
 from ..flying.report import sentence
@@ -89,12 +88,11 @@ def fly(case, folder, rate=1.0, say=print):
     return accounts(live.bias, live.ekf, flight), [Score(name, one, flight.truth) for name, one in estimates.items()]
 
 
-def next_steps(recording=None, survey=None):
-    """[command] to type after the demo: check a recording, then diagnose it. Default: one that the user has yet to make."""
-    run = "ros2 run uwb_tdoa_tools" if shutil.which("ros2") else "./dev run uwb_tdoa_tools"
-    words = shlex.join([str(recording), *(("--survey", str(survey)) if survey else ())]) if recording else ""
-    words = words or "RECORDING --survey SURVEY"
-    return [f"{run} check {words}", f"{run} diagnose {words} --out diagnosis/"]
+def next_steps(recording, survey=None):
+    """[command line] to copy after the demo: check a recording, localize it, calibrate the tag by it."""
+    words = [recording, *(("--survey", survey) if survey else ())]
+    lines = [("check",), ("localize", "--out", "localized/"), ("calibrate", "--out", "calibrated/")]
+    return [command_lines.tool(name, *words, *more) for name, *more in lines]
 
 
 def _absolute(path):

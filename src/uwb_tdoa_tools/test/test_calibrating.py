@@ -1,0 +1,165 @@
+"""calibrate: from recordings to a calibrated tag."""
+
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.calibrating import calibrate as library
+from uwb_tdoa_tools.calibrating.calibrate import Calibration, without_truth
+from uwb_tdoa_tools.calibrating.parts import between, split
+from uwb_tdoa_tools.calibrating.quick import prospect
+from uwb_tdoa_tools.commands import calibrate
+from uwb_tdoa_tools.localizing.estimate import Estimator
+from uwb_tdoa_tools.scoring.evaluation import score_of
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+
+CLEAN = dict(duration=60.0, floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
+
+
+def shaken_flight(seed):
+    """A flight whose anchors stand elsewhere than the survey says, the same in each."""
+    flight = simulate(SimulationConfig(seed=seed, trajectory="sines", **CLEAN))
+    off = 0.1 * np.random.default_rng(5).standard_normal(flight.anchors.positions.shape)
+    return replace(flight, name=f"flight{seed}", anchors=flight.anchors.at(flight.anchors.positions + off))
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return [shaken_flight(seed) for seed in (1, 2, 3)]
+
+
+# --- parts ---
+
+
+def test_a_flight_in_two_parts_is_all_of_it(flights):
+    flight = flights[0]
+    first, rest = split(flight, 0.25)
+    for name in ("tdoa", "imu", "truth"):
+        one, two, whole = (getattr(part, name).t for part in (first, rest, flight))
+        np.testing.assert_array_equal(np.concatenate([one, two]), whole)
+        assert len(two) == pytest.approx(3 * len(one), rel=0.05)
+    assert np.ptp(between(flight, 10.0, 20.0).tdoa.t) == pytest.approx(10.0, abs=0.1)
+
+
+# --- without ground truth ---
+
+
+@pytest.mark.slow
+def test_without_ground_truth_other_flights_get_better_and_none_is_read(flights):
+    *fitted, other = flights
+    blind = [replace(flight, truth=None) for flight in fitted]
+    wrong = [replace(flight, truth=replace(flight.truth, p=flight.truth.p + np.nan)) for flight in fitted]
+    made = [without_truth(some[:1], some[1:]) for some in (blind, wrong)]
+    assert made[0].why_not is None and made[0].after < 0.8 * made[0].before and made[0].judged_on == "flight2"
+    np.testing.assert_array_equal(made[0].anchors.positions, made[1].anchors.positions)
+    before = score_of(other, Estimator())[0].row()["rmse_3d"]
+    after = score_of(replace(other, anchors=made[0].anchors), Estimator(None, made[0].effects))[0].row()["rmse_3d"]
+    assert after < 0.8 * before
+
+
+@pytest.mark.slow
+def test_a_single_flight_is_judged_on_its_end(flights):
+    made = without_truth([replace(flights[0], truth=None)], [])
+    assert made.judged_on == "the last third of flight1" and made.after < made.before
+
+
+@pytest.mark.slow
+def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, monkeypatch):
+    told = iter([0.01, 0.02])
+    monkeypatch.setattr(library, "slow_innovations", lambda *_: next(told))
+    made = without_truth([replace(flight, truth=None) for flight in flights[:1]], [replace(flights[1], truth=None)])
+    assert "it makes things worse where it took no part: slow innovations 1.0 -> 2.0 cm (+100%) on flight2" in made.why_not
+
+
+@pytest.mark.slow
+def test_quick_says_what_is_to_be_expected(flights):
+    told = prospect([replace(flight, truth=None) for flight in flights])
+    assert told.exciting and told.left < told.before and told.better.mean() > 0.5
+    assert np.median(told.expected) < 0.7 * np.median(told.given)
+    sentences = told.sentences()
+    assert f"all flights are likely to tell {told.better.sum()} of 24 coordinates better" in sentences[1]
+    assert sentences[-1] == "the flights are exciting enough"
+
+
+# --- the command ---
+
+
+@pytest.fixture
+def room(flights, tmp_path, monkeypatch):
+    """A folder with flights as bags to work in."""
+    monkeypatch.chdir(tmp_path)
+    for flight in flights:
+        write_bag(flight, f"{flight.name}.bag")
+    return tmp_path
+
+
+GOOD = Calibration(
+    Anchors([0, 1, 2, 3], np.eye(4)[:, :3], np.full((4, 4), np.nan)), EffectSet((AnchorDelay({"0": 0.1}),)), 0.1, "3D RMSE", 0.2, 0.1,
+    "flight3", None, "found",
+)  # fmt: skip
+
+
+def stub(monkeypatch, made, seen):
+    def instead(flights, holdout, *_):
+        seen.append(([flight.name for flight in flights], [flight.name for flight in holdout], [f.truth is not None for f in flights]))
+        return made
+
+    monkeypatch.setattr(calibrate, "with_truth", instead)
+    monkeypatch.setattr(calibrate, "without_truth", instead)
+    monkeypatch.setattr(calibrate, "_checked", lambda *_: True)
+
+
+@pytest.mark.parametrize(
+    ("more", "seen"),
+    [
+        ((), (["flight1", "flight2"], ["flight3"], [True, True])),  # the last one judges
+        (("--no-truth",), (["flight1", "flight2"], ["flight3"], [False, False])),
+        (("--holdout", "flight1.bag"), (["flight2", "flight3"], ["flight1"], [True, True])),
+    ],
+)
+def test_what_judges_takes_no_part(room, monkeypatch, more, seen):
+    calls = []
+    stub(monkeypatch, GOOD, calls)
+    flights = [f"flight{k}.bag" for k in (1, 2, 3) if f"flight{k}.bag" not in more]
+    assert calibrate.main([*flights, *more, "--out", "out"]) == 0
+    assert calls == [seen]
+    assert sorted(path.name for path in (room / "out").iterdir()) == ["anchors.yaml", "calibration.json", "effects.yaml", "ekf_node.yaml"]
+
+
+def test_what_is_not_to_be_used_is_not_written(room, monkeypatch, capsys):
+    stub(monkeypatch, replace(GOOD, why_not="it makes things worse"), [])
+    assert calibrate.main(["flight1.bag", "--out", "out"]) == 1
+    assert [path.name for path in (room / "out").iterdir()] == ["calibration.json"]
+    assert json.loads((room / "out" / "calibration.json").read_text())["offered"] is False
+    assert "calibrate: stopped, and nothing to use is written: it makes things worse." in capsys.readouterr().err
+
+
+def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys):
+    for name in ("with_truth", "without_truth"):
+        monkeypatch.setattr(calibrate, name, lambda *_: pytest.fail("it went on"))
+    wrong = replace(flights[0], tdoa=replace(flights[0].tdoa, d=-flights[0].tdoa.d))
+    write_bag(wrong, "wrong.bag")
+    assert calibrate.main(["wrong.bag", "--out", "out"]) == 1
+    printed = capsys.readouterr()
+    assert "sign" in printed.out and "check finds an error" in printed.err and not (room / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["flight1.bag"], "--out: is missing"),
+        (["flight1.bag", "--holdout", "flight1.bag", "--out", "out"], "is also a FLIGHT to fit"),
+        (["flight1.bag", "--std", "0.1", "--out", "out"], "--std: says how well anchors are known, and ground truth is there to tell"),
+        (["flight1.bag", "blind.bag", "--out", "out"], "blind: holds no ground truth, and others do"),
+    ],
+)
+def test_bad_usage_is_one_sentence(room, flights, monkeypatch, capsys, words, sentence):
+    stub(monkeypatch, GOOD, [])
+    write_bag(replace(flights[0], truth=None, name="blind"), "blind.bag")
+    assert calibrate.main(words) == 2
+    assert sentence in capsys.readouterr().err

@@ -1,0 +1,95 @@
+"""Command lines that are printed to be copied: each runs as it stands, and does good where it says so."""
+
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+import re
+import shlex
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.survey import read_survey
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools import command_lines
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
+from uwb_tdoa_tools.readers.inputs import Reading
+from uwb_tdoa_tools.scoring.judge import Judge
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+
+READS = {"anchors_file": read_survey, "effects_file": EffectSet.from_yaml, "--params-file": FilterConfig.from_yaml}
+LINE = re.compile(r"\./dev run uwb_tdoa_\w+ .*$", re.MULTILINE)
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    """A folder to work in, for somebody who starts things with ./dev run."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(command_lines.RUN, "./dev run")
+    return tmp_path
+
+
+def lines_of(text):
+    """Command lines in what was printed, whose lines may be wrapped."""
+    return [line.strip() for line in LINE.findall(re.sub(r"\n {10}(?! )", " ", text))]
+
+
+def run(line):
+    """Run a line as it stands; of a node, read what it would."""
+    (dev, verb, package, name, *words) = shlex.split(line)
+    assert (dev, verb) == ("./dev", "run")
+    if name.endswith("_node"):
+        assert words[0] == "--ros-args" and package == command_lines.PACKAGES[name]
+        for option, value in zip(words[1::2], words[2::2]):
+            parameter, _, file = value.partition(":=") if option == "-p" else (option, "", value)
+            READS[parameter](Path(file))
+        return
+    assert package == "uwb_tdoa_tools"
+    assert import_module(f"uwb_tdoa_tools.commands.{name}").main(words) == 0, line
+
+
+def test_lines_are_quoted_and_begin_as_the_user_began(monkeypatch):
+    monkeypatch.delenv(command_lines.RUN, raising=False)
+    assert command_lines.tool("check", "a flight.bag") == "ros2 run uwb_tdoa_tools check 'a flight.bag'"
+    monkeypatch.setenv(command_lines.RUN, "../dev run")
+    assert command_lines.node("ekf_node", {"effects_file": "e.yaml"}, ["p.yaml"]) == (
+        "../dev run uwb_tdoa_ekf ekf_node --ros-args -p effects_file:=e.yaml --params-file p.yaml"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["survey", "calibrate", "diagnose"])
+def test_every_line_that_a_calibration_prints_runs_as_it_stands(desk, capsys, name):
+    """From another folder than --out, with a survey in a file."""
+    flight = simulate(SimulationConfig(seed=1, duration=60.0, trajectory="sines", imu_rate=100.0, multipath=False, outlier_probability=0.0))
+    off = flight.anchors.at(flight.anchors.positions + 0.1 * np.random.default_rng(5).standard_normal(flight.anchors.positions.shape))
+    off.to_yaml("tape.yaml")
+    write_bag(flight, "a flight.bag")
+    command, more = {"survey": (survey, []), "calibrate": (calibrate, ["--no-truth"]), "diagnose": (diagnose, [])}[name]
+    assert command.main(["a flight.bag", "--survey", "tape.yaml", "--out", "made/in", *more]) == 0
+    lines = lines_of(capsys.readouterr().out)
+    assert len(lines) == {"survey": 1, "calibrate": 3, "diagnose": 3}[name]
+    for line in lines:
+        assert "made/in/effects.yaml" in line and ("ekf_node.yaml" in line or "bias_node" in line)
+        run(line)
+
+
+@pytest.mark.slow
+def test_the_line_that_survey_prints_makes_the_error_of_a_measured_flight_smaller(desk, shared_data, capsys, monkeypatch):
+    """Though its bag holds the anchors of the tape."""
+    for trial in (1, 2):
+        flight = Reading(shared_data / "surveys").one(shared_data / "util" / f"const1-trial{trial}-tdoa2.csv.gz")
+        tape = 0.1 * np.random.default_rng(100).standard_normal(flight.anchors.positions.shape)
+        write_bag(replace(flight, anchors=flight.anchors.at(flight.anchors.positions + tape)), f"flight{trial}.bag")
+    assert survey.main(["flight1.bag", "--out", "surveyed/"]) == 0
+    (line,) = lines_of(capsys.readouterr().out)
+    errors = []
+    judge = Judge.__call__
+    monkeypatch.setattr(Judge, "__call__", lambda self, one: errors.append(judge(self, one)) or errors[-1])
+    words = shlex.split(line.replace("flight1.bag", "flight2.bag"))[4:]
+    assert evaluate.main(["flight2.bag"]) == evaluate.main(words) == 0
+    before, after = (one.row["rmse_3d"] for one in errors)
+    assert after < 0.7 * before
+    assert "surveyed/anchors.yaml count here, whatever anchors the bag holds" in capsys.readouterr().err
