@@ -7,6 +7,7 @@ from signal import SIGINT
 
 import pytest
 
+from uwb_tdoa_bias.foundation import executable as module
 from uwb_tdoa_bias.foundation.executable import executable, node_executable
 
 SLOW = """
@@ -40,6 +41,19 @@ def test_what_main_returns_is_returned(write):
 
 def test_nothing_is_imported_before_it_is_called():
     executable("no_such_module")
+
+
+def test_an_import_that_takes_long_is_said(write, monkeypatch, capsys):
+    waits = "import sys, time\nend = time.monotonic() + 30.0\nwhile 'starting' not in sys.stderr.getvalue() and time.monotonic() < end: pass\n"
+    write("takes_long", waits + "def main(): return 0")
+    monkeypatch.setattr(module, "SAID", 0.01)
+    assert executable("takes_long")() == 0
+    assert capsys.readouterr().err == "takes_long: starting\n"
+
+
+def test_it_is_said_within_two_seconds_and_short_imports_say_nothing(write, capsys):
+    write("short", "def main(): return 0")
+    assert executable("short")() == 0 and capsys.readouterr().err == "" and module.SAID <= 2.0
 
 
 def test_an_interrupt_while_it_imports_is_quiet_whatever_is_imported(write):

@@ -8,11 +8,13 @@ import pytest
 
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.streams import ERROR, Finding
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.calibrating import calibrate as library
 from uwb_tdoa_tools.calibrating.calibrate import Calibration, without_truth
 from uwb_tdoa_tools.calibrating.parts import between, split
 from uwb_tdoa_tools.calibrating.quick import prospect
+from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands import calibrate
 from uwb_tdoa_tools.localizing.estimate import Estimator
 from uwb_tdoa_tools.scoring.evaluation import score_of
@@ -74,6 +76,19 @@ def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, mo
     monkeypatch.setattr(library, "slow_innovations", lambda *_: next(told))
     made = without_truth([replace(flight, truth=None) for flight in flights[:1]], [replace(flights[1], truth=None)])
     assert "it makes things worse where it took no part: slow innovations 1.0 -> 2.0 cm (+100%) on flight2" in made.why_not
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "why"),
+    [
+        (0.2, 0.1, "10.0 cm of the innovations are slow with it on flight3, more than 5.5 cm: something else is wrong too"),
+        (0.05, 0.04, "it gains too little to be sure that it does no harm"),
+        (0.05, 0.02, None),
+    ],
+)
+def test_innovations_alone_must_speak_clearly(before, after, why):
+    told = library._why_not_blindly(replace(GOOD, before=before, after=after))
+    assert told is why if why is None else why in told
 
 
 @pytest.mark.slow
@@ -147,6 +162,15 @@ def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys)
     assert calibrate.main(["wrong.bag", "--out", "out"]) == 1
     printed = capsys.readouterr()
     assert "sign" in printed.out and "check finds an error" in printed.err and not (room / "out").exists()
+
+
+def test_a_tape_that_is_off_does_not_stop_it_and_another_room_does(flights):
+    flight, findings = flights[0], [Finding(library.MISFIT, ERROR, "", "", "", 0.0)]
+    assert library.stopping(of_flight(flight), findings, 0.1) == []
+    far = flight.anchors.at(flight.anchors.positions + np.random.default_rng(6).standard_normal(flight.anchors.positions.shape))
+    assert library.stopping(of_flight(replace(flight, anchors=far)), findings, 0.1) == findings
+    other = Finding("tdoa_sign", ERROR, "", "", "", 0.0)
+    assert library.stopping(of_flight(flight), [other, *findings], 0.1) == [other]
 
 
 @pytest.mark.parametrize(

@@ -356,7 +356,7 @@ def test_advice_on_what_is_not_added_is_less_urgent(result):
         finding(delay(), worth=0.0),
         finding(EFFECTS["outlier_rate"]({"share": 0.1}, {"share": 0.01}), False, None, tried=False),
     ]
-    text = said(sections.to_do(entries(replace(result, findings=findings))))
+    text = said(sections.to_do(result, entries(replace(result, findings=findings))))
     todo, _, rest = text.partition("Seen too, less urgent")
     assert "Calibrate" not in todo and "Calibrate the antenna delay" in rest and "10 ± 1 % of the TDOAs" in rest
 
@@ -368,7 +368,7 @@ def test_a_blocked_region_is_on_the_map_and_in_the_list(result):
     shifts, (region,) = room.shifts_and_regions(changed)
     assert shifts == {} and region.anchor == 1 and region.radius == 1.0
     assert "1 region where an anchor is disturbed" in maps.maps(changed)
-    assert "anchor 1 and (-0.9, -1.2, 2.0) m" in said(sections.to_do(entries(changed)))
+    assert "anchor 1 and (-0.9, -1.2, 2.0) m" in said(sections.to_do(changed, entries(changed)))
 
 
 def test_shifts_of_anchors_add_up_over_effects(result):

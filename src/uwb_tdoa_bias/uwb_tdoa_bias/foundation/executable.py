@@ -12,9 +12,11 @@ from importlib import import_module
 import os
 import signal
 import sys
+from threading import Timer
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
 SOON = 0.05  # s, until an interrupt that was lost comes again
+SAID = 1.5  # s of importing after which it is said that something goes on
 
 
 def executable(module):
@@ -69,14 +71,18 @@ def _run_node(module, *arguments):
 
 
 def _imported(module):
-    """Import a module. Meanwhile SIGINT ends the process at once: some of what is imported answers a KeyboardInterrupt
+    """Import a module, and say that it takes its time where it does. Meanwhile SIGINT ends the process at once: some of what is imported answers a KeyboardInterrupt
     with a traceback or not at all, and there is nothing yet to clean up."""
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.SIG_IGN:  # as in a job that a shell script put in the background
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
+    slow = Timer(SAID, lambda: print(f"{module.rpartition('.')[2]}: starting", file=sys.stderr, flush=True))
+    slow.daemon = True
+    slow.start()
     try:
         return import_module(module)
     finally:
+        slow.cancel()
         signal.signal(signal.SIGINT, before)
 
 

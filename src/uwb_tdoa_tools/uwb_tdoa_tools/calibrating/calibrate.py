@@ -9,15 +9,23 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.streams import ERROR
 
+from ..checking.case import Case
+from ..checking.survey_fit import displacement
+from ..checking.tdoa_rules import survey_fit
 from ..diagnosis import diagnose
+from ..diagnosis.calibration import LEFT
 from ..diagnosis.self_survey import slow_innovations, tdoa_std_of
 from ..localizing.estimate import Estimator
 from ..scoring.evaluation import score_of
+from ..surveying.result import CLEARLY
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
 from .parts import split
 
+MISFIT = "survey_misfit"  # the rule of `check` of a survey that does not fit, though no other mistake explains it
+OFF = 3.0  # standard deviations of a coordinate that anchors may be off by, in the median, and be of the same room
 FITTED = 2.0 / 3.0  # of the time of a single flight without ground truth; the rest judges
 
 
@@ -47,6 +55,17 @@ class Calibration:
         """What it is worth, in a line."""
         ratio = self.after / self.before if self.before else np.nan
         return f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm ({ratio - 1.0:+.0%}) on {self.judged_on}"
+
+
+def stopping(recording, findings, std):
+    """Those Findings of `check` in a Recording that a calibration cannot put right: all errors, but for a survey that does not fit by
+    as much as a tape may be off. std : m, of a coordinate."""
+    errors = [finding for finding in findings if finding.severity == ERROR]
+    if any(finding.rule == MISFIT for finding in errors):
+        fit = survey_fit(Case.of(recording))
+        if np.median(displacement(fit.positions, fit.solve()[1])) <= OFF * std:
+            errors = [finding for finding in errors if finding.rule != MISFIT]
+    return errors
 
 
 def with_truth(flights, holdout, base=EffectSet(), config=None, progress=lambda what: None) -> Calibration:
@@ -82,7 +101,20 @@ def without_truth(flights, holdout, tape=Tape(), base=EffectSet(), config=None, 
         found = survey(flights, tape, base, config, (), said)  # what was judged, of all of it
     std = found.surveyed.tdoa_std
     calibration = Calibration(found.anchors, found.effects, std, "slow innovations", before, after, on, found.why_not, found.as_text())
-    return _judged(calibration, True)
+    calibration = _judged(calibration, True)
+    return calibration if calibration.why_not else replace(calibration, why_not=_why_not_blindly(calibration))
+
+
+def _why_not_blindly(calibration):
+    """Why a Calibration that was judged by innovations alone may do harm, though they are smaller; or None."""
+    if calibration.after > LEFT:
+        return (
+            f"{100 * calibration.after:.1f} cm of the innovations are slow with it on {calibration.judged_on}, more than {100 * LEFT:.1f} cm: something "
+            "else is wrong too, of which anchors may take the place; record ground truth, or give survey some --marks"
+        )
+    if calibration.before < CLEARLY * calibration.after:
+        return f"it gains too little to be sure that it does no harm: {calibration.as_text()}; fly more, or keep what there is"
+    return None
 
 
 def _judged(calibration, something):

@@ -6,7 +6,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, command_lines, options
-from ..calibrating.calibrate import with_truth, without_truth
+from ..calibrating.calibrate import stopping, with_truth, without_truth
 from ..calibrating.quick import prospect
 from ..checking import report
 from ..checking.check import check, different_surveys
@@ -63,7 +63,7 @@ def _calibrate(args):
     found, held = reading.find(args.flights), reading.find(args.holdout)
     if shared := {path.resolve() for path, _ in found} & {path.resolve() for path, _ in held}:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
-    if not _checked(reading, found + held):
+    if not _checked(reading, found + held, tape.std):
         return _stop("check finds an error: put it right first, as said above")
     flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)
     known = [flight.truth is not None for flight in flights + holdout]
@@ -85,18 +85,19 @@ def _calibrate(args):
     cli.show(made.text, made.as_text())
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()})
-    return _stop(made.why_not) if made.why_not is not None else _write(made, out, args.holdout or args.flights)
+    judges = args.holdout or [path for path, _ in found[-1:]]
+    return _stop(made.why_not) if made.why_not is not None else _write(made, out, judges)
 
 
-def _checked(reading, recordings):
-    """Whether check finds no error in recordings; says what it finds."""
+def _checked(reading, recordings, std):
+    """Whether check finds no error in recordings that stops a calibration; says what it finds. std : m, of a coordinate of an anchor."""
     checked, sound = [], True
     with Progress("calibrate", len(recordings), "recording") as progress:
         for path, survey in recordings:
             checked.append(read_recording(reading, path, survey))
             told = check(checked[-1])
             cli.show(report.text(told))
-            sound = sound and not told.faulty
+            sound = sound and not stopping(checked[-1], told.findings, std)
             progress.update()
     for finding in different_surveys(checked):
         cli.show(*report.lines(finding))

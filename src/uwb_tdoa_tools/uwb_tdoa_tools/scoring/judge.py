@@ -15,7 +15,6 @@ from ..readers.inputs import Reading, tell
 from ..results_file import ResultsFile, state_of
 from .evaluation import need_truth, score_of
 from .metrics import Result, Score
-from .plots import plot_error
 from .tum import write_tum
 
 
@@ -47,6 +46,8 @@ class Judge:
             score, run = score_of(flight, self.estimator)
             odometry, residuals = run.odometry, run.residuals
         if self.picture:
+            from .plots import plot_error  # takes a second to import
+
             plot_error(score, odometry, flight.truth, self.picture)
         if self.trajectories:
             truth, folder = flight.truth, self.trajectories

@@ -17,7 +17,7 @@ def html(diagnosis):
     parts = [
         head(diagnosis, verdict(diagnosis)),
         section("What is wrong with the numbers", paragraphs(faults_in_words(diagnosis))) if diagnosis.numbers else "",
-        to_do(found),
+        to_do(diagnosis, found),
         worth(diagnosis, found),
         section("Where in the room", maps(diagnosis)),
         section("When in the flight", errors_over_time(diagnosis)),

@@ -26,7 +26,7 @@ def head(diagnosis, verdict):
     )
 
 
-def to_do(found):
+def to_do(diagnosis, found):
     """What to do in the hall, and how to let the filter do the rest. found : [Entry]."""
     added = [entry for entry in found if entry.added]
     urgent = [entry for entry in added if entry.matters and entry.advice]
