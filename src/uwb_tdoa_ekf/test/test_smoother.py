@@ -83,6 +83,18 @@ def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
     assert 2.0 < np.mean(nees) < (4.0 if use_imu else 6.0)  # the wave is no white acceleration
 
 
+def test_its_covariance_holds_errors_that_do_not_average_out():
+    """As much of them as the filter's: it averages no more of them out."""
+    flight = fly(2, 14.0, **NOISE)
+    config = FilterConfig(initial_yaw_std=0.1)  # known: an unknown one the smoother finds first, and runs the filter with it
+    filtered, smoothed = (engine(flight, config).odometry for engine in (run_offline, smooth))
+    rows = np.searchsorted(filtered.t, smoothed.t, side="right") - 1
+    known = (rows > 0) & (smoothed.t > 2.0)
+    expected = np.einsum("nii->n", filtered.persistent[rows[known]])
+    np.testing.assert_array_equal(np.einsum("nii->n", smoothed.persistent[known]), expected)
+    assert (np.einsum("nii->n", smoothed.covariance[known, :3, :3]) > expected).all() and expected.min() > 0.0
+
+
 def test_without_imu_it_is_the_least_squares_solution():
     """After the start, with white noise and a tag at rest, where nothing is non-linear."""
     flight = fly(3, 2.0, hover=True, tdoa_rate=50.0, tdoa_std=0.05)

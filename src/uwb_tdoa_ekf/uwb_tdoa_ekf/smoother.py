@@ -42,7 +42,18 @@ def smooth(flight, config=None, corrector=None):
         room = np.zeros(len(records[k]), ODOMETRY)
         count = _backward(records[k], before[k], config.odometry_rate, adjoint, information, room)
         rows.append(room[len(room) - count :])
-    return replace(result, odometry=Odometry.from_rows(np.concatenate(rows[::-1])))
+    return replace(result, odometry=_with_persistent(Odometry.from_rows(np.concatenate(rows[::-1])), result.odometry))
+
+
+def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
+    """The smoothed Odometry with what errors that do not average out make of its covariance: smoothing averages no more of them out than
+    the filter does, so that it is the same as on line, at the last stamp before."""
+    if not len(online):
+        return smoothed
+    persistent = online.persistent[np.maximum(np.searchsorted(online.t, smoothed.t, side="right") - 1, 0)]
+    covariance = smoothed.covariance.copy()
+    covariance[:, :3, :3] += persistent
+    return replace(smoothed, covariance=covariance, persistent=persistent)
 
 
 @compiled
