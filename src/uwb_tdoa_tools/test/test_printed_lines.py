@@ -12,8 +12,10 @@ import pytest
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.streams import Finding
 from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.checking import report
 from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.scoring.judge import Judge
@@ -57,6 +59,21 @@ def test_lines_are_quoted_and_begin_as_the_user_began(monkeypatch):
     assert command_lines.node("ekf_node", {"effects_file": "e.yaml"}, ["p.yaml"]) == (
         "../dev run uwb_tdoa_ekf ekf_node --ros-args -p effects_file:=e.yaml --params-file p.yaml"
     )
+
+
+def test_remedies_begin_as_the_user_began(monkeypatch):
+    monkeypatch.setenv(command_lines.RUN, "./dev run")
+    monkeypatch.setattr(command_lines.shutil, "which", lambda name: None)
+    for line, runs in (
+        ("plan anchors.yaml --volume --out maps  # where it is", "./dev run uwb_tdoa_tools plan anchors.yaml --volume --out maps  # where it is"),
+        ("ros2 topic hz imu/data", "./dev ros2 topic hz imu/data"),
+        ("record a minute in which the tag is carried", "record a minute in which the tag is carried"),
+        ("id -= 1", "id -= 1"),
+    ):
+        assert command_lines.as_it_runs(line) == runs
+        assert list(report.lines(Finding("rule", "error", "cause", "evidence", line, 0.0)))[2] == f"      remedy: {runs}"
+    monkeypatch.delenv(command_lines.RUN)
+    assert command_lines.as_it_runs("ros2 topic hz imu/data") == "ros2 topic hz imu/data"
 
 
 @pytest.mark.slow

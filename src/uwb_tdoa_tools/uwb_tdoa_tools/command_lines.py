@@ -6,9 +6,11 @@
 
 import os
 import shlex
+import shutil
 
 RUN = "UWB_TDOA_RUN"  # variable of the environment in which ./dev says how the user started it
 PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf", "debias_node": "uwb_tdoa_ekf", "compile_nodes": "uwb_tdoa_ekf"}
+NAMED = "check", "convert", "diagnose", "evaluate", "plan", "survey"  # executables with which a remedy may begin
 
 
 def tool(name, *words):
@@ -19,6 +21,17 @@ def tool(name, *words):
 def started(name):
     """How an executable is started: the beginning of its line."""
     return f"{os.environ.get(RUN, 'ros2 run')} {PACKAGES.get(name, 'uwb_tdoa_tools')} {name}"
+
+
+def as_it_runs(line):
+    """A line that begins with an executable of ours, or with what ./dev does as ros2 does, as it runs where the user is; any other one as it
+    is."""
+    first, _, rest = line.partition(" ")
+    if first in NAMED:
+        return f"{started(first)} {rest}"
+    if line.startswith(("ros2 topic ", "ros2 node ", "ros2 param ")) and RUN in os.environ and not shutil.which("ros2"):
+        return f"{os.environ[RUN].removesuffix(' run')} {line}"
+    return line
 
 
 def node(name, parameters, files=()):

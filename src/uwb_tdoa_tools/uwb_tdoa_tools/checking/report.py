@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 
+from .. import command_lines
 from ..scoring.metrics import as_json
 
 SYMBOL = {"error": "ERROR", "warning": "warning", "note": "note"}
@@ -29,7 +30,7 @@ def lines(finding):
     """Lines of text about one Finding."""
     yield f"  {SYMBOL[finding.severity]}: {finding.cause}"
     yield f"      seen:   {finding.evidence}"
-    first, *more = finding.remedy.splitlines()
+    first, *more = command_lines.as_it_runs(finding.remedy).splitlines()
     yield f"      remedy: {first}"
     for line in more:
         yield f"              {line}"
