@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from .. import cli
-from ..studies import aids, crazyflie, noise, recalibrating, scale, situations, surveying
+from ..studies import aids, calibrating, crazyflie, localizing, noise, recalibrating, scale, situations, surveying
 from ..studies.checking import figures as checking, in_flight
 from ..studies.closed_loop import experiment
 from ..studies.debiasing import measured, set_up
@@ -13,6 +13,7 @@ from ..studies.training import compare, default, spin, splits
 
 STUDIES = {
     "aids": aids,
+    "calibrating": calibrating,
     "checking": checking,
     "closed-loop": experiment,
     "compare-models": compare,
@@ -22,6 +23,7 @@ STUDIES = {
     "default-model": default,
     "diagnosis": figures,
     "in-flight": in_flight,
+    "localizing": localizing,
     "noise": noise,
     "random-splits": splits,
     "recalibrating": recalibrating,
@@ -34,6 +36,7 @@ DESCRIPTION = """Make the figures of the documentation anew. Nothing here is nee
 of measured flights: flights/, util/, surveys/.
 
   aids             height, pressure and velocity on measured flights, and their faults (docs/aids.md)
+  calibrating      surveys shaken, calibrated without ground truth, judged on other flights (docs/calibration.md)
   checking         mistakes put into flights, and what check says of them (docs/connect.md)
   closed-loop      the flights of Zhao et al. by networks and by effects (docs/flying.md)
   compare-models   bias models side by side on flights that took no part in training (docs/bias.md)
@@ -43,6 +46,7 @@ of measured flights: flights/, util/, surveys/.
   default-model    the model that bias_node ships
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
+  localizing       what localize says of flights, against their ground truth (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
@@ -64,6 +68,7 @@ def parser():
         "study",
         DESCRIPTION,
         "study aids worth DATA/flights/0425 --survey DATA/surveys",
+        "study calibrating --data DATA --draws 3",
         "study checking DATA/flights DATA/util --survey DATA/surveys --only nothing",
         "study closed-loop --out paper/",
         "study compare-models --train DATA/flights/0425 --test 0426 DATA/flights/0426 --survey DATA/surveys --out out/",
@@ -76,6 +81,7 @@ def parser():
         "study diagnosis measured --data DATA --out bench/",
         "study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
         "study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
+        "study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
         "study noise --data DATA --split const1",
         "study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "study recalibrating --data DATA --only const1",

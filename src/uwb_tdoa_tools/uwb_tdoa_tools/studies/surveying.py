@@ -181,9 +181,9 @@ def _simulated():
     return flights[:-1], flights[-1:]
 
 
-def rmse(flights, effects=None):
+def rmse(flights, effects=None, config=None):
     """Mean 3D RMSE of the filter on Flights, m."""
-    return float(np.mean([evaluate(flight, effects=effects)[0].row()["rmse_3d"] for flight in flights]))
+    return float(np.mean([evaluate(flight, config, effects)[0].row()["rmse_3d"] for flight in flights]))
 
 
 def _root(values):
