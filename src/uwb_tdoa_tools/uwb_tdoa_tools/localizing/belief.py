@@ -43,7 +43,7 @@ class Belief:
         if not told["estimates"]:
             return [f"{self.level}: there is no estimate", *self.reasons, *self.remedies]
         spread = ", ".join(f"{axis} {100 * told[f'std_{axis}']:.0f}" for axis in "xyz")
-        within = f"standard deviation {100 * told['std']:.0f} cm ({spread}): it is within {100 * told['within']:.0f} cm for 95 % of the time"
+        within = f"standard deviation {100 * told['std']:.0f} cm ({spread}): the position is within {100 * told['within']:.0f} cm for 95 % of the time"
         fits = f"{told['explained']:.1%} of {told['tdoas']} TDOAs fit it within three standard deviations (NIS {told['nis']:.2f}, 1 or less is sound)"
         return [f"{self.level}: {within}; {fits}", *self.reasons, *self.remedies]
 

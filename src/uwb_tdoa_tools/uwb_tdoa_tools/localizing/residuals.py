@@ -81,13 +81,14 @@ def picture(path: Path, residuals: Residuals, title: str) -> None:
     axes = np.atleast_1d(figure.subplots(len(pairs), 1, sharex=True, sharey=True))
     begin = min(one.t[0] for one in pairs)
     limit = max(0.3, SPREAD * 1.4826 * float(np.median(np.abs(np.concatenate([one.value for one in pairs])))))
+    tick = np.floor(8.0 * limit) / 10.0  # m, whole tens of cm
     for ax, one in zip(axes, pairs):
         shown = np.clip(one.value, -limit, limit)
         ax.axhline(0.0, color="0.8", lw=0.8)
         ax.plot(one.t - begin, shown, ".", ms=2.0, color="tab:blue")
         ax.plot((one.t - begin)[~one.explained], shown[~one.explained], ".", ms=3.0, color="tab:red")
-        ax.set(ylim=(-limit, limit), yticks=(-0.8 * limit, 0.0, 0.8 * limit))
-        ax.set_yticklabels([f"{-80 * limit:.0f}", "0", f"{80 * limit:.0f}"], fontsize=7)
+        ax.set(ylim=(-limit, limit), yticks=(-tick, 0.0, tick))
+        ax.set_yticklabels([f"{-100 * tick:.0f}", "0", f"{100 * tick:.0f}"], fontsize=7)
         ax.set_ylabel(f"{one.a} - {one.b}", rotation=0, ha="right", va="center", fontsize=9)
         told = f"{100 * np.median(one.value):+.0f} cm, {one.explained.mean():.0%} explained"
         ax.text(1.005, 0.5, told, transform=ax.transAxes, fontsize=8, va="center")
