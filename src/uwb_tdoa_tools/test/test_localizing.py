@@ -156,6 +156,15 @@ def test_what_is_not_good_is_told_by_the_exit_code(flight, tmp_path, capsys):
     assert "flight: bad: " in capsys.readouterr().out
 
 
+def test_a_recording_without_an_estimate_has_files_and_a_picture_too(flight, tmp_path, capsys):
+    write_bag(replace(flight, tdoa=replace(flight.tdoa, d=1000.0 * flight.tdoa.d)), tmp_path / "flight.bag")
+    run([tmp_path / "flight.bag", "--out", tmp_path / "out", "--bag", "--residuals", "--json", tmp_path / "all.json"], 1)
+    (told,) = json.loads((tmp_path / "all.json").read_text())["flights"]
+    assert told["verdict"] == "bad" and told["estimates"] == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(path.rpartition("/")[2] for path in told["files"])
+    assert "flight: bad: there is no estimate" in capsys.readouterr().out
+
+
 def test_rerun_is_left_out_with_a_sentence_where_it_is_not_installed(bags, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(rerun_file, "find_spec", lambda name: None)
     run([bags / "none" / "flight.bag", "--out", tmp_path, "--rerun", tmp_path / "flight.rrd"])

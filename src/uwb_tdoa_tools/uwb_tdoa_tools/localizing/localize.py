@@ -70,7 +70,7 @@ class Localizer:
         if self.rerun is not None:
             rerun_file.write_rerun(self.rerun, flight, odometry, run.residuals, belief.sentences())
             written.append(self.rerun)
-        return Located(name, belief, tuple(written))
+        return Located(name, belief, tuple(file for file in written if file.exists()))
 
 
 def name_of(path) -> str:
