@@ -238,7 +238,7 @@ def test_the_recording_of_one_tag_in_the_namespace_of_another(tmp_path, start, n
     frames = subscribe(node, TFMessage, "/tf_static", latched)
     command = [line.split() for line in replay.parser().epilog.splitlines() if "__ns:=/tag1" in line][0]
     options = ["--wait-matched", LIMIT, "--wait-topics", *kinds]
-    start("replay", tmp_path / "flight.bag", *options, *command[2:])
+    start("replay", tmp_path / "flight.bag", *options, *command[command.index("flight.bag") + 1 :])
     for topic, count in (("uwb/tdoa", 100), ("imu/data", 200), ("ground_truth/pose", 50)):
         take(streams[topic], lambda messages, count=count: len(messages) == count)
     take(anchors, lambda messages: messages)

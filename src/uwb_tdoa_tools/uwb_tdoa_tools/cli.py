@@ -30,9 +30,11 @@ FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used 
 
 
 def parser(name, description, *examples):
-    """An ArgumentParser that keeps line breaks, and ends its help with the given example command lines."""
+    """An ArgumentParser that keeps line breaks, and ends its help with the given example command lines: those that begin with the name, as
+    they run where the user is."""
     started = command_lines.started(name).removesuffix(name)
-    epilog = "examples:\n" + "\n".join(f"  {started}{example}" for example in examples) if examples else None
+    lines = [f"  {started if example.partition(' ')[0] == name else ''}{example}" for example in examples]
+    epilog = "\n".join(["examples:", *lines]) if examples else None
     made = argparse.ArgumentParser(
         prog=name, description=description, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
     )
