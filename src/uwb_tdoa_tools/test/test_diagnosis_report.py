@@ -16,6 +16,7 @@ from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative, Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.report import curves, maps, pictures, room, sections
+from uwb_tdoa_tools.diagnosis.report.apply import applying
 from uwb_tdoa_tools.diagnosis.report.entries import doubt_in_words, entries, worth_in_words
 from uwb_tdoa_tools.diagnosis.report.style import STYLE
 from uwb_tdoa_tools.diagnosis.report.unclear import by_remedy, untold
@@ -35,7 +36,7 @@ def result():
     flights = [clean_flight(100, 24.0), clean_flight(101, 18.0)]
     for effect in effects:
         flights = [effect.inject(flight) for flight in flights]
-    return diagnose(flights[:1], flights[1:])
+    return replace(diagnose(flights[:1], flights[1:]), applying=applying(Path("out"), ["other.bag"]))
 
 
 @pytest.fixture(scope="module")
@@ -255,6 +256,8 @@ def test_all_outputs_say_the_same(result, page):
         assert worth_in_words(entry) in screen and worth_in_words(entry) in text
         for sentence in doubt_in_words(entry):
             assert sentence in screen and sentence in text
+    for command, _ in result.applying:
+        assert " ".join(command.split()) in screen and command in text
     order = [screen.index(part) for part in ("verdict", " do ", " found ", " apply ")]
     assert order == sorted(order)
     parts = (

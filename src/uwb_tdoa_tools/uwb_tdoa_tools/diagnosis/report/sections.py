@@ -44,7 +44,7 @@ def to_do(diagnosis, found):
             "note",
         )
         parts.append(listing([(entry.advice, ()) for entry in rest]))
-    return section("What to do in the hall", *parts, _apply(diagnosis.applying) if added else "")
+    return section("What to do in the hall", *parts, _apply(diagnosis.applying) if added and diagnosis.applying else "")
 
 
 def _known_with(entry):
