@@ -22,8 +22,8 @@ ENOUGH = 0.5  # of the coordinates that must become known better
 @dataclass(frozen=True, eq=False)
 class Prospect:
     """seconds : s in the air that were looked at, and `total` that there are; given, expected : (N, 3) m, standard deviations of the
-    anchors before, and as they are to be expected of all flights; before, left : m, of the slow innovations; path : (3,) m, its extent; hall : (3,) m, of the anchors;
-    ids : of the anchors; why_not : what keeps a survey from being applied so far, or None."""
+    anchors before, and as they are to be expected of all flights; before, left : m, of the slow innovations; path : (3,) m, its extent;
+    hall : (3,) m, of the anchors; ids : of the anchors; why_not : what keeps a survey from being applied so far, or None."""
 
     seconds: float
     total: float
