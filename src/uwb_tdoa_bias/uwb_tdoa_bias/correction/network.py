@@ -26,15 +26,14 @@ import numpy as np
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
 from ..foundation.foreign_text import harmless
-from .features import NAMES, everything, fill_all
+from .features import NAMES, everything
+from .graph_size import Unplayable
 from .onnx_file import Unreadable, read_graph
-from .tape import Tape, Unplayable, play
 
 MODELS = Path(__file__).parent / "models"
 SHIPPED = "default"  # instead of a path: the model that comes with the package
 UNASKED = "auto"  # where nobody named a model: see `unasked`
 NO_NUMBERS = np.empty(0)
-FEATURE_COUNT = len(NAMES)
 _COLUMN = {name: column for column, name in enumerate(NAMES)}
 
 
@@ -63,13 +62,12 @@ class Network:
             raise InputError(f"model: {path} does not exist; give an .onnx file or leave the model empty.")
         try:
             graph = read_graph(path)
-            tape = Tape(graph)
-            self._model = tape if tape.complete else _session(graph, tape)
+            self._model = _session(graph)
         except (Unreadable, Unplayable) as error:
             raise InputError(
                 f"model: {path} cannot be played as an ONNX model of dense layers ({error}); export it again, without what it names."
             ) from error
-        self.meta, inputs = tape.meta, tape.inputs
+        self.meta, inputs = graph.meta, graph.inputs
         try:
             self._read(self.meta)
         except (KeyError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
@@ -124,34 +122,16 @@ class Network:
         yaw_std = NO_NUMBERS if samples.yaw_std is None else np.ascontiguousarray(samples.yaw_std, dtype=float)
         limits = self.clip, self._fade_std, self.share, self._largest_yaw_std
         judging, found = (self._judged, self._lower, self._upper, self._margin, limits, yaw_std), np.empty((3, len(samples)))
-        anchors, scaling = samples.anchors, (self._inputs, self._offset, self._scale)
-        if isinstance(self._model, Tape):
-            at = samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, anchors.orientations
-            _predict(*at, *scaling, *self._model.playable, *judging, found)
-            return tuple(found)
         table, x = everything(samples), np.empty((len(samples), len(self._inputs)))
-        _select(table, *scaling, x)
+        _select(table, self._inputs, self._offset, self._scale, x)
         _judge(self._model.run(x), table, *judging, found)
         return tuple(found)
 
 
-def _session(graph, tape):
-    from .session import Session  # takes a third of a second
+def _session(graph):
+    from .session import Session  # imports onnxruntime
 
-    return Session(graph.content, tape)
-
-
-@compiled
-def _predict(
-    p, q, a, b, ids, positions, orientations, inputs, offset, scale, operations, room, start, place, outputs,
-    judged, lower, upper, margin, limits, yaw_std, found,
-):  # fmt: skip
-    """All of `Network.predict` in one call: what Python takes for three is more than what they do for one TDOA."""
-    table, x, out = np.empty((len(a), FEATURE_COUNT)), np.empty((len(a), len(inputs))), np.empty((len(a), outputs))
-    fill_all(p, q, a, b, ids, positions, orientations, table)
-    _select(table, inputs, offset, scale, x)
-    play(operations, room, start, x, place, out)
-    _judge(out, table, judged, lower, upper, margin, limits, yaw_std, found)
+    return Session(graph)
 
 
 @compiled

@@ -15,7 +15,7 @@ from ..foundation.errors import InputError
 from ..foundation.files import read_bytes
 from ..foundation.limits import MODEL_BYTES, MODEL_NODES
 
-VARINT, EIGHT_BYTES, BYTES, FOUR_BYTES = 0, 1, 2, 5  # wire types
+VARINT, BYTES, FOUR_BYTES = 0, 2, 5  # wire types; in those of eight bytes nothing is that is read here
 KINDS = {1: np.float32, 7: np.int64}  # of tensors, by TensorProto.DataType
 
 
@@ -36,12 +36,14 @@ class Node:
 @dataclass(frozen=True)
 class Graph:
     """nodes : in the order of their execution; constants : {name: array}; inputs : [(name, shape, with None for what is not
-    fixed)]; outputs : names; meta : {key: text}; content : the bytes of the file."""
+    fixed)]; outputs : names; shapes : [(name, shape)] of what the file says of other values; meta : {key: text}; content : the bytes
+    of the file."""
 
     nodes: list
     constants: dict
     inputs: list
     outputs: list
+    shapes: list
     meta: dict
     content: bytes
 
@@ -57,14 +59,16 @@ def read_graph(path):
                 raise Unreadable(f"more than {MODEL_NODES} {part}")
         if model[25] or graph[15]:
             raise Unreadable("functions or sparse constants")
-        constants = dict(map(_tensor, graph[5]))
-        inputs = [_value(data) for data in graph[11]]
+        constants = _unique(map(_tensor, graph[5]))
+        inputs, outputs, others = ([_value(data) for data in graph[k]] for k in (11, 12, 13))
+        said = [(name, shape) for name, kind, shape in (*outputs, *others) if name not in constants and _is_float(kind, name)]
         entries = [_message(data) for data in model[14]]
         return Graph(
             nodes=[_node(data) for data in graph[1]],
             constants=constants,
-            inputs=[one for one in inputs if one[0] not in constants],
-            outputs=[_message(data)[1][0].decode() for data in graph[12]],
+            inputs=[(name, shape) for name, kind, shape in inputs if name not in constants and _is_float(kind, name)],
+            outputs=[name for name, *_ in outputs],
+            shapes=[(name, shape) for name, shape in said if shape is not None],
             meta={entry[1][0].decode(): entry[2][0].decode() for entry in entries},
             content=content,
         )
@@ -75,8 +79,8 @@ def read_graph(path):
 
 
 def _message(data, *repeated):
-    """{number of a field: its values in their order}: ints or bytes. Only fields that are `repeated` come twice: of others, one reader
-    takes the first, one the last, and one both."""
+    """{number of a field: its values in their order}: ints, bytes, or float32 as float. Only fields that are `repeated` come twice: of
+    others, one reader takes the first, one the last, and one both."""
     out, place = defaultdict(list), 0
     while place < len(data):
         key, place = _varint(data, place)
@@ -85,12 +89,14 @@ def _message(data, *repeated):
         if key & 7 == VARINT:
             value, place = _varint(data, place)
         else:
-            size = {EIGHT_BYTES: 8, FOUR_BYTES: 4}.get(key & 7)
-            if key & 7 == BYTES:
+            size = {BYTES: None, FOUR_BYTES: 4}.get(key & 7, -1)
+            if size is None:
                 size, place = _varint(data, place)
-            if size is None or not 0 <= size <= len(data) - place:
+            if not 0 <= size <= len(data) - place:
                 raise Unreadable("no protocol buffer")
             value, place = data[place : place + size], place + size
+            if key & 7 == FOUR_BYTES:
+                (value,) = struct.unpack("<f", value)
         out[key >> 3].append(value)
     if any(len(values) > 1 and field not in repeated for field, values in out.items()):
         raise Unreadable("a field twice")
@@ -114,26 +120,41 @@ def _ints(values):
     """Of a repeated int64, packed or not."""
     out = []
     for value in values:
-        place = 0
         if isinstance(value, int):
             out.append(value)
             continue
+        place = 0
         while place < len(value):
             one, place = _varint(value, place)
             out.append(one)
     return out
 
 
+def _floats(values):
+    """Of a repeated float, packed or not: (n,) float32."""
+    return np.concatenate([np.float32([value]) if isinstance(value, float) else np.frombuffer(value, "<f4") for value in values])
+
+
+def _unique(pairs):
+    """{name: value}: a name that comes twice is refused."""
+    pairs = list(pairs)
+    if len(out := dict(pairs)) < len(pairs):
+        raise Unreadable("a name twice")
+    return out
+
+
 def _tensor(data):
-    """(name, array) of a TensorProto."""
+    """(name, array) of a TensorProto. Its numbers are in one of the fields that its type may have."""
     fields = _message(data, 1, 4, 5, 6, 7, 10, 11, 13, 16)
     kind = KINDS[fields[2][0]]
-    if fields[13] or fields[14] or not (fields[4] or fields[7] or fields[9]):
+    own = 4 if kind is np.float32 else 7
+    there = [number for number in (4, 5, 6, 7, 9, 10, 11) if fields[number]]
+    if fields[13] or fields[14] or there not in ([own], [9]):
         raise Unreadable("a tensor whose numbers are elsewhere")
     if fields[9]:
         values = np.frombuffer(fields[9][0], np.dtype(kind).newbyteorder("<"))
     else:
-        values = np.array(_ints(fields[7])) if fields[7] else np.frombuffer(b"".join(fields[4]), "<f4")
+        values = _floats(fields[4]) if own == 4 else np.array(_ints(fields[7]))
     name = fields[8][0].decode() if fields[8] else ""
     return name, values.astype(kind).reshape(_ints(fields[1]))
 
@@ -143,7 +164,7 @@ def _node(data):
     if fields[7] and fields[7][0] not in (b"", b"ai.onnx"):
         raise Unreadable("an operator that is none of ONNX")
     inputs, outputs = ([name.decode() for name in fields[k]] for k in (1, 2))
-    return Node(fields[4][0].decode(), inputs, outputs, dict(map(_attribute, fields[5])))
+    return Node(fields[4][0].decode(), inputs, outputs, _unique(map(_attribute, fields[5])))
 
 
 def _attribute(data):
@@ -153,7 +174,7 @@ def _attribute(data):
     if fields[5]:
         value = _tensor(fields[5][0])[1]
     elif fields[2]:
-        value = struct.unpack("<f", fields[2][0])[0]
+        value = float(fields[2][0])
     elif fields[3]:
         value = fields[3][0]
     else:
@@ -162,10 +183,18 @@ def _attribute(data):
 
 
 def _value(data):
-    """(name, shape) of a ValueInfoProto of a float tensor."""
+    """(name, type of its numbers, shape or None) of a ValueInfoProto of a tensor."""
     fields = _message(data, 4)
+    if not fields[2]:
+        return fields[1][0].decode(), [1], None
     tensor = _message(_message(fields[2][0])[1][0])
-    if tensor[1] != [1]:
-        raise Unreadable("a value that is no float32")
+    if not tensor[2]:
+        return fields[1][0].decode(), tensor[1], None
     dimensions = [_message(one) for one in _message(tensor[2][0], 1)[1]]
-    return fields[1][0].decode(), [one[1][0] if one[1] else None for one in dimensions]
+    return fields[1][0].decode(), tensor[1], [one[1][0] if one[1] else None for one in dimensions]
+
+
+def _is_float(kind, name):
+    if kind != [1]:
+        raise Unreadable(f"{name[:40]!r} is no float32")
+    return True

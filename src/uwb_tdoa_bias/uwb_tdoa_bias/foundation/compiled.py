@@ -4,13 +4,18 @@ numba's own cache notices a change in the file of a compiled function, but not i
 Here every state of the sources has a cache folder of its own.
 """
 
+import atexit
 from contextlib import contextmanager
 from functools import lru_cache
+import grp
 import hashlib
 import os
 from pathlib import Path
+import pwd
+import shutil
 import stat
 import sys
+import tempfile
 
 
 @contextmanager
@@ -36,41 +41,68 @@ config.CACHE_LOCATOR_CLASSES = ""  # numba would import those that a .numba_conf
 
 def compiled(function):
     """Decorator: compile `function`, which may call others below its folder and of the foundation, and cache it."""
-    return _compiled(function)
-
-
-def contracted(function):
-    """The same, with x * y + z as one operation where the processor has it: twice as fast in large sums of products, and other
-    in the last digit from one kind of processor to another."""
-    return _compiled(function, fastmath={"contract"})
-
-
-def _compiled(function, **options):
     before = config.CACHE_DIR
-    config.CACHE_DIR = str(_base() / _digest(Path(function.__code__.co_filename).parent))
+    config.CACHE_DIR = str(_place(_digest(Path(function.__code__.co_filename).parent)))
     try:
-        return njit(error_model="numpy", cache=True, **options)(function)
+        return njit(error_model="numpy", cache=True)(function)
     finally:
         config.CACHE_DIR = before
 
 
-def _base():
-    """NUMBA_CACHE_DIR if set, else the user's cache folder."""
+@lru_cache(maxsize=None)
+def _place(name):
+    """The folder `name` in NUMBA_CACHE_DIR if set, else in the user's cache folder: the first in which nobody else may have put
+    compiled code, which would be run; else a temporary one."""
     home, named = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", os.environ.get("NUMBA_CACHE_DIR")
-    own = Path(home) / "uwb_tdoa"
-    return Path(named) if named and _is_ours(named, own) else own
+    own = str(Path(home) / "uwb_tdoa")
+    for base, instead in ((named, own), (own, "a temporary folder")):
+        if base:
+            try:
+                os.makedirs(Path(base) / name, mode=0o700, exist_ok=True)
+                if _is_ours(found := (Path(base) / name).resolve()):
+                    return found
+                why = "others may write to"
+            except OSError as error:
+                why = f"nothing can be kept ({error.strerror}) in"
+            _say(f"{'NUMBA_CACHE_DIR: ' * (base == named)}{why} {base}; {instead} is used; name a folder of your own.")
+    return Path(_temporary()) / name
+
+
+def _is_ours(folder):
+    """Whether nobody else may write, or have written, to an absolute folder, to what is in it, or to what leads to it."""
+    own, above = os.stat(folder), [os.stat(parent) for parent in folder.parents]
+    within = [os.lstat(os.path.join(at, name)) for at, *names in os.walk(folder) for name in (*names[0], *names[1])]
+    if {found.st_uid for found in (own, *above, *within)} - {os.getuid(), 0}:
+        return False
+    writable = [own, *(found for found in above if not found.st_mode & stat.S_ISVTX)]
+    writable += within if own.st_mode & (stat.S_IXGRP | stat.S_IXOTH) else []  # else nobody gets there
+    return not any(map(_others_may_write, writable))
+
+
+def _others_may_write(found):
+    """By the mode of a file or folder, where a group that the user alone is in does not count."""
+    return bool(found.st_mode & stat.S_IWOTH or found.st_mode & stat.S_IWGRP and not _is_alone(found.st_gid))
 
 
 @lru_cache(maxsize=None)
-def _is_ours(folder, instead):
-    """Whether nobody else may have put compiled code into a folder, which would be run; says so if not, and what is used instead."""
-    if not os.path.exists(folder):
-        return True
-    found = os.stat(folder)
-    if found.st_uid in (os.getuid(), 0) and not found.st_mode & stat.S_IWOTH:
-        return True
-    print(f"NUMBA_CACHE_DIR: others may write to {folder}; {instead} is used; name a folder of your own.", file=sys.stderr)
-    return False
+def _is_alone(gid):
+    try:
+        user, group = pwd.getpwuid(os.getuid()), grp.getgrgid(gid)
+    except KeyError:
+        return False
+    return user.pw_gid == gid and group.gr_name == user.pw_name and not {*group.gr_mem} - {user.pw_name}
+
+
+@lru_cache(maxsize=None)
+def _temporary():
+    folder = tempfile.mkdtemp(prefix="uwb_tdoa_")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+@lru_cache(maxsize=None)
+def _say(text):
+    print(text, file=sys.stderr)
 
 
 @lru_cache(maxsize=None)

@@ -20,7 +20,7 @@ NAME_LENGTH = 100  # characters of a flight, a model, ...
 YAML_NODES, YAML_DEPTH = 100_000, 20
 
 # ONNX.
-MODEL_NODES = 10_000  # operators, and as many constants
+MODEL_NODES = 2_000  # operators, and as many constants: onnxruntime takes 0.2 s to load so many, but 4 s for 10 000
 MODEL_NUMBERS = 100_000  # float32 that are held for each row
 MODEL_WORK = 2_000_000  # multiplications and additions for each row: some milliseconds
 

@@ -7,7 +7,7 @@ from onnx import TensorProto, checker, helper, numpy_helper
 
 from uwb_tdoa_bias.foundation.version import version
 
-OPSET, IR_VERSION = 13, 8  # whose operators `tape.py` plays
+OPSET, IR_VERSION = 13, 8  # whose operators `graph_size.py` knows
 
 
 class Graph:

@@ -1,0 +1,115 @@
+"""What a model says is what the reference of ONNX says, with the same bits whatever comes with it."""
+
+import numpy as np
+import pytest
+
+onnx = pytest.importorskip("onnx")
+from onnx import helper, numpy_helper  # noqa: E402
+from onnx.reference import ReferenceEvaluator  # noqa: E402
+from onnx_models import model  # noqa: E402
+from random_samples import random_samples  # noqa: E402
+from uwb_tdoa_bias.correction import graph_size  # noqa: E402
+from uwb_tdoa_bias.correction.features import NAMES, everything  # noqa: E402
+from uwb_tdoa_bias.correction.network import MODELS, Network  # noqa: E402
+from uwb_tdoa_bias.correction.onnx_file import read_graph  # noqa: E402
+from uwb_tdoa_bias.correction.session import BATCH, Session  # noqa: E402
+
+ROW_OF_ITS_OWN = [("ReduceSum", ["x", "a"], ["y"], {"keepdims": 1})]  # of five numbers
+
+
+def assert_plays(path, positive=False, atol=1e-6, seed=0):
+    graph, reference, random = read_graph(path), ReferenceEvaluator(str(path)), np.random.default_rng(seed)
+    session = Session(graph)
+    ((name, (_, width)),) = graph.inputs
+    assert graph.meta == {entry.key: entry.value for entry in onnx.load(path).metadata_props}
+    x = random.normal(size=(2 * BATCH + 3, width))
+    x = np.abs(x) + 0.1 if positive else x
+    (expected,) = reference.run(None, {name: x.astype(np.float32)})
+    together = session.run(x)
+    np.testing.assert_allclose(together, expected, rtol=2e-6, atol=atol)
+    for n in (0, 1, 2, 3, 4, 5, 7, 16, BATCH - 1):
+        for first in (0, 1, 6):
+            np.testing.assert_array_equal(session.run(x[first : first + n]), together[first : first + n])  # to the bit
+    other = np.concatenate([x[:3], 100.0 * x[3:]])
+    np.testing.assert_array_equal(session.run(other)[:3], together[:3])
+    np.testing.assert_array_equal(session.run(x[::-1])[::-1], together)
+
+
+@pytest.mark.parametrize("name", ["default", "known_answer"])
+def test_the_models_that_are_shipped(name):
+    assert_plays(MODELS / f"{name}.onnx")
+
+
+@pytest.mark.parametrize("width", [1, 5, 33])
+@pytest.mark.parametrize("kind", [*graph_size.UNARY, *graph_size.OF_ROWS])
+def test_operators_of_one_value(tmp_path, kind, width):
+    path = model(tmp_path / "model.onnx", [(kind, ["x"], ["y"], {})], width)
+    assert_plays(path, positive=kind in ("Log", "Sqrt", "Reciprocal"), atol=1e-5)
+
+
+@pytest.mark.parametrize("other", ["x", "one", "row", "column"])
+@pytest.mark.parametrize("kind", graph_size.ELEMENTWISE)
+def test_operators_of_two(tmp_path, kind, other):
+    nodes = [("Abs", ["column of x"], ["column"], {}), (kind, ["x", other], ["y"], {})]
+    nodes = [("MatMul", ["x", "C"], ["column of x"], {}), *nodes]
+    assert_plays(model(tmp_path / "model.onnx", nodes), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [("Gemm", ["x", "W", "c"], ["y"], {})],
+        [("Gemm", ["x", "WT", "c"], ["y"], {"transB": 1, "alpha": 0.5, "beta": 2.0})],
+        [("Gemm", ["x", "W", "c"], ["h"], {}), ("Relu", ["h"], ["g"], {}), ("Gemm", ["g", "WT"], ["y"], {})],
+        [("Sum", ["x", "x", "r"], ["y"], {})],
+        [("Gather", ["x", "i"], ["y"], {"axis": 1})],
+        [
+            ("Reshape", ["x", "s"], ["y"], {}), ("ReduceMax", ["y"], ["z"], {"axes": [1], "keepdims": 1}),
+            ("Reshape", ["z", "t"], ["u"], {}),
+        ],
+        [("ReduceSum", ["x", "a"], ["y"], {"keepdims": 1}), ("Concat", ["y", "x", "y"], ["z"], {"axis": 1})],
+        [("MatMul", ["x", "W"], ["h"], {}), ("Tanh", ["h"], ["g"], {}), ("MatMul", ["g", "WT"], ["y"], {})],
+        [("LeakyRelu", ["x"], ["y"], {}), ("LeakyRelu", ["y"], ["z"], {"alpha": 2.0})],
+        [("Clip", ["x", "low", "high"], ["y"], {}), ("Clip", ["y", "", "low"], ["z"], {}), ("Clip", ["z"], ["u"], {})],
+        [("Constant", [], ["k"], {"value": numpy_helper.from_array(np.float32([0.5]), "k")}), ("Mul", ["x", "k"], ["y"], {})],
+        [  # what the processor adds up differs with the place of a row in memory
+            ("Reshape", ["x", "s"], ["h"], {}), ("MatMul", ["h", "d"], ["g"], {}), ("Sin", ["g"], ["f"], {}),
+            ("ReduceSum", ["f", "a"], ["e"], {"keepdims": 1}), ("Reshape", ["e", "t"], ["y"], {}),
+        ],
+    ],
+)  # fmt: skip
+def test_what_models_are_made_of(tmp_path, nodes):
+    assert_plays(model(tmp_path / "model.onnx", nodes, d=np.float32([[1, 2, 3, 4, 5, 6, 7]])), atol=1e-5)
+
+
+def test_an_older_form_of_clip(tmp_path):
+    assert_plays(model(tmp_path / "model.onnx", [("Clip", ["x"], ["y"], {"min": -0.5, "max": 0.5})], opset=9))
+
+
+@pytest.mark.parametrize("width", [3, 4, 5, 7, 8, 14, 33, 200])
+def test_sums_of_rows_of_any_width(tmp_path, width):
+    assert_plays(model(tmp_path / "model.onnx", ROW_OF_ITS_OWN, width), atol=1e-4, seed=width)
+
+
+@pytest.mark.parametrize("width", [3, 14, 200])
+@pytest.mark.parametrize("columns", [1, 2, 7, 32, 129])
+def test_products_of_any_size(tmp_path, width, columns):
+    nodes = [("MatMul", ["x", "weights"], ["h"], {}), ("Tanh", ["h"], ["y"], {})]
+    weights = np.random.default_rng(columns).normal(size=(width, columns)).astype(np.float32)
+    assert_plays(model(tmp_path / "model.onnx", nodes, width, weights=weights), atol=1e-4)
+
+
+def test_a_model_for_one_row_at_a_time(tmp_path):
+    assert_plays(model(tmp_path / "model.onnx", [("MatMul", ["x", "C"], ["y"], {})], batch=1))
+
+
+def test_a_network_of_another_operator_predicts(tmp_path):
+    meta = {"features": '["dx_a"]', "offset": "[0.0]", "scale": "[1.0]", "clip": "1.0", "name": '"elu"'}
+    path = model(tmp_path / "elu.onnx", [("Elu", ["x"], ["y"], {})], width=1)
+    whole = onnx.load(path)
+    helper.set_model_props(whole, meta)
+    path.write_bytes(whole.SerializeToString())
+    network, samples = Network(path), random_samples(50)
+    (column,) = [k for k, name in enumerate(NAMES) if name == "dx_a"]
+    feature = everything(samples)[:, column]
+    np.testing.assert_allclose(network.predict(samples)[0], np.clip(np.where(feature > 0.0, feature, np.expm1(feature)), -1.0, 1.0), atol=1e-6)
