@@ -75,7 +75,7 @@ def check_machine():
             f"ROS 2 from the Python package index needs Linux on x86_64, this is {sys.platform} on "
             f"{platform.machine()}; source a ROS 2 Jazzy installation."
         )
-    if OWN_ROS and subprocess.run([BASE_PYTHON, "-c", "import rclpy"], stderr=subprocess.DEVNULL).returncode != 0:
+    if OWN_ROS and subprocess.run([BASE_PYTHON, "-c", "import rclpy"], stderr=subprocess.DEVNULL, cwd=ROOT).returncode != 0:
         raise Failure(
             f"ROS_DISTRO is jazzy, but {BASE_PYTHON} cannot import rclpy; source /opt/ros/jazzy/setup.bash in this "
             "shell, or unset ROS_DISTRO to use the wheels."
@@ -121,7 +121,7 @@ def install(title, arguments):
 def missing_requirements():
     """The pins of those MODULES that the new environment cannot import."""
     code = f"import importlib.util as u; print(*(n for m, n in {MODULES}.items() if u.find_spec(m) is None))"
-    names = subprocess.check_output([PYTHON, "-c", code], text=True).split()
+    names = subprocess.check_output([PYTHON, "-c", code], text=True, cwd=ROOT).split()
     pins = (ROOT / "requirements.txt").read_text().splitlines()
     return [pin for pin in pins if pin.split("==")[0] in names]
 

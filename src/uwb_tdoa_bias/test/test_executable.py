@@ -118,3 +118,14 @@ def test_the_linear_algebra_of_a_node_takes_one_thread_unless_the_user_says_more
     write(name, "import os\nseen = os.environ['OMP_NUM_THREADS']\ndef main(): return seen")
     monkeypatch.setenv("OMP_NUM_THREADS", given) if given else monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     assert node_executable(name)() == kept  # before anything is imported
+
+
+def test_a_folder_of_recordings_does_not_say_how_libraries_behave(write, tmp_path, monkeypatch):
+    """matplotlib takes the settings of the folder in which it is imported: of its memory, and of LaTeX."""
+    pytest.importorskip("matplotlib")
+    (tmp_path / "matplotlibrc").write_text("savefig.dpi: 100000\ntext.usetex: True\n")
+    monkeypatch.chdir(tmp_path)
+    write("draws", "import os, matplotlib\ndef main(): print(matplotlib.rcParams['savefig.dpi'], os.getcwd())")
+    code = START.format("draws")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == f"figure {tmp_path}\n", done.stderr

@@ -6,6 +6,7 @@ import pytest
 onnx = pytest.importorskip("onnx")
 from onnx import helper, numpy_helper  # noqa: E402
 from onnx_models import CONSTANTS, model  # noqa: E402
+from uwb_tdoa_bias.correction.graph_size import Unplayable, size_of  # noqa: E402
 from uwb_tdoa_bias.correction.onnx_file import Unreadable, read_graph  # noqa: E402
 
 
@@ -70,6 +71,14 @@ def test_what_would_be_read_in_two_ways(tmp_path, change):
     (tmp_path / "model.onnx").write_bytes(whole.SerializeToString())
     with pytest.raises(Unreadable, match="a name twice|numbers are elsewhere"):
         read_graph(tmp_path / "model.onnx")
+
+
+def test_an_input_without_a_shape(tmp_path):
+    whole = onnx.load(model(tmp_path / "model.onnx", [("Exp", ["x"], ["y"], {})]))
+    whole.graph.input[0].type.tensor_type.ClearField("shape")
+    (tmp_path / "model.onnx").write_bytes(whole.SerializeToString())
+    with pytest.raises(Unplayable):
+        size_of(read_graph(tmp_path / "model.onnx"))
 
 
 @pytest.mark.parametrize("data", [b"\x00", b"no model", b"\x3a\xff\xff\xff\xff\x0f"])

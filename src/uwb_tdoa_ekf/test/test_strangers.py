@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from flights import corners  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically  # noqa: E402
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically  # noqa: E402
 from rig import make_rig, recording  # noqa: E402, F401
 from sensor_msgs.msg import Imu  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
@@ -110,6 +110,8 @@ def test_no_pose_and_no_parameter_ends_a_node_and_no_flood_of_poses_fills_it(mak
     assert any("set_parameters: a request cannot be read" in line for line in process.lines)
     many = stranger.call(SetParameters, "ekf_node/set_parameters", parameters=[Parameter(name="nothing")] * 1000)
     assert not many.results
+    listed = stranger.call(ListParameters, "ekf_node/list_parameters", prefixes=["t"] * 1000)
+    assert not listed.result.names and stranger.call(ListParameters, "ekf_node/list_parameters", prefixes=["qos_overrides"]).result.names
     text = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="x" * 10_000_000)
     stranger.call(SetParameters, "ekf_node/set_parameters", parameters=[Parameter(name="tdoa_std", value=text)])
     assert stranger.alive("ekf_node") and not any("Traceback" in line for line in process.lines)

@@ -3,10 +3,12 @@
 Messages of every type that a node takes, so many on each topic, changed at random: numbers that are none, huge, tiny or negative, ids
 and stamps of anything, long names; then, as bytes, cut off, longer, of a type without its last 8 bytes, bits turned over, of another
 encoding, noise. In between come whole ones. No node may end; every message of a stream is received or counted as unreadable, every
-other one that cannot be read is counted; memory stays what it was.
+other one that cannot be read is counted; memory stays what it was. Then as many requests of every service of each node, those for
+parameters too, with values that are odd: each is answered. With them come odd messages to those nodes that count none.
 """
 
 import argparse
+from collections import Counter
 from dataclasses import dataclass
 import json
 from pathlib import Path
@@ -19,27 +21,34 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped, Twist
 from nav_msgs.msg import Odometry
 import numpy as np
 import rclpy
-from rcl_interfaces.srv import GetParameters
+from rcl_interfaces.msg import Parameter
+from rcl_interfaces.srv import (
+    DescribeParameters, GetParameters, GetParameterTypes, ListParameters, SetParameters, SetParametersAtomically,
+)  # fmt: skip
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import FluidPressure, Imu, Range
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message
 from uwb_tdoa_bias.foundation.ros_frames import read_transforms
 from uwb_tdoa_bias.foundation.ros_wire import Unreadable, decode
-from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected
-from uwb_tdoa_tools.benchmark.nodes import PACKAGES, READY_LIMIT, ready_at, surroundings
+from uwb_tdoa_msgs.msg import AnchorArray, EstimatorStatus, Tdoa, TdoaCorrected
+from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
+from uwb_tdoa_tools.benchmark import nodes
+from uwb_tdoa_tools.benchmark.nodes import READY_LIMIT, ready_at, surroundings
 from uwb_tdoa_tools.benchmark.usage import memory
-from uwb_tdoa_tools.live.processes import Diagnostics, wait
+from uwb_tdoa_tools.live.processes import Diagnostics, LiveError, wait
 
 RCLError = rclpy_implementation.RCLError
+CORPUS = Path(__file__).parent / "fuzz" / "corpus"
 ALIGNED = 4  # bytes; the middleware fills up to that, so that other lengths arrive longer
 SHORTEST = 4  # bytes; after an empty message Fast DDS delivers nothing more of a reliable publisher, to whomever
 PATIENCE = 60.0  # s
-LATCHED = "uwb/anchors", "/tf_static"
+LATCHED = "uwb/anchors", "/tf_static", "status"
 EXTREME = np.nan, np.inf, -np.inf, 1e308, -1e308, 1e150, 1e16, 1e-320, 0.0, -1.0
 STREAMS = {  # of each node: topic, type, and what counts those that could be read
     "ekf_node": {
@@ -48,13 +57,26 @@ STREAMS = {  # of each node: topic, type, and what counts those that could be re
         "velocity": (TwistWithCovarianceStamped, "velocity_received"), "velocity/odometry": (Odometry, "velocity_received"),
     },
     "bias_node": {"uwb/tdoa": (Tdoa, "received"), "odometry": (Odometry, "poses")},
+    "debias_node": {"odometry": (Odometry, "received")},
 }  # fmt: skip
 SINGLE = {
     "ekf_node": {
         "uwb/anchors": AnchorArray, "/tf_static": TFMessage, "/tf": TFMessage, "initialpose": PoseWithCovarianceStamped,
     },
     "bias_node": {"uwb/anchors": AnchorArray, "/tf_static": TFMessage},
+    "debias_node": {},
 }  # fmt: skip
+UNCOUNTED = {"vehicle_node": {"odometry": Odometry, "status": EstimatorStatus}}  # topics, beside requests
+PACKAGES = nodes.PACKAGES | {"debias_node": "uwb_tdoa_ekf", "anchors_node": "uwb_tdoa_bias", "vehicle_node": "uwb_tdoa_tools"}
+OF_PARAMETERS = {
+    "set_parameters": SetParameters, "set_parameters_atomically": SetParametersAtomically, "get_parameters": GetParameters,
+    "get_parameter_types": GetParameterTypes, "describe_parameters": DescribeParameters, "list_parameters": ListParameters,
+}  # fmt: skip
+SERVICES = {
+    "ekf_node": {"ekf_node/reset": Trigger}, "bias_node": {}, "debias_node": {}, "anchors_node": {},
+    "vehicle_node": {"takeoff": Takeoff, "go_to": GoTo, "land": Land},
+}  # fmt: skip
+NAMES = "use_sim_time", "frozen", "tdoa_std", "anchors_file", "map", "marker_size", "seed", "", "nothing", "x" * 5000, "\x1b[2J"
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 1], [0, 8, 2], [8, 8, 0], [0, 0, 3], [8, 0, 3], [0, 8, 3], [8, 8, 3]])
 
 
@@ -97,7 +119,7 @@ def odd(message, rng):
     """The same message with some values that are odd, but that its type may have."""
     for name, kind in message.get_fields_and_field_types().items():
         value = getattr(message, name)
-        parts = [value] if hasattr(value, "get_fields_and_field_types") else value if isinstance(value, list) else []
+        parts = [part for part in (value if isinstance(value, list) else [value]) if hasattr(part, "get_fields_and_field_types")]
         for part in parts:
             odd(part, rng)
         if parts or rng.random() > 0.2:
@@ -109,7 +131,7 @@ def odd(message, rng):
         elif isinstance(value, int) and not isinstance(value, bool):
             signed, bits = not kind.startswith("u"), int("".join(filter(str.isdigit, kind)) or 8)
             low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-            setattr(message, name, int(rng.choice([low, high, int(rng.integers(low, high))])))
+            setattr(message, name, int(rng.choice([low, high, int(rng.integers(low, min(high, 2**63 - 1)))])))
         elif isinstance(value, np.ndarray) and len(value):
             value[rng.integers(len(value), size=3)] = rng.choice(EXTREME, size=3)
     return message
@@ -142,7 +164,7 @@ def ordeal(name, count, folder, seed=1):
     with surroundings(folder) as (node, processes):
         diagnostics, log = Diagnostics(node), processes.file(name)
         told = [part for topic in STREAMS[name] for part in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")]
-        told += ["-p", "publish_tf:=odom"] if name == "ekf_node" else ["-p", "model_file:=auto"]
+        told += _told(name, folder)
         processes.start(PACKAGES[name], name, "--ros-args", *told)
         wait(READY_LIMIT, f"{name} to be ready", processes, node, lambda: ready_at(name, log.read_text(errors="replace")))
         publishers = _publishers(node, processes, diagnostics, name)
@@ -228,6 +250,65 @@ def qos(topic):
     return QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
 
+def _told(name, folder):
+    """Parameters that a node needs, as arguments."""
+    if name == "anchors_node":
+        ANCHORS.to_yaml(Path(folder) / "anchors.yaml")
+    return {
+        "ekf_node": ["-p", "publish_tf:=odom"],
+        "bias_node": ["-p", "model_file:=auto"],
+        "debias_node": ["-p", f"map:={CORPUS / 'bias_map' / '0'}"],
+        "anchors_node": ["-p", f"anchors_file:={Path(folder) / 'anchors.yaml'}"],
+        "vehicle_node": ["-p", "duration:=1800.0"],
+    }[name]
+
+
+def request_ordeal(name, count, folder, seed=1):
+    """{service: how many of `count` odd requests were answered}, and bytes of memory after each tenth, of a node that is asked by
+    every service, and gets the messages of UNCOUNTED. A vehicle that falls ends its node, as it should: it is started again."""
+    answered, used, rng = Counter(), [], np.random.default_rng(seed)
+    while (left := count - max(answered.values(), default=0)) > 0:
+        with surroundings(folder) as (node, processes):
+            processes.start(PACKAGES[name], name, "--ros-args", *_told(name, folder))
+            services = {f"{name}/{service}": kind for service, kind in OF_PARAMETERS.items()} | SERVICES[name]
+            clients = {service: node.create_client(kind, f"/{service}") for service, kind in services.items()}
+            publishers = {topic: node.create_publisher(kind, topic, qos(topic)) for topic, kind in UNCOUNTED.get(name, {}).items()}
+            wait(READY_LIMIT, f"{name} to offer its services", processes, node, lambda: all(c.service_is_ready() for c in clients.values()))
+            try:
+                for k in range(left):
+                    for publisher in publishers.values():
+                        message = whole(publisher.msg_type, k, (lambda one: odd(one, rng)) if rng.random() < 0.5 else (lambda one: one))
+                        publisher.publish(changed(message, rng))
+                    for service, client in clients.items():
+                        wait(PATIENCE, f"an answer of {service}", processes, node, client.call_async(_request(services[service], rng)).done)
+                        answered[service] += 1
+                    if k % max(1, count // 10) == 0:
+                        used.append(memory(processes.pid(name)))
+                processes.stop(name)
+            except LiveError:
+                if "the flight is over" not in processes.file(name).read_text(errors="replace"):
+                    raise
+            assert not re.search("Traceback", processes.file(name).read_text(errors="replace")), processes.file(name)
+    return answered, used
+
+
+def _request(kind, rng):
+    """A request whose values are odd, for some names that there are and some that there are not."""
+    out, some = kind.Request(), [str(one) for one in rng.choice(NAMES, size=rng.integers(5))]
+    if hasattr(out, "parameters"):
+        out.parameters = [Parameter(name=one) for one in some]
+        for parameter in out.parameters:
+            parameter.value.type = int(rng.integers(12))
+            odd(parameter.value, rng)
+            parameter.value.double_array_value = [float(one) for one in rng.choice(EXTREME, size=rng.integers(4))]
+            parameter.value.string_array_value = [str(one) for one in rng.choice(NAMES, size=rng.integers(4))]
+    elif hasattr(out, "names"):
+        out.names = some
+    elif hasattr(out, "prefixes"):
+        out.prefixes = some
+    return odd(out, rng) if rng.random() < 0.8 else out
+
+
 def clock_ordeal(count, folder, seed=1):
     """Send `count` odd messages on /clock; returns whether ekf_node still answers."""
     rng = np.random.default_rng(seed)
@@ -254,16 +335,21 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("count", type=int, help="messages on each topic")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="+", choices=SERVICES, default=[*SERVICES], metavar="NODE", help="default: all")
     args, bad = parser.parse_args(), False
     with tempfile.TemporaryDirectory() as folder:
-        for name in STREAMS:
+        for name in (name for name in STREAMS if name in args.only):
             began = time.monotonic()
             account = ordeal(name, args.count, Path(folder), args.seed)
             took, total = time.monotonic() - began, sum(account.sent.values())
             print(name, json.dumps({k: v for k, v in vars(account).items()}), wrong(account) or "all accounted for")
             print(f"{name}: {total} messages in {took:.0f} s, {total / took:.0f} in a second", flush=True)
             bad |= bool(wrong(account))
-        fine = clock_ordeal(args.count, Path(folder), args.seed)
+        for name in args.only:
+            began = time.monotonic()
+            answered, used = request_ordeal(name, args.count, Path(folder), args.seed)
+            print(f"{name}: answered {dict(answered)} in {time.monotonic() - began:.0f} s; memory {used}", flush=True)
+        fine = "ekf_node" not in args.only or clock_ordeal(args.count, Path(folder), args.seed)
         print("/clock:", "goes on" if fine else "ended")
     return int(bad or not fine)
 

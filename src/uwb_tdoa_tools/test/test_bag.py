@@ -1,4 +1,5 @@
 import dataclasses
+import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -47,6 +48,22 @@ def test_round_trip(tmp_path, storage):
     assert back.name == "small" and back.meta["protocol"] == "tdoa3" and "reordered" not in back.meta
     (file,) = (tmp_path / "flight").glob("flight.*")  # the data file alone will do
     assert differences(flight, read_bag(file)) == []
+
+
+@BOTH
+def test_a_file_that_was_read_is_closed(tmp_path, storage):
+    """A process may have no more than 1024 files open, and bags may be more."""
+    write_bag(small_flight(0.1), tmp_path / "flight", storage)
+    (file,) = (tmp_path / "flight").glob("flight.*")
+
+    def opened():
+        return [name for name in map(os.path.realpath, Path("/proc/self/fd").iterdir()) if name == str(file)]
+
+    for path in (tmp_path / "flight", file):
+        read_bag(path)
+        with open_bag(path) as outer, open_bag(path) as inner:
+            assert len(list(outer.messages())) == len(list(inner.messages()))
+        assert opened() == []
 
 
 @st.composite

@@ -19,6 +19,7 @@ from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.localizing.estimate import with_antenna
+import yaml
 
 BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 AT_ONCE = 2.0  # s of processor time
@@ -105,6 +106,18 @@ def test_a_file_is_unpacked_once(tmp_path):
     text = (tmp_path / "bag" / "metadata.yaml").read_text()
     (tmp_path / "bag" / "metadata.yaml").write_text(text.replace("  - bag.mcap", "  - bag.mcap\n  - ./bag.mcap"))
     with pytest.raises(InputError, match="is no file, or is there twice"):
+        read_bag(tmp_path / "bag")
+
+
+@pytest.mark.parametrize("files", ["x", "5", "null", "{}"])
+def test_files_that_are_no_list(tmp_path, files):
+    """rosbags clears them when it closes the bag."""
+    write_bag(small_flight(0.1), tmp_path / "bag")
+    file = tmp_path / "bag" / "metadata.yaml"
+    content = yaml.safe_load(file.read_text())
+    content["rosbag2_bagfile_information"]["files"] = yaml.safe_load(files)
+    file.write_text(yaml.safe_dump(content))
+    with pytest.raises(InputError, match="metadata.yaml: files is"):
         read_bag(tmp_path / "bag")
 
 

@@ -85,6 +85,7 @@ def test_every_column_can_be_named_and_every_time_has_units():
     [
         ("t_ms,from,to\n1,0,1\n", "has no column 'diff'; its columns are t_ms, from, to"),
         ("t_ms,from,to,diff\n1,0,1,x\n", "line 2: diff is 'x'; it must be a number"),
+        (f"t_ms,from,to,diff\n1,0,1,0x{'f' * 300}\n", "line 2: diff is '0xffff.*; it must be a number"),
         ("t_ms,from,to,diff\n1,,1,3\n", "line 2: from is ''"),
         ("t_ms,from,to,diff\n1,0.5,1,3\n", "ids are whole numbers"),
         ("t_ms,from,to,diff\n1,0,70000,3\n", "ids are whole numbers"),

@@ -160,6 +160,27 @@ def test_what_was_kept_before_there_were_phases_is_refused(bag, tmp_path, capsys
     assert "its results were made with another version of the figures" in capsys.readouterr().err
 
 
+FORGED = ("5", "{}", '{"row": {}, "sums": {}, "distributions": {}, "phases": {}}', '{"row": [], "sums": 1, "distributions": {}, "phases": {}}')
+
+
+def test_a_result_that_somebody_has_forged_is_refused(bag, tmp_path, capsys):
+    kept = tmp_path / "kept"
+    options = [str(bag), "--no-bias", "--resume", str(kept)]
+    assert main(options) == 0
+    first, line = kept.read_text().splitlines()
+    forged = [json.loads(result) for result in FORGED] + [json.loads(line)["result"] for _ in range(3)]
+    forged[-3]["row"]["rmse_3d"] = "a"
+    forged[-2]["distributions"]["distance"][3] = [0, 1]
+    forged[-1]["phases"]["in_the_air"] = {}
+    for result in forged:
+        kept.write_text(f"{first}\n{json.dumps({'key': json.loads(line)['key'], 'result': result})}\n")
+        capsys.readouterr()
+        assert main(options) == 2, result
+        assert "kept: holds something else than results" in capsys.readouterr().err
+    kept.write_text(f"{first}\n{line}\n")
+    assert main(options) == 0
+
+
 def test_corrects_with_what_bias_node_takes_unasked(flight, bag, tmp_path, capsys):
     effects = tmp_path / "effects.yaml"
     EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.1}),)).to_yaml(effects)

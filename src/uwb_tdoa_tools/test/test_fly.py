@@ -64,6 +64,9 @@ def test_it_goes_on_from_what_is_there(tmp_path, capsys, monkeypatch):
     assert flown == [1, 2, 3] and [one["seed"] for one in json.loads(out.read_text())["flights"]] == [1, 2, 3]
     assert main(["--flights", "3", *options[3:]]) == 2
     assert "another floor_effect" in capsys.readouterr().err
+    kept.write_text(kept.read_text().splitlines()[0] + '\n{"key": "1", "result": {"landed": true}}\n')
+    assert main(["--no-floor-effect", "--flights", "1", *options[3:]]) == 2
+    assert "holds something else than results" in capsys.readouterr().err
 
 
 def test_a_flight_is_recorded_for_the_other_tools(tmp_path):

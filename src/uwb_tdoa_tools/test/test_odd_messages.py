@@ -14,13 +14,20 @@ FEW = 100
 GROWTH = 100e6  # bytes in the second half; an effect that is compiled takes 50 MB
 
 
-@pytest.mark.parametrize("name", ["ekf_node", pytest.param("bias_node", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["ekf_node", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bias_node", "debias_node"))])
 def test_no_message_ends_a_node_and_each_is_accounted_for(name, tmp_path):
     account = odd_messages.ordeal(name, FEW, tmp_path)
     assert not odd_messages.wrong(account)
     assert all(count > FEW // 4 for count in account.unreadable.values())  # they are odd enough
     assert all(count > FEW // 20 for count in account.received.values())
     assert account.memory[-1] < account.memory[len(account.memory) // 2] + GROWTH
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "vehicle_node" else pytest.mark.slow) for name in odd_messages.SERVICES])
+def test_no_request_ends_a_node_and_each_is_answered(name, tmp_path):
+    answered, used = odd_messages.request_ordeal(name, FEW // 4, tmp_path)
+    assert len(answered) == 6 + len(odd_messages.SERVICES[name]) and min(answered.values()) >= FEW // 4
+    assert used[-1] < used[len(used) // 2] + GROWTH
 
 
 @pytest.mark.slow

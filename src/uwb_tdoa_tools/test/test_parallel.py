@@ -86,6 +86,20 @@ def test_an_interrupt_ends_all_of_it_without_a_word(importable):
     assert work.returncode == 130 and all(b" of 201 flights done, " in line for line in err.splitlines())
 
 
+def test_a_folder_of_flights_does_not_say_what_the_others_run(tmp_path, importable):
+    """Python looks for modules where it starts, if it is told to by -m, as joblib does: whatever lies there would run."""
+    for name in ("joblib", "struct", "selectors", "runpy", "pickle"):
+        (tmp_path / f"{name}.py").write_text(f"open('{tmp_path}/ran', 'w').close(); raise SystemExit(1)")
+    (tmp_path / "work.py").write_text(
+        "import os, sys; sys.path.pop(0)\n"
+        "from uwb_tdoa_tools import parallel\n"
+        "print([*parallel.over(os.path.abspath, ['a', 'b', 'c', 'd'], 2)])\n"
+    )
+    ended = subprocess.run([sys.executable, "work.py"], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert ended.stdout == f"{[str(tmp_path / name) for name in 'abcd']}\n", ended.stderr
+    assert not (tmp_path / "ran").exists()
+
+
 def options(*argv):
     parser = cli.parser("tool", "A tool.")
     parser.add_argument("--out")

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools import results_file
 from uwb_tdoa_tools.results_file import ResultsFile, asked_of, state_of
 
 
@@ -49,6 +50,25 @@ def test_what_was_asked_otherwise_is_not_mixed(tmp_path):
     fill(path, ["a"], {"seed": 1, "smooth": False, "effects": None})
     with pytest.raises(InputError, match="made with another effects and seed; ask for the same, or name another file"):
         fill(path, ["a"], {"seed": 2, "smooth": False, "effects": "1f"})
+
+
+def test_a_result_that_somebody_has_written_is_one_or_is_refused(tmp_path):
+    path = tmp_path / "results"
+    fill(path, ["a"])
+    with ResultsFile(path, {"seed": 1}) as done:
+        assert done.read("a", lambda result: result["length"]) == 1
+        for parse in (lambda result: result["width"], lambda result: result["length"]["of"], lambda result: float(result["length"] * "x")):
+            with pytest.raises(InputError, match="holds something else"):
+                done.read("a", parse)
+
+
+def test_a_line_without_end_is_not_read(tmp_path, monkeypatch):
+    path = tmp_path / "results"
+    fill(path, ["a"])
+    monkeypatch.setattr(results_file, "LINE", 1000)
+    path.write_bytes(path.read_bytes() + b" " * 2000)
+    with pytest.raises(InputError, match="holds something else"):
+        fill(path, ["a"])
 
 
 @pytest.mark.parametrize("content", ["flight,rmse\n", "[1]\n", "not a result", '{"runs": []}\n', '{"asked": 1}\n', b"\xff\x00\n", "[" * 100_000 + "\n"])

@@ -227,14 +227,14 @@ def test_a_header_of_many_types_takes_no_time(read):
     assert time.perf_counter() - began < 5.0
 
 
-@pytest.mark.parametrize("setting", ["cache_dir: planted", "cache_locator_classes: evil.Locator"])
+@pytest.mark.parametrize("setting", ["cache_dir: planted", "cache_locator_classes: evil.Locator", "disable_jit: 1", "opt: none", "["])
 def test_a_folder_of_flights_does_not_say_where_compiled_code_is(tmp_path, setting):
     """numba looks for a configuration of its own where it is started; what it finds in such a cache, or module, is run."""
     (tmp_path / ".numba_config.yaml").write_text(f"{setting}\n")
     (tmp_path / "evil.py").write_text("open('planted', 'w').close()")
     (tmp_path / "flight.log").write_bytes(log_bytes())
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | {"XDG_CACHE_HOME": str(tmp_path)}
-    reads = "from recordings import ANCHORS; from uwb_tdoa_tools.readers import read_usd_log; read_usd_log('flight.log', ANCHORS)"
+    reads = "from recordings import ANCHORS; from uwb_tdoa_tools.readers import read_usd_log; read_usd_log('flight.log', ANCHORS); from uwb_tdoa_bias.foundation import compiled; assert not compiled.config.DISABLE_JIT"
     environment["PYTHONPATH"] = os.pathsep.join([os.path.dirname(__file__), environment.get("PYTHONPATH", "")])
     ended = subprocess.run([sys.executable, "-c", reads], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr

@@ -78,8 +78,8 @@ TDOA = "t_tdoa,idA,idB,tdoa_meas"
         (csv_text(TDOA, ["inf,0,1,1"]), "line 2: t_tdoa is 'inf'"),
         (csv_text(TDOA, ["1,0.5,1,1"]), "line 2: idA is 0.5"),
         (csv_text(TDOA, ["1,0,-1,1"]), "line 2: idB is -1"),
-        (csv_text(TDOA, ["1,0,1,1", ",,,", "3,0,1,1"]), "line 4: t_tdoa is '3' although"),
-        (csv_text(TDOA, ["1,0,1,1", "2,0,,1"]), "line 3: t_tdoa is '2' although"),
+        (csv_text(TDOA, ["1,0,1,1", ",,,", "3,0,1,1"]), "line 4: t_tdoa is filled although"),
+        (csv_text(TDOA, ["1,0,1,1", "2,0,,1"]), "line 3: t_tdoa is filled although"),
     ],
 )
 def test_refused_with_the_line(read, text, sentence):
@@ -164,3 +164,38 @@ def test_a_gzip_that_unfolds_without_end_is_refused(read, monkeypatch):
         read(packed)
     assert tracemalloc.get_traced_memory()[1] < 100e6
     tracemalloc.stop()
+
+
+def test_short_cells_take_less_memory_than_their_text_would(read):
+    content = csv_text(TDOA, ["1,1,0,1"] * 200_000).encode()
+    tracemalloc.start()
+    flight = read(content)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(flight.tdoa) == 200_000 and most < 40e6  # 60e6 as rows of text
+
+
+def test_a_row_without_end_is_refused(read):
+    with pytest.raises(InputError, match="line 1 has a row of more than 100000 characters"):
+        read(TDOA + "\n" + "1," * 100_000 + "\n")
+    with pytest.raises(InputError, match="a row of more than 100000 characters"):
+        read(TDOA + "\n" + '"\n",' * 100_000 + "\n")
+
+
+def test_more_cells_than_a_flight_has_are_refused(read, monkeypatch):
+    monkeypatch.setattr(util_csv, "CSV_CELLS", 40_000)
+    content = csv_text(TDOA, ["1,1,0,1"] * 20_000)
+    with pytest.raises(InputError, match="has more than 40000 cells"):
+        read(content)
+
+
+def test_cells_of_all_blocks_count(read, monkeypatch):
+    monkeypatch.setattr(util_csv, "_ROWS", 2)
+    rows = [f"{k},0,1,{k},{k if k < 3 else ''},{k if k < 3 else ''}" for k in range(7)]
+    flight = read(csv_text(TDOA + ",t_baro,baro", rows))
+    np.testing.assert_array_equal(flight.tdoa.d, range(7))
+    np.testing.assert_array_equal(flight.pressure.t, range(3))
+    with pytest.raises(InputError, match="line 8: baro is filled although t_baro, baro ended with an empty cell at line 5"):
+        read(csv_text(TDOA + ",t_baro,baro", [*rows[:6], "6,0,1,6,,9"]))
+    with pytest.raises(InputError, match="line 8: tdoa_meas is 'x'; it must be a number"):
+        read(csv_text(TDOA + ",t_baro,baro", [*rows[:6], "6,0,1,x,,"]))

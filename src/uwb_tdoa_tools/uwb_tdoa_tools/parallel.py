@@ -7,6 +7,7 @@ Processes are kept from one call to the next, if each ends of itself: whoever st
 """
 
 import argparse
+import os
 import signal
 import sys
 import warnings
@@ -15,6 +16,8 @@ from functools import lru_cache
 
 from joblib import Parallel, cpu_count, delayed, parallel_config
 from threadpoolctl import threadpool_limits
+
+from uwb_tdoa_bias.foundation.elsewhere import elsewhere
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .progress import Progress
@@ -67,20 +70,22 @@ def _results(function, items, jobs, dask):
     if not rest or (min(count, len(rest)) == 1 and dask is None):
         yield from map(function, items)
         return
+    os.environ["PYTHONSAFEPATH"] = "1"  # for processes that joblib starts later, as Python 3.11 and newer understand it; see `elsewhere`
     with _cluster(dask) as backend:
 
         def spread(calls):
             with parallel_config(**backend):  # not around the loop: the caller's own use of joblib is its own affair
                 # Arrays go as they are: numba compiles anew for those mapped from files, which cannot be written to.
                 pool = Parallel(count, return_as="generator", batch_size=1, max_nbytes=None)
-            with _children_ignore_interrupts():
+            with _children_ignore_interrupts(), elsewhere():  # joblib starts Python by -m, which looks for modules in the present folder
                 return pool(calls)
 
+        folder = os.getcwd() if dask is None else None
         with _closing(spread(delayed(_import)(function) for _ in range(count))) as starting:
             yield from map(function, first)
             for _ in starting:
                 pass
-        with _closing(spread(delayed(_attempt)(function, item) for item in rest)) as outcomes:
+        with _closing(spread(delayed(_attempt)(function, item, folder) for item in rest)) as outcomes:
             for result, error in outcomes:
                 if error is not None:
                     raise error
@@ -102,9 +107,12 @@ def _closing(outcomes):
 
 
 @in_one_thread
-def _attempt(function, item):
-    """(result, None), or (None, what cli tells in one sentence): else joblib would raise it before earlier results."""
+def _attempt(function, item, folder):
+    """(result, None), or (None, what cli tells in one sentence): else joblib would raise it before earlier results. folder : in which
+    paths of the item are, or None."""
     try:
+        if folder is not None:
+            os.chdir(folder)
         return function(item), None
     except (InputError, OSError) as error:
         return None, error

@@ -21,6 +21,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.version import written_by
 
 BEGIN = b'{"asked"'
+LINE = 64 << 20  # bytes of one result
 
 
 class ResultsFile:
@@ -42,7 +43,7 @@ class ResultsFile:
 
     def _begin(self, asked):
         self._file.seek(0)
-        first = self._file.readline()
+        first = self._file.readline(LINE)
         if not first.endswith(b"\n"):  # new, or not even its first line was written
             if not (first.startswith(BEGIN) or BEGIN.startswith(first)):
                 raise self._foreign()
@@ -57,8 +58,10 @@ class ResultsFile:
             raise InputError(
                 f"{self._path}: its results were made with another {' and '.join(different)}; ask for the same, or name another file."
             )
-        while line := self._file.readline():
+        while line := self._file.readline(LINE):
             place = self._file.tell() - len(line)
+            if len(line) == LINE:
+                raise self._foreign()
             if not line.endswith(b"\n"):  # cut by the interruption
                 self._file.truncate(place)
                 break
@@ -73,6 +76,13 @@ class ResultsFile:
     def __getitem__(self, key):
         self._file.seek(self._places[key])
         return self._parsed(self._file.readline())["result"]
+
+    def read(self, key, parse):
+        """parse(result). Raises InputError where that fails: anybody may have written the file."""
+        try:
+            return parse(self[key])
+        except (AssertionError, AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError):
+            raise self._foreign() from None
 
     def __setitem__(self, key, result):
         self._places[key] = self._append({"key": key, "result": result})

@@ -66,7 +66,7 @@ def read_graph(path):
         return Graph(
             nodes=[_node(data) for data in graph[1]],
             constants=constants,
-            inputs=[(name, shape) for name, kind, shape in inputs if name not in constants and _is_float(kind, name)],
+            inputs=[(name, shape or []) for name, kind, shape in inputs if name not in constants and _is_float(kind, name)],
             outputs=[name for name, *_ in outputs],
             shapes=[(name, shape) for name, shape in said if shape is not None],
             meta={entry[1][0].decode(): entry[2][0].decode() for entry in entries},

@@ -17,6 +17,8 @@ import stat
 import sys
 import tempfile
 
+from .elsewhere import elsewhere
+
 
 @contextmanager
 def _hidden(*names):
@@ -32,11 +34,11 @@ def _hidden(*names):
 
 # numba imports these only to see whether they are there, which takes a fifth of a second of a node's start: for products of matrices
 # in compiled code, of which there are none here, and for coverage of it.
-with _hidden("scipy", "coverage"):
+with _hidden("scipy", "coverage"), elsewhere():
     from numba import config, njit
     import numba.np.arraymath  # noqa: F401
 
-config.CACHE_LOCATOR_CLASSES = ""  # numba would import those that a .numba_config.yaml in the present folder names
+config._config_fname = "/dev/null/.numba_config.yaml"  # numba would look into the present folder before it compiles anything
 
 
 def compiled(function):

@@ -14,6 +14,8 @@ import signal
 import sys
 from threading import Timer
 
+from .elsewhere import elsewhere
+
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
 SOON = 0.05  # s, until an interrupt that was lost comes again
 SAID = 1.5  # s of importing after which it is said that something goes on
@@ -80,7 +82,8 @@ def _imported(module):
     slow.daemon = True
     slow.start()
     try:
-        return import_module(module)
+        with elsewhere():  # matplotlib takes settings of the present folder
+            return import_module(module)
     finally:
         slow.cancel()
         signal.signal(signal.SIGINT, before)

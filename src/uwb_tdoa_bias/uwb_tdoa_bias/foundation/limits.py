@@ -7,7 +7,11 @@ what is needed: a flight of an hour has 300 MB as a log, our YAML files have som
 # Whole files, bytes.
 RECORDING_BYTES = 1 << 30  # micro-SD log, or CSV as it lies on the disc
 CSV_BYTES = 200_000_000  # text of a recording; ten minutes of the full UTIL schema
+CSV_CELLS = 16_000_000  # of it
 TABLE_BYTES = 50_000_000  # CSV of other tools
+TABLE_CELLS = 8_000_000  # of a recording in it: a quarter of an hour at 1 kHz
+SMALL_TABLE_CELLS = 400_000  # of other tables, whose rows become objects
+ROW_CHARACTERS = 100_000  # of one row of any CSV
 SURVEY_BYTES = YAML_BYTES = 1_000_000
 MODEL_BYTES = 4_000_000  # ONNX: a million weights
 ARRAYS_BYTES = 100_000_000  # of all arrays of an .npz file, unpacked; four million cells have 20 MB

@@ -102,9 +102,9 @@ class ParameterNode(Node):
         @wraps(callback)
         def answer(request, response):
             try:
-                asked = len(getattr(request, "parameters", getattr(request, "names", ())))
+                asked = sum(len(getattr(request, several, ())) for several in ("parameters", "names", "prefixes"))
                 if asked > MOST_ASKED:
-                    raise InputError(f"it has {asked} parameters; at most {MOST_ASKED} are read.")
+                    raise InputError(f"it has {asked} parameters, names or prefixes; at most {MOST_ASKED} are read.")
                 return callback(request, response)
             except Exception as error:
                 text = f"{srv_name}: a request cannot be read and changes nothing more: {error!r:.{LONGEST_NAME}}"

@@ -2,10 +2,11 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 import re
 import shutil
+import sys
 import tempfile
 
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
@@ -88,7 +89,8 @@ def open_bag(path, salvage=False):
         try:
             yield reader
         finally:
-            reader.close()
+            with suppress(Exception):  # of what rosbags has believed
+                reader.close()
 
 
 def _opened(path, folder, salvage):
@@ -104,7 +106,8 @@ def _opened(path, folder, salvage):
                 unpack(path, folder)
                 check_whole(folder)
         reader = Reader(readable)
-        reader.open()
+        with _closing_second_connections(reader):
+            reader.open()
         _take_qos_of_metadata(reader)
         reader.remarks, reader.unreadable = remarks, Counter()
         reader.most = most_unpacked(sum(file.stat().st_size for file in (path, *path.glob("*")) if file.is_file()))
@@ -116,6 +119,22 @@ def _opened(path, folder, salvage):
     except Exception as error:  # rosbags raises whatever its parsers run into
         raise _damaged(path, error) from error
     return reader
+
+
+@contextmanager
+def _closing_second_connections(reader):
+    """rosbags opens each SQLite file twice, and closes it once: each file that was read would stay open."""
+    before = {*map(id, _connections())}
+    yield
+    used = {id(getattr(one, "dbconn", None)) for one in (reader.storage, *getattr(reader.storage, "storages", ()))}
+    for connection in _connections():
+        if id(connection) not in before | used:
+            connection.close(True)
+
+
+def _connections():
+    """All that are open to SQLite files of rosbags."""
+    return sys.modules["apsw"].connections() if "apsw" in sys.modules else []
 
 
 def _take_qos_of_metadata(reader):

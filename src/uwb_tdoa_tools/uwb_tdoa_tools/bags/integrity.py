@@ -83,14 +83,14 @@ def metadata(path):
     information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
     if not isinstance(information, dict):
         raise Damaged("metadata.yaml has no rosbag2_bagfile_information")
-    information = {"compression_mode": "", "custom_data": None, **information}
+    information = {"compression_mode": "", "custom_data": None, "files": [], **information}
     information["custom_data"] = information["custom_data"] or {}
     if isinstance(information["compression_mode"], str):
         information["compression_mode"] = information["compression_mode"].lower().replace("none", "")
     kinds = {
         "version": int, "message_count": int, "relative_file_paths": list, "topics_with_message_count": list,
         "custom_data": dict, "storage_identifier": str, "duration": dict, "starting_time": dict,
-        "compression_mode": str,
+        "compression_mode": str, "files": list,
     }  # fmt: skip
     for name, kind in kinds.items():
         if type(information.get(name)) is not kind:

@@ -93,7 +93,7 @@ def ask(folder, seconds, clock=0.0, tf=0.0, streams=True, busy=0, arguments=()):
         loads = {"tf": tf, "streams": FLIGHT if streams else 0.0, "clock": clock}
         running = {what: stack.enter_context(_load(what, number)) for what, number in loads.items() if number}
         for _ in range(busy):
-            stack.enter_context(_process([sys.executable, "-c", "while True: pass"]))
+            stack.enter_context(_process([sys.executable, "-I", "-c", "while True: pass"]))
         return _Asking(node, processes, log).ask(seconds, running.get("clock"))
 
 
@@ -167,7 +167,7 @@ class _Asking:
 @contextmanager
 def _load(what, number):
     command = [sys.executable, "-m", "uwb_tdoa_tools.benchmark.load", what, f"{number:g}"]
-    with _process(command, stdout=subprocess.PIPE) as process:
+    with _process(command, stdout=subprocess.PIPE, cwd="/") as process:  # -m looks for modules in the folder where it starts
         process.stdout.readline()  # it begins
         yield process
 

@@ -10,7 +10,7 @@ from uwb_tdoa_bias.foundation.files import read_head
 from uwb_tdoa_ekf.debias import Part
 from uwb_tdoa_ekf.offline import run_offline
 
-from ..readers.tables import number, read_table
+from ..readers.tables import read_numbers
 from ..scoring.evaluation import judging_truth
 from ..scoring.metrics import position_at
 from .judge import Estimator
@@ -54,10 +54,9 @@ def static_parts(path, estimator=Estimator(), planar=False):
 
 def _from_table(path, planar):
     names = [name for name in COLUMNS if not (planar and name.endswith("z"))]
-    rows = read_table(path, names)
-    if not rows:
+    table = read_numbers(path, names)
+    if not len(table):
         raise InputError(f"{path}: holds no positions; give one row for each.")
-    table = np.array([[number(path, line, row, name) for name in names] for line, row in rows])
     d = len(names) // 2
     _, place, counts = np.unique(table[:, :d], axis=0, return_inverse=True, return_counts=True)
     true, measured = (np.pad(side, ((0, 0), (0, 3 - d))) for side in (table[:, :d], table[:, d:]))

@@ -8,6 +8,7 @@ from .. import parallel
 from ..bags.bag import write_bag
 from ..results_file import ResultsFile
 from .plots import drawn
+from .report import summary, text
 from .trial import fly
 from .verdict import judge
 
@@ -28,8 +29,14 @@ def flown(tasks, done, record=None, draw=False, jobs=None, dask=None):
         key, picture = str(task.seed), None
         if key not in done:
             done[key], picture = next(made)
-        yield done[key], picture
+        yield (done.read(key, _sound) if isinstance(done, ResultsFile) else done[key]), picture
     next(made, None)  # to its end, so that its processes are kept
+
+
+def _sound(verdict):
+    """A verdict that a file holds, of which a summary can be made."""
+    text(summary([verdict]))
+    return verdict
 
 
 def judged(record, draw, task):

@@ -25,6 +25,7 @@ from .sensors import VELOCITY_STD
 from .vehicle import ATTITUDE, POSITION
 
 FARTHEST, FASTEST = 1e3, 100.0  # m, m/s; what is beyond is no odometry of a hall
+CLOSEST = 0.5e-3  # s between odometries that are kept: anybody may publish one for each nanosecond
 LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
 MARKER_SIZE = 0.12  # m
 VARIANCES = [VELOCITY_STD**2] * 3 + [UNKNOWN_VARIANCE] * 3  # of a velocity and a rate
@@ -108,6 +109,8 @@ class OverTopics:
     def listen(self):
         """Take the odometry that has come."""
         for frame, rows, _ in self._odometry.fetch(self._wire):
+            if self._begin is None:  # nothing was measured yet: whose odometry is that?
+                continue
             t = 1e-9 * (rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"] - self._begin)
             usable = np.isfinite(rows["pose"]).all(axis=1) & np.isfinite(rows["twist"]).all(axis=1) & (frame == self._anchors.frame)
             for k in np.flatnonzero(usable & (t <= self._now)):
@@ -118,7 +121,7 @@ class OverTopics:
         length = np.linalg.norm(q)
         sound = length > 0.5 and (np.diag(covariance) >= 0.0).all()
         near = np.abs(p).max() < FARTHEST and np.abs(twist[:3]).max() < FASTEST
-        if not (sound and near) or (self._rows and t <= self._rows[-1][0]):
+        if not (sound and near) or (self._rows and t < self._rows[-1][0] + CLOSEST):
             return
         q /= length
         self._rows.append((float(t), p, Rotation.from_quat(q).apply(twist[:3]), q, covariance))

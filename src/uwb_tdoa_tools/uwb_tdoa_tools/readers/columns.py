@@ -4,11 +4,13 @@
     flight = read_columns(["ranging.csv", "imu.csv"], columns, anchors)
 """
 
+from array import array
 from pathlib import Path
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.limits import TABLE_CELLS
 
 from .streams import GRAVITY, make_flight
 from .tables import read_table
@@ -71,15 +73,16 @@ def read_columns(paths, columns, anchors, salvage=False):
     whole numbers, or hexadecimal as 0x1A2B. columns : see `parse_columns`; anchors : Anchors; salvage : leave out
     records that are not finite. Raises InputError, with the line for a cell that is no number.
     """
-    tables = {path: read_table(path) for path in paths}
-    streams = {}
+    tables = {path: read_table(path, most=TABLE_CELLS) for path in paths}
+    wanted, streams = {path: {} for path in paths}, {}
     for stream, known in STREAMS.items():
         mine = {name: columns[name] for name in known if name in columns}
         if mine:
             mine["t"] = columns.get(TIMES[stream]) or columns["time"]
-            path, rows = _table_with(tables, mine)
-            place = {name: "t" if name == "t" else known[name][0] for name in mine}
-            streams[stream] = {place[name]: values for name, values in _values(path, rows, mine).items()}
+            wanted[_having(tables, mine)][stream] = mine
+    for path, of_file in wanted.items():
+        for stream, values in _values(path, tables[path], of_file).items():
+            streams[stream] = {"t" if name == "t" else STREAMS[stream][name][0]: column for name, column in values.items()}
     for row, (a, b) in enumerate(zip(streams["tdoa"]["a"], streams["tdoa"]["b"])):
         if not all(value == np.floor(value) and 0 <= value <= 65535 for value in (a, b)):
             raise InputError(f"{paths[0]}: TDOA {row + 1}: anchors {a:g} and {b:g}; ids are whole numbers 0 ... 65535.")
@@ -90,35 +93,35 @@ def read_columns(paths, columns, anchors, salvage=False):
     return make_flight(Path(paths[0]).stem, anchors, streams, {}, meta, salvage)
 
 
-def _table_with(tables, mine):
-    """(path, rows) of the one table that has all columns."""
+def _having(tables, mine):
+    """The path of the one table that has all columns."""
     names = {theirs for theirs, _ in mine.values()}
-    having = [(path, rows) for path, rows in tables.items() if rows and names <= rows[0][1].keys()]
+    having = [path for path, table in tables.items() if names <= {*table.names}]
     if len(having) == 1:
         return having[0]
     if having:
-        raise InputError(f"{having[1][0]}: has column {min(names)!r} as {having[0][0]} has; give one of them.")
-    path, rows = next(iter(tables.items()))
-    if not rows:
+        raise InputError(f"{having[1]}: has column {min(names)!r} as {having[0]} has; give one of them.")
+    path, table = next(iter(tables.items()))
+    raise InputError(f"{path}: has no column {min(names - {*table.names})!r}; its columns are {', '.join(table.names)}.")
+
+
+def _values(path, table, streams):
+    """{stream: {our name: (n,) array}}, in our units, of the rows in which a cell of the stream is filled. streams : {stream: columns}
+    that the table has."""
+    values, rows = {stream: {name: array("d") for name in mine} for stream, mine in streams.items()}, 0
+    for rows, (line, cells) in enumerate(table, start=1):
+        for stream, mine in streams.items():
+            texts = {name: cells[theirs].strip() for name, (theirs, _) in mine.items()}
+            if any(text for name, text in texts.items() if name != "t"):
+                for name, text in texts.items():
+                    values[stream][name].append(_number(path, line, mine[name][0], text))
+    if streams and not rows:
         raise InputError(f"{path}: has no row below its header; record the flight again.")
-    there = list(rows[0][1])
-    missing = sorted(names - set(there))
-    raise InputError(f"{path}: has no column {missing[0]!r}; its columns are {', '.join(there)}.")
+    return {stream: {name: np.array(column) * streams[stream][name][1] for name, column in of.items()} for stream, of in values.items()}
 
 
-def _values(path, rows, mine):
-    """{our name: (n,) array}, in our units, of the rows in which all cells are filled."""
-    values = {name: [] for name in mine}
-    for line, cells in rows:
-        texts = {name: (cells[theirs] or "").strip() for name, (theirs, _) in mine.items()}
-        filled = [name for name, text in texts.items() if text and name not in ("t", "a", "b")]
-        if not filled:
-            continue
-        for name, text in texts.items():
-            try:
-                values[name].append(float(int(text, 16)) if text[:2] in ("0x", "0X") else float(text))
-            except ValueError:
-                raise InputError(
-                    f"{path}: line {line}: {mine[name][0]} is {text[:40]!r}; it must be a number."
-                ) from None
-    return {name: np.array(column) * mine[name][1] for name, column in values.items()}
+def _number(path, line, name, text):
+    try:
+        return float(int(text, 16)) if text[:2] in ("0x", "0X") else float(text)
+    except (ValueError, OverflowError):
+        raise InputError(f"{path}: line {line}: {name} is {text[:40]!r}; it must be a number.") from None

@@ -1,34 +1,90 @@
-"""CSV tables with a header line, of few columns."""
+"""CSV tables with a header line. What is read at a time is a row: a file may have many more cells than memory would hold as text."""
 
+from array import array
+from collections.abc import Iterator
 import csv
 import io
 import math
 
+import numpy as np
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
-from uwb_tdoa_bias.foundation.limits import TABLE_BYTES
+from uwb_tdoa_bias.foundation.limits import ROW_CHARACTERS, SMALL_TABLE_CELLS, TABLE_BYTES, TABLE_CELLS
 
 
-def read_table(path, columns=None):
-    """[(line, {column: text})] of a CSV file that has at least the columns, others passed over; default: of all that it
-    has. Raises InputError."""
-    try:
-        text = read_bytes(path, TABLE_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not text; give a CSV file.") from error
-    rows, found = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True), []
-    try:
-        columns = columns if columns is not None else [name for name in rows.fieldnames or () if name]
-        missing = [name for name in columns if name not in (rows.fieldnames or ())]
-        if missing:
-            raise InputError(f"{path}: has no column {missing[0]}; it needs columns {', '.join(columns)}.")
-        for row in rows:
-            if any(row[name] is None for name in columns):
-                raise InputError(f"{path}: line {rows.line_num}: has fewer cells than the header; complete it.")
-            found.append((rows.line_num, {name: row[name] for name in columns}))
-    except csv.Error as error:
-        raise InputError(f"{path}: line {rows.line_num}: is no CSV ({error}); correct it there.") from error
-    return found
+class Rows:
+    """Lists of cells, row by row, of CSV content, bytes. line : how many lines were read. Raises csv.Error for what is no CSV, and
+    InputError for what is no text."""
+
+    def __init__(self, path, content, **options):
+        self._path, self._content, self._read = path, content, 0
+        self._file = io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline="")
+        self._reader = csv.reader(self._lines(), **options)
+
+    @property
+    def line(self) -> int:
+        return self._reader.line_num
+
+    def __iter__(self) -> Iterator[list]:
+        try:
+            for row in self._reader:
+                self._read = 0
+                yield row
+        except UnicodeDecodeError:
+            check_text(self._path, self._content)
+            raise
+
+    def _lines(self):
+        while line := self._file.readline(ROW_CHARACTERS):
+            self._read += len(line)  # a row goes over several lines where cells do
+            if self._read >= ROW_CHARACTERS:
+                raise csv.Error(f"has a row of more than {ROW_CHARACTERS} characters")
+            yield line
+
+
+class Table:
+    """(line, {column: text}) of each row of a CSV file. names : the columns of its header."""
+
+    def __init__(self, path, columns, most):
+        self._path, self._most = path, most
+        self._rows = Rows(path, read_bytes(path, TABLE_BYTES), skipinitialspace=True)
+        self._cells = self._each()
+        self.names = next(self._cells, [])
+        self._columns = columns if columns is not None else [name for name in self.names if name]
+        if missing := [name for name in self._columns if name not in self.names]:
+            raise InputError(f"{path}: has no column {missing[0]}; it needs columns {', '.join(self._columns)}.")
+
+    def __iter__(self):
+        names, count = {name: self.names.index(name) for name in self._columns}, 0
+        for cells in self._cells:
+            count += len(cells)
+            if count > self._most:
+                raise InputError(f"{self._path}: has more than {self._most} cells; split it.")
+            if len(cells) <= max(names.values(), default=0):
+                raise InputError(f"{self._path}: line {self._rows.line}: has fewer cells than the header; complete it.")
+            yield self._rows.line, {name: cells[place] for name, place in names.items()}
+
+    def _each(self):
+        """The rows that are not empty."""
+        try:
+            yield from filter(None, self._rows)
+        except csv.Error as error:
+            raise InputError(f"{self._path}: line {self._rows.line}: is no CSV ({error}); correct it there.") from error
+
+
+def read_table(path, columns=None, most=SMALL_TABLE_CELLS) -> Table:
+    """The Table of a CSV file that has at least the columns, others passed over; default: of all that it has. It may have `most`
+    cells. Raises InputError, also while it is iterated over."""
+    return Table(path, columns, most)
+
+
+def read_numbers(path, columns) -> np.ndarray:
+    """(n, k) float: the columns of a CSV file, all finite. Raises InputError."""
+    out = array("d")
+    for line, row in read_table(path, columns, TABLE_CELLS):
+        out.extend(number(path, line, row, name) for name in columns)
+    return np.array(out).reshape(-1, len(columns))
 
 
 def number(path, line, row, column):
@@ -40,3 +96,11 @@ def number(path, line, row, column):
     if not math.isfinite(value):
         raise InputError(f"{path}: line {line}: {column} is {row[column][:40]!r}; it must be a finite number.")
     return value
+
+
+def check_text(path, content):
+    """Raises InputError for bytes that are no text."""
+    try:
+        content.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: byte {error.start} is not text; give a CSV file.") from error

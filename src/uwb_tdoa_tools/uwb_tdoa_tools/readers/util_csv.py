@@ -9,9 +9,10 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
-from uwb_tdoa_bias.foundation.limits import CSV_BYTES, most_unpacked
+from uwb_tdoa_bias.foundation.limits import CSV_BYTES, CSV_CELLS, most_unpacked
 
 from .streams import SALVAGE, make_flight
+from .tables import Rows, check_text
 
 GZIP_MAGIC = b"\x1f\x8b"
 _BLOCK = 1 << 24  # bytes that are unpacked at once
@@ -29,6 +30,8 @@ _STREAMS = {  # our stream: {column of the file: column of the stream}, the time
 }
 _QUATERNION = {"pose_qx": "qx", "pose_qy": "qy", "pose_qz": "qz", "pose_qw": "qw"}
 TDOA_COLUMNS = tuple(_STREAMS["tdoa"])
+_KNOWN = {name for rename in _STREAMS.values() for name in rename} | {*_QUATERNION}
+_ROWS = 4096  # that are text at a time
 
 
 def read_util_csv(path, anchors, salvage=False, truth=True):
@@ -43,8 +46,8 @@ def read_util_csv(path, anchors, salvage=False, truth=True):
         tells what is missing.
     """
     remarks = []
-    header, rows = _table(path, _text(path, remarks, salvage), remarks, salvage)
-    cells = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
+    content = _text(path, remarks, salvage)
+    header, cells = _table(path, content, remarks, salvage)
 
     streams = {}
     for stream, rename in _STREAMS.items():
@@ -67,8 +70,7 @@ def read_util_csv(path, anchors, salvage=False, truth=True):
         streams["pose"].update({name: np.full(len(streams["pose"]["t"]), np.nan) for name in _QUATERNION.values()})
 
     meta = {"source": str(path), "format": "UTIL CSV", "remarks": remarks}
-    known = {name for rename in _STREAMS.values() for name in rename} | set(_QUATERNION)
-    if ignored := [name for name in header if name not in known]:
+    if ignored := [name for name in header if name not in _KNOWN]:
         meta["ignored_columns"] = ignored
     name = Path(path).name.removesuffix(".gz").removesuffix(".csv")
     return make_flight(name, anchors, streams, {}, meta, salvage, truth)
@@ -86,74 +88,120 @@ def _text(path, remarks, salvage):
         content = _unpacked(path, content, most, remarks, salvage)
     if len(content) > most:
         raise InputError(f"{path}: has more than {most} bytes of text, too many for one flight; split it.")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: byte {error.start} is not text; a UTIL CSV file (plain or gzip) was expected."
-        ) from error
-    if "\0" in text:
-        raise InputError(
-            f"{path}: byte {text.index(chr(0))} is 0, not text; a UTIL CSV file was expected: copy it again."
-        )
-    if not text.strip():
+    if b"\0" in content:
+        raise InputError(f"{path}: byte {content.index(0)} is 0, not text; a UTIL CSV file was expected: copy it again.")
+    if content.isspace():
         raise InputError(f"{path}: holds no text; a UTIL CSV file with a header line was expected.")
-    return text
+    return content
 
 
 def _unpacked(path, content, most, remarks, salvage):
     """What gzip holds, somewhat more than `most` bytes at most: its header does not tell how much that is."""
-    parts, size, problem = [], 0, "it ends early"
+    out, problem = io.BytesIO(), "it ends early"
     try:
-        while content and size <= most:  # a file may have several members
+        while content and out.tell() <= most:  # a file may have several members
             unpacker = zlib.decompressobj(zlib.MAX_WBITS | 16)
-            while content and not unpacker.eof and size <= most:
-                parts.append(unpacker.decompress(content, _BLOCK))
+            while content and not unpacker.eof and out.tell() <= most:
+                out.write(unpacker.decompress(content, _BLOCK))
                 content = unpacker.unconsumed_tail
-                size += len(parts[-1])
             if not unpacker.eof:
                 break
             content = unpacker.unused_data.lstrip(b"\0")  # as gzip itself does
             problem = None if not content else problem
     except zlib.error as error:
         problem = str(error)
-    if problem and size <= most:
+    if problem and out.tell() <= most:
         if not salvage:
             raise InputError(
                 f"{path}: the gzip data is cut or damaged ({problem}); copy the file again, or {SALVAGE}."
             )
         remarks.append(f"the gzip data is cut or damaged ({problem}): read up to there.")
-    return b"".join(parts)
+    return out.getvalue()
 
 
-def _table(path, text, remarks, salvage):
-    """Header, and rows of as many cells."""
-    if not text.endswith(("\n", "\r")):
-        line = len(text.splitlines())
+def _table(path, content, remarks, salvage):
+    """Header, and {name: _Column} of the columns that are known, of rows of as many cells."""
+    if not content.endswith((b"\n", b"\r")):
+        check_text(path, content)
+        line = content.count(b"\n") + content.count(b"\r") - content.count(b"\r\n") + 1
         if not salvage or line < 2:
             raise InputError(
                 f"{path}: line {line} has no line end: the file is cut; copy it again, end it with a new line if it is "
                 f"whole, or {SALVAGE}."
             )
         remarks.append(f"line {line} is cut and left out.")
-        text = text[: max(text.rfind("\n"), text.rfind("\r")) + 1]
-    lines, header, rows = csv.reader(io.StringIO(text, newline="")), None, []
+        content = content[: max(content.rfind(b"\n"), content.rfind(b"\r")) + 1]
+    rows, header, block, columns, count = Rows(path, content), None, [], {}, 0
     try:
-        for row in lines:
+        for row in rows:
             if header is None:
                 header = [name.strip() for name in row]
                 _check_header(path, header)
+                columns = {name: _Column() for name in header if name in _KNOWN}
             elif len(row) != len(header):
                 raise csv.Error(f"has {len(row)} cells, the header has {len(header)}")
             else:
-                rows.append(row)
+                block.append(row)
+            if len(block) == _ROWS:
+                _add(block, header, columns)
+                count += _ROWS
+            if count * len(header) > CSV_CELLS:
+                raise InputError(f"{path}: has more than {CSV_CELLS} cells, too many for one flight; split it.")
     except csv.Error as error:
         if header is None or not salvage:
-            raise InputError(f"{path}: line {lines.line_num} {error}; copy the file again, or {SALVAGE}.") from error
-        remarks.append(f"line {lines.line_num} {error}: read up to there.")
+            raise InputError(f"{path}: line {rows.line} {error}; copy the file again, or {SALVAGE}.") from error
+        remarks.append(f"line {rows.line} {error}: read up to there.")
     if header is None:
         raise InputError(f"{path}: holds no line that is whole; copy the file again.")
-    return header, rows
+    _add(block, header, columns)
+    return header, columns
+
+
+def _add(block, header, columns):
+    """Move rows to the columns."""
+    for name, cells in zip(header, zip(*block)):
+        if name in columns:
+            columns[name].add(cells)
+    block.clear()
+
+
+class _Column:
+    """What is needed of the cells of a column, of which there may be many more than memory would hold as text."""
+
+    def __init__(self):
+        self._parts, self._count = [], 0  # arrays of numbers, NaN for what is none, up to the first empty cell
+        self.end = None  # row of the first empty cell
+        self.odd = None  # (row, text, is a number) of the first cell that is no finite number
+        self.after = None  # row of the first cell after an empty one
+
+    def add(self, cells):
+        """Take more cells, text."""
+        cells = [cell.strip() for cell in cells]
+        if self.end is None:
+            filled = cells.index("") if "" in cells else len(cells)
+            self._take(cells[:filled])
+            if filled < len(cells):
+                self.end = self._count + filled
+        if self.end is not None and self.after is None and any(cells):
+            self.after = next((self._count + k for k, cell in enumerate(cells) if cell and self._count + k > self.end), None)
+        self._count += len(cells)
+
+    def _take(self, cells):
+        try:
+            self._parts.append(np.array(cells, dtype=float))
+        except ValueError:
+            self._parts.append(np.array([float(cell) if _is_number(cell) else np.nan for cell in cells]))
+        bad = np.flatnonzero(~np.isfinite(self._parts[-1]))
+        if self.odd is None and len(bad):
+            self.odd = self._count + bad[0], cells[bad[0]], _is_number(cells[bad[0]])
+
+    @property
+    def length(self):
+        return self._count if self.end is None else self.end
+
+    def values(self, length):
+        """The first numbers, (length,)."""
+        return np.concatenate([np.empty(0), *self._parts])[:length]
 
 
 def _check_header(path, header):
@@ -171,30 +219,24 @@ def _check_header(path, header):
 def _numbers(path, names, cells, salvage):
     """{name: (n,) float array} of the columns of one sensor: the rows before the first empty cell. NaN for what is no
     number, with salvage."""
-    columns = {name: [cell.strip() for cell in cells[name]] for name in names}
-    length = min((column.index("") if "" in column else len(column)) for column in columns.values())
-    values = {}
-    for name, column in columns.items():
-        after = next((row for row in range(length, len(column)) if column[row]), None)
-        if after is not None and not salvage:
+    columns = {name: cells[name] for name in names}
+    length = min(column.length for column in columns.values())
+    for name, column in {} if salvage else columns.items():
+        first = length if column.length > length else column.after
+        if first is not None:
             raise InputError(
-                f"{path}: line {after + 2}: {name} is {column[after]!r} although {', '.join(names)} ended with an "
+                f"{path}: line {first + 2}: {name} is filled although {', '.join(names)} ended with an "
                 f"empty cell at line {length + 2}; fill the columns of one sensor from the top, without holes."
             )
-        try:
-            values[name] = np.array(column[:length], dtype=float)
-        except ValueError:
-            row = next(row for row in range(length) if not _is_number(column[row]))
-            if not salvage:
-                raise InputError(f"{path}: line {row + 2}: {name} is {column[row]!r}; it must be a number.") from None
-            values[name] = np.array([float(cell) if _is_number(cell) else np.nan for cell in column[:length]])
-        bad = np.flatnonzero(~np.isfinite(values[name]))
-        if len(bad) and not salvage:
+        row, text, is_number = column.odd or (length, "", False)
+        if row < length and not is_number:
+            raise InputError(f"{path}: line {row + 2}: {name} is {text!r}; it must be a number.")
+        if row < length:
             raise InputError(
-                f"{path}: line {bad[0] + 2}: {name} is {column[bad[0]]!r}; it must be finite: leave the cells after "
+                f"{path}: line {row + 2}: {name} is {text!r}; it must be finite: leave the cells after "
                 "the end of a sensor empty, and delete broken measurements."
             )
-    return values
+    return {name: column.values(length) for name, column in columns.items()}
 
 
 def _is_number(cell):

@@ -13,8 +13,9 @@ from ..localizing.estimate import Estimator
 from ..localizing.rerun_file import write_rerun
 from ..readers.inputs import Reading, tell
 from ..results_file import ResultsFile, state_of
+from . import table
 from .evaluation import need_truth, score_of
-from .metrics import Result, Score
+from .metrics import Pool, Result, Score
 from .tum import write_tum
 
 
@@ -85,4 +86,13 @@ def results(judge, recordings, path, asked, jobs=None, dask=None):
         for key in keys:
             if key not in done:
                 done[key] = next(made).as_dict()
-            yield Result.from_dict(done[key])
+            yield done.read(key, _sound)
+
+
+def _sound(content):
+    """The Result of what a file holds, of which all figures can be made."""
+    result, pool = Result.from_dict(content), Pool()
+    pool.add(result)
+    table.line({**result.row, **pool.figures()})
+    table.lines_of_phases(result.phases)
+    return result

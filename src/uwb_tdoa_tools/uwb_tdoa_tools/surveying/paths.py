@@ -1,10 +1,12 @@
 """Paths of another odometry or SLAM: a CSV file, or a topic of the bags that the flights are in."""
 
+from array import array
 from pathlib import Path
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.limits import TABLE_CELLS
 
 from ..bags.bag import read_odometry
 from ..diagnosis.references.path import OdometryPath
@@ -32,15 +34,15 @@ def read_paths(source, flights, drift=DRIFT, namespace=""):
 
 
 def _of_table(path, flights, drift):
-    rows = {flight.name: [] for flight in flights}
-    for line, row in read_table(path, ("flight", *COLUMNS)):
+    rows = {flight.name: array("d") for flight in flights}
+    for line, row in read_table(path, ("flight", *COLUMNS), TABLE_CELLS):
         if row["flight"] in rows:
-            rows[row["flight"]].append([number(path, line, row, name) for name in COLUMNS])
+            rows[row["flight"]].extend(number(path, line, row, name) for name in COLUMNS)
     out = []
     for name, some in rows.items():
         if not some:
             raise InputError(f"{path}: holds no row of flight {name}; its first column names the flight.")
-        table = np.array(some)
+        table = np.array(some).reshape(-1, len(COLUMNS))
         if (np.diff(table[:, 0]) <= 0.0).any():
             raise InputError(f"{path}: the stamps of flight {name} do not rise; sort its rows by t.")
         out.append(OdometryPath(name, table[:, 0], table[:, 1:], drift))

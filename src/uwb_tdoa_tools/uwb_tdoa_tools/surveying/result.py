@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.elsewhere import elsewhere
 
 from ..diagnosis.calibration import LEFT, why_marks_speak_against
 from ..diagnosis.self_survey import Surveyed, calibrated
@@ -127,7 +128,8 @@ class Result:
 
     def picture(self, path):
         """Plan and elevation, before and after, with 95 % intervals."""
-        from matplotlib.figure import Figure  # takes a second to import
+        with elsewhere():  # where no settings of others are
+            from matplotlib.figure import Figure  # takes a second to import
 
         figure = Figure(figsize=(11.0, 5.0), layout="constrained")
         found = self.surveyed.anchors.positions
