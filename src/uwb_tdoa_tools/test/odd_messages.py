@@ -131,7 +131,7 @@ def odd(message, rng):
         elif isinstance(value, int) and not isinstance(value, bool):
             signed, bits = not kind.startswith("u"), int("".join(filter(str.isdigit, kind)) or 8)
             low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-            setattr(message, name, int(rng.choice([low, high, int(rng.integers(low, min(high, 2**63 - 1)))])))
+            setattr(message, name, (low, high, int(rng.integers(low, min(high, 2**63 - 1))))[rng.integers(3)])
         elif isinstance(value, np.ndarray) and len(value):
             value[rng.integers(len(value), size=3)] = rng.choice(EXTREME, size=3)
     return message

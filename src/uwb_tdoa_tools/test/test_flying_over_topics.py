@@ -110,3 +110,15 @@ def test_where_the_filter_does_not_run_it_knows_nothing_and_says_why(topics):
     assert topics.deviation == np.inf and topics.why == "the tag is lost"
     topics.status = None
     assert topics.deviation == np.inf and "nothing came on status" in topics.why
+
+
+def test_odometry_from_before_anything_was_measured_is_not_taken(topics):
+    """Whoever publishes it would have ended the node: in real time stamps count from the start, and there was none."""
+    topics._begin = None
+    hear(topics, odometry(4.9))
+    assert topics.pose is None
+
+
+def test_a_flood_of_odometry_does_not_fill_it(topics):
+    hear(topics, *(odometry(4.0 + 1e-6 * k) for k in range(2000)))
+    assert len(topics.odometry.t) <= 5
