@@ -85,7 +85,7 @@ def test_nothing_is_advised_on_what_the_data_do_not_tell(effect, value, doubt):
             "anchor_position",
             {"5.x": 0.2, "5.z": -0.1},
             {"5.x": 0.01, "5.z": 0.01},
-            ["+x", "-z", "Survey anchor 5 again"],
+            ["+x", "-z", "Measure anchor 5 again before you move it"],
         ),
         ("nlos", {"1.delay": 0.5, "1.start": 20, "1.end": 32}, {"1.delay": 0.02}, ["from 20 to 32 s", "anchor 1"]),
         ("imu_misalignment", {"z": -0.0698}, {"z": 0.005}, ["Turn the IMU by 4.0 ± 0.3 degrees about z"]),

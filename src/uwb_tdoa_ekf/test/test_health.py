@@ -149,10 +149,12 @@ def test_what_is_wrong_with_the_streams_is_said_before_what_comes_of_it(clock):
         return judge.report(None, estimator, Counter(counts), wiring, findings)
 
     level, text, values = said(STARTING, [publishers], [units, slow])
-    assert (level, text) == (ERROR, "the accelerometer is in g (it is 1.0): multiply it")
+    first = "the accelerometer is in g (it is 1.0): multiply it"
+    assert (level, text) == (ERROR, f"{first} | {publishers} | imu/data is slow (20 Hz): raise it")
+    assert said(STARTING, [publishers, "one", "two"], [units, slow])[1].endswith("| one | and 2 more")
     assert publishers in values["wrong with the streams"] and "imu/data is slow" in values["wrong with the streams"]
     assert (values["found imu_force_unit"], values["found rate"]) == ("9.81", "20")
-    assert said(RUNNING, [publishers], [slow], used=400)[:2] == (WARN, publishers)
+    assert said(RUNNING, [publishers], [slow], used=400)[:2] == (WARN, f"{publishers} | imu/data is slow (20 Hz): raise it")
     assert said(RUNNING, [], [slow], used=800)[:2] == (WARN, "imu/data is slow (20 Hz): raise it")
     level, text, values = said(RUNNING, used=1200)
     assert (level, text, values["wrong with the streams"]) == (OK, "running", "nothing")

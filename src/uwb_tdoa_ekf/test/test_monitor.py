@@ -151,3 +151,15 @@ def test_does_not_depend_on_when_it_is_asked():
             monitor.judge(t[part][-1])
         said.append((monitor.alarms, monitor.delays[0].tolist()))
     assert said[0][0] and said[0] == said[1] == said[2]
+
+
+def test_a_swap_is_named_until_something_else_has_been_true_for_a_while(monkeypatch):
+    """Text flipped between two pairs and "running" from one half second to the next."""
+    answers = iter([(), (3, 4), *5 * [(1, 2)], (), (3, 4), (1, 2), (), (3, 4), *12 * [()], *20 * [(3, 4)]])
+    monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.swapped", lambda *_: next(answers, (3, 4)))
+    monitor, named = Monitor(ANCHORS), []
+    for _ in range(44):
+        monitor._look_for_swap(np.zeros(1, int), np.ones(1, int), np.zeros(1), np.zeros(3))
+        named.append(monitor._swapped)
+    kept = [pair for k, pair in enumerate(named) if k == 0 or pair != named[k - 1]]
+    assert kept == [(), (1, 2), (), (3, 4)] and named.count((1, 2)) > 12

@@ -40,7 +40,7 @@ from .estimator import STREAMS, VERDICTS, Estimator, invalid
 from .frames import rotation_std
 from .imu_mount import ImuMount
 from .monitoring.change import YOUNGEST, ChangeDetector
-from .monitoring.health import OK, WARN, Health
+from .monitoring.health import OK, WARN, Health, together
 from .monitoring.slices import LENGTH, Slice
 from .monitoring.status import status_of, yaw_in_words
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
@@ -358,7 +358,7 @@ class EkfNode(ros.StreamNode):
         frames = [*self._frame_troubles(), self._frames.trouble]
         others = [*filter(None, [*frames, self.outputs.trouble, refused, *alarms])]
         if level == OK and others:
-            level, text = WARN, others[0]
+            level, text = WARN, together(others)
         values |= {"yaw": yaw_in_words(self._yaw_std()), "frames of imu/data": heard or "none yet"}
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
         outside = self._imu_corrector.outside if estimator is not None else []

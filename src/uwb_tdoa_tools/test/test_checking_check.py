@@ -10,6 +10,7 @@ from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import constellation
 from uwb_tdoa_tools.studies.checking.mistakes import MISTAKES
+from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
 
 from checking_flights import QUICK, recording
 
@@ -108,3 +109,23 @@ def test_measured_flights_and_their_mistakes(shared_data, name):
         other = dict((p.rsplit("/")[-1], a) for p, a in surveys)["anchor_const1.csv"]
         made = MISTAKES[mistake].make(measured, np.random.default_rng(1), other)
         assert rules(check(made, surveys)) & set(MISTAKES[mistake].named)
+
+
+OF_ANOTHER_ROOM = {"ids_swapped", "pair_sign", "imu_rate_unit", "imu_axes", "tdoa_sign"}  # what it was taken for
+
+
+def test_a_survey_of_another_room_is_not_blamed_on_ids_nor_on_the_gyroscope():
+    """Eight anchors elsewhere under the same ids: many of them exchanged explain most of it, and a slower gyroscope the rest."""
+    flight = clean_flight(702, 40.0)
+    elsewhere = flight.anchors.positions[[3, 7, 2, 5, 0, 4, 1, 6]] * [0.8, 1.0, 1.0] + [0.5, 0.0, 0.2]
+    found = rules(check(of_flight(replace(flight, anchors=flight.anchors.at(elsewhere)))))
+    assert "survey_misfit" in found and not found & OF_ANOTHER_ROOM
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("log", "survey"), [("util/const1-trial2-tdoa2.csv.gz", "const4.csv"), ("flights/0425/TDOA2/0425-traj2", "const1.csv")])
+def test_a_measured_log_with_the_survey_of_another_room(log, survey, shared_data):
+    """The first was said to have the sign of all TDOAs wrong."""
+    (flight,) = inputs.Reading(str(shared_data / "surveys" / f"anchor_{survey}")).flights([str(shared_data / log)])
+    found = rules(check(of_flight(flight)))
+    assert "survey_misfit" in found and not found & OF_ANOTHER_ROOM

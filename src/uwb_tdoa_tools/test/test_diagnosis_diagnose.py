@@ -4,6 +4,7 @@ import json
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
@@ -75,3 +76,33 @@ def test_two_processes_give_the_same_to_the_bit(tmp_path, more):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
     told = json.loads((tmp_path / "1" / "diagnosis.json").read_text())
     assert told["findings"][0]["added"] and (more or told["unattributed"][0]["flight"] == flights[1].name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("inertial", [False, True])
+def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
+    """It was "87 % gone", and tdoa_time_offset -0.41 s made another flight worse."""
+    fitted, other = (clean_flight(seed, 40.0) for seed in (100, 101))
+    if not inertial:
+        fitted, other = fitted.without("imu"), other.without("imu")
+    result = diagnose([shifted(fitted, "truth", 0.4)], [other])
+    assert not {"tdoa_time_offset", "truth_frame"} & {effect.name for effect in result.effects}
+    assert result.after["pooled"]["rmse_3d"] <= 1.05 * result.before["pooled"]["rmse_3d"]
+    (said,) = result.of_truth[fitted.name]
+    assert ("gyroscope" in said) == inertial and said in result.as_text().replace("\n          ", " ")
+    assert list(result.as_json()["ground_truth"]) == [fitted.name]
+
+
+@pytest.mark.slow
+def test_without_inertial_sensor_the_clock_of_the_tdoas_is_left_alone():
+    late = shifted(clean_flight(100, 40.0).without("imu"), "tdoa", 0.06)  # too little to be seen before anything else
+    result = diagnose([late])
+    assert "tdoa_time_offset" not in {effect.name for effect in result.effects}
+    assert "tdoa_time_offset" in {item.effect for item in result.unobservable}
+
+
+@pytest.mark.slow
+def test_ground_truth_of_another_epoch_is_one_sentence(flight, tmp_path, capsys):
+    write_bag(shifted(flight, "truth", 1.7e9), tmp_path / "epoch")
+    assert main([str(tmp_path / "epoch"), "--out", str(tmp_path / "out")]) == 2
+    assert "the ground truth is on another clock than the TDOAs" in capsys.readouterr().err

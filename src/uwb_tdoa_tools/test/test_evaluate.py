@@ -8,11 +8,13 @@ import yaml
 
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
+from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import new_bag
+from uwb_tdoa_tools.commands.convert import main as convert
 from uwb_tdoa_tools.commands.evaluate import main
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.bags.message_types import typestore
@@ -406,3 +408,34 @@ def test_a_name_is_no_command_to_picture_table_or_terminal(flight, tmp_path, cap
     assert main([str(folder / "none")]) == 2
     said = capsys.readouterr()
     assert "\x1b" not in said.out + said.err and r"\x1b[2Jflights" in said.err and "__frac_ _b____31m" in said.out
+
+
+@pytest.mark.slow
+def test_ground_truth_of_another_epoch_is_refused_or_aligned(flight, tmp_path, capsys):
+    """It was evaluated to nan with exit code 0, and converted to a recording of 1.7e9 s."""
+    other = shifted(flight, "truth", 1.7e9)
+    write_bag(other, tmp_path / "epoch")
+    assert main([str(tmp_path / "epoch")]) == 2
+    assert "on another clock than the TDOAs: its stamps go from 1700000000" in capsys.readouterr().err
+    assert main([str(tmp_path / "epoch"), "--align", "time", "--json", str(tmp_path / "errors.json")]) == 0
+    (run,) = json.loads((tmp_path / "errors.json").read_text())["runs"]
+    assert "nan" not in capsys.readouterr().out and run["rmse_3d"] < 0.2
+    assert run["aligned"]["late"] == pytest.approx(1.7e9, abs=0.05) and run["aligned"]["rmse_3d_none"] is None
+    assert convert([str(tmp_path / "epoch"), "--out", str(tmp_path / "one")]) == 2
+    assert convert([str(tmp_path / "epoch"), "--align", "time", "--out", str(tmp_path / "one")]) == 0
+    capsys.readouterr()
+    assert main([str(tmp_path / "one")]) == 0
+
+
+@pytest.mark.slow
+def test_what_is_found_of_the_ground_truth_is_told_with_the_error_of_each(flight, tmp_path, capsys):
+    write_bag(shifted(flight, "truth", 0.4), tmp_path / "late")
+    errors = {}
+    for how in ("none", "time", "frame"):
+        assert main([str(tmp_path / "late"), "--align", how, "--json", str(tmp_path / "errors.json")]) == 0
+        (run,) = json.loads((tmp_path / "errors.json").read_text())["runs"]
+        assert run["rmse_3d"] == run["aligned"][f"rmse_3d_{how}"]
+        errors[how] = run["rmse_3d"]
+        out, err = capsys.readouterr()
+        assert "its stamps 0.4" in out and "--align time" in out and ("judge with --align time" in err) == (how == "none")
+    assert errors["time"] < 0.5 * errors["none"] and errors["frame"] <= errors["time"] + 0.01

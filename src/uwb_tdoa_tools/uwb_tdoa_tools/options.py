@@ -6,6 +6,7 @@
     options.add_most(parser, 10**6)                 # --most
     options.add_known(parser)                       # --marks, --distances
     options.add_tape(parser)                        # --std, --height-std, --trusted, --trusted-std, --unknown
+    options.add_align(parser)                       # --align
     reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
@@ -21,6 +22,7 @@ from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 from .localizing.estimate import Estimator
 from .parallel import whole_number
 from .readers import inputs
+from .scoring.alignment import ALIGN, NONE
 from .surveying.distances import read_distances
 from .surveying.marks import read_marks
 from .surveying.tape import Tape
@@ -147,6 +149,17 @@ def tape_of(args, effects):
     if effects is not None and effects.covariance is not None:
         refuse(args, OF_TAPE, f"{args.effects} says how well each anchor is known, by its last calibration")
     return Tape(**{name: getattr(args, name) for name in OF_TAPE if given(args, name)}, unknown=tuple(args.unknown))
+
+
+def add_align(parser, judges=False):
+    """--align. judges : of a tool that judges by ground truth, and may move its frame too; else of what learns from it."""
+    words = "ground truth on another clock (another epoch): none refuses it (default), time finds how far they are apart"
+    if judges:
+        words = (
+            "what of the ground truth to move onto the estimate before it is judged: none (default); time, its stamps; frame, its frame too, "
+            "turned and shifted (as evo -a, without scale). What is found is told in any case, with the error of each"
+        )
+    parser.add_argument("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=words)
 
 
 def add_known(parser):

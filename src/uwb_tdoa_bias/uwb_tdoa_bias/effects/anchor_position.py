@@ -79,8 +79,8 @@ class AnchorPosition(Effect):
         moved = {anchor: listed(by[axis] for axis in sorted(by)) for anchor, by in shifts.items()}
         each = [f"{f'anchor {anchor}' if len(moved) > 1 else 'it'} seems off by {by}" for anchor, by in moved.items()]
         return (
-            f"Survey {counted(sorted(shifts, key=int), 'anchor')} again: {'; '.join(each)}. If the survey proves "
-            "right, ranges to there are wrong by direction.",
+            f"Measure {counted(sorted(shifts, key=int), 'anchor')} again before you move {'them' if len(moved) > 1 else 'it'}: {'; '.join(each)}. "
+            "If the survey proves right, ranges to there are wrong by direction.",
         )
 
     def marks(self, anchors):

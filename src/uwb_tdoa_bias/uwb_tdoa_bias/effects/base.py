@@ -63,6 +63,8 @@ class Effect:
     price: ClassVar[float] = 0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
     distinguished_by: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
     usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
+    unused: ClassVar[str] = "nodes cannot, or need not, take it out"  # why not, where it is not usable
+    witnesses: ClassVar[tuple] = ()  # channels, one of which must be there too: else what it is compared with may be as wrong
     weighed: ClassVar[bool] = False  # may be there or not: the filter weighs that, and no Corrector takes it out
     needs_reference: ClassVar[bool] = False  # cannot be told from the filter's innovations alone
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag

@@ -22,6 +22,7 @@ class TdoaTimeOffset(StampEffect):
     distinguished_by = {
         "truth_time_offset": "a flight with IMU: its stamps belong to neither",
     }
+    witnesses = ("gyro", "accel")  # without an inertial sensor the ground truth may as well be late
     reference = "UTIL web page: about 10 ms of radio latency"
     needs_reference = True
 

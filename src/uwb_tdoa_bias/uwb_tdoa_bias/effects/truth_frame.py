@@ -14,7 +14,8 @@ DEGREES = 180.0 / np.pi
 
 class TruthFrame(Effect):
     """In the frame of the truth, an anchor surveyed at A stands at R A + (x, y, z), R of the rotation vector (roll,
-    pitch, yaw). Correcting it moves the anchors, so that estimates come out in the frame of the truth."""
+    pitch, yaw). Which of the two frames is right nobody can tell, so that nodes are not given it. Where effects.yaml has it,
+    correcting it moves the anchors, so that estimates come out in the frame of the truth."""
 
     name = "truth_frame"
     unit = "m, rad"
@@ -27,6 +28,8 @@ class TruthFrame(Effect):
     reference = "rigid alignment of two coordinate frames"
     needs_reference = True
     portable = False
+    usable = False
+    unused = "whether the survey or the ground truth is turned or shifted nobody can tell, so that nothing goes to the nodes"
 
     @classmethod
     def groups(cls, anchors, pairs):

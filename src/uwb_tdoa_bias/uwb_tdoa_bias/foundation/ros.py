@@ -4,6 +4,8 @@ import argparse
 from copy import copy
 from functools import wraps
 import gc
+import math
+import re
 import signal
 import sys
 import time
@@ -36,6 +38,9 @@ STREAM_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 OUTPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LARGEST_LOSS = 0.01  # share of the messages of a second
 BEHIND = 0.5  # s that something may wait until this process serves it
+AGAIN = 30.0  # s after which the log says what it has said before
+# Of what is measured: with a sign, a decimal point or a unit. The id of an anchor has none of these.
+NUMBER = re.compile(r"[-+]\d+(\.\d+)?|\d+\.\d+|\d+(?=\s*(%|s\b|ms\b|m\b|Hz|messages|samples|TDOAs|times))")
 REPORT_PERIOD, LOOKS = 1.0, 5  # s from one report to the next, and looks in between at what is to be told at once
 PAUSED, SLOWEST_CLOCK = 0.5, 2.0  # s without a new time on /clock; s from one time to the next of a clock that runs
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
@@ -270,14 +275,14 @@ def orientation_of(q):
 
 class Diagnostics:
     """Publishes one status on /diagnostics each second of the wall clock, and at once when simulated time stops or goes on; logs it
-    whenever its text changes.
+    when it says something else than before (see Saying).
 
     report() -> (level, text, {key: value}), with level one of DiagnosticStatus.OK, WARN, ERROR; look() : called LOOKS times a
     second.
     """
 
     def __init__(self, node, report, look=lambda: None):
-        self._node, self._report, self._look, self._said = node, report, look, None
+        self._node, self._report, self._look, self._saying = node, report, look, Saying()
         self._clock, self._judgement, self._looks = SimulatedClock(node), None, 0
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS_QOS)
         node.create_timer(REPORT_PERIOD / LOOKS, self._on_timer, clock=SteadyClock(clock_type=ClockType.STEADY_TIME))
@@ -309,19 +314,35 @@ class Diagnostics:
         if refused and level == DiagnosticStatus.OK:
             level, text = DiagnosticStatus.WARN, refused
         level, text = self._judgement or (level, text)
-        if text != self._said:
+        if self._saying.anew(text, time.monotonic()):
             logger = self._node.get_logger()
             if level == DiagnosticStatus.OK:
                 logger.info(text)
             else:  # a statement of its own: rclpy allows one severity per line
                 logger.warning(text)
-            self._said = text
         name = self._node.get_fully_qualified_name()
         values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=name, values=values)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
+
+
+class Saying:
+    """What is worth a line of the log: a sentence of another kind than the last one. Sentences that differ in measured numbers alone,
+    not in the anchors that they name, are of one kind, and each kind is said once in AGAIN seconds."""
+
+    def __init__(self):
+        self._last, self._when = None, {}
+
+    def anew(self, text, now):
+        """Whether to say a text now, s; then it counts as said."""
+        kind = NUMBER.sub("#", text)
+        if kind == self._last or now - self._when.get(kind, -math.inf) < AGAIN:
+            return False
+        self._when = {one: when for one, when in self._when.items() if now - when < AGAIN} | {kind: now}
+        self._last = kind
+        return True
 
 
 class SimulatedClock:

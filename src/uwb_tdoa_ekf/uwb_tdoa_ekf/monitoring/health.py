@@ -14,6 +14,7 @@ START_TIMEOUT = 5.0  # s of data without a start position before it becomes a wa
 BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is of another time
 STOPPED = 2.0  # s without a message of an aid that was there, before it becomes a warning
 LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it becomes a warning
+MOST_SAID = 3  # sentences in one text; all of them are among the values
 REPEATS = 2  # reports in a row in which that is so of an aid; optical flow contradicts everything else for a second at times
 
 REMEDY = {  # of each aid, what to check
@@ -148,10 +149,16 @@ class Health:
 
 
 def _worst(wiring, findings):
-    """(level, text) of the worst; findings come most severe first."""
-    if findings and (findings[0].severity == SEVERE or not wiring):
-        return ERROR if findings[0].severity == SEVERE else WARN, findings[0].sentence
-    return WARN, wiring[0]
+    """(level, text) of what is wrong, the worst first; findings come most severe first."""
+    severe = [finding for finding in findings if finding.severity == SEVERE]
+    said = [*(f.sentence for f in severe), *wiring, *(f.sentence for f in findings if f not in severe)]
+    return ERROR if severe else WARN, together(said)
+
+
+def together(sentences):
+    """One text of several sentences, the first MOST_SAID of them."""
+    more = len(sentences) - MOST_SAID
+    return " | ".join([*sentences[:MOST_SAID], *([f"and {more} more"] if more > 0 else [])])
 
 
 def _behind(seconds):

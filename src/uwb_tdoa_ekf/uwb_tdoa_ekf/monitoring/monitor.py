@@ -26,6 +26,7 @@ SMALLEST_CHANGE = 0.15  # m; less does not matter, and what has come back to tha
 SILENT, FEWEST = 4, 40  # slices without an anchor, and the TDOAs of the others in them
 OFTEN = 0.5  # share of the slices in which it was heard before
 TOGETHER = 4  # slices in which a swap is looked for
+NAMED, HELD = 4, 8  # slices in a row that must say so until a swap is named, and something else until it is no longer
 CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
 BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}  # rad/s and m/s^2, by which an estimated bias must have moved
 
@@ -52,6 +53,7 @@ class Monitor:
         self._slices, self._heard, self._missing = 0, np.zeros(n), np.zeros(n)  # slices: all, with each, lately without it
         self._counts = []  # TDOAs of the last slices
         self._swapped, self._silent = (), ()  # rows
+        self._instead = (), 0  # rows of another swap, or of none, and slices in a row that say so
         self._moving_since = None  # s, stamp
         self._bias = self._bias_now = None  # (6,): gyroscope, accelerometer; as calibrated, and the latest
         self._bias_calibration = []
@@ -121,8 +123,7 @@ class Monitor:
             return
         self._follow_biases(end, np.concatenate([gyro_bias[-1], accel_bias[-1]]))
         place = p.mean(axis=0)
-        self._look_for_swap(a, b, innovation, place)
-        if not self._swapped:
+        if not self._look_for_swap(a, b, innovation, place) and not self._swapped:
             self._detector.add(reduced(end - 0.5 * LENGTH, place, self._anchors.positions, a, b, innovation))
             self._look_for_change(end)
 
@@ -138,10 +139,16 @@ class Monitor:
         self._changes = {row: found for row, found in self._changes.items() if abs(delays[row]) > SMALLEST_CHANGE}
 
     def _look_for_swap(self, a, b, innovation, place):
+        """Whether this slice looks like one: it is named once several do."""
         positions = self._anchors.positions
         measured = innovation + tdoa(place, positions[a], positions[b])
         self._latest = [*self._latest[1 - TOGETHER :], (a, b, measured, np.broadcast_to(place, (len(a), 3)))]
-        self._swapped = swapped(positions, *map(np.concatenate, zip(*self._latest)))
+        found = swapped(positions, *map(np.concatenate, zip(*self._latest)))
+        other, count = self._instead
+        self._instead = found, count + 1 if found == other else 1
+        if self._instead[1] >= (HELD if self._swapped else NAMED):
+            self._swapped = found
+        return bool(found)
 
     def _listen(self, a, b):
         """Which anchors are not heard any more, while others are?"""

@@ -14,7 +14,7 @@ FEWEST = 20  # TDOAs with either of the two
 
 
 def swapped(positions, a, b, d, p):
-    """Rows of two anchors which, exchanged, explain what is wrong, or ().
+    """Rows of two anchors, the smaller first, which, exchanged, explain what is wrong, or ().
 
     positions : (N, 3) m; a, b : (n,) rows; d : (n,) m, measured; p : (n, 3) m, where the filter had the tag. A filter that
     has enough other anchors stays where the tag is.
@@ -35,5 +35,5 @@ def swapped(positions, a, b, d, p):
         left = np.abs(d - tdoa(p, exchanged[a], exchanged[b]))
         then = np.median(left[concerned])
         if now > LARGE and GAIN * then < now and then < best and np.quantile(left, SHARE) < WITHIN:
-            best, pair = then, (i, k)
+            best, pair = then, (min(i, k), max(i, k))
     return pair

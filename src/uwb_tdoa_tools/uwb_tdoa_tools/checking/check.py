@@ -25,12 +25,16 @@ HOPELESS = {
     "tdoa_clipped",
 }
 WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "imu_clipped"}
+OTHER_SURVEY = "--survey FOLDER  # with all surveys: check says which one fits; or survey the anchors again"
+# What a survey of another room is taken for: many things explain some of it, and it does not fit with them undone either.
+BLAMED = {"tdoa_sign", "ids_swapped", "pair_sign", "tdoa_one_sign", "anchor_moved"}
 # What a finding explains that the stream itself only shows.
 EXPLAINS = {
     "tdoa_unit": {"tdoa_large", "tdoa_outliers", "tdoa_rounded"},
     "ids_renumbered": {"ids_unknown", "anchor_missing"},
     "ids_swapped": {"tdoa_large", "tdoa_outliers"},
     "survey_other": {"tdoa_large", "tdoa_outliers"},
+    "survey_misfit": {"tdoa_large", "tdoa_outliers"},
     "tdoa_one_sign": {"tdoa_one_sign"},
 }
 
@@ -110,19 +114,31 @@ def upright(force):
 
 def _tried(case, names, others):
     """([Finding], places of the tag (k, 3) m): what is found by undoing it."""
-    found = []
+    found, given = [], case
     for _ in range(ROUNDS):
         finding, case = tdoa_rules.best(case, others)
         if finding is None:
             break
         found.append(finding)
     fit = tdoa_rules.survey_fit(case)
+    blamed = [finding for finding in found if finding.rule in BLAMED]
     if not found:
         found += _misfit(fit)
+    elif blamed and tdoa_rules.gained(fit) is not None:  # what was put right did not make it fit
+        found = [finding for finding in found if finding not in blamed]
+        found += [*_misfit(tdoa_rules.survey_fit(given))] or [*_misfit(fit)]
     if case.imu is not None and not names & WITHOUT_IMU and not any(f.rule == "survey_misfit" for f in found):
         finding = imu_rules.fit(case)
         found += [finding] if finding else []
+        if finding and (mixed := [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]):
+            found = [other for other in found if other is not finding and other not in mixed] + [_other_room(*mixed)]
     return found, fit.places
+
+
+def _other_room(mixed):
+    """Many ids mixed up and a faulty inertial sensor at once: rather the survey of another room, of which both are what it looks like."""
+    cause = "the survey is of another room, or its ids are mixed up: with many ids exchanged it nearly fits, and the inertial sensor does not"
+    return Finding("survey_misfit", ERROR, cause, mixed.evidence, OTHER_SURVEY, mixed.value)
 
 
 def _misfit(fit):
@@ -133,8 +149,7 @@ def _misfit(fit):
         evidence = f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
         evidence += f"by {np.median(displacement(fit.positions, anchors)):.1f} m in the median"
         cause = "the survey does not fit: of another room, or anchors have been moved"
-        remedy = "--survey FOLDER  # with all surveys: check says which one fits; or survey the anchors again"
-        yield Finding("survey_misfit", ERROR, cause, evidence, remedy, gain)
+        yield Finding("survey_misfit", ERROR, cause, evidence, OTHER_SURVEY, gain)
 
 
 def _facts(recording, streams):

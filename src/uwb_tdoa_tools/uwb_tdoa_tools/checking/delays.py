@@ -36,6 +36,14 @@ class Delays:
         best = int(np.argmin(total))
         return float(total[best] / max(total[NONE], 1e-12)), float(DELAYS[best])
 
+    def exact(self):
+        """s, the best delay of all, between those that are tried: the vertex of a parabola through the three about it."""
+        total = self.power.sum(axis=(0, 1))
+        k = int(np.clip(np.argmin(total), 1, len(total) - 2))
+        before, here, after = total[k - 1 : k + 2]
+        bend = before - 2.0 * here + after
+        return float(DELAYS[k] + (0.5 * STEP * np.clip((before - after) / bend, -1.0, 1.0) if bend > 0.0 else 0.0))
+
     def drift(self):
         """(ratio, s): what is left if the delay changes evenly, over what is left with a constant one; from first to last block."""
         of = self.power.sum(axis=0)

@@ -38,7 +38,7 @@ ATTITUDES = {
 
 
 class TrueMotion:
-    """measured {"gyro", "accel": (n, 3)}, means over cells at t (n,) s in the air; block (n,), of BLOCK seconds; smooth {sensor: bool},
+    """measured {"gyro", "accel": (n, 3)}, means over cells at t (n,) s in the air, or of all of a rover; block (n,), of BLOCK seconds; smooth {sensor: bool},
     whether it changes too evenly for a sensor that vibrates."""
 
     def __init__(self, flight):
@@ -47,7 +47,8 @@ class TrueMotion:
         known = np.isfinite(truth.q).all(axis=1)
         self._t, first = np.unique(truth.t[known], return_index=True)
         self._p, self._q = truth.p[known][first], truth.q[known][first]
-        flown = self._t[self._p[:, 2] > 0.3]
+        above = self._p[:, 2] > 0.3
+        flown = self._t[above] if above.any() else self._t  # a rover
         margin = LONGEST + 0.5
         start, end = max(flown[0], imu.t[0], self._t[0]) + margin, min(flown[-1], imu.t[-1], self._t[-1]) - margin
         self.t = start + CELL * np.arange(max(int((end - start) / CELL), 0))

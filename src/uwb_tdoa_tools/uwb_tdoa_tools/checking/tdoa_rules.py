@@ -30,6 +30,7 @@ ALONE = 0.85  # share of the gain that one anchor explains
 FEWEST = 10  # windows in which the tag was located
 CONTRARY, FAR = 0.7, 0.5  # share of a pair's TDOAs that fit the other sign, of those longer than that, m
 MOST_PAIRS = 4  # that may be wrong by themselves
+MIXED_UP = "the ids of anchors are mixed up"  # of more than two
 SAME = 0.2  # m at most between the places of an anchor in two surveys of one installation
 
 
@@ -139,7 +140,7 @@ def swapped(case):
     if not table or (len(table) > 2 and gained(survey_fit(trial)) is not None):
         return  # a survey of another room is explained better by exchanging many ids, and still does not fit
     names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
-    cause = "the ids of two anchors are swapped" if len(table) == 2 else "the ids of anchors are mixed up"
+    cause = "the ids of two anchors are swapped" if len(table) == 2 else MIXED_UP
     yield Trial(
         trial,
         _says(

@@ -10,6 +10,7 @@ from .. import cli, options
 from ..bags.convert import convert
 from ..bags.files import STORAGES
 from ..readers import columns, read_survey
+from ..scoring.settling import on_one_clock
 
 DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
@@ -40,6 +41,7 @@ def parser():
     made.add_argument("input", metavar="IN", nargs="+", help="the recording; its kind is found by its content")
     made.add_argument("--columns", metavar="MAP", help=columns.HELP)
     options.add_reading(made)
+    options.add_align(made)
     made.add_argument("--out", metavar="BAG", required=True, help="the bag to write, a new directory")
     made.add_argument("--storage", choices=STORAGES, default="mcap", help="default: mcap")
     made.add_argument("--force", action="store_true", help="replace an existing bag")
@@ -48,7 +50,7 @@ def parser():
 
 
 def _convert(args):
-    made = convert(lambda: _read(args), args.out, args.storage, args.force)
+    made = convert(lambda: on_one_clock(_read(args), args.align), args.out, args.storage, args.force)
     if args.json:
         cli.show(json.dumps(asdict(made), indent=2, default=str))
         return

@@ -42,6 +42,7 @@ def parser():
     for one, nargs in ((fitting, "*"), (judging, "+")):
         options.add_recordings(one, nargs)
         options.add_filter(one)
+        options.add_align(one)
         one.add_argument("--json", metavar="FILE", type=Path, help="write all figures")
         parallel.add_options(one)
     add = fitting.add_argument
@@ -63,7 +64,7 @@ def _fit(args):
         raise InputError("FLIGHT: there is none; give flights with ground truth, or --static points.")
     if not 0.01 <= args.step <= 10.0:
         raise InputError(f"--step: {args.step!r} is outside 0.01 ... 10 m.")
-    estimator = Estimator(options.reading_of(args), *options.filter_of(args))
+    estimator = Estimator(options.reading_of(args), *options.filter_of(args), args.align)
     recordings, held = (estimator.reading.find(paths, bool(args.dask)) for paths in (args.flights, args.holdout))
     shared = {path.resolve() for path, _ in recordings} & {path.resolve() for path, _ in held}
     if shared:
@@ -87,7 +88,7 @@ def _fit(args):
 
 def _judge(args):
     cli.check_folders(args.json)
-    estimator, made = Estimator(options.reading_of(args), *options.filter_of(args)), BiasMap.load(args.map)
+    estimator, made = Estimator(options.reading_of(args), *options.filter_of(args), args.align), BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     report.say_rows("flight", rows)
     _write(args.json, {"map": report.about_figures(made), "runs": rows})

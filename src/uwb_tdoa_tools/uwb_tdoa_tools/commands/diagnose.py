@@ -67,6 +67,7 @@ def parser():
     )  # fmt: skip
     add("--drift", type=float, default=DRIFT, metavar="M", help="of that, m per square root of a second (default %(default)s)")
     options.add_most(made, MOST)
+    options.add_align(made)
     parallel.add_options(made)
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
@@ -94,7 +95,8 @@ def _diagnose(args):
     known = options.known_of(args, (*flights, *holdout))
     if args.odometry is not None:
         known = (*known, *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace))
-    reference = REFERENCES[args.reference](config, known)
+    align = {"align": args.align} if args.reference == "truth" else {}
+    reference = REFERENCES[args.reference](config, known, **align)
     over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # no bar beside the line of Progress
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress, over)

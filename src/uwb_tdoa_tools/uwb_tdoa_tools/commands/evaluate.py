@@ -44,6 +44,7 @@ def parser():
     add = made.add_argument
     options.add_recordings(made)
     options.add_estimator(made)
+    options.add_align(made, judges=True)
     add("--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT")
     add("--json", metavar="FILE", help="write all figures: runs, pooled")
     add("--markdown", metavar="FILE", help="write the table as Markdown")
@@ -74,7 +75,7 @@ def _evaluate(args):
             raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
     trajectories = cli.output_folder(args.tum, "--tum").absolute() if args.tum else None
     rerun = args.rerun if args.rerun and rerun_file.is_there(partial(cli.say, "evaluate")) else None
-    judge = Judge(reading, estimator, args.odometry, args.plot, trajectories, rerun)
+    judge = Judge(reading, estimator, args.odometry, args.plot, trajectories, rerun, args.align)
     if not args.odometry:
         cli.show(f"correcting with: {estimator.correction}")
     cli.show(table.head())
@@ -90,6 +91,7 @@ def _evaluate(args):
         cli.show(f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
                  f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
     cli.show("", *table.lines_of_phases(together["phases"] if len(found) > 1 else result.phases))
+    cli.show("", *table.lines_of_alignment(result.aligned if len(found) == 1 else {}, pool.aligned))
     if args.json:
         cli.write_json(args.json, {"runs": [one.as_json() for one in told], "pooled": as_json(together)})
     if args.markdown:

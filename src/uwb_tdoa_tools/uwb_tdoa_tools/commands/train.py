@@ -8,6 +8,7 @@ import sys
 from .. import cli, options, parallel
 from ..progress import Progress
 from ..results_file import ResultsFile, asked_of, resumed, state_of
+from ..scoring.settling import told
 from ..training import labels as labelling, models, shrinking
 from ..training.plots import plot_curve
 
@@ -44,6 +45,7 @@ def parser():
     options.add_recordings(made)
     add("--model", choices=models.KINDS, required=True, help="what to train")
     options.add_most(made, MOST)
+    options.add_align(made)
     add("--out", metavar="DIR", type=Path, required=True, help="where to write")
     add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
     add("--name", help="of the model, goes into every corrected message (default: the kind)")
@@ -63,6 +65,7 @@ def _train(args):
     with _kept(args, reading) as done:
         over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # no line beside that of Progress
         flights = reading.flights(args.flights, args.most, jobs, dask)
+        flights = list(parallel.over(partial(told, align=args.align), flights, jobs, dask))
         with Progress("train") as progress:
             _write(args, flights, resumed(over, args.resume, done) if done else over, progress)
 

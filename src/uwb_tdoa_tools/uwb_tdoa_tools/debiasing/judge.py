@@ -7,8 +7,10 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from ..readers.inputs import Reading
+from ..scoring.alignment import NONE
 from ..scoring.evaluation import evaluate, judging_truth
 from ..scoring.metrics import Score
+from ..scoring.settling import told
 
 
 def debiased(odometry, bias_map):
@@ -18,7 +20,7 @@ def debiased(odometry, bias_map):
     return replace(odometry, p=p, covariance=covariance)
 
 
-def fly(flight, config=None, effects=None):
+def fly(flight, config=None, effects=None, align=NONE):
     """(Flight, Score, odometry) of a Flight with ground truth, run through the filter. Raises InputError: what diagnose finds with
     less, heights, odometry or marks, is corrected before the filter, and a map of that path would only repeat the filter's own error."""
     if flight.truth is None:
@@ -26,6 +28,7 @@ def fly(flight, config=None, effects=None):
             f"{flight.name}: it holds no ground truth to map the bias with; diagnose --reference heights, odometry or marks finds what is "
             "wrong without it, and --effects takes that."
         )
+    flight = told(flight, effects, config, align)
     score, run = evaluate(flight, config, effects)
     return flight, score, run.odometry
 
@@ -34,15 +37,17 @@ def fly(flight, config=None, effects=None):
 class Estimator:
     """What positions are estimated with; estimator((path, survey)) is what `judge.fly` gives. Can be pickled.
 
-    reading : Reading; config : FilterConfig; effects : EffectSet or None, of the TDOAs before the filter.
+    reading : Reading; config : FilterConfig; effects : EffectSet or None, of the TDOAs before the filter; align : as of
+    `settled`.
     """
 
     reading: Reading = Reading()
     config: FilterConfig | None = None
     effects: EffectSet | None = None
+    align: str = NONE
 
     def __call__(self, recording):
-        return fly(self.reading.read(recording), self.config, self.effects)
+        return fly(self.reading.read(recording), self.config, self.effects, self.align)
 
 
 def judge(flown, bias_map, effects=None):

@@ -12,6 +12,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from ..parallel import in_one_thread
 from .channels import CHANNELS, residuals
 from .detectors import DETECTORS
+from .deviations import with_deviations
 from .domains import Seen
 from .findings import Finding, Refused
 from .over_flights import of_one, shares
@@ -69,7 +70,7 @@ class Attribution:
 
     def of(self, kept):
         """The Attribution of what was Kept."""
-        return replace(self, selection=kept.selection, detections=kept.detections, alone=())
+        return replace(self, selection=with_deviations(kept.selection), detections=kept.detections, alone=())
 
     def findings(self):
         """[Finding], those by regression first, those of one flight alone last."""
@@ -127,7 +128,7 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
     selection = with_rivals(selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress)
     if undeclared and len(flights) >= FOR_MAPS:
         selection = _with_maps(selection, smooth, refused)
-    remaining = at(effects_of(selection))
+    remaining, selection = at(effects_of(selection)), with_deviations(selection)
     detections = (detector.detect(remaining) for detector in detectors)
     found = tuple(detection for detection in detections if detection is not None)
     alone, names = [], tuple(flight.name for flight in flights)
@@ -232,6 +233,7 @@ def _declared(found, reference, kinds, installation):
         effect
         for effect in effects
         if (kinds is None or effect.name in kinds) and (all(reference.positions_known) or not effect.needs_reference)
+        and (not effect.witnesses or shown & set(effect.witnesses))
     ]
     return [candidate for effect in chosen for candidate in candidates_of(effect(), *installation)]
 

@@ -1,6 +1,7 @@
 """The whole loop in one call."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -29,7 +30,8 @@ class Diagnosis:
     EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
     `judging.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
     ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes : sentences, what is not as in the last calibration;
-    applying : ((command line, what it does), ...), how the effects are put to use.
+    applying : ((command line, what it does), ...), how the effects are put to use;
+    of_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its ground truth.
     """
 
     flights: tuple
@@ -47,6 +49,7 @@ class Diagnosis:
     numbers: dict
     changes: tuple = ()
     applying: tuple = ()
+    of_truth: dict = field(default_factory=dict)
 
     def as_json(self):
         """What diagnosis.json holds."""
@@ -79,6 +82,14 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     def saying(what):
         return lambda: progress(what)
 
+    looking, count = saying(f"looking at {reference.words}"), len(flights)
+    settled = []
+    for one in over(partial(_settled, reference, base, config), [*flights, *holdout]):
+        settled.append(one)
+        looking()
+    of_truth = {flight.name: said for flight, said in settled if said}
+    flights, holdout = (tuple(flight for flight, _ in some) for some in (settled[:count], settled[count:]))
+
     repairs = repairing.repaired(flights, base, config, saying("looking at ids and signs")) if reference.judges else {}
     sound, rest = repairing.sound(flights, base, repairs)
     attribution = attribute(sound, reference, rest, progress=saying("tracing residuals to effects"), over=over)
@@ -91,7 +102,7 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         kept = judging.borne_out(attribution, sound, rest, config, reference.constraints, trying, over)
     attribution, kept = repairing.before_others(attribution, kept, repairs)
     model = attribution.of(kept)
-    effects = merged(base, usable(model.effects).effects, kept.selection)
+    effects = merged(base, usable(model.effects).effects, model.selection)
     judged = judging.judge(model, flights, holdout, baseline, effects, reference, saying("judging"), over)
     before, after, judged_on = judged
     refused = [*attribution.refused, *kept.refused]
@@ -99,7 +110,8 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     if why_not and len(effects) > len(base) + len(attribution.of_floor):  # of those it tells nothing
         refused.append(Refused("all", why_not))
         after, kept = before, replace(judging.nothing(attribution), worth=kept.worth)
-        effects, model = merged(base, attribution.of_floor, kept.selection), attribution.of(kept)
+        model = attribution.of(kept)
+        effects = merged(base, attribution.of_floor, model.selection)
     remaining = residuals_of(flights, reference, effects, saying("judging"), over)
     baseline.prepare(flights, saying("judging"), over)
     runs = [baseline.run(flight) for flight in flights]
@@ -123,7 +135,12 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
         remaining,
         {flight.name: found for found, flight in zip(over(numbers, flights), flights) if found},
         kept.changes,
+        of_truth=of_truth,
     )
+
+
+def _settled(reference, base, config, flight):
+    return reference.settled(flight, base, config)
 
 
 def _findings(attribution, model, kept):

@@ -7,9 +7,10 @@ import numpy as np
 from uwb_tdoa_bias.effects.wording import listed
 
 from .over_flights import course
+from .report import anchors
 from .report.entries import doubt_in_words, entries, worth_in_words
 from .report.unclear import by_remedy, untold
-from .report.verdict import faults_in_words, verdict
+from .report.verdict import faults_in_words, truth_in_words, verdict
 
 WIDTH, LABEL = 120, 10  # columns of the screen, and of them for what a line is
 
@@ -23,6 +24,7 @@ def as_json(diagnosis):
             "rests_on": diagnosis.reference.words,
             "findings": [_finding(finding) for finding in diagnosis.findings if finding.declared],
             "numbers": {name: [vars(item) for item in found] for name, found in diagnosis.numbers.items()},
+            "ground_truth": {name: list(said) for name, said in diagnosis.of_truth.items()},
             "unattributed": [_function(finding) for finding in diagnosis.findings if not finding.declared],
             "ambiguous": _ambiguous(diagnosis),
             "unobservable": [
@@ -47,6 +49,7 @@ def as_text(diagnosis):
     """Lines for the screen: verdict, what to do, what was found and its worth, what could not be told, what to run."""
     found = entries(diagnosis)
     lines = [("" if k else "verdict", sentence) for k, sentence in enumerate(verdict(diagnosis).sentences)]
+    lines += [("truth", sentence) for sentence in truth_in_words(diagnosis)]
     lines += [("numbers", sentence) for sentence in faults_in_words(diagnosis)]
     lines += [("changed", f"since the last calibration, {sentence}") for sentence in diagnosis.changes]
     lines += [("do", sentence) for entry in found if entry.matters for sentence in entry.advice]
@@ -61,7 +64,7 @@ def as_text(diagnosis):
         lines.append(("not told", f"{listed(what)}; what would tell: {told_by}."))
     if any(entry.added for entry in found):
         lines += [("apply", command) for command, _ in diagnosis.applying]
-    return "\n".join(_wrapped(*line) for line in lines)
+    return "\n".join([*(_wrapped(*line) for line in lines), *anchors.lines(diagnosis)])
 
 
 def _wrapped(label, text):

@@ -96,10 +96,10 @@ def solve(gram, vector, prior, offset):
     gram (k, k), vector (k,) : the first 4N columns those of a Prior, the others functions; offset (4N,) m: where the equations
     were made, from the mean of the prior.
     """
-    parts = [(std, *_without_functions(gram, vector, len(offset), std)) for std in FUNCTION_STDS]
+    parts = [(eliminated(gram, vector, len(offset), std), std) for std in FUNCTION_STDS]
 
     def best(covariance):
-        return max((_solution(part, covariance, offset) for part in parts), key=lambda one: one.evidence)
+        return max((posterior(*part, covariance, offset, std) for part, std in parts), key=lambda one: one.evidence)
 
     if not prior.told.any():
         trials = [(best(prior.with_delays(std)), std) for std in DELAY_STDS]
@@ -118,17 +118,20 @@ def solve(gram, vector, prior, offset):
     return Solution(found.evidence, found.step, found.covariance, found.function_std, changed=changed)
 
 
-def _without_functions(gram, vector, n, std):
-    """(gram (n, n), vector (n,), logarithm of the evidence of the rest) with functions of a size integrated out."""
+def eliminated(gram, vector, n, sizes):
+    """(gram (n, n), vector (n,), logarithm of the evidence of the rest): normal equations with what comes after the first n unknowns
+    integrated out, whose standard deviations are `sizes`, a number or one for each."""
     cross = gram[:n, n:]
-    functions = gram[n:, n:] + np.eye(len(gram) - n) / std**2
-    solved = np.linalg.solve(functions, np.column_stack([cross.T, vector[n:]]))
-    evidence = vector[n:] @ solved[:, -1] - np.linalg.slogdet(functions)[1] - 2.0 * len(functions) * np.log(std)
+    sizes = np.broadcast_to(sizes, len(gram) - n)
+    rest = gram[n:, n:] + np.diag(sizes**-2.0)
+    solved = np.linalg.solve(rest, np.column_stack([cross.T, vector[n:]]))
+    evidence = vector[n:] @ solved[:, -1] - np.linalg.slogdet(rest)[1] - 2.0 * np.sum(np.log(sizes))
     return gram[:n, :n] - cross @ solved[:, :-1], vector[:n] - cross @ solved[:, -1], 0.5 * evidence
 
 
-def _solution(part, covariance, offset):
-    std, gram, vector, evidence = part
+def posterior(gram, vector, evidence, covariance, offset, std=0.0):
+    """Solution of what `eliminated` leaves, with a prior of some covariance whose mean is `offset` before the equations; std : of what
+    was integrated out, for the Solution."""
     prior = np.linalg.inv(covariance)
     right, information = vector - prior @ offset, gram + prior
     step = np.linalg.solve(information, right)

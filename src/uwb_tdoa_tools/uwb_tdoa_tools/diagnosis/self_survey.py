@@ -254,7 +254,7 @@ def _equations(part, flight, constraints):
     ids = [str(i) for i in anchors.ids]
     positions = EFFECTS[POSITION]().regressors(samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
     late = EFFECTS[DELAY]().regressors(samples, ids)
-    functions = (late[:, :, None] * _features(samples.p)[:, None, :]).reshape(len(late), -1)
+    functions = (late[:, :, None] * features(samples.p)[:, None, :]).reshape(len(late), -1)
     stamps = [one.stamps(flight.tdoa.t[0]) for one in constraints]
     regressors = np.nan_to_num(np.concatenate([positions, late, functions], axis=1))
     columns, moved = part.innovations.and_positions(regressors, np.sort(np.concatenate([[], *stamps])))
@@ -307,7 +307,7 @@ def _inflation(grams, vectors, sizes):
     return float(np.mean(np.sum((scores @ directions[:, told]) ** 2, axis=0) / values[told]))
 
 
-def _features(p):
+def features(p):
     """Random Fourier features of a Gaussian kernel at places p (n, 3) m: (n, FEATURES)."""
     waves = np.random.default_rng(3).standard_normal((3, FEATURES // 2)) / LENGTH
     phase = p @ waves

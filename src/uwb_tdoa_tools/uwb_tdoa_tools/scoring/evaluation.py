@@ -2,9 +2,8 @@
 
 from dataclasses import replace
 
-from uwb_tdoa_bias.foundation.errors import InputError
-
 from ..localizing.estimate import Estimator
+from .alignment import need_truth
 from .metrics import Score
 
 
@@ -14,7 +13,8 @@ def evaluate(flight, config=None, effects=None, network=None):
 
 
 def score_of(flight, estimator):
-    """(Score, Run) of a Flight with ground truth, by an Estimator. Raises InputError if there is no truth."""
+    """(Score, Run) of a Flight with ground truth, by an Estimator. Raises InputError if there is no truth, or one on
+    another clock."""
     need_truth(flight)
     run = estimator(flight)
     return Score(flight.name, run.odometry, judging_truth(flight, estimator.effects), run.residuals, flight.tdoa.t), run
@@ -23,9 +23,3 @@ def score_of(flight, estimator):
 def judging_truth(flight, effects=None):
     """The Truth to compare estimates with: that of the Flight, without what the EffectSet says is wrong with it."""
     return effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth
-
-
-def need_truth(flight):
-    """Raise InputError if the Flight has no ground truth."""
-    if flight.truth is None:
-        raise InputError(f"{flight.name}: it holds no ground truth to compare with.")

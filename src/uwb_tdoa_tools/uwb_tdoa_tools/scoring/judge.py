@@ -1,6 +1,6 @@
 """Recordings judged one by one, with a picture and trajectories for others."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import sys
 
@@ -8,13 +8,15 @@ from tqdm import tqdm
 
 from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
+from ..checking.against_truth import of_truth
 from ..checking.remarks import survey_remarks
 from ..localizing.estimate import Estimator
 from ..localizing.rerun_file import write_rerun
 from ..readers.inputs import Reading, tell
 from ..results_file import ResultsFile, state_of
 from . import table
-from .evaluation import need_truth, score_of
+from .alignment import ALIGN, NONE, alignment_of, need_truth
+from .evaluation import judging_truth
 from .metrics import Pool, Result, Score
 from .tum import write_tum
 
@@ -24,7 +26,8 @@ class Judge:
     """judge((path, survey)) is the Result of a recording: of the filter run over it, or of the odometry in a bag.
 
     reading : Reading; estimator : Estimator; odometry : path of a bag whose odometry is judged instead, or None; picture :
-    file to draw the errors to, or None; trajectories : folder for TUM files, or None; rerun : file for Rerun, or None.
+    file to draw the errors to, or None; trajectories : folder for TUM files, or None; rerun : file for Rerun, or None; align : of
+    ALIGN, what of the ground truth is moved onto the estimate before it judges.
     Raises InputError. Can be pickled.
     """
 
@@ -34,30 +37,45 @@ class Judge:
     picture: str | None = None
     trajectories: Path | None = None
     rerun: str | None = None
+    align: str = NONE
 
     def __call__(self, recording):
         flight = self.reading.read(recording)
-        need_truth(flight)
+        need_truth(flight, self.align == NONE)
         tell(flight.name, () if self.odometry else survey_remarks(flight))
         if self.odometry:
-            odometry = read_odometry(self.odometry, *self._where)
+            odometry, residuals = read_odometry(self.odometry, *self._where), None
             tell(self.odometry, odometry.remarks)
-            score, residuals = Score(flight.name, odometry, flight.truth, heard=flight.tdoa.t), None
         else:
-            score, run = score_of(flight, self.estimator)
+            run = self.estimator(flight)
             odometry, residuals = run.odometry, run.residuals
+            flight = replace(flight, truth=judging_truth(flight, self.estimator.effects))
+        found = alignment_of(flight, odometry)
+        tell(flight.name, self._of_truth(flight, found))
+        truths = {how: found.applied(flight.truth, how) for how in ALIGN}
+        scores = {how: Score(flight.name, odometry, one, residuals, flight.tdoa.t) for how, one in truths.items()}
+        score, truth = scores[self.align], truths[self.align]
         if self.picture:
             from .plots import plot_error  # takes a second to import
 
-            plot_error(score, odometry, flight.truth, self.picture)
+            plot_error(score, odometry, truth, self.picture)
         if self.trajectories:
-            truth, folder = flight.truth, self.trajectories
+            folder = self.trajectories
             write_tum(folder / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
             write_tum(folder / f"{flight.name}_truth.tum", truth.t, truth.p, truth.q)
         if self.rerun:
             told = [f"{name}: {value}" for name, value in score.row().items()]
-            write_rerun(self.rerun, flight, odometry, residuals, told, flight.truth)
-        return score.result()
+            write_rerun(self.rerun, flight, odometry, residuals, told, truth)
+        aligned = {**found.as_dict(), "align": self.align, "words": found.frame_in_words()}
+        return replace(score.result(), aligned=aligned | {f"rmse_3d_{how}": one.row()["rmse_3d"] for how, one in scores.items()})
+
+    def _of_truth(self, flight, found):
+        """Sentences on the ground truth of a Flight, by its Alignment and by itself."""
+        for how, words in (("time", found.of_clock()), ("frame", found.of_frame())):
+            if words:
+                yield words + (f"; judge with --align {how}, and put it right where it comes from." if self.align == NONE else ".")
+        for finding in of_truth(flight):
+            yield f"{finding.cause}: {finding.evidence}; {finding.remedy}."
 
     def late_tdoas(self):
         """How many TDOAs were late for the odometry that is judged."""

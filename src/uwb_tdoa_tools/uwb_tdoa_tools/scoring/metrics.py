@@ -1,7 +1,7 @@
 """How far an estimate is from ground truth, and whether its covariance is honest."""
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
 
@@ -14,12 +14,13 @@ from .by_phase import EVERYTHING, Judged, Together
 from .distribution import Distribution
 from .phases import AIRBORNE, TITLES, in_the_air, motion, phases
 
+ALIGN = "none", "time", "frame"  # what of a ground truth is moved before it judges
 LOST = 1.0  # m; a larger error is no estimate
 LOST_SHARE = 0.25  # of the airborne time; more is a diverged run
 HOLE = 0.5  # s without a true pose, and SPARSE times their usual interval, over which none is interpolated
 SPARSE = 4.0
 START_GRACE = 1.0  # s into the airborne part by which the first estimate must have come
-FIGURES = 2  # version of what a Result holds
+FIGURES = 3  # version of what a Result holds
 READY = 100  # TDOAs that a filter may take to begin with
 
 
@@ -179,29 +180,31 @@ class Score:
 @dataclass(frozen=True)
 class Result:
     """What a run leaves for the figures of many, of a size that does not depend on its length. row : Score.row; sums : {name: sum
-    over its samples}; distributions : {quantity: Distribution}; phases : Score.phases."""
+    over its samples}; distributions : {quantity: Distribution}; phases : Score.phases; aligned : where its ground truth is beside the
+    estimate, as of `Alignment.as_dict`, and its 3D RMSE with each of ALIGN, m; {} where nobody looked."""
 
     row: dict
     sums: dict
     distributions: dict
     phases: dict
+    aligned: dict = field(default_factory=dict)
 
     def as_dict(self):
         """For JSON, without loss."""
         parts = {name: part.as_list() for name, part in self.distributions.items()}
         of_phases = {name: _as_texts(figures) for name, figures in self.phases.items()}
-        return {"row": _as_texts(self.row), "sums": _as_texts(self.sums), "distributions": parts, "phases": of_phases}
+        return {"row": _as_texts(self.row), "sums": _as_texts(self.sums), "distributions": parts, "phases": of_phases, "aligned": as_json(self.aligned)}
 
     @classmethod
     def from_dict(cls, content):
         """Of what `as_dict` gives."""
         parts = {name: Distribution.from_list(numbers) for name, numbers in content["distributions"].items()}
         of_phases = {name: _from_texts(figures) for name, figures in content["phases"].items()}
-        return cls(_from_texts(content["row"]), _from_texts(content["sums"]), parts, of_phases)
+        return cls(_from_texts(content["row"]), _from_texts(content["sums"]), parts, of_phases, content["aligned"])
 
     def as_json(self):
         """All figures of the run, as JSON takes them."""
-        return as_json({**self.row, "phases": self.phases})
+        return as_json({**self.row, "phases": self.phases, "aligned": self.aligned})
 
 
 class Pool:
@@ -210,7 +213,7 @@ class Pool:
     def __init__(self):
         self._sums, self._distributions, self._runs, self._total, self._largest = Counter(), {}, 0, 0.0, 0.0
         self._row = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
-        self._ready, self._phases = math.nan, {}
+        self._ready, self._phases, self._aligned = math.nan, {}, Counter()
 
     def add(self, result):
         """Count a Result."""
@@ -224,8 +227,16 @@ class Pool:
         for key in ("diverged", "late_start"):
             self._row[key] += row[key]
 
+        for how in ALIGN if result.aligned else ():
+            error = result.aligned[f"rmse_3d_{how}"]
+            self._aligned[how] += math.nan if error is None else error
         for name, figures in result.phases.items():
             self._phases.setdefault(name, Together()).add(figures)
+
+    @property
+    def aligned(self):
+        """{one of ALIGN: mean 3D RMSE of the runs, m, with that of their ground truth moved}; NaN where it is of another clock."""
+        return {how: total / self._runs for how, total in self._aligned.items()}
 
     def phases(self):
         """{name of a phase: dict of `Together.figures`}, of those that any of the runs has."""

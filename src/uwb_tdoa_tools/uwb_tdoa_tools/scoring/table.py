@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from uwb_tdoa_bias.foundation.foreign_text import harmless
 
 from ..readers.tables import number, read_table
@@ -47,6 +49,17 @@ def markdown(rows, others):
         cells = [f"{row[key]:.3f}" for key in COLUMNS] + [peer.get(row["flight"], "") for peer in others.values()]
         table.append([row["flight"], *cells])
     return _as_markdown(table)
+
+
+def lines_of_alignment(aligned, means):
+    """Lines on ground truth beside estimates. aligned : of a single run, as of Result, else {}; means : {one of ALIGN: 3D RMSE, m}."""
+    if aligned:
+        late = aligned["late"]
+        clock = f"its stamps {abs(late):.2f} s {'late' if late > 0.0 else 'early'}" if late else "its stamps in time"
+        yield f"ground truth beside the estimate: {clock}, {aligned['words']}"
+    figures = [f"{error:.3f} m --align {how}" for how, error in means.items() if np.isfinite(error)]
+    if figures:
+        yield f"{'3D RMSE' if aligned else 'mean 3D RMSE of the runs'}: {', '.join(figures)}"
 
 
 def lines_of_phases(phases):

@@ -2,18 +2,20 @@
 
 import argparse
 from dataclasses import replace
+from functools import partial
 import json
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.flight import AIDS
 
+from .. import parallel
 from ..diagnosis import diagnose
 from ..diagnosis.constraints import Mark
 from ..diagnosis.references import Odometry, OdometryPath
+from ..parallel import whole_number
 from ..readers import inputs
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import airborne
@@ -23,11 +25,12 @@ from ..surveying.tape import Tape
 from .diagnosis.bank import clean_flight
 from .diagnosis.measured import SPLITS
 
-SHAKES = 0.1, 0.3  # m
-_UTIL, _0425 = "util/const{}-trial{}.csv.gz", "flights/0425/TDOA2/0425-traj{}"
+SHAKES = 0.1, 0.3  # m, unless others are asked for
+_UTIL, _CONST4, _0425 = "util/const{}-trial{}.csv.gz", "util/const4-trial1-tdoa2-traj{}.csv.gz", "flights/0425/TDOA2/0425-traj{}"
 SETS = {  # name: (paths to survey with, paths to judge on, aids that are used)
     "const1": ([_UTIL.format(1, k) for k in ("1-tdoa2", "1-tdoa3")], [_UTIL.format(1, k) for k in ("2-tdoa2", "3-tdoa2")], ()),
     "const3": ([_UTIL.format(3, k) for k in ("1-tdoa2", "2-tdoa2")], [_UTIL.format(3, k) for k in ("3-tdoa2", "4-tdoa2")], ()),
+    "const4": ([_CONST4.format(k) for k in (1, 2)], [_CONST4.format(3)], ()),
     "0425": ([_0425.format(k) for k in (1, 2, 6)], [_0425.format(k) for k in (3, 7, 10)], ()),
     "0425 with its range finder": ([_0425.format(k) for k in (1, 2, 6)], [_0425.format(k) for k in (3, 7, 10)], AIDS),
 }
@@ -44,6 +47,9 @@ def add_options(add):
     add("--draws", type=int, default=20, metavar="N", help="of each set and each size of the errors (default 20)")
     add("--first", type=int, default=0, metavar="SEED", help="of the first draw, or of what is known (default 0)")
     add("--only", choices=(*SETS, "simulated"), help="one set")
+    add("--tape", nargs="+", type=float, default=SHAKES, metavar="M", help="standard deviations of the tape, m (default 0.1 0.3)")
+    add("--plain", action="store_true", help="trust no coordinate more than others, as somebody with a tape measure alone")
+    add("--jobs", type=whole_number, default=1, metavar="N", help="draws at once (default 1)")
     add("--known", choices=(*KNOWN, "odometry"), help="instead: flights of every split with this known beside, judged on others")
     add("--split", choices=tuple(SPLITS), help="with --known: one of these alone")
     add("--json", type=argparse.FileType("w"), metavar="FILE", help="write every draw")
@@ -53,14 +59,14 @@ def run(args):
     """Print a table, a row for each set and size."""
     if args.known:
         return with_known(args.data, args.known, [args.split] if args.split else SPLITS, args.first)
-    print("| set | tape off by [m] | applied | tag, true survey | shaken | surveyed | surveyed / true, median (worst) | ", end="")
+    print("| set | tape off by [m] | applied | tag, true survey | shaken | surveyed | surveyed / shaken, median (worst) | ", end="")
     print("worse than shaken | anchors shaken | surveyed | normalised error |\n|---|" + 10 * "---:|")
     every = {}
     for name in [args.only] if args.only else [*SETS, "simulated"]:
         flights, judged = _simulated() if name == "simulated" else _measured(args.data, *SETS[name])
-        for std in SHAKES:
-            seeds = tqdm(range(args.first, args.first + args.draws), desc=f"{name} {std}", disable=None)
-            draws = [draw(flights, judged, std, seed) for seed in seeds]
+        for std in args.tape:
+            seeds = range(args.first, args.first + args.draws)
+            draws = list(parallel.over(partial(draw, flights, judged, std, plain=args.plain), seeds, args.jobs, unit=f"draw of {name} {std}"))
             every[f"{name} {std}"] = draws
             print(f"| {name} | {std} | {_summary(draws)} |", flush=True)
     if args.json:
@@ -128,11 +134,12 @@ KNOWN = {  # kind: function of (Flight, how many there are, Generator) that give
 }
 
 
-def draw(flights, judged, std, seed):
+def draw(flights, judged, std, seed, plain=False):
     """dict of figures of one draw: mean 3D RMSE, m, of the judged Flights with the true, shaken and surveyed anchors; root
-    mean square errors, m, of the coordinates that are not trusted, shaken and surveyed, and of the latter over its std."""
+    mean square errors, m, of the coordinates that are not trusted, shaken and surveyed, and of what was found, applied or not, over
+    its std. plain : trust none more than others."""
     true = flights[0].anchors
-    tape = Tape(std, trusted=third(true))
+    tape = Tape(std, trusted=() if plain else third(true))
     free = tape.position_std(true) > tape.trusted_std
     noise = np.random.default_rng(seed).standard_normal(true.positions.shape)
     rough = true.positions + np.where(free, std, tape.trusted_std) * noise
@@ -192,7 +199,7 @@ def _root(values):
 
 def _summary(draws):
     columns = {key: np.array([one[key] for one in draws]) for key in draws[0]}
-    ratio = columns["surveyed"] / columns["true"]
+    ratio = columns["surveyed"] / columns["shaken"]
     worse = int(np.sum(columns["surveyed"] > 1.03 * columns["shaken"]))
     cells = [f"{columns[key].mean():.3f}" for key in ("true", "shaken", "surveyed")]
     cells += [f"{np.median(ratio):.2f} ({ratio.max():.2f})", f"{worse} of {len(draws)}"]

@@ -11,7 +11,7 @@ from ..diagnosis.calibration import LEFT, why_marks_speak_against
 from ..diagnosis.self_survey import Surveyed, calibrated
 
 IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
-CLEARLY = 1.5  # slow innovations as given over those that are left, beyond which the tape was worse than what else is wrong
+CLEARLY = 2.6  # slow innovations as given over those that are left, beyond which the tape was worse than what else is wrong
 KNOWN_WELL = 0.02  # m, standard deviation as given that leaves nothing to wish for
 
 
@@ -98,7 +98,8 @@ class Result:
 
     def as_text(self):
         """A table of all coordinates, and what it means."""
-        lines = [f"{'anchor':>6}  {'given [m]':>24}  {'shift [cm]':>20}  {'std [cm]':>17}  improved"]
+        lines = ["values that make these data fit; measure again before you move an anchor:"] if self.why_not else []
+        lines += [f"{'anchor':>6}  {'given [m]':>24}  {'shift [cm]':>20}  {'std [cm]':>17}  improved"]
         found = self.surveyed
         for row, i in enumerate(found.anchors.ids):
             given = "".join(f"{v:8.2f}" for v in self.given.positions[row])
@@ -107,7 +108,8 @@ class Result:
             better = "".join(axis if good else "-" for axis, good in zip("xyz", self.improved[row]))
             lines.append(f"{i:>6}  {given:>24}  {shift:>20}  {std:>17}  {better}")
         count = int(self.improved.sum())
-        lines.append(f"{count} of {self.improved.size} coordinates are known better than before")
+        if not self.why_not:
+            lines.append(f"{count} of {self.improved.size} coordinates are known better than before")
         rough = self.given_std.max(axis=1) > KNOWN_WELL
         unseen = [str(i) for row, i in enumerate(found.anchors.ids) if rough[row] and not self.improved[row].any()]
         if unseen:

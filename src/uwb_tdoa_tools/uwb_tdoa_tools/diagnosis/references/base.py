@@ -39,6 +39,11 @@ class Reference:
         """The Flight without what must not be used. Raises InputError where it lacks what the reference is."""
         return flight
 
+    def settled(self, flight, base, config=None):
+        """(Flight, sentences): a prepared one, in which what this compares with was put right where it is plainly wrong itself. base :
+        EffectSet that is in the model; config : FilterConfig."""
+        return flight, ()
+
     def view(self, flight, effects):
         """View of a prepared Flight under the EffectSet `effects`."""
         raise NotImplementedError

@@ -154,7 +154,7 @@ def _why_not(finding, refused):
     if label in reasons:
         return reasons[label]
     if not finding.effect.usable:
-        return "nodes cannot, or need not, take it out"
+        return finding.effect.unused
     if any(f" + {label} + " in f" + {what} + " for what in reasons):
         return "judged together with others: see the verdict"
     return reasons.get("all", "the filter does as well without it")

@@ -1,12 +1,13 @@
 """The report: one page of HTML that holds everything itself."""
 
+from .anchors import fitted
 from .curves import errors_over_time
 from .details import details, phases, terms
 from .entries import entries
 from .maps import maps
 from .markup import page, paragraphs, section
 from .sections import head, not_told, to_do, worth
-from .verdict import faults_in_words, verdict
+from .verdict import faults_in_words, truth_in_words, verdict
 
 
 def html(diagnosis):
@@ -17,7 +18,9 @@ def html(diagnosis):
     parts = [
         head(diagnosis, verdict(diagnosis)),
         section("What is wrong with the numbers", paragraphs(faults_in_words(diagnosis))) if diagnosis.numbers else "",
+        section("What is wrong with the ground truth", paragraphs(truth_in_words(diagnosis))) if diagnosis.of_truth else "",
         to_do(diagnosis, found),
+        fitted(diagnosis),
         worth(diagnosis, found),
         section("Where in the room", maps(diagnosis)),
         section("When in the flight", errors_over_time(diagnosis)),

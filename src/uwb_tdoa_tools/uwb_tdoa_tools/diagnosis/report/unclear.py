@@ -69,7 +69,9 @@ def _told_by(item, diagnosis):
     effect = EFFECTS[item.effect]
     alone = not all(diagnosis.reference.positions_known)
     if item.direction is None:
-        return GROUND_TRUTH if alone and effect.needs_reference else CHANNELS[effect.channels[0]].needs
+        if alone and effect.needs_reference:
+            return GROUND_TRUTH
+        return CHANNELS[(effect.witnesses or effect.channels)[0]].needs
     size, parts = _contribution(item, diagnosis)
     if parts > 0.0 and size <= NOTHING * parts:
         return CANCELS

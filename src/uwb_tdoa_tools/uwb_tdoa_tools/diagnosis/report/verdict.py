@@ -48,6 +48,11 @@ def faults_in_words(diagnosis):
     ]
 
 
+def truth_in_words(diagnosis):
+    """What was wrong with clocks and frames of the ground truth: sentences."""
+    return [f"{name}: {sentence}." for name, said in diagnosis.of_truth.items() for sentence in said]
+
+
 def centimetres(value):
     """ "20.2 cm" of metres."""
     return f"{value * CM:.1f} cm"

@@ -1,0 +1,49 @@
+"""Positions and delays of anchors that were found: values that make the data fit, which is not the same as a survey."""
+
+import numpy as np
+
+from ..prior import DELAY, POSITION
+from .markup import paragraphs, section, table
+
+TITLE = "Values that make these data fit; measure again before you move an anchor"
+HEAD = ("anchor", "x, cm", "y, cm", "z, cm", "late by, cm")
+SURE = 2.0  # standard deviations from which a value is marked
+
+
+def rows(diagnosis):
+    """[[cell]] of a table with HEAD, a row for each anchor of which a position or a delay was found; [] without any."""
+    found = {}
+    for finding in diagnosis.findings:
+        if finding.effect.name in (POSITION, DELAY) and not finding.on_floor and finding.flight is None:
+            for key, value in finding.effect.values.items():
+                anchor, _, axis = key.partition(".")
+                found.setdefault(anchor, {})[axis] = value, finding.effect.std.get(key, np.nan)
+    return [[anchor, *(_cell(found[anchor].get(axis)) for axis in ("x", "y", "z", ""))] for anchor in sorted(found, key=int)]
+
+
+def _cell(known):
+    if known is None:
+        return ""
+    value, std = known
+    sure = abs(value) >= SURE * std
+    return f"{100.0 * value:+.0f} ± {100.0 * std:.0f}{'' if sure else ' ?'}"
+
+
+def lines(diagnosis):
+    """The same for the screen."""
+    several = rows(diagnosis)
+    if not several:
+        return []
+    return [f"{TITLE} (? less than {SURE:g} standard deviations):", *("".join(f"{cell:>12s}" for cell in row) for row in (HEAD, *several))]
+
+
+def fitted(diagnosis):
+    """The section of the page; "" without any."""
+    several = rows(diagnosis)
+    if not several:
+        return ""
+    words = (
+        f"± one standard deviation of where the anchor may be, not of the fit; ? marks less than {SURE:g} of them. Other causes of the same "
+        "errors have been counted, as far as the catalogue knows them."
+    )
+    return section(TITLE, paragraphs([words], "note"), table(HEAD, several, (1, 2, 3, 4)))

@@ -1,0 +1,331 @@
+"""Ground truth is a sensor too: its clock and its frame beside those of an estimate.
+
+What is looked for, in this order, because one hides the next: other axes (z down, two exchanged), stamps that are late, or of
+another epoch, and a frame that is turned and shifted. Nothing is moved unless somebody asks for it.
+
+Stamps that are late by what the gyroscope and the accelerometer say are the fault of the ground truth. Where no inertial sensor
+tells, only the difference of two clocks is known, that of the ground truth and that of the TDOAs.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from ..checking.delays import of_tdoas
+from ..checking.known_path import KnownPath
+from ..checking.motion_rules import FEWEST, TrueMotion
+from .metrics import ALIGN, judged_part, position_at
+
+NONE, TIME, FRAME = ALIGN
+OVERLAP = 1.0  # s that ground truth and TDOAs must have in common
+LATE, LEAST = 0.965, 0.1  # of the power that is left with the stamps moved, and s; 37 measured recordings: 0.984 at least
+CONTRAST = 0.9  # of the median power over all delays: what tells a delay leaves less with the best one; measured: 0.67 at most
+RATE = 20.0  # Hz at which paths are compared
+AXES = 0.5  # of the error that must be left with other axes; measured recordings: 0.8 at least
+LONGEST = 1.6  # s at either end of a path that is left out, because stamps are moved by that much
+YAW, TILT, LEVEL, HEIGHT = np.deg2rad(4.0), np.deg2rad(12.0), 0.25, 0.6  # rad and m that stand out; measured: 2.9, 8.2 degrees, 0.14, 0.35 m
+COMMON, ALIKE, APART = 0.6, 1.3, 2.0  # of the shorter path in common; error of the second best epoch over that of the best; s between them
+AS_WELL = 0.02  # share by which a turned frame and stamps that are late may differ in what they leave, to be as likely
+FITS = 0.6  # of the size of the path, that may be left where an epoch is found
+EPOCH_STEP = 0.1  # s between epochs that are tried
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Where a ground truth is beside an estimate. late : s, by which its stamps are late; told_by : who says so, "inertial" or
+    "tdoa", None where nobody tells; axes (3, 3) : what makes its axes those of the survey; turn (3, 3), shift (3,) m : rotation and
+    translation that bring it, its axes put right, onto the estimate; middle (3,) m : of the path, by where a shift is told; or_turned :
+    whether a frame that is turned would explain as much as stamps that are late, as on circles."""
+
+    late: float
+    told_by: str | None
+    axes: np.ndarray
+    turn: np.ndarray
+    shift: np.ndarray
+    middle: np.ndarray
+    or_turned: bool = False
+
+    def applied(self, truth, how):
+        """The Truth with its clock put right ("time"), or its frame too ("frame"); "none" leaves it as it is."""
+        if how == NONE:
+            return truth
+        truth = _earlier(truth, self.late)
+        return truth if how == TIME else moved_frame(truth, self.turn @ self.axes, self.shift)
+
+    @property
+    def yaw(self):
+        """rad, by which the ground truth is turned against the estimate about the vertical."""
+        return float(np.arctan2(self.turn[0, 1] - self.turn[1, 0], self.turn[0, 0] + self.turn[1, 1]))
+
+    @property
+    def tilt(self):
+        """rad, between the verticals of the two."""
+        return float(np.arccos(np.clip(self.turn[2, 2], -1.0, 1.0)))
+
+    @property
+    def moved(self):
+        """(3,) m, by which the ground truth is beside the estimate in the middle of its path."""
+        return self.middle - self.turn @ self.middle - self.shift
+
+    @property
+    def other_axes(self):
+        """Whether its axes are not those of the survey."""
+        return not np.array_equal(self.axes, np.eye(3))
+
+    @property
+    def other_frame(self):
+        """Whether the frame is another one than what a filter errs by makes it seem."""
+        return self.other_axes or any(self._stands_out)
+
+    @property
+    def _stands_out(self):
+        """Whether yaw, tilt, level shift and height are more than a filter errs by: (bool, ...)."""
+        x, y, z = np.abs(self.moved)
+        return bool(abs(self.yaw) > YAW), bool(self.tilt > TILT), bool(np.hypot(x, y) > LEVEL), bool(z > HEIGHT)
+
+    def least(self):
+        """The Alignment with those parts alone of turn and shift that stand out, and what goes with a turn: the rest may be what the estimate
+        errs by."""
+        turned, tilted, level, height = self._stands_out
+        level = level or turned or tilted
+        turn = self.turn if tilted else Rotation.from_euler("z", -self.yaw if turned else 0.0).as_matrix()
+        there = self.middle - self.moved * (level, level, height)
+        return replace(self, turn=turn, shift=there - turn @ self.middle)
+
+    def as_dict(self):
+        """For JSON: s, degrees, m."""
+        return {
+            "late": self.late,
+            "told_by": self.told_by,
+            "axes": self.axes.astype(int).tolist(),
+            "yaw": float(np.rad2deg(self.yaw)),
+            "tilt": float(np.rad2deg(self.tilt)),
+            "shift": self.moved.tolist(),
+        }
+
+    def of_clock(self):
+        """Sentence on a clock that is off; None if it is not."""
+        if not self.late:
+            return None
+        if abs(self.late) > LONGEST:
+            return f"the ground truth is on another clock: its stamps are {self.late:.2f} s ahead of those of the TDOAs"
+        by = f"{abs(self.late):.2f} s {'late' if self.late > 0.0 else 'early'}"
+        if self.told_by == "inertial":
+            return f"the stamps of the ground truth are {by}, as the gyroscope and the accelerometer tell"
+        turned = ", or the frame of the truth is turned: along this path one looks like the other" * self.or_turned
+        apart_by = f"ground truth or TDOAs are {abs(self.late):.2f} s apart"
+        return f"{apart_by} (the truth {by}, or the TDOAs the other way{turned}); no inertial sensor tells which"
+
+    def of_frame(self):
+        """Sentence on a frame that is another one; None if it is not."""
+        if not self.other_frame:
+            return None
+        parts = [f"its axes x, y, z are {_axes_in_words(self.axes)} of the survey"] if self.other_axes else []
+        parts.append(self.frame_in_words())
+        return "the ground truth is in another frame than the survey: " + "; ".join(parts)
+
+    def frame_in_words(self):
+        """By how much the frames differ, as numbers."""
+        x, y, z = self.moved
+        turned = f"turned by {np.rad2deg(self.yaw):.1f} degrees about the vertical, tilted by {np.rad2deg(self.tilt):.1f}"
+        return f"{turned}, shifted by ({x:.2f}, {y:.2f}, {z:.2f}) m"
+
+
+def need_truth(flight, one_clock=True):
+    """Raise InputError if the Flight has no ground truth, or, unless `one_clock` is False, one on another clock than its TDOAs."""
+    if flight.truth is None or len(flight.truth) < 2:
+        raise InputError(f"{flight.name}: it holds no ground truth to compare with.")
+    if one_clock and on_another_clock(flight):
+        truth, tdoa = flight.truth.t, flight.tdoa.t
+        raise InputError(
+            f"{flight.name}: the ground truth is on another clock than the TDOAs: its stamps go from {truth[0]:.1f} to {truth[-1]:.1f} s, "
+            f"theirs from {tdoa[0]:.1f} to {tdoa[-1]:.1f} s; write both on one clock, or give --align time, which finds how far they are apart."
+        )
+
+
+def on_another_clock(flight):
+    """Whether the ground truth of a Flight, at least two poses, has hardly an instant in common with its TDOAs."""
+    truth, tdoa = flight.truth.t, flight.tdoa.t
+    if not len(tdoa):
+        return False
+    common = min(truth[-1], tdoa[-1]) - max(truth[0], tdoa[0])
+    return bool(common < min(OVERLAP, 0.5 * (truth[-1] - truth[0]), 0.5 * (tdoa[-1] - tdoa[0])))
+
+
+def apart(path, other):
+    """m, root of the median square distance of two paths (n, 3)."""
+    return float(np.sqrt(np.median(np.sum((path - other) ** 2, axis=1)))) if len(path) else np.inf
+
+
+def alignment_of(flight, odometry):
+    """Alignment of the ground truth of a Flight beside an Odometry. Raises InputError where it is on another clock, and the
+    paths do not tell on which."""
+    epoch = _epoch(flight, odometry) if on_another_clock(flight) else 0.0
+    flight = replace(flight, truth=_earlier(flight.truth, epoch))
+    axes = _other_axes(flight.truth, odometry)
+    flight = replace(flight, truth=moved_frame(flight.truth, axes, np.zeros(3)))
+    late, told_by = _late(flight, exact=epoch != 0.0)
+    behind = _behind(flight, late) if told_by == "inertial" else 0.0
+    ratio = _turned_or_late(flight, odometry, late, behind)
+    if ratio < 1.0 - AS_WELL and told_by == "tdoa" and not epoch:
+        late = 0.0
+    if ratio < 1.0:
+        behind = 0.0
+    true, estimated = paths(_earlier(flight.truth, late + behind), odometry)
+    turn, shift = rigid(true, estimated) if len(true) >= FEWEST else (np.eye(3), np.zeros(3))
+    middle = true.mean(axis=0) if len(true) else np.zeros(3)
+    or_turned = bool(late and told_by == "tdoa" and ratio < 1.0 + AS_WELL)
+    return Alignment(epoch + late, told_by, axes, turn, shift, middle, or_turned)
+
+
+def _turned_or_late(flight, odometry, late, behind):
+    """What is left of the distance of the paths if the frame is turned, over what is left if ground truth and TDOAs are apart in time too:
+    below 1 the turn is all of it. Infinite where they are not apart, or nobody can tell."""
+    if not (behind or late):
+        return np.inf
+    pairs = [paths(_earlier(flight.truth, by), odometry) for by in ((late, late + behind) if behind else (0.0, late))]
+    if min(len(true) for true, _ in pairs) < FEWEST:
+        return np.inf
+    return _left(*pairs[0]) / max(_left(*pairs[1]), 1e-9)
+
+
+def _earlier(truth, seconds):
+    """The Truth with stamps that much earlier."""
+    return replace(truth, t=truth.t - seconds)
+
+
+def _left(path, other):
+    """m, root mean square distance of two paths (n, 3) after one was laid onto the other."""
+    turn, shift = rigid(path, other)
+    return float(np.sqrt(np.mean(np.sum((path @ turn.T + shift - other) ** 2, axis=1))))
+
+
+def rigid(path, other):
+    """(rotation (3, 3), translation (3,) m) that bring a path (n, 3) m onto another one, robustly (Umeyama, Least-squares estimation
+    of transformation parameters between two point patterns, IEEE PAMI 1991, without scale)."""
+    weight = np.ones(len(path))
+    for _ in range(5):
+        here, there = (weight @ one / weight.sum() for one in (path, other))
+        u, _, vt = np.linalg.svd(((path - here) * weight[:, None]).T @ (other - there))
+        turn = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
+        left = np.linalg.norm(other - there - (path - here) @ turn.T, axis=1)
+        weight = 1.0 / (1.0 + (left / (2.0 * 1.4826 * np.median(left) + 1e-9)) ** 2)
+    return turn, there - turn @ here
+
+
+def _late(flight, exact):
+    """(s, who tells) by which the ground truth of a Flight is late: by the inertial sensor if it tells, else against the TDOAs; (0, None)
+    where nobody tells. exact : whether the least counts."""
+    found, teller = _inertial(flight), "inertial"
+    if found is None:
+        found, teller = of_tdoas(KnownPath(flight)), "tdoa"
+    if found is None:
+        return 0.0, None
+    if not exact and not _is_late(*found.constant()):
+        return 0.0, teller
+    late = -found.exact()
+    moved = replace(flight, truth=_earlier(flight.truth, late))  # once more from there: a parabola is off between what is tried
+    again = _inertial(moved) if teller == "inertial" else of_tdoas(KnownPath(moved))
+    return late - (again.exact() if again else 0.0), teller
+
+
+def _behind(flight, late):
+    """s by which the ground truth of a Flight, with its own `late` taken out, is later than the TDOAs, and so than an estimate."""
+    found = of_tdoas(KnownPath(replace(flight, truth=_earlier(flight.truth, late))))
+    return -found.exact() if found and _is_late(*found.constant()) else 0.0
+
+
+def _is_late(ratio, delay):
+    return ratio < LATE and abs(delay) >= LEAST
+
+
+def _inertial(flight):
+    """Delays of the inertial samples of a Flight against its ground truth; None where they do not tell."""
+    if flight.imu is None or len(flight.imu) < 2 or np.isfinite(flight.truth.q).all(axis=1).sum() < 2:
+        return None
+    motion = TrueMotion(flight)
+    if len(motion) < FEWEST:
+        return None
+    found = motion.delays()
+    power = found.power.sum(axis=(0, 1))
+    return found if power.min() < CONTRAST * np.median(power) else None
+
+
+def _other_axes(truth, odometry):
+    """(3, 3) signed permutation after which the ground truth is much nearer to the estimate; the identity if there is none."""
+    true, estimated = paths(truth, odometry)
+    if len(true) < FEWEST:
+        return np.eye(3)
+
+    def error(axes):
+        return apart(true @ axes.T, estimated)
+
+    arrangements = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
+    best = min(arrangements, key=error)
+    return best if error(best) < AXES * error(np.eye(3)) else np.eye(3)
+
+
+def paths(truth, odometry):
+    """(true (n, 3), estimated (n, 3)) m at the same instants, while the tag moves."""
+    if len(odometry.t) < 2:
+        return np.empty((0, 3)), np.empty((0, 3))
+    _, first, last = judged_part(truth)
+    begin, end = max(first, odometry.t[0]) + LONGEST, min(last, odometry.t[-1]) - LONGEST
+    t = np.arange(begin, max(begin, end), 1.0 / RATE)
+    return position_at(t, truth), _at(t, odometry)
+
+
+def _at(t, path):
+    return np.stack([np.interp(t, path.t, path.p[:, k]) for k in range(3)], axis=1)
+
+
+def _epoch(flight, odometry):
+    """s by which the stamps of a ground truth on another clock are late: where its path is nearest to that of the estimate."""
+    truth = flight.truth
+    if len(odometry.t) < 2:
+        raise InputError(f"{flight.name}: the ground truth is on another clock than the TDOAs, and there is no estimate to find it by.")
+    ours, theirs = (_at(np.arange(one.t[0], one.t[-1], EPOCH_STEP), one) for one in (odometry, truth))
+    shorter = min(len(ours), len(theirs))
+    lags = np.arange(-len(theirs) + 1, len(ours))
+    common = np.minimum(lags + len(theirs), len(ours)) - np.maximum(lags, 0)
+    square = _over(np.sum(ours**2, axis=1), np.ones(len(theirs))) + _over(np.ones(len(ours)), np.sum(theirs**2, axis=1))
+    square -= 2.0 * sum(_over(mine, its) for mine, its in zip(ours.T, theirs.T))
+    error = np.sqrt(np.maximum(square, 0.0) / common)
+    error[common < COMMON * shorter] = np.inf
+    best = int(np.argmin(error))
+    others = error[np.abs(lags - lags[best]) > APART / EPOCH_STEP]
+    size = np.sqrt(np.sum(ours.var(axis=0)))
+    if not error[best] < FITS * size or np.min(others, initial=np.inf) < ALIKE * error[best]:
+        raise InputError(
+            f"{flight.name}: the ground truth is on another clock than the TDOAs, and its path does not tell on which (the nearest is "
+            f"{error[best]:.2f} m off, another one {np.min(others, initial=np.inf):.2f} m): write both on one clock."
+        )
+    return float(truth.t[0] - odometry.t[0] - lags[best] * EPOCH_STEP)
+
+
+def _over(ours, theirs):
+    """Sums of products over what both have in common, with theirs moved by each lag."""
+    return np.correlate(ours, theirs, mode="full")
+
+
+def moved_frame(truth, axes, shift):
+    """The Truth in a frame whose axes are (3, 3) others, then shifted by (3,) m. Attitudes stay where it is mirrored: whatever they
+    are, turns of the body are the same."""
+    p, known = truth.p @ axes.T + shift, np.isfinite(truth.q).all(axis=1)
+    q = truth.q.copy()
+    if np.linalg.det(axes) > 0.0 and known.any():
+        q[known] = (Rotation.from_matrix(axes) * Rotation.from_quat(truth.q[known])).as_quat()
+    return replace(truth, p=p, q=q)
+
+
+def _axes_in_words(axes):
+    """Which axis of the survey each axis of the ground truth is: "x, y, -z"."""
+    words = []
+    for column in axes.T:
+        k = int(np.argmax(np.abs(column)))
+        words.append(f"{'-' if column[k] < 0.0 else ''}{'xyz'[k]}")
+    return ", ".join(words)

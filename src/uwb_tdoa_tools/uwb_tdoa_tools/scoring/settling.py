@@ -1,0 +1,60 @@
+"""Ground truth put right, before errors are judged by it or learned from it.
+
+Whatever a ground truth has wrong, clock or frame, is its own: it is moved, which changes what estimates are compared with, and
+nothing of that goes into effects, which nodes take.
+"""
+
+from dataclasses import replace
+
+from uwb_tdoa_bias.effects import EffectSet
+
+from ..checking.repairs import repairs
+from ..localizing.estimate import Estimator
+from ..readers.inputs import tell
+from .alignment import FRAME, NONE, TIME, alignment_of, apart, need_truth, on_another_clock, paths
+
+AS_WELL = 1.5  # times the distance that another frame leaves, which wrong ids and signs may leave to explain as much
+
+
+def settled(flight, effects=None, config=None, align=NONE):
+    """(Flight, sentences): its ground truth on the clock and in the frame of its TDOAs, where it was plainly not, and what was found.
+
+    flight : Flight with ground truth; effects : EffectSet that is in the model, or None; config : FilterConfig; align : of ALIGN: with
+    "none" a ground truth on another clock is refused. Raises InputError.
+    """
+    need_truth(flight, align == NONE)
+    effects = effects or EffectSet()
+    found = _alignment(flight, effects, config)
+    said = [f"{words}: it is moved to judge by, and nothing of that goes to the nodes" for words in (found.of_clock(), found.of_frame()) if words]
+    return replace(flight, truth=found.least().applied(flight.truth, FRAME if found.other_frame else TIME)), tuple(said)
+
+
+def told(flight, effects=None, config=None, align=NONE):
+    """The Flight of `settled`; what was found is told on stderr. Can be handed to other processes."""
+    flight, said = settled(flight, effects, config, align)
+    tell(flight.name, (f"{sentence}." for sentence in said))
+    return flight
+
+
+def on_one_clock(flight, align=NONE):
+    """The Flight with its ground truth, if it has one, on the clock of the TDOAs. align : of ALIGN: with "none" one on another clock is
+    refused. Raises InputError."""
+    if flight.truth is None or len(flight.truth) < 2 or not on_another_clock(flight):
+        return flight
+    need_truth(flight, align == NONE)
+    found = alignment_of(flight, Estimator()(flight).odometry)
+    tell(flight.name, [f"{found.of_clock()}: they are moved."])
+    return replace(flight, truth=found.applied(flight.truth, TIME))
+
+
+def _alignment(flight, effects, config):
+    """Alignment of a Flight, or, where wrong ids and signs explain another frame as well, the one without these."""
+    straight, odometry = effects.correct_streams(flight), Estimator(config, effects)(flight).odometry
+    found = alignment_of(straight, odometry)
+    repair = EffectSet(repairs(replace(straight, truth=found.applied(straight.truth, TIME)))) if found.other_frame else EffectSet()
+    if not len(repair):
+        return found
+    of_labels = Estimator(config, effects)(repair.correct_streams(flight)).odometry
+    error = apart(*paths(found.applied(straight.truth, TIME), of_labels))
+    left = apart(*paths(found.applied(straight.truth, FRAME), odometry))
+    return alignment_of(repair.correct_streams(straight), of_labels) if error < AS_WELL * left else found
