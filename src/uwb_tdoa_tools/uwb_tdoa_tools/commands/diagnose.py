@@ -43,7 +43,6 @@ def parser():
         "diagnose 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out diagnosis/",
         "diagnose flight.bag --effects effects.yaml --out second/",
         "diagnose flight.bag --reference heights --out by-height/",
-        "diagnose flight.bag --reference marks --marks marks.yaml --out by-marks/",
         "diagnose flight.bag --reference odometry --odometry /vio/odometry --marks marks.yaml --out by-odometry/",
         "diagnose flight.bag --no-truth --out without/",
         "diagnose today.bag --no-truth --effects last-week/effects.yaml --out today/",
@@ -95,8 +94,7 @@ def _diagnose(args):
     known = options.known_of(args, (*flights, *holdout))
     if args.odometry is not None:
         known = (*known, *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace))
-    align = {"align": args.align} if args.reference == "truth" else {}
-    reference = REFERENCES[args.reference](config, known, **align)
+    reference = REFERENCES[args.reference](config, known, *[args.align][: args.reference == "truth"])
     over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # no bar beside the line of Progress
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress, over)
