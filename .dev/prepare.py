@@ -2,7 +2,7 @@
 
 Called by ./dev with a Python 3.10 - 3.12 of the system; uses nothing but its standard library. Each step is remembered
 by a hash of what it depends on, in .venv/steps.json, so that doing nothing takes milliseconds. Two calls at once wait
-for each other.
+for each other, if there is anything to do.
 """
 
 import fcntl
@@ -42,6 +42,9 @@ class Failure(Exception):
 
 
 def main(command):
+    compiled = command in ("build", "demo")
+    if is_ready(compiled):
+        return
     LOG.mkdir(exist_ok=True)
     with open(LOG / "dev.lock", "w") as lock:
         try:
@@ -49,23 +52,31 @@ def main(command):
         except BlockingIOError:
             say("waiting for another ./dev to finish its set-up")
             fcntl.flock(lock, fcntl.LOCK_EX)
-        prepare()
-        if command == "build":
-            compile_nodes()
+        prepare(compiled)
 
 
-def prepare():
+def is_ready(compiled):
+    """Whether nothing is to be done. compiled : the nodes shall be, too."""
+    done, sources = read_steps(), digests()
+    wanted = {"environment": environment(), **sources, **({"compiled": sources["packages"]} if compiled else {})}
+    return (INSTALL / "setup.bash").exists() and wanted.items() <= done.items()
+
+
+def prepare(compiled):
     done = read_steps()
-    inputs = [ROOT / "requirements.txt", LOCK, ROOT / ".dev" / "wheels.py"]
-    environment = digest(inputs, str(ROOT), BASE_PYTHON, VERSION, str(OWN_ROS))
-    if done.get("environment") != environment:
+    if done.get("environment") != environment():
         check_machine()
         make_environment()
-        done = {"environment": environment}
+        done = {"environment": environment()}
         write_steps(done)
     elif not (INSTALL / "setup.bash").exists():
-        done = {"environment": environment}
-    build(done)
+        done = {"environment": environment()}
+    build(done, compiled)
+
+
+def environment():
+    """Digest of all that .venv depends on."""
+    return digest([ROOT / "requirements.txt", LOCK, ROOT / ".dev" / "wheels.py"], str(ROOT), BASE_PYTHON, VERSION, str(OWN_ROS))
 
 
 def check_machine():
@@ -126,46 +137,49 @@ def missing_requirements():
     return [pin for pin in pins if pin.split("==")[0] in names]
 
 
-def build(done):
-    own_tf2 = [] if OWN_ROS else ["tf2_msgs"]  # the wheels lack it
-    sources = {
+def digests():
+    """{step: digest of its sources}."""
+    return {
         "messages": digest([ROOT / "colcon.meta", ROOT / ".dev" / "tf2_msgs", ROOT / "src" / "uwb_tdoa_msgs"]),
         "packages": digest([ROOT / "src" / name for name in PACKAGES]),
     }
-    selected = []
-    if done.get("messages") != sources["messages"]:
-        selected += own_tf2 + MESSAGES
+
+
+def build(done, compiled):
+    """Python packages first, which takes seconds: then the nodes can be compiled, for which they need no messages, beside the messages."""
+    sources, running = digests(), []
     if done.get("packages") != sources["packages"]:
-        selected += PACKAGES
         for name in PACKAGES:  # setuptools would copy what is newer only, and keep what was deleted
             for copy in (BUILD / name / "build", *INSTALL.glob(f"lib/python3*/site-packages/{name}")):
                 shutil.rmtree(copy, ignore_errors=True)
-    if not selected:
-        return
-    if OWN_ROS:
-        paths, options, variables = ["src"], [], {}
-    else:
+        finish(colcon(PACKAGES))
+        done = {**done, "packages": sources["packages"]}
+        write_steps(done)
+    if compiled and done.get("compiled") != sources["packages"]:  # or the first start would; and several tests at once
+        (site,) = INSTALL.glob("lib/python3*/site-packages")
+        path = os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])
+        running.append(start("compile the nodes", "compile", [PYTHON, "-m", "uwb_tdoa_ekf.compile_nodes"], PYTHONPATH=path))
+    if done.get("messages") != sources["messages"]:
+        running.append(colcon(([] if OWN_ROS else ["tf2_msgs"]) + MESSAGES))  # the wheels lack tf2_msgs
+    finish(*running)
+    write_steps({**done, **sources, **({"compiled": sources["packages"]} if compiled else {})})
+
+
+def colcon(selected):
+    """The step that builds some packages; it runs."""
+    paths, options, variables = ["src"], [], {}
+    if not OWN_ROS:
         paths, options = ["src", ".dev/tf2_msgs"], ["-G", "Ninja"]
         variables = {"AMENT_PREFIX_PATH": str(VENV), "CMAKE_PREFIX_PATH": str(VENV)}
-    run(
+    return start(
         f"build {', '.join(selected)}",
-        "build",
+        "build" if selected == PACKAGES else "build_messages",
         [PYTHON, "-m", "colcon", "build", "--merge-install", "--base-paths", *paths, "--packages-select", *selected]
+        + ["--event-handlers", "console_direct+", "console_cohesion-", "console_stderr-"]
         + ["--cmake-args", *options, f"-DPython3_EXECUTABLE={PYTHON}"],
         PATH=f"{VENV / 'bin'}{os.pathsep}{os.environ['PATH']}",
         **variables,
     )
-    write_steps({**done, **sources})
-
-
-def compile_nodes():
-    """Before the first start, and before several tests would do it at once."""
-    done = read_steps()
-    if done.get("compiled") == done["packages"]:
-        return
-    source = f"source {INSTALL}/setup.bash && exec {PYTHON} -m uwb_tdoa_ekf.compile_nodes"
-    run("compile the nodes", "compile", ["bash", "-c", source])
-    write_steps({**done, "compiled": done["packages"]})
 
 
 def digest(paths, *words):
@@ -192,33 +206,60 @@ def write_steps(steps):
 
 
 def run(title, log_name, command, **variables):
-    """Run one step with its output in log/dev_<log_name>.log; on failure show the end of it and raise Failure."""
+    """Run one step."""
+    finish(start(title, log_name, command, **variables))
+
+
+def start(title, log_name, command, **variables):
+    """A step that runs, with its output in log/dev_<log_name>.log."""
+    say(f"{title} ...")
     log = LOG / f"dev_{log_name}.log"
-    started = time.monotonic()
-    live = sys.stderr.isatty()
-    if not live:
-        say(f"{title} ...")
     with open(log, "wb") as output:
-        step = subprocess.Popen(
+        process = subprocess.Popen(
             list(map(str, command)),
             cwd=ROOT, env={**os.environ, **variables}, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
         )  # fmt: skip
-        while True:
-            try:
-                code = step.wait(timeout=1.0)
-                break
-            except subprocess.TimeoutExpired:
-                if live:
-                    say(f"{title} ... {time.monotonic() - started:.0f} s", end="\r")
-    if code != 0:
-        tail = "".join(f"  | {line}\n" for line in log.read_text(errors="replace").splitlines()[-15:])
-        print(tail, end="", file=sys.stderr)
-        raise Failure(f"the step '{title}' failed; all of its output is in {log.relative_to(ROOT)}.")
-    say(f"{title} ... {time.monotonic() - started:.0f} s")
+    return title, log, process, time.monotonic()
+
+
+def finish(*steps):
+    """Wait for steps that run, and say how far they are; the first that fails shows the end of its output, ends the others, and raises
+    Failure."""
+    running, live = list(steps), sys.stderr.isatty()
+    said = time.monotonic()
+    try:
+        while running:
+            time.sleep(0.1)
+            for step in [step for step in running if step[2].poll() is not None]:
+                running.remove(step)
+                title, log, process, started = step
+                if process.returncode != 0:
+                    tail = "".join(f"  | {line}\n" for line in log.read_text(errors="replace").splitlines()[-15:])
+                    print(tail, end="", file=sys.stderr)
+                    raise Failure(f"the step '{title}' failed; all of its output is in {log.relative_to(ROOT)}.")
+                say(f"{title} ... {time.monotonic() - started:.0f} s")
+            if running and time.monotonic() - said > (1.0 if live else 5.0):
+                said = time.monotonic()
+                say("; ".join(f"{title} ... {said - began:.0f} s{share(log)}" for title, log, _, began in running), "\r" if live else "\n")
+    finally:
+        for *_, process, _ in running:
+            process.terminate()
+            process.wait()
+
+
+def share(log):
+    """How much of a step is done, as far as its output tells: ", 40 %"."""
+    text = log.read_text(errors="replace")
+    if log.name == "dev_pip.log":
+        return f", package {text.count('Collecting ')} of {LOCK.read_text().count('==')}" if "Installing" not in text else ", unpacking"
+    for done, total, percent in re.findall(r"\[(\d+)/(\d+)\]|\b(\d+) ?%", text)[-1:]:
+        return f", {percent or round(100 * int(done) / int(total))} %"
+    return ""
 
 
 def say(line, end="\n"):
-    print(f"[dev] {line}", end=end, file=sys.stderr, flush=True)
+    clear = "\x1b[K" if sys.stderr.isatty() else ""  # what is left of a longer line
+    print(f"[dev] {line}{clear}", end=end, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from uwb_tdoa_bias.correction import known_answer
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.correction.network import MODELS, SHIPPED, Network, load_network, unasked
+from uwb_tdoa_bias.correction.network import MODELS, SHIPPED, Network, load_network
 
 KNOWN = MODELS / "known_answer.onnx"
 ANCHORS = Anchors.from_positions([[5, 0, 1], [-3, 2, 3], [0, -400, 2]])
@@ -169,7 +169,6 @@ def test_a_model_is_named_by_its_file_or_as_the_one_shipped():
     assert load_network("") is None and load_network(None) is None
     assert load_network(str(KNOWN)).name == "known_answer"
     assert load_network(SHIPPED).name == "default"
-    assert unasked(None) == SHIPPED and load_network(unasked("effects.yaml")) is None
     with pytest.raises(InputError, match="other.onnx does not exist"):
         load_network("other.onnx")
 

@@ -17,9 +17,8 @@ import numpy as np
 from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
 from .foundation import ros
-from .foundation.anchors import Anchors
 from .foundation.errors import InputError
-from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
+from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector, warm_up
 from .effects import EffectSet, LabelCorrector
 from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
@@ -28,7 +27,7 @@ from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of,
 from .foundation.ros_streams import StreamOutput, Streams, Turns
 from .foundation.ros_wire import Wire
 from .correction.pose_queue import PoseQueue
-from .correction.network import UNASKED, load_network, unasked
+from .correction.network import load_network
 from .correction.poses import parts_of
 from .foundation.stamps import StampGate
 
@@ -38,9 +37,7 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
         "", 'path of an effects.yaml: which systematic effects to remove, with which values; "" for none'
     ),
     "model_file": Parameter(
-        UNASKED,
-        'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 modules; auto: default, or none '
-        "beside effects_file, whose effects were found without it",
+        "", 'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 modules, which helps some flights and harms others'
     ),
     "pose_lag": Parameter(
         0.05, "s; a TDOA is corrected at the newest pose at least this much older than the TDOA before it", 0.001, 10.0
@@ -54,7 +51,6 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
     "frozen": FROZEN,
 }
 POSE = "pose", "twist"  # what is read of an Odometry, its numbers,
-POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36
 MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a Tdoa
 CORRECTED = (  # what is written of a TdoaCorrected
     "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status", "bias_slope", "bias_state",
@@ -80,7 +76,7 @@ class BiasNode(ros.StreamNode):
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._late = self._effects.stamp_offset("tdoa")  # s
         self._labels = LabelCorrector(self._effects.effects)
-        self._network = load_network(unasked(effects_file) if model_file == UNASKED else model_file)
+        self._network = load_network(model_file)
         self._model = self._warm_up()
         self._idle = self._model[NETWORK] == "none"
         self._corrector = None
@@ -335,14 +331,6 @@ class BiasNode(ros.StreamNode):
         if unready:
             return DiagnosticStatus.WARN, "odometry is late: TDOAs leave before their pose; check the load of ekf_node"
         return DiagnosticStatus.OK, f"correcting with {self._model[NETWORK]}"
-
-
-def warm_up(effects, network, lag=0.05):
-    """A Corrector, after compiling, or loading from numba's cache, whatever its first correction needs."""
-    corrector = Corrector(Anchors.from_positions(np.eye(3)), effects, network, lag)
-    corrector.add_pose(np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6), np.zeros((1, TWIST_NUMBERS))))
-    corrector.correct(np.array([1.0]), np.array([0]), np.array([1]), np.array([0.0]))
-    return corrector
 
 
 def main(argv=None):

@@ -163,8 +163,6 @@ class Rig:
         """
         for name in names:
             command = [sys.executable, "-u", "-m", MODULES[name], "--ros-args", "-r", f"__ns:=/{self.namespace}"]
-            if name in ("bias_node", "localization_node"):
-                command += ["-p", "model_file:=''"]  # unless the arguments name one
             if self._reliable:
                 for end in (*(f"{i}.subscription" for i in INPUTS[name]), *(f"{o}.publisher" for o in OUTPUTS[name])):
                     command += ["-p", f"qos_overrides./{self.namespace}/{end}.reliability:=reliable"]

@@ -1,18 +1,18 @@
 """compile_nodes: compile what the nodes need, so that their first start takes no longer than any other.
 
 Compiled code is kept in the folder that NUMBA_CACHE_DIR names, by default ~/.cache/uwb_tdoa, and used until the sources, numba or
-the processor change. `./dev build` calls this; after a `colcon build` call it as the user who starts the nodes.
+the processor change. `./dev build` and `./dev demo` call this; after a `colcon build` call it as the user who starts the nodes.
 """
 
 import argparse
 import sys
 import time
 
-from uwb_tdoa_bias import bias_node
+from uwb_tdoa_bias.correction import corrector
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network
 from uwb_tdoa_bias.effects import EffectSet
 
-from . import ekf_node
+from .warm_up import warm_up
 
 
 def parser():
@@ -29,8 +29,8 @@ def main(argv=None):
     except SystemExit as ended:  # argparse has said it already
         return ended.code
     began = time.monotonic()
-    bias_node.warm_up(EffectSet(), load_network(SHIPPED))
-    ekf_node.warm_up()
+    warm_up()
+    corrector.warm_up(EffectSet(), load_network(SHIPPED))
     print(f"both nodes are compiled; {time.monotonic() - began:.0f} s")
     return 0
 

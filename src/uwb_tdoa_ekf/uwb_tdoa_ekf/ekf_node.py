@@ -10,7 +10,7 @@ Every parameter is documented in config/ekf_node.yaml.
 """
 
 from collections import Counter, deque
-from functools import cache, partial
+from functools import partial
 import math
 import sys
 import time
@@ -23,7 +23,6 @@ from sensor_msgs.msg import FluidPressure, Imu, Range
 from std_srvs.srv import Trigger
 from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
 from uwb_tdoa_bias.foundation import ros
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
@@ -39,14 +38,13 @@ from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import STREAMS, VERDICTS, Estimator, invalid
 from .frames import rotation_std
 from .imu_mount import ImuMount
-from .monitoring.change import YOUNGEST, ChangeDetector
 from .monitoring.health import OK, WARN, Health, together
-from .monitoring.slices import LENGTH, Slice
 from .monitoring.status import status_of, yaw_in_words
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
-from .outputs import Outputs, StatusOutput, pose_and_twist
+from .outputs import Outputs, StatusOutput
 from .streams import most_severe_first
 from .told_pose import told_pose
+from .warm_up import warm_up
 
 # Of each stream: topic, type and the fields of its messages that are read.
 TOPICS = {
@@ -377,32 +375,6 @@ class EkfNode(ros.StreamNode):
         values |= {"subscribers of odometry": self.outputs.odometry.publisher.get_subscription_count()}
         values |= {"subscribers of uwb/residual": self.outputs.residual.publisher.get_subscription_count()}
         return level, text, values
-
-
-@cache
-def warm_up():
-    """Compile, or load from numba's cache, what the first messages would."""
-    estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]))
-    watch, steps = StreamWatch(estimator.anchors, 0.25), np.arange(400)
-    watch.add_imu(0.01 * steps, 0.01 * steps, np.zeros((400, 3)), np.tile((0.0, 0.0, 9.81), (400, 1)))
-    watch.add_tdoa(0.01 * steps, 0.01 * steps, steps % 4, (steps + 1) % 4, np.zeros(400))
-    for some in np.split(steps, 20):
-        t, none = 0.01 * some, np.zeros((len(some), 3))
-        estimator.add_imu(t, none, none + (0.0, 0.0, 9.81))
-        estimator.add_tdoa(t, some % 4, (some + 1) % 4, np.zeros(len(some)))
-        estimator.add_height(t, np.ones(len(some)))
-        estimator.add_pressure(t, np.full(len(some), 1e5))
-        estimator.add_velocity(t, none, none + 0.1)
-        odometry, _ = estimator.advance()
-    pose_and_twist(odometry, *estimator.rates_at(odometry.t))
-    rotation_std(odometry.q[-1:], odometry.covariance[-1:])
-    watch.findings()
-    detector = ChangeDetector(1)
-    for k in range(YOUNGEST + 2):
-        detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1, int), np.zeros(1), np.eye(1)))
-    detector.find(0.0)
-    estimator.tell_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
-    estimator.finish()
 
 
 def main(argv=None):

@@ -12,6 +12,9 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .core.state import rotation
 
+POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a TwistWithCovariance
+UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
+
 
 def to_odometry(q, v, covariance):
     """Velocity in the body frame, and the covariance of what an Odometry holds.
@@ -72,3 +75,27 @@ def _rotation_std(q, covariance, out):
                 for j in range(3):
                     variance += R[axis, i] * covariance[n, 6 + i, 6 + j] * R[axis, j]
             out[n, axis] = math.sqrt(variance)
+
+
+def pose_and_twist(odometry, rates, rate_variances):
+    """The numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST), of Odometry messages."""
+    velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
+    pose, twist = np.empty((len(odometry), POSE)), np.zeros((len(odometry), TWIST))
+    p, q = np.ascontiguousarray(odometry.p), np.ascontiguousarray(odometry.q)
+    _fill(p, q, velocity, covariance, rates, rate_variances, pose, twist)
+    return pose, twist
+
+
+@compiled
+def _fill(p, q, velocity, covariance, rates, rate_variances, pose, twist):
+    for n in range(len(p)):
+        pose[n, :3], pose[n, 3:7], twist[n, :3] = p[n], q[n], velocity[n]
+        known = math.isfinite(rates[n, 0]) and math.isfinite(rate_variances[n])
+        for i in range(6):
+            for j in range(6):
+                pose[n, 7 + 6 * i + j] = covariance[n, i, j]
+        for i in range(3):
+            twist[n, 3 + i] = rates[n, i] if known else 0.0
+            twist[n, 6 + 7 * (3 + i)] = rate_variances[n] if known else UNKNOWN_RATE
+            for j in range(3):
+                twist[n, 6 + 6 * i + j] = covariance[n, 6 + i, 6 + j]

@@ -8,7 +8,6 @@ from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from tf2_msgs.msg import TFMessage
-from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.later import rotations
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.foundation.ros_frames import TF_QOS
@@ -17,13 +16,11 @@ from uwb_tdoa_bias.foundation.ros_wire import Wire
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM
-from .frames import to_odometry
+from .frames import pose_and_twist
 
 STATUS_PERIOD = 0.95  # s; it is looked at five times a second
-UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
 ODOMETRY = "pose", "twist"
 RESIDUAL = "anchor_a", "anchor_b", "innovation", "innovation_variance", "weight", "verdict"
-POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a TwistWithCovariance
 UNPLACED = 100  # odometries in a row without odom -> body on /tf, before it is a trouble
 
 
@@ -124,27 +121,3 @@ class Outputs:
         out.translation.x, out.translation.y, out.translation.z = p
         out.rotation.x, out.rotation.y, out.rotation.z, out.rotation.w = q
         self._tf_publisher.publish(self._tf)
-
-
-def pose_and_twist(odometry, rates, rate_variances):
-    """The numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST), see `publish_odometry`."""
-    velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
-    pose, twist = np.empty((len(odometry), POSE)), np.zeros((len(odometry), TWIST))
-    p, q = np.ascontiguousarray(odometry.p), np.ascontiguousarray(odometry.q)
-    _fill(p, q, velocity, covariance, rates, rate_variances, pose, twist)
-    return pose, twist
-
-
-@compiled
-def _fill(p, q, velocity, covariance, rates, rate_variances, pose, twist):
-    for n in range(len(p)):
-        pose[n, :3], pose[n, 3:7], twist[n, :3] = p[n], q[n], velocity[n]
-        known = math.isfinite(rates[n, 0]) and math.isfinite(rate_variances[n])
-        for i in range(6):
-            for j in range(6):
-                pose[n, 7 + 6 * i + j] = covariance[n, i, j]
-        for i in range(3):
-            twist[n, 3 + i] = rates[n, i] if known else 0.0
-            twist[n, 6 + 7 * (3 + i)] = rate_variances[n] if known else UNKNOWN_RATE
-            for j in range(3):
-                twist[n, 6 + 6 * i + j] = covariance[n, 6 + i, 6 + j]

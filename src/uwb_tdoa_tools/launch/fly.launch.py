@@ -48,7 +48,7 @@ def _nodes(context):
     values |= {name: _number(kind, values[name]) for name, kind in NUMBERS.items() if name in values}
     given = {name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *NETWORK)}
     simulated = values.get("simulated_time", False)
-    of_nodes = {"use_sim_time": simulated, "model_file": ""} | typed({name: given[name] for name in ("effects_file", "frozen")})  # the model is of another hall
+    of_nodes = {"use_sim_time": simulated} | typed({name: given[name] for name in ("effects_file", "frozen")})
     starts = tag(given["namespace"], of_nodes, None, given["log_level"])
     vehicle = Start("uwb_tdoa_tools", "vehicle_node", given["namespace"], [values], given["log_level"])
     return [

@@ -44,7 +44,7 @@ def hall(folder, *parameters, ekf=()):
     """A Hall with all nodes, on simulated time, while the block lasts. parameters, ekf : NAME:=VALUE, of vehicle_node and ekf_node."""
     with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
         told = {
-            ("uwb_tdoa_bias", "bias_node"): ["use_sim_time:=true", "model_file:=''"],
+            ("uwb_tdoa_bias", "bias_node"): ["use_sim_time:=true"],
             ("uwb_tdoa_ekf", "ekf_node"): ["use_sim_time:=true", *ekf],
             ("uwb_tdoa_tools", "vehicle_node"): ["simulated_time:=true", *parameters],
         }

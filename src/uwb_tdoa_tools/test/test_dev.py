@@ -1,5 +1,7 @@
 """What ./dev says without doing anything, and what it says is missing. Nothing here installs or builds."""
 
+import fcntl
+from importlib.util import module_from_spec, spec_from_file_location
 import os
 import re
 import shutil
@@ -150,3 +152,53 @@ def test_a_step_that_fails_shows_the_end_of_its_log(workspace, machine):
     assert "  | ERROR: Invalid requirement" in err
     assert err.splitlines()[-1].endswith("all of its output is in log/dev_pip.log.")
     assert not (workspace / ".venv" / "steps.json").exists()
+
+
+# --- what it says meanwhile ---
+
+
+@pytest.fixture
+def prepare(workspace):
+    """The module .dev/prepare.py of a fresh copy, with a folder for its logs."""
+    for name in ("colcon.meta", "src", "log"):
+        (workspace / name).mkdir() if name != "colcon.meta" else shutil.copy(ROOT / name, workspace)
+    spec = spec_from_file_location("prepare", workspace / ".dev" / "prepare.py")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_where_nothing_is_to_be_done_nobody_waits_for_another(prepare, monkeypatch):
+    prepare.VENV.mkdir()
+    prepare.INSTALL.mkdir()
+    (prepare.INSTALL / "setup.bash").touch()
+    prepare.write_steps({"environment": prepare.environment(), **prepare.digests()})
+    monkeypatch.setattr(prepare, "prepare", lambda compiled: pytest.fail("there was nothing to do"))
+    with open(prepare.LOG / "dev.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        prepare.main("run")
+    with pytest.raises(BaseException, match="nothing to do"):  # the demo wants the nodes compiled, too
+        prepare.main("demo")
+
+
+@pytest.mark.parametrize(
+    ("name", "output", "share"),
+    [
+        ("dev_compile.log", "compiling, which is done once: 40%, 20 s\ncompiling, which is done once: 52%, 25 s\n", ", 52 %"),
+        ("dev_build_messages.log", "[0.1s] Starting\n[12/48] Building CXX object a.o\n", ", 25 %"),
+        ("dev_pip.log", "Collecting numpy\nCollecting scipy\n", ", package 2 of 3"),
+        ("dev_pip.log", "Collecting numpy\nInstalling collected packages: numpy, scipy\n", ", unpacking"),
+        ("dev_venv.log", "", ""),
+    ],
+)
+def test_how_far_a_step_is(prepare, name, output, share):
+    prepare.LOCK.write_text("a==1\nb==2\nc==3\n")
+    (prepare.LOG / name).write_text(output)
+    assert prepare.share(prepare.LOG / name) == share
+
+
+def test_a_step_that_fails_ends_those_beside_it(prepare):
+    long = prepare.start("wait", "wait", ["sleep", "600"])
+    with pytest.raises(prepare.Failure, match="the step 'fail' failed; all of its output is in log/dev_fail.log."):
+        prepare.finish(long, prepare.start("fail", "fail", ["false"]))
+    assert long[2].returncode is not None

@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import chi2
 import yaml
 
-from uwb_tdoa_bias.correction.network import SHIPPED, load_network
+from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN, load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -183,16 +183,20 @@ def test_a_result_that_somebody_has_forged_is_refused(bag, tmp_path, capsys):
     assert main(options) == 0
 
 
-def test_corrects_with_what_bias_node_takes_unasked(flight, bag, tmp_path, capsys):
+def test_corrects_with_nothing_unless_told_and_says_what_is_known_of_the_shipped_network(flight, bag, tmp_path, capsys):
     effects = tmp_path / "effects.yaml"
     EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.1}),)).to_yaml(effects)
     (row,) = report([bag], tmp_path)["runs"]
-    assert row["rmse_3d"] == pytest.approx(evaluate(flight, network=load_network(SHIPPED))[0].row()["rmse_3d"], abs=1e-4)
+    assert row["rmse_3d"] == pytest.approx(evaluate(flight)[0].row()["rmse_3d"], abs=1e-4)
     assert main([str(bag), "--effects", str(effects)]) == 0
+    (row,) = report([bag, "--model", SHIPPED], tmp_path)["runs"]
+    assert row["rmse_3d"] == pytest.approx(evaluate(flight, network=load_network(SHIPPED))[0].row()["rmse_3d"], abs=1e-4)
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if line.startswith("correcting")] == [
-        "correcting with: default", "correcting with: anchor_delay",
-    ]  # fmt: skip
+        "correcting with: nothing (neither --effects nor --model is given)",
+        "correcting with: anchor_delay",
+        f"correcting with: default ({UNPROVEN})",
+    ]
 
 
 def test_no_bias_runs_without_effects(flight, bag, tmp_path):

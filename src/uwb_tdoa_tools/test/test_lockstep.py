@@ -41,7 +41,7 @@ def load():
 def replayed(bag, folder, *options, nodes=()):
     """(exit code of a replay that follows the odometry, its output, diagnostics {node: {key: text}}, recorded bag).
     nodes : {node: arguments}."""
-    nodes, recorded = dict(nodes), folder / "recorded.bag"
+    nodes, recorded = {"bias_node": ("--ros-args", "-p", f"model_file:={SHIPPED}"), **dict(nodes)}, folder / "recorded.bag"
     with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
         diagnostics = Diagnostics(node)
         for package, name in (("uwb_tdoa_bias", "bias_node"), ("uwb_tdoa_ekf", "ekf_node")):

@@ -22,13 +22,13 @@ def test_measured_flight_through_the_nodes_at_any_rate_is_the_offline_run(shared
     bag = tmp_path / "flight.bag"
     write_bag(first(read_flight(log, survey), SECONDS), bag)
     flight = read_bag(bag)
-    offline, _ = evaluate(flight, network=load_network(SHIPPED))  # what bias_node takes unasked
+    offline, _ = evaluate(flight, network=load_network(SHIPPED))
     expected = offline.row()["rmse_3d"]
     assert expected < 0.35
     for rate in (1.0, 4.0):
         folder = tmp_path / f"rate{rate:g}"
         folder.mkdir()
-        live = run_live(bag, folder, rate)
+        live = run_live(bag, folder, rate, {"model_file": SHIPPED})
         row = Score("live", read_odometry(live.recorded), flight.truth).row()
         assert row["rmse_3d"] == pytest.approx(expected, abs=1e-3)
         counts = {name: int(live.ekf[name]) for name in VERDICTS}

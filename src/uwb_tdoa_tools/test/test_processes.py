@@ -83,6 +83,55 @@ def test_a_signal_to_us_ends_the_run(start):
         start.processes.check()
 
 
+# --- waiting ---
+
+
+class NobodySpeaks:
+    """In the place of rclpy, whose node has nothing to serve."""
+
+    @staticmethod
+    def spin_once(node, timeout_sec):
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(processes, "rclpy", NobodySpeaks)
+    monkeypatch.setattr(processes, "LOOK", 0.2)
+
+
+COMPILING = ("echo 'compiling, which is done once: 40%, 20 s'", "while true; do :; done")
+READY = "echo '[INFO] [1.5] [node]: ready; correcting with: none'"
+
+
+def test_who_starts_and_works_is_waited_for_however_long_that_takes(start, quick):
+    start("node", *COMPILING)
+    until, told = time.monotonic() + 3.0, []
+    processes.wait(0.5, "the node", start.processes, None, lambda: time.monotonic() > until, told.append)
+    assert told and set(told[1:]) <= {"waiting for the node: node: compiling, which is done once: 40%, 20 s"}
+
+
+@pytest.mark.parametrize("lines", [["sleep 600"], [READY, *COMPILING[1:]]], ids=["it sleeps", "it is ready, and busy otherwise"])
+def test_if_nothing_goes_on_it_is_not_waited_for_any_longer(start, quick, tmp_path, lines):
+    start("node", *lines)
+    if READY in lines:
+        wait_for_output(tmp_path / "node.log", "ready")
+    with pytest.raises(processes.LiveError, match=r"waited 0.5 s for the node, and nothing went on \(node: "):
+        processes.wait(0.5, "the node", start.processes, None, lambda: False)
+
+
+def test_who_dies_is_reported_at_once(start, quick):
+    start("node", "echo no such file", "exit 3")
+    with pytest.raises(processes.LiveError, match="node ended with code 3"):
+        processes.wait(1000.0, "the node", start.processes, None, lambda: False)
+
+
+def test_signs_of_life_are_waited_for(start, quick):
+    start("node", READY, "sleep 600")
+    until = time.monotonic() + 2.0
+    processes.wait(0.5, "the counts", start.processes, None, lambda: time.monotonic() > until, goes_on=lambda: int(10 * time.monotonic()))
+
+
 class Queue(nullcontext):
     """The handle of a subscription, with messages that wait to be read."""
 

@@ -12,7 +12,7 @@
 
 from dataclasses import fields, replace
 
-from uwb_tdoa_bias.correction.network import load_network, unasked
+from uwb_tdoa_bias.correction.network import UNPROVEN, load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
@@ -79,8 +79,7 @@ def add_estimator(parser):
     add = parser.add_argument
     add(
         "--model", metavar="FILE",
-        help='ONNX bias network to correct with; "default" is the one shipped, which is taken, as bias_node takes it, where '
-        "neither this nor --effects is given",
+        help=f'ONNX bias network to correct with; "default" is the one shipped: {UNPROVEN}'.replace("%", "%%"),
     )  # fmt: skip
     add("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
     add(
@@ -100,7 +99,7 @@ def estimator_of(args, say):
     config = with_parameters(config, args.parameters + [f"use_{aid}:=false" for aid in args.without])
     if args.no_bias:
         return Estimator(config, smoothed=args.smooth)
-    network = load_network(unasked(args.effects) if args.model is None else args.model)
+    network = load_network(args.model)
     given = {effect.name for effect in effects.effects} if effects else set()
     if network and (lacking := sorted(set(network.trained_with) - given)):
         say(f"{args.model} was trained with {', '.join(lacking)} taken out, which no --effects gives; give the effects.yaml that was "

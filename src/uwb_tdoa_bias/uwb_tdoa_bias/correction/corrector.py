@@ -8,8 +8,9 @@ import numpy as np
 from ..effects import EffectSet, Samples
 from ..effects.motion import POSE_LAG, motion_at
 from ..effects.slope import N_STATES, slope_of, state_of
+from ..foundation.anchors import Anchors
 from ..foundation.compiled import compiled
-from .poses import Poses, rotated_in_yaw
+from .poses import POSE_NUMBERS, TWIST_NUMBERS, Poses, parts_of, rotated_in_yaw
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
@@ -142,6 +143,14 @@ class Corrector:
             interval=t - np.concatenate([[last_t], t[:-1]]),
             previous=np.concatenate([[last_b], self.anchors.ids[b[:-1]]]),
         )
+
+
+def warm_up(effects, network, lag=POSE_LAG):
+    """A Corrector, after compiling, or loading from numba's cache, whatever its first correction needs."""
+    corrector = Corrector(Anchors.from_positions(np.eye(3)), effects, network, lag)
+    corrector.add_pose(np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6), np.zeros((1, TWIST_NUMBERS))))
+    corrector.correct(np.array([1.0]), np.array([0]), np.array([1]), np.array([0.0]))
+    return corrector
 
 
 @compiled

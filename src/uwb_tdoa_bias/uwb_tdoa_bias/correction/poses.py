@@ -7,6 +7,7 @@ import numpy as np
 from ..effects.motion import precede
 from ..foundation.compiled import compiled
 
+POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36  # of PoseWithCovariance and TwistWithCovariance
 TILT = 0.5  # rad; a filter that does not know the tilt better estimates no attitude
 
 

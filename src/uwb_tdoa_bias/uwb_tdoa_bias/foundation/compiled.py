@@ -16,6 +16,7 @@ import shutil
 import stat
 import sys
 import tempfile
+import time
 
 from .elsewhere import elsewhere
 
@@ -36,7 +37,11 @@ def _hidden(*names):
 # in compiled code, of which there are none here, and for coverage of it.
 with _hidden("scipy", "coverage"), elsewhere():
     from numba import config, njit
+    from numba.core import event
     import numba.np.arraymath  # noqa: F401
+
+_FUNCTIONS = []  # all that are compiled when they are first called
+SAY_EVERY = 4.0  # s
 
 config._config_fname = "/dev/null/.numba_config.yaml"  # numba would look into the present folder before it compiles anything
 
@@ -46,9 +51,37 @@ def compiled(function):
     before = config.CACHE_DIR
     config.CACHE_DIR = str(_place(_digest(Path(function.__code__.co_filename).parent)))
     try:
-        return njit(error_model="numpy", cache=True)(function)
+        _FUNCTIONS.append(njit(error_model="numpy", cache=True)(function))
+        return _FUNCTIONS[-1]
     finally:
         config.CACHE_DIR = before
+
+
+class _Listener(event.Listener):
+    """Says on stderr, every few seconds, how much is compiled: where nothing is in the cache that takes a minute or two. The share is of the
+    functions of all modules that are imported, nearly all of which the filter needs."""
+
+    def __init__(self):
+        self._compiled, self._depth, self._began = 0.0, 0, 0.0  # s
+
+    def on_start(self, event):
+        self._began = self._began if self._depth else time.monotonic()
+        self._depth += 1
+        self._tell()
+
+    def on_end(self, event):
+        self._tell()
+        self._depth -= 1
+
+    def _tell(self):
+        now = time.monotonic()
+        if now - self._began > SAY_EVERY:
+            self._compiled, self._began = self._compiled + now - self._began, now
+            share = sum(bool(each.signatures) for each in _FUNCTIONS) / len(_FUNCTIONS)
+            print(f"compiling, which is done once: {share:.0%}, {self._compiled:.0f} s", file=sys.stderr, flush=True)
+
+
+event.register("numba:compile", _Listener())
 
 
 @lru_cache(maxsize=None)

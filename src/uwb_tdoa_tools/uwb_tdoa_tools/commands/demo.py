@@ -4,6 +4,7 @@ from pathlib import Path
 import sys
 import time
 
+from uwb_tdoa_bias.correction.network import UNPROVEN
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
@@ -17,8 +18,8 @@ compare the estimate with ground truth.
 Without --flight a simulated vehicle first takes off, flies and lands by nothing but the estimate (as in `fly`), among
 anchors that have delays of 0.1 m (standard deviation). It and the nodes correct for them with an effects.yaml that holds
 their true values, as a calibration would find them. A measured flight is corrected with what --effects and --model give,
-or else with the model that bias_node ships. "raw" is the same filter without any correction, run without ROS. The exit
-code is 1 if the estimate diverged, or messages were lost or late.
+and with nothing else: what helped other flights may harm it. "raw" is the same filter without any correction, run
+without ROS. The exit code is 1 if the estimate diverged, or messages were lost or late.
 """
 
 
@@ -42,7 +43,7 @@ def parser():
     add("--rate", metavar="R", type=float, default=1.0, help="replay R times as fast as flown (default 1)")
     add("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="for all files (default out/demo)")
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
-    add("--model", metavar="FILE", help='ONNX bias network to correct with; "default" is the one shipped')
+    add("--model", metavar="FILE", help=f'ONNX bias network to correct with; "default" is the one shipped: {UNPROVEN}'.replace("%", "%%"))
     return made
 
 
@@ -56,26 +57,35 @@ def _demo(args):
     if args.flight:
         case = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
     else:
-        cli.show("flying     a simulated vehicle; the very first time it is compiled, which takes a minute")
+        cli.show("flying     a simulated vehicle")
         case = demo.simulated(args.out, args.effects, args.model)
     flight = case.flight
     length = flight.truth.t[-1] - flight.truth.t[0]
     cli.show(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
     if case.became:
         cli.show(f"flown      by the estimate: {case.became}")
-    cli.show(f"correction {case.corrector().model} ({', '.join(case.sources)})")
+    cli.show(f"correction {case.correction()}")
     became, scores = demo.fly(case, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
     in_time = _all_in_time(flight, became)
     if not in_time:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
     cli.show(*lines_of_errors(scores))
-    before, after = (score.row()["rmse_3d"] for score in scores[:2])
-    cli.show(f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: {round(100.0 * (after - before) / before):+d} %")
-    plot_comparison(flight, scores[:2], args.out / "error.png")
+    cli.show(_told(scores))
+    plot_comparison(flight, scores[:-1], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
     cli.show("next       " + "\n           ".join(demo.next_steps(args.flight or args.out / "flight.bag", args.survey)))
-    return int(scores[1].row()["diverged"] or not in_time)
+    return int(scores[-2].row()["diverged"] or not in_time)  # of the nodes
+
+
+def _told(scores):
+    """What correction did to the error, in words."""
+    before, after = (score.row()["rmse_3d"] for score in scores[:2])
+    if len(scores) == 2:
+        return f"3D RMSE {before:.3f} m, with nothing corrected: diagnose finds what is wrong with this flight, and what that is worth on others"
+    change = f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: {round(100.0 * (after - before) / before):+d} %"
+    worse = "; this correction does not fit this flight: other anchors, another day, another IMU. Do not fly with it; diagnose finds one that fits"
+    return change + (worse if after > before else "")
 
 
 def _all_in_time(flight, became):

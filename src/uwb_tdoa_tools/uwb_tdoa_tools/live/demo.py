@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import SHIPPED, load_network, unasked
+from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN, load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
@@ -34,15 +34,18 @@ class Case:
     became: str = ""
 
     def corrector(self):
-        """Corrector of the flight. Raises InputError."""
+        """Corrector of the flight, or None if nothing corrects it. Raises InputError."""
+        if not (self.effects_file or self.model):
+            return None
         effects = EffectSet.from_yaml(self.effects_file) if self.effects_file else EffectSet()
         return Corrector(self.flight.anchors, effects, load_network(self.model))
 
-    @property
-    def sources(self):
-        """Where the correction comes from: list of texts."""
-        paths = [path for path in (self.effects_file, self.model) if path]
-        return ["shipped with bias_node" if path == SHIPPED else str(path) for path in paths]
+    def correction(self):
+        """What corrects the flight, from where and why, in words."""
+        if not (self.effects_file or self.model):
+            return "nothing: neither --effects nor --model is given, and what other flights needed may harm this one"
+        sources = [f"the network shipped: {UNPROVEN}" if path == SHIPPED else str(path) for path in (self.effects_file, self.model) if path]
+        return f"{self.corrector().model} ({', '.join(sources)})"
 
 
 def simulated(folder, effects_file=None, model=None):
@@ -59,20 +62,19 @@ def simulated(folder, effects_file=None, model=None):
 
 
 def measured(path, reading, effects_file=None, model=None):
-    """Case of a recording, read by a Reading, corrected, if nothing else is given, with the model that bias_node ships.
-    Raises InputError."""
+    """Case of a recording, read by a Reading, corrected with what is given and nothing else. Raises InputError."""
     flight = reading.one(path)
     if flight.truth is None:
         raise InputError(f"{path}: holds no ground truth to compare with; take a flight that has it.")
     airborne(flight.truth)
-    return Case(flight, effects_file, model or unasked(effects_file))
+    return Case(flight, effects_file, model)
 
 
 def fly(case, folder, rate=1.0, say=print):
     """Write the flight of a Case as a bag, play it to both nodes, and run the filter without ROS beside them.
 
-    Returns ({what became of the messages: count}, see `accounts`, [Score of the filter without correction, of the
-    nodes, of the filter with correction]). The bags and the output of the nodes go to the folder. Raises InputError,
+    Returns ({what became of the messages: count}, see `accounts`, [Score]): of the filter without correction, of the nodes, and of the
+    filter with correction; or, if nothing corrects, of the nodes and of the filter. The bags and the output of the nodes go to the folder. Raises InputError,
     LiveError. say(text) : told what happens.
     """
     flight, bag, correction = case.flight, folder / "flight.bag", case.corrector()
@@ -80,11 +82,11 @@ def fly(case, folder, rate=1.0, say=print):
     model = SHIPPED if case.model == SHIPPED else _absolute(case.model)
     bias, ekf = {"effects_file": _absolute(case.effects_file), "model_file": model}, {"use_imu": flight.imu is not None}
     live = run_live(bag, folder, rate, bias, ekf, say)
-    estimates = {
-        "raw": run_offline(flight).odometry,
-        "corrected": read_odometry(live.recorded),
-        "corrected, without ROS": run_offline(flight, corrector=correction).odometry,
-    }
+    nodes, raw = read_odometry(live.recorded), run_offline(flight).odometry
+    estimates = {"nodes": nodes, "without ROS": raw}
+    if correction:
+        corrected = run_offline(flight, corrector=correction).odometry
+        estimates = {"raw": raw, "corrected": nodes, "corrected, without ROS": corrected}
     return accounts(live.bias, live.ekf, flight), [Score(name, one, flight.truth) for name, one in estimates.items()]
 
 

@@ -1,6 +1,7 @@
 """Executables of our packages as processes in a ROS domain of their own, and what they say on /diagnostics."""
 
 import os
+import re
 import signal
 import subprocess
 import time
@@ -15,6 +16,10 @@ from domain_coordinator import domain_id
 from uwb_tdoa_bias.foundation.errors import Failure
 
 STOP_LIMIT = 10.0  # s
+LOOK = 5.0  # s between two looks at what the processes do, and between two lines about it
+READY = re.compile(r"\]: ready\b")  # in the log of a node
+TAIL = 8192  # bytes of a log that are looked at
+BUSY = 0.2  # of the time: a process that runs, or waits for a core, for more than that works; nodes that wait for messages take 0.02
 
 
 class LiveError(Failure):
@@ -44,13 +49,27 @@ def own_domain():
             yield
 
 
-def wait(limit, what, processes, node, condition):
-    """Serve the node until condition(); raises LiveError after `limit` s, or if a process has ended that should not."""
-    until = None if limit is None else time.monotonic() + limit
+def wait(limit, what, processes, node, condition, say=lambda text: None, goes_on=lambda: None):
+    """Serve the node until condition(). Raises LiveError if a process has ended that should not, or after `limit` s in which nothing
+    went on: what goes_on() gives stayed the same, and no process that is still starting worked, as a node that compiles does.
+
+    limit : s, or None; say(text) : told every few seconds for what it waits and what the processes do."""
+    looked = moved = time.monotonic()
+    worked, sign = processes.worked(), goes_on()
     while not condition():
         processes.check()
-        if until is not None and time.monotonic() > until:
-            raise LiveError(f"waited {limit:g} s for {what}; their output is in {processes.folder}/*.log.")
+        now = time.monotonic()
+        if now - looked > LOOK:
+            working, before, work = now - looked, worked, processes.worked()
+            busy = any(work[title] - before.get(title, 0.0) > BUSY * working for title in work)
+            looked, worked = now, work
+            say(f"waiting for {what}: {processes.doing()}")
+            if busy or goes_on() != sign:
+                moved, sign = now, goes_on()
+        if limit is not None and now - moved > limit:
+            raise LiveError(
+                f"waited {limit:g} s for {what}, and nothing went on ({processes.doing()}); their output is in {processes.folder}/*.log."
+            )
         rclpy.spin_once(node, timeout_sec=0.05)
     processes.check()
 
@@ -66,8 +85,7 @@ class Diagnostics:
         for status in message.status:
             name = status.name.strip("/")
             values = {pair.key: pair.value for pair in status.values}
-            counts = {key: value for key, value in values.items() if value.isdigit()}
-            before = self._newest.get(name, {})
+            before, counts = self._newest.get(name, {}), _counts(values)
             same = bool(before) and all(before.get(key) == value for key, value in counts.items())
             self._repeated[name] = self._repeated.get(name, 0) + 1 if same else 0
             self._newest[name] = values
@@ -85,9 +103,17 @@ class Diagnostics:
                 pass
         self._repeated.clear()
 
+    def counts(self):
+        """Everything that the nodes counted, for comparison with what they had counted before."""
+        return {name: _counts(values) for name, values in self._newest.items()}
+
     def is_settled(self):
         """Whether each node has said the same counts twice in a row: nothing is on its way any more."""
         return len(self._repeated) == len(self._newest) and all(self._repeated.values())
+
+
+def _counts(values):
+    return {key: value for key, value in values.items() if value.isdigit()}
 
 
 class Processes:
@@ -137,6 +163,15 @@ class Processes:
             if code is not None and code not in self._may_end[title]:
                 raise self._failure(title, code)
 
+    def worked(self):
+        """{title: s that its threads have run, or waited for a core} of those that are starting: they have not said that they are ready."""
+        return {title: _worked(process.pid) for title, process in self._running.items() if not READY.search(self._said(title))}
+
+    def doing(self):
+        """What each that is starting said last, in words; of all if none is."""
+        titles = [title for title in self._running if not READY.search(self._said(title))] or list(self._running)
+        return "; ".join(f"{title}: {_bare(self._said(title)) or 'starting'}" for title in titles)
+
     def stop(self, title):
         """Interrupt a process and wait for it; raises LiveError if it does not end well."""
         code = self._end(title)
@@ -154,7 +189,29 @@ class Processes:
                     continue
         return process.returncode
 
+    def _said(self, title):
+        """The end of its output."""
+        with open(self.file(title), "rb") as log:
+            log.seek(max(0, os.fstat(log.fileno()).st_size - TAIL))
+            return log.read().decode(errors="replace").strip()
+
     def _failure(self, title, code):
-        file = self.file(title)
-        last = file.read_text(errors="replace").strip().splitlines()[-1:]
-        return LiveError(f"{title} ended with code {code} ({' '.join(last)}); all of its output is in {file}.")
+        last = " ".join(self._said(title).splitlines()[-1:])
+        return LiveError(f"{title} ended with code {code} ({last}); all of its output is in {self.file(title)}.")
+
+
+def _bare(said):
+    """The last line of a log, without level, time and name."""
+    return re.sub(r"^(\[[^]]*\] ?)+: ", "", (said.splitlines() or [""])[-1])
+
+
+def _worked(pid):
+    """s that the threads of a process have run or were ready to run: on a loaded machine that of one that works is still about all."""
+    total = 0
+    for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        try:
+            ran, waited, _ = file.read_text().split()
+        except (OSError, ValueError):  # that thread has ended
+            continue
+        total += int(ran) + int(waited)
+    return 1e-9 * total

@@ -30,9 +30,9 @@ RELIABLE = {
     ),
 }  # fmt: skip
 DEPTH = 1_000_000  # messages that may wait in a subscription
-READY_LIMIT = 180.0  # s: the very first start compiles the filter
+READY_LIMIT = 60.0  # s in which nothing goes on: the very first start compiles the filter, which takes as long as it takes
 MATCH_LIMIT = 60.0  # s
-SETTLE_LIMIT = 600.0  # s: on a slow machine a replay at a high rate leaves a lot to catch up with
+SETTLE_LIMIT = 60.0  # s in which no count of the nodes changes: a replay at a high rate may leave a lot to catch up with
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, s
     """
     with open_bag(bag) as reader:
         present = {connection.topic for connection in reader.connections}
+        total = sum(connection.msgcount for connection in reader.connections if connection.topic == "/uwb/tdoa")
     inputs = [topic for topic in INPUTS if topic in present]
     recorded = Path(folder) / "recorded.bag"
     if recorded.exists():
@@ -64,14 +65,14 @@ def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, s
         processes.start("uwb_tdoa_bias", "bias_node", *_parameters("bias_node", bias_parameters))
         processes.start("uwb_tdoa_ekf", "ekf_node", *_parameters("ekf_node", ekf_parameters))
         processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
-        say("starting the nodes; the very first start compiles the filter, which takes a minute")
-        wait(READY_LIMIT, "the nodes to find each other", processes, node, lambda: _is_ready(node, diagnostics))
+        say("starting the nodes")
+        wait(READY_LIMIT, "the nodes to find each other", processes, node, lambda: _is_ready(node, diagnostics), say)
         say(f"replaying {bag} at rate {rate:g}")
         options = ("--rate", rate, "--follow", "odometry", "--wait-matched", MATCH_LIMIT, "--wait-topics", *inputs)
         replay = processes.start("uwb_tdoa_tools", "replay", bag, *options, may_end_with=(0, 1))
-        wait(None, None, processes, node, lambda: replay.poll() is not None)
+        wait(None, "the end of the replay", processes, node, lambda: replay.poll() is not None, lambda _: say(_played(diagnostics, total)))
         diagnostics.forget()
-        wait(SETTLE_LIMIT, "the nodes to finish", processes, node, diagnostics.is_settled)
+        wait(SETTLE_LIMIT, "the nodes to finish", processes, node, diagnostics.is_settled, say, diagnostics.counts)
         for name in ("record", "ekf_node", "bias_node"):
             processes.stop(name)
     return LiveRun(recorded, diagnostics.newest("bias_node"), diagnostics.newest("ekf_node"))
@@ -95,6 +96,12 @@ def _parameters(name, values):
     for end in RELIABLE[name]:
         values |= {f"qos_overrides.{end}.reliability": "reliable", f"qos_overrides.{end}.depth": DEPTH}
     return ["--ros-args", *(part for key, value in values.items() for part in ("-p", f"{key}:={json.dumps(value)}"))]
+
+
+def _played(diagnostics, total):
+    """How much of the TDOAs of the bag bias_node has, in words."""
+    received = int(diagnostics.newest("bias_node").get("received", 0))
+    return f"{100.0 * received / max(total, 1):.0f} % of the flight is through"
 
 
 def _is_ready(node, diagnostics):

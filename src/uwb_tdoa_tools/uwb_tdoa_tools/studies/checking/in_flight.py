@@ -103,7 +103,7 @@ class _Nodes:
         self._imu = self._node.create_publisher(Imu, "imu/data", QoSProfile(depth=1000))
         self._tdoa = self._node.create_publisher(Tdoa, "uwb/tdoa", QoSProfile(depth=1000))
         diagnostics = Diagnostics(self._node)
-        processes.start("uwb_tdoa_bias", "bias_node", "--ros-args", "-p", "model_file:=''")
+        processes.start("uwb_tdoa_bias", "bias_node")
         processes.start("uwb_tdoa_ekf", "ekf_node")
         ends = (self._anchors, self._imu, self._tdoa)
         wait(READY, "the nodes", processes, self._node, lambda: (

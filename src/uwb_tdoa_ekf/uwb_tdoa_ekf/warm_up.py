@@ -1,0 +1,38 @@
+"""What the first messages of ekf_node would compile, compiled before: without ROS, so that it can be done before the messages are built."""
+
+from functools import cache
+
+import numpy as np
+from uwb_tdoa_bias.foundation.anchors import Anchors
+
+from .estimator import Estimator
+from .frames import pose_and_twist, rotation_std
+from .monitoring.change import YOUNGEST, ChangeDetector
+from .monitoring.slices import LENGTH, Slice
+from .monitoring.stream_watch import StreamWatch
+
+
+@cache
+def warm_up():
+    """Compile, or load from numba's cache, what the first messages would."""
+    estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]))
+    watch, steps = StreamWatch(estimator.anchors, 0.25), np.arange(400)
+    watch.add_imu(0.01 * steps, 0.01 * steps, np.zeros((400, 3)), np.tile((0.0, 0.0, 9.81), (400, 1)))
+    watch.add_tdoa(0.01 * steps, 0.01 * steps, steps % 4, (steps + 1) % 4, np.zeros(400))
+    for some in np.split(steps, 20):
+        t, none = 0.01 * some, np.zeros((len(some), 3))
+        estimator.add_imu(t, none, none + (0.0, 0.0, 9.81))
+        estimator.add_tdoa(t, some % 4, (some + 1) % 4, np.zeros(len(some)))
+        estimator.add_height(t, np.ones(len(some)))
+        estimator.add_pressure(t, np.full(len(some), 1e5))
+        estimator.add_velocity(t, none, none + 0.1)
+        odometry, _ = estimator.advance()
+    pose_and_twist(odometry, *estimator.rates_at(odometry.t))
+    rotation_std(odometry.q[-1:], odometry.covariance[-1:])
+    watch.findings()
+    detector = ChangeDetector(1)
+    for k in range(YOUNGEST + 2):
+        detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1, int), np.zeros(1), np.eye(1)))
+    detector.find(0.0)
+    estimator.tell_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
+    estimator.finish()
