@@ -40,20 +40,21 @@ def test_a_volume(anchors, tmp_path, capsys):
     assert {path.name for path in out.iterdir()} == FILES
     assert report(out) == json.loads((tmp_path / "copy.json").read_text())
     found = report(out)["map"]
-    assert found["cells"] == [14, 16, 6] and 0.5 < found["flyable_share_of_hull"] < 1.0
-    assert found["flyable_share_of_hull"] == found["unique_share_of_hull"]
+    assert found["cells"] == [14, 16, 6] and 0.3 < found["flyable_share"] < 1.0
+    assert found["flyable_share"] + found["outside_share"] + found["two_solutions_share"] == pytest.approx(1.0)
     for name in ("precision.png", "failure.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     volume = FlyableVolume.load(out / "flyable.npz")
     assert volume.belongs_to(corners()) and volume.contains([0.0, 0.0, 1.5]) and not volume.contains([3.4, 3.9, 0.2])
     assert found["flyable_size"] == pytest.approx(volume.flyable.sum() * 0.125)
     text = capsys.readouterr().out
-    assert "flyable" in text and str(out) in text
+    assert f"{100 * found['flyable_share']:.0f} % of your room can be flown (" in text and str(out) in text
+    assert "what the anchors span; if yours is another: --room" in text
 
 
 def test_a_slice_of_known_height(square, tmp_path, capsys):
     out = tmp_path / "out"
-    options = ["--planar", "--height", "0.2", "--area", "-1", "5", "-1", "5", "--tx-power", "-3", "--check", *COARSE]
+    options = ["--planar", "--height", "0.2", "--room", "-1", "5", "-1", "5", "--tx-power", "-3", "--check", *COARSE]
     assert plan.main([square, *options, "--out", str(out)]) == 0
     assert {path.name for path in out.iterdir()} == FILES | {"flips.png"}
     found = report(out)
@@ -93,25 +94,55 @@ def test_measured_accuracy(anchors, tmp_path, capsys):
     assert f"{one['achieved_over_bound']:.3f}" in capsys.readouterr().out
 
 
+def test_one_figure_of_the_room_and_an_anchor_that_makes_it_larger(tmp_path, capsys):
+    """Six anchors in one half of a room: the other half cannot be flown, and the anchor proposed stands there."""
+    half = Anchors.from_positions([[0, 0, 0.2], [4, 0, 2.8], [4, 5, 0.2], [0, 5, 2.8], [0, 0, 2.8], [4, 5, 2.8]], [7, 3, 12, 5, 1, 9])
+    half.to_yaml(tmp_path / "half.yaml")
+    options = [str(tmp_path / "half.yaml"), "--volume", "--room", "0", "8", "0", "5", "0", "3", "--step", "0.5", "--flyable", "round"]
+    out = tmp_path / "out"
+    assert plan.main([*options, "--out", str(out)]) == 0
+    found, text = report(out), capsys.readouterr().out
+    share, more = found["map"]["flyable_share"], found["addition"]
+    assert share == pytest.approx(found["map"]["flyable_size"] / 120.0) and found["map"]["size"] == pytest.approx(120.0)
+    x, y, z = more["position"]
+    assert x > 5.0 and more["gain"] > 0.1
+    assert f"add an anchor at ({x:.2f}, {y:.2f}, {z:.2f}): " in text
+    Anchors.from_positions([*half.positions, more["position"]]).to_yaml(tmp_path / "half.yaml")
+    assert plan.main([*options, "--out", str(out)]) == 0
+    assert report(out)["map"]["flyable_share"] == pytest.approx(share + more["gain"], abs=0.05)
+
+
+@pytest.mark.parametrize("turned", [True, False], ids=["orientations surveyed", "not surveyed"])
 @pytest.mark.parametrize("how", ["add", "move"])
-def test_improve(how, tmp_path, capsys):
+def test_improve(how, turned, tmp_path, capsys):
     poor = corners()
-    Anchors(poor.ids[:5], poor.positions[:5] * [0.5, 1, 1], poor.orientations[:5]).to_yaml(tmp_path / "poor.yaml")
+    ids, orientations = [7, 3, 12, 5, 1], poor.orientations[:5] if turned else np.full((5, 4), np.nan)
+    before = Anchors(ids, poor.positions[:5] * [0.5, 1, 1], orientations, "hall")
+    before.to_yaml(tmp_path / "poor.yaml")
     out = tmp_path / "out"
     options = ["--fly", "-1", "1", "-2", "2", "0.6", "1.6", "--flyable", "round", "--starts", "1"]
     assert plan.main([str(tmp_path / "poor.yaml"), "--step", "1", *options, "--improve", how, "--out", str(out)]) == 0
     assert {path.name for path in out.iterdir()} == FILES | {"improved.yaml", "layout.png"}
-    found = report(out)["improve"]
+    found, text = report(out)["improve"], capsys.readouterr().out
     assert found["after"]["worst"] < found["before"]["worst"]
-    assert len(Anchors.from_yaml(out / "improved.yaml")) == (6 if how == "add" else 5)
-    assert "worst" in capsys.readouterr().out
+    assert found["before"]["flyable_share"] == report(out)["map"]["flyable_share"]
+    assert f"{100 * found['after']['flyable_share']:8.1f}" in next(line for line in text.splitlines() if line.startswith("flyable, %"))
+    better = Anchors.from_yaml(out / "improved.yaml")
+    assert set(better.ids) == set(ids) | ({0} if how == "add" else set()) and better.frame == "hall"
+    np.testing.assert_allclose(better.positions, better.positions.round(2), atol=1e-4 if how == "add" else 1e-12)
+    assert np.isfinite(better.orientations).all() if turned else np.isnan(better.orientations).all()
+    if how == "add":
+        np.testing.assert_array_equal(better.positions[better.index(ids)], before.positions)
+    assert [int(line.split()[1].strip(":")) for line in text.splitlines() if line.startswith("anchor ")] == [
+        one["id"] for one in found["placed"]
+    ]
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--area", "1", "2", "3"], "area: 3 numbers"),
-        (["--area", "1", "0", "0", "1"], "area: "),
+        (["--room", "1", "2", "3"], "room: 3 numbers"),
+        (["--room", "1", "0", "0", "1"], "room: "),
         (["--step", "-1"], "step: -1"),
         (["--step", "1e-4"], "cells, more than"),
         (["--noise", "0"], "noise: 0"),
@@ -198,7 +229,7 @@ def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
 
 def test_with_a_height_sensor_four_anchors_at_one_height_serve_a_volume(square, tmp_path, capsys):
     """They do not without: their plane mirrors every position."""
-    options, out = ["--volume", "--area", "0", "4", "0", "4", "0", "2", "--step", "0.5"], tmp_path / "o"
+    options, out = ["--volume", "--room", "0", "4", "0", "4", "0", "2", "--step", "0.5"], tmp_path / "o"
     assert plan.main([square, *options, "--out", str(out)]) == 2
     assert "--with height" in capsys.readouterr().err
     figures = []

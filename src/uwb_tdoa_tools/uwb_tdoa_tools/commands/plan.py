@@ -31,7 +31,7 @@ def parser():
         "and better places for the anchors. Writes pictures, plan.json, flyable.npz (for the filter's node) and a bag\n"
         "with the maps (OccupancyGrid, MarkerArray) for RViz and Foxglove.",
         "plan anchors.yaml --height 1.2 --out plan/",
-        "plan survey.txt --volume --area -3 4 -4 4 0 3 --protocol tdoa3 --out plan/",
+        "plan survey.txt --volume --room -3 4 -4 4 0 3 --protocol tdoa3 --out plan/",
         "plan square.yaml --planar --height 0.2 --check --out plan/",
         "plan survey.txt --volume --with height --flights flights/0425 --out plan/",
         "plan survey.txt --volume --improve add --out plan/",
@@ -44,8 +44,8 @@ def parser():
 
     where = made.add_argument_group("where")
     add, either = where.add_argument, where.add_mutually_exclusive_group()
-    area = "X0 X1 Y0 Y1 [Z0 Z1] of the room, m (default: around the anchors)"
-    add("--area", metavar="M", nargs="+", **number, help=area)
+    room = "X0 X1 Y0 Y1 [Z0 Z1], m: from wall to wall, from floor to ceiling (default: what the anchors span)"
+    add("--room", metavar="M", nargs="+", **number, help=room)
     either.add_argument("--height", metavar="M", **number, help="one slice there (default: at half the room's height)")
     either.add_argument("--volume", action="store_true", help="the whole room")
     add("--step", metavar="M", **number, help="size of a cell (default: 100 along a slice, 50 in a volume)")
@@ -94,13 +94,18 @@ def _plan(args):
     aim = options.aim_of(args, installation, room, grid.axes[2][0]) if args.improve else None
 
     if not np.isfinite(anchors.orientations).all():
-        cli.show("note: anchors without orientation are taken to radiate alike in all directions")
+        cli.show("anchors without orientation are taken to radiate alike in all directions")
+    report.say_room(room, args.room is not None)
     cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
     with Progress("plan") as progress:
         progress("mapping")
         found = chart(installation, grid, args.flyable)
     figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
     report.say_summary(figures["map"])
+    figures["addition"] = run.addition(
+        found, anchors, options.installed(args, installation), options.places_of(args, room), args.flyable
+    )
+    report.say_flyable(figures["map"], figures["addition"], args.flyable)
     outgoing = run.draw_map(found, installation, args.out)
     if args.check:
         figures["check"] = run.check(installation, grid, args.out)

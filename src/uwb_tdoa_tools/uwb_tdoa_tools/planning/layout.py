@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
@@ -31,37 +32,37 @@ class Layout:
     Places, times their length over an arm, then a rotation vector, rad.
 
     count : anchors to place; fixed : Anchors that stay, or None; target : (3,) m, what new antennas face, their axis
-    upright, before they are turned."""
+    upright, before they are turned; turned : whether they are, or radiate alike in all directions, like anchors whose
+    orientation nobody surveyed."""
 
     places: Places
     count: int
     fixed: Anchors | None
     target: np.ndarray
+    turned: bool = True
 
     @property
     def width(self):
         """Numbers per anchor."""
-        return self.places.numbers + 3
+        return self.places.numbers + 3 * self.turned
 
     @property
     def bounds(self):
         """(low, high) of every number of x."""
-        return ([(0.0, length / _ARM) for length in self.places.lengths] + [(-np.pi, np.pi)] * 3) * self.count
+        return ([(0.0, length / _ARM) for length in self.places.lengths] + [(-np.pi, np.pi)] * 3 * self.turned) * self.count
 
     def start(self, numbers):
         """x of place numbers (count, places.numbers), antennas not turned."""
         placed = np.reshape(numbers, (self.count, -1)) * self.places.lengths / _ARM
-        return np.hstack([placed, np.zeros((self.count, 3))]).ravel()
+        return np.hstack([placed, np.zeros((self.count, 3 * self.turned))]).ravel()
 
     def anchors(self, x):
         """Anchors of x, after the fixed ones."""
         positions, orientations = self._placed(np.reshape(x, (self.count, self.width)))
         if self.fixed is None:
             return Anchors(np.arange(self.count), positions, orientations)
-        taken = self.fixed.ids
-        ids = np.setdiff1d(np.arange(self.count + taken.max() + 1), taken)[: self.count]
         return Anchors(
-            np.append(taken, ids),
+            np.append(self.fixed.ids, _free_ids(self.fixed.ids, self.count)),
             np.vstack([self.fixed.positions, positions]),
             np.vstack([self.fixed.orientations, orientations]),
             self.fixed.frame,
@@ -96,8 +97,11 @@ class Layout:
 
     def _placed(self, rows):
         """Positions (n, 3) m and orientations (n, 4) of rows (n, width)."""
-        new = facing(self.places.positions(rows[:, :-3] * _ARM / self.places.lengths), self.target)
-        return new.positions, (Rotation.from_rotvec(rows[:, -3:]) * Rotation.from_quat(new.orientations)).as_quat()
+        n = self.places.numbers
+        new = facing(self.places.positions(rows[:, :n] * _ARM / self.places.lengths), self.target)
+        if not self.turned:
+            return new.positions, np.full((len(rows), 4), np.nan)
+        return new.positions, (Rotation.from_rotvec(rows[:, n:]) * Rotation.from_quat(new.orientations)).as_quat()
 
 
 def optimise(goal, places, count, fixed=None, start=None, starts=16, seed=0, progress=iter):
@@ -106,7 +110,7 @@ def optimise(goal, places, count, fixed=None, start=None, starts=16, seed=0, pro
     goal : Goal; places : Places; start : (count, 3) m, a layout to begin with besides the quasi-random ones;
     progress : wraps the starts. Descents from all starts at a few of the goal's points; the best of what
     they lead to descend again, with the points that turn out to be the worst. The best score at all points wins."""
-    layout = Layout(places, count, fixed, goal.points.mean(axis=0))
+    layout = Layout(places, count, fixed, goal.points.mean(axis=0), are_turned(goal.installation.anchors))
     rows = _some(goal, ROUGH, seed)
     looked_at = replace(goal, points=goal.points[rows])
     drawn = qmc.Halton(count * places.numbers, seed=seed).random(DRAWN * starts)
@@ -125,9 +129,75 @@ def optimise(goal, places, count, fixed=None, start=None, starts=16, seed=0, pro
 
 def one_more(goal, anchors, places, count=400):
     """What one more anchor would give at places all over: (positions (n, 3) m, scores (n,) m), facing the points."""
-    layout = Layout(places, 1, anchors, goal.points.mean(axis=0))
+    layout = Layout(places, 1, anchors, goal.points.mean(axis=0), are_turned(anchors))
     numbers = places.grid(count)
     return places.positions(numbers), np.array([goal.score(layout.anchors(layout.start(x))) for x in numbers])
+
+
+def are_turned(anchors):
+    """Whether the orientation of any of the Anchors is known: only then are directions part of a layout."""
+    return bool(np.isfinite(anchors.orientations).all(axis=1).any())
+
+
+def with_one(anchors, position):
+    """Anchors with one more, whose orientation is not known, at position (3,) m."""
+    return Anchors(
+        np.append(anchors.ids, _free_ids(anchors.ids, 1)),
+        np.vstack([anchors.positions, position]),
+        np.vstack([anchors.orientations, np.full(4, np.nan)]),
+        anchors.frame,
+    )
+
+
+def named(better, before):
+    """Anchors of a layout with the ids that they have `before`: who is moved is moved as little as possible in all. New ids where there are
+    more than before."""
+    away = np.linalg.norm(better.positions[:, None] - before.positions, axis=2)
+    rows, old = linear_sum_assignment(away)
+    ids = np.empty(len(better), int)
+    ids[np.setdiff1d(np.arange(len(better)), rows)] = _free_ids(before.ids, len(better) - len(rows))
+    ids[rows] = before.ids[old]
+    order = np.argsort(ids)
+    return Anchors(ids[order], better.positions[order], better.orientations[order], before.frame)
+
+
+def rounded(better, before):
+    """The same Anchors as somebody can put them up: to the centimetre and the degree; those that stay as they are `before` are not touched."""
+    moved = _moved(better, before)
+    positions, orientations = better.positions.copy(), better.orientations.copy()
+    positions[moved] = positions[moved].round(2)
+    turned = moved & np.isfinite(orientations).all(axis=1)
+    if turned.any():
+        angles = Rotation.from_quat(orientations[turned]).as_euler("ZYX", degrees=True).round()
+        orientations[turned] = Rotation.from_euler("ZYX", angles, degrees=True).as_quat().round(4)
+    return Anchors(better.ids, positions, orientations, better.frame)
+
+
+def placed(better, before):
+    """[{"id", "words"}] of the Anchors that are not where they are `before`: where to put them, and which way they face."""
+    rows = before.index(better.ids)
+    found = []
+    for row in np.flatnonzero(_moved(better, before)).tolist():
+        position, q = better.positions[row], better.orientations[row]
+        words = ("new, at" if rows[row] < 0 else "to") + " ({:.2f}, {:.2f}, {:.2f})".format(*position)
+        if rows[row] >= 0:
+            words += f", by {np.linalg.norm(position - before.positions[rows[row]]):.2f} m"
+        if np.isfinite(q).all():
+            yaw, pitch, roll = Rotation.from_quat(q).as_euler("ZYX", degrees=True).round()
+            words += f", its front turned {yaw:.0f} deg from x towards y, {pitch:.0f} deg downwards, rolled by {roll:.0f} deg"
+        found.append({"id": int(better.ids[row]), "words": words})
+    return found
+
+
+def _moved(better, before):
+    """Which of the Anchors are new, or more than a millimetre from where they are `before`: (n,) bool."""
+    rows = before.index(better.ids)
+    return (rows < 0) | (np.linalg.norm(better.positions - before.positions[rows], axis=1) > 1e-3)
+
+
+def _free_ids(taken, count):
+    """The `count` smallest ids that nobody has."""
+    return np.setdiff1d(np.arange(count + taken.max() + 1), taken)[:count]
 
 
 def _some(goal, count, seed):

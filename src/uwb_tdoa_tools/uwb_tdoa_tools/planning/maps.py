@@ -33,7 +33,7 @@ class Grid:
             raise InputError(f"step: {step!r} m is not the size of a cell; give one above 0, e.g. 0.1.")
         if not (upper > lower).all():
             raise InputError(
-                f"area: {lower.tolist()} to {upper.tolist()} m is empty; give X0 X1 Y0 Y1 (Z0 Z1), each rising."
+                f"room: {lower.tolist()} to {upper.tolist()} m is empty; give X0 X1 Y0 Y1 (Z0 Z1), each rising."
             )
         shape = np.ceil((upper - lower) / step - 1e-6)
         if np.prod(shape) > MOST_CELLS:
@@ -104,9 +104,14 @@ class Chart:
 def chart(installation, grid, criterion="pairings"):
     """Chart of an Installation over a Grid. criterion : of FLYABLE."""
     points = grid.points
-    subsets = Subsets(installation.anchors, installation.unknowns)
     covariance = bound(information(points, installation))
     dop = np.linalg.norm(dilution(points, installation), axis=1)
+    return Chart(grid, covariance, position_error(covariance), dop, *flyable(installation, points, criterion))
+
+
+def flyable(installation, points, criterion):
+    """hull, ambiguous, flyable of a Chart, (n,) each, at points (n, 3) m."""
+    subsets = Subsets(installation.anchors, installation.unknowns)
     hull, ambiguous = installation.inside_hull(points), subsets.ambiguous(points)
     unique = ambiguous == 0.0 if criterion == "pairings" else subsets.separation(points, installation) > CLEAR
-    return Chart(grid, covariance, position_error(covariance), dop, hull, ambiguous, hull & unique)
+    return hull, ambiguous, hull & unique

@@ -44,13 +44,13 @@ def installation_of(args, anchors):
 
 
 def room_for(args, anchors):
-    """Room that --area gives, or that the anchors stand in. Raises InputError."""
+    """Room that --room gives, or that the anchors stand in. Raises InputError."""
     room = room_of(anchors)
-    if args.area is None:
+    if args.room is None:
         return room
-    if len(args.area) not in (4, 6):
-        raise InputError(f"area: {len(args.area)} numbers were given; give X0 X1 Y0 Y1 or X0 X1 Y0 Y1 Z0 Z1.")
-    return _box("area", args.area if len(args.area) == 6 else [*args.area, room.lower[2], room.upper[2]])
+    if len(args.room) not in (4, 6):
+        raise InputError(f"room: {len(args.room)} numbers were given; give X0 X1 Y0 Y1 or X0 X1 Y0 Y1 Z0 Z1.")
+    return _box("room", args.room if len(args.room) == 6 else [*args.room, room.lower[2], room.upper[2]])
 
 
 def grid_of(args, room):
@@ -79,8 +79,17 @@ def aim_of(args, installation, room, height):
     def goal(step):
         return Goal(lattice(lower, upper, step), installation, _pairing(args), args.objective, args.flyable)
 
-    places = Places.from_yaml(args.places) if args.places else Places.walls(room.lower, room.upper)
-    return Aim(goal(step), goal(0.4 * step), places, count)
+    return Aim(goal(step), goal(0.4 * step), places_of(args, room), count)
+
+
+def installed(args, installation):
+    """Callable that gives the Installation of other Anchors."""
+    return Goal(np.empty((0, 3)), installation, _pairing(args)).installed
+
+
+def places_of(args, room):
+    """Places that --places gives, or the walls of the Room. Raises InputError."""
+    return Places.from_yaml(args.places) if args.places else Places.walls(room.lower, room.upper)
 
 
 def plain(args):

@@ -2,6 +2,7 @@
 
 import numpy as np
 from matplotlib.collections import EllipseCollection
+from matplotlib.colors import ListedColormap
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -35,10 +36,11 @@ def plot_failure(installation, chart, path):
     figure, axes = _panels(2 * len(layers), 2)
     subsets = Subsets(installation.anchors, installation.unknowns)
     x, y, _ = chart.grid.axes
+    share = (0.0, max(10.0, 100.0 * np.quantile(chart.ambiguous[chart.hull], 0.98) if chart.hull.any() else 0.0))  # %
     for row, k in zip(axes, layers):
         points = chart.grid.layer(chart.grid.points, k).reshape(-1, 3)
         discriminant = subsets.discriminant(points).reshape(len(y), len(x), -1)
-        _field(row[0], chart, chart.hull, 100.0 * chart.ambiguous, k, "pairings with two solutions, %", levels=False)
+        _field(row[0], chart, chart.hull, 100.0 * chart.ambiguous, k, "pairings with two solutions, %", levels=False, scale=share)
         row[1].contourf(x, y, chart.grid.layer(chart.flyable, k).astype(float), levels=[0.5, 1.5], colors=[FLYABLE])
         for q in range(discriminant.shape[2]):
             row[1].contour(x, y, discriminant[:, :, q], levels=[0.0], colors="0.55", linewidths=0.5)
@@ -47,7 +49,8 @@ def plot_failure(installation, chart, path):
             row[1].contour(x, y, worst, levels=[0.0], colors=ENVELOPE, linewidths=1.8)
         for ax in row:
             _room(ax, installation, chart.grid, k)
-    _save(figure, "Left: ambiguity. Right: flyable (yellow), curves (grey), envelope (green), hull (magenta)", path)
+    title = "Left: ambiguity. Right: flyable (yellow), curves (grey), envelope (green), hull of the anchors (magenta)"
+    _save(figure, f"{title}\n{100.0 * chart.flyable.mean():.0f} % of {'the slice' if chart.grid.shape[2] == 1 else 'the room'} is flyable", path)
 
 
 def plot_flips(installation, points, unique, agrees, mirrors, path):
@@ -107,10 +110,10 @@ def plot_layouts(charts, path, candidates=None):
         for ax, (title, installation, chart) in zip(row, charts):
             _field(ax, chart, chart.hull, 100.0 * chart.error, k, "bound, 3D rms, cm", scale=scale)
             x, y, _ = chart.grid.axes
-            blocked = chart.grid.layer(chart.hull & ~chart.flyable, k).astype(float)
-            ax.contourf(x, y, blocked, levels=[0.5, 1.5], colors="none", hatches=["////"])
+            _hatch(ax, chart, k)
             _room(ax, installation, chart.grid, k)
-            ax.set_title(f"{title}{ax.get_title()}", fontsize=9)
+            flown = chart.grid.layer(chart.flyable, k).mean()
+            ax.set_title(f"{title}{ax.get_title()}: {100.0 * flown:.0f} % flyable", fontsize=9)
     if candidates is not None:
         worst_first = np.argsort(-candidates[1])
         positions, scores = candidates[0][worst_first], candidates[1][worst_first]
@@ -119,7 +122,8 @@ def plot_layouts(charts, path, candidates=None):
             row[-1].set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal")
             row[-1].set_title("score with one more anchor there", fontsize=9)
             figure.colorbar(dots, ax=row[-1], label="cm", shrink=0.8)
-    _save(figure, "Before and after; hatched: inside the hull, not flyable", path)
+    hatched = any(not chart.flyable.all() for _, _, chart in charts)
+    _save(figure, "Before and after; hatched: not flyable" if hatched else "Before and after; all is flyable", path)
 
 
 def _layers(grid):
@@ -139,13 +143,24 @@ def _field(ax, chart, judged, values, k, label, levels=True, scale=None):
     x, y, _ = chart.grid.axes
     inside = values[judged & np.isfinite(values)]
     inside = inside if len(inside) else np.array([0.0, 1.0])
-    low, high = scale or (inside.min(), max(np.quantile(inside, 0.98), inside.min() + 1e-9))
+    low, high = scale or (inside.min(), np.quantile(inside, 0.98))
+    high = high if high > low else low + 1.0  # all the same
     layer = chart.grid.layer(np.where(np.isfinite(values), values, np.nan), k)
     mesh = ax.pcolormesh(x, y, layer, cmap="viridis_r", vmin=low, vmax=high, shading="nearest", rasterized=True)
     if levels and min(layer.shape) > 1:
         lines = ax.contour(x, y, layer, levels=np.linspace(low, high, 7)[1:-1], colors="k", linewidths=0.4)
         ax.clabel(lines, fontsize=6, fmt="%.1f")
     ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.85)
+
+
+def _hatch(ax, chart, k):
+    """Lines, on a lighter ground, over what is not flyable."""
+    x, y, _ = chart.grid.axes
+    edges = [np.append(axis - 0.5 * chart.grid.step, axis[-1] + 0.5 * chart.grid.step) for axis in (x, y)]
+    blocked = np.ma.masked_equal(~chart.grid.layer(chart.flyable, k), False)
+    ax.pcolormesh(*edges, blocked.astype(float), cmap=ListedColormap(["white"]), alpha=0.5, lw=0)
+    if min(blocked.shape) > 1 and blocked.any():
+        ax.contourf(x, y, blocked.filled(0).astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
 
 
 def _room(ax, installation, grid, k):

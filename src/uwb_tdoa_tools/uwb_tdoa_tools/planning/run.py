@@ -11,7 +11,10 @@ from ..progress import Progress
 from ..readers.inputs import Reading
 from . import accuracy, layout, messages, plots
 from .check import brute_force
-from .maps import Grid, chart
+from .maps import Grid, chart, flyable
+
+ENOUGH = 0.95  # of the room that can be flown: no anchor is proposed
+LOOKED_AT, TRIED = 600, 60  # cells of the room, and places, that are tried for one more anchor, about
 
 
 def draw_map(found, installation, out):
@@ -61,6 +64,32 @@ def judge_flights(flown, installation, room, step, out):
     return rows
 
 
+def addition(found, anchors, installed, places, criterion):
+    """What the best of some places for one more anchor would add to what is flyable: {"position": (3,) m, "gain": share of the room}, to
+    the centimetre; None where nearly all is flyable. found : Chart of Anchors; installed(anchors) : Installation of others; places : Places."""
+    if found.flyable.mean() > ENOUGH:
+        return None
+    grid = found.grid
+    coarse = Grid.box(grid.lower, grid.lower + grid.step * np.array(grid.shape), grid.step * (found.flyable.size / LOOKED_AT) ** (1.0 / _across(grid)))
+    if grid.shape[2] == 1:
+        x, y, z = grid.axes
+        coarse = Grid.slice((x[0], x[-1]), (y[0], y[-1]), z[0], coarse.step)
+    points = coarse.points
+    before, best = flyable(installed(anchors), points, criterion)[2].mean(), (0.0, None)
+    for position in np.unique(places.positions(places.grid(TRIED)).round(2), axis=0):
+        try:
+            more = installed(layout.with_one(anchors, position))
+        except InputError:  # where there is one already
+            continue
+        best = max(best, (flyable(more, points, criterion)[2].mean() - before, position.tolist()), key=lambda one: one[0])
+    return {"position": best[1], "gain": float(best[0])}
+
+
+def _across(grid):
+    """Dimensions of a grid."""
+    return 2 if grid.shape[2] == 1 else 3
+
+
 def improve(before, aim, how, starts, criterion, out):
     """Better places for the anchors, improved.yaml. before : Chart as it is; aim : options.Aim; how : "move" or "add";
     criterion : of what is flyable."""
@@ -74,9 +103,15 @@ def improve(before, aim, how, starts, criterion, out):
             better = layout.optimise(goal, places, 1, anchors, start, **search)
         else:
             start = anchors.positions if aim.count == len(anchors) else None
-            better = layout.optimise(goal, places, aim.count, None, start, **search)
+            better = layout.named(layout.optimise(goal, places, aim.count, None, start, **search), anchors)
+        better = layout.rounded(better, anchors)
         better.to_yaml(out / "improved.yaml")
         after = goal.installed(better)
-        charts = [("before, ", installation, before), ("after, ", after, chart(after, before.grid, criterion))]
+        charted = chart(after, before.grid, criterion)
+        charts = [("before, ", installation, before), ("after, ", after, charted)]
     plots.plot_layouts(charts, out / "layout.png", candidates)
-    return {"points": len(aim.judge.points), "before": aim.judge.judge(anchors), "after": aim.judge.judge(better)}
+    judged = {
+        when: {"flyable_share": float(one.flyable.mean()), **aim.judge.judge(those)}
+        for when, one, those in (("before", before, anchors), ("after", charted, better))
+    }
+    return {"points": len(aim.judge.points), **judged, "placed": layout.placed(better, anchors)}
