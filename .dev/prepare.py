@@ -167,9 +167,10 @@ def build(done, compiled):
 
 def colcon(selected):
     """The step that builds some packages; it runs."""
-    paths, options, variables = ["src"], [], {}
+    paths = [f"src/{name}" for name in selected if (ROOT / "src" / name).exists()]  # of others colcon would ask that they are built
+    options, variables = [], {}
     if not OWN_ROS:
-        paths, options = ["src", ".dev/tf2_msgs"], ["-G", "Ninja"]
+        paths, options = [*paths, ".dev/tf2_msgs"] if "tf2_msgs" in selected else paths, ["-G", "Ninja"]
         variables = {"AMENT_PREFIX_PATH": str(VENV), "CMAKE_PREFIX_PATH": str(VENV)}
     return start(
         f"build {', '.join(selected)}",

@@ -7,7 +7,9 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.commands.convert import main
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.readers.columns import TIME, UNITS, parse_columns, read_columns
+from uwb_tdoa_tools.readers.names import Named, read_named
 
+NAMED = Named(ANCHORS)
 TDOA = "time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff:mm"
 IMU = ",".join(f"{s}_{axis}={s[0]}{axis}{unit}" for s, unit in (("gyro", ":deg/s"), ("accel", ":g")) for axis in "xyz")
 RANGING = "t_ms,to,from,diff,quality\n1000,1,0,250,9\n1010,5,1,-500,9\n1020,0,0x5,750,9\n"
@@ -24,7 +26,7 @@ def files(tmp_path, monkeypatch):
 
 
 def test_units_and_names_end_at_the_border(files):
-    flight = read_columns(["ranging.csv", "imu.csv"], parse_columns(f"{TDOA},{IMU}"), ANCHORS)
+    flight = read_columns(["ranging.csv", "imu.csv"], parse_columns(f"{TDOA},{IMU}"), NAMED)
     assert flight.name == "ranging"
     np.testing.assert_allclose(flight.tdoa.t, [1.0, 1.01, 1.02])
     np.testing.assert_array_equal(flight.tdoa.a, [0, 1, 5])
@@ -40,7 +42,7 @@ def test_units_and_names_end_at_the_border(files):
 )
 def test_every_unit_of_a_tdoa(files, unit, cell):
     (files / "one.csv").write_text(f"t,a,b,d\n0.5,0,1,{cell}\n")
-    flight = read_columns(["one.csv"], parse_columns(f"time=t,anchor_a=a,anchor_b=b,tdoa=d:{unit}"), ANCHORS)
+    flight = read_columns(["one.csv"], parse_columns(f"time=t,anchor_a=a,anchor_b=b,tdoa=d:{unit}"), NAMED)
     assert flight.tdoa.d[0] == pytest.approx(1.5, abs=1e-4)
 
 
@@ -49,7 +51,7 @@ def test_rows_of_several_sensors_in_one_file(files):
     (files / "all.csv").write_text(rows)
     others = (f"{sensor}_{axis}={sensor[0]}{axis}" for sensor in ("gyro", "accel", "pose") for axis in "xyz")
     columns = parse_columns(",".join(["time=t,anchor_a=a,anchor_b=b,tdoa=d", *others]))
-    flight = read_columns(["all.csv"], columns, ANCHORS)
+    flight = read_columns(["all.csv"], columns, NAMED)
     assert (len(flight.tdoa), len(flight.imu), len(flight.truth)) == (1, 1, 1)
     np.testing.assert_allclose(flight.imu.gyro, [[1, 2, 3]])
     np.testing.assert_allclose(flight.imu.accel, [[4, 5, 6]])
@@ -84,27 +86,26 @@ def test_every_column_can_be_named_and_every_time_has_units():
     "rows, said",
     [
         ("t_ms,from,to\n1,0,1\n", "has no column 'diff'; its columns are t_ms, from, to"),
-        ("t_ms,from,to,diff\n1,0,1,x\n", "line 2: diff is 'x'; it must be a number"),
-        (f"t_ms,from,to,diff\n1,0,1,0x{'f' * 300}\n", "line 2: diff is '0xffff.*; it must be a number"),
-        ("t_ms,from,to,diff\n1,,1,3\n", "line 2: from is ''"),
-        ("t_ms,from,to,diff\n1,0.5,1,3\n", "ids are whole numbers"),
-        ("t_ms,from,to,diff\n1,0,70000,3\n", "ids are whole numbers"),
-        ("t_ms,from,to,diff\n1,0,nan,3\n", "ids are whole numbers"),
-        ("t_ms,from,to,diff\n1,0,1,inf\n", "it must be finite"),
-        ("t_ms,from,to,diff\n1,0,1\n", "line 2: has fewer cells"),
+        ("t_ms,from,to,diff\n1,0,1,x\n", "line 2: diff is 'x'; it must be a finite number"),
+        ("t_ms,from,to,diff\n1,,1,3\n", "line 2: from is ''; it must be an anchor"),
+        ("t_ms,from,to,diff\n1,0.5,1,3\n", "it must be an anchor of the survey, by its name, or an id 0 ... 65535"),
+        ("t_ms,from,to,diff\n1,0,70000,3\n", "it must be an anchor of the survey, by its name, or an id 0 ... 65535"),
+        ("t_ms,from,to,diff\n1,0,nan,3\n", "it must be an anchor of the survey, by its name, or an id 0 ... 65535"),
+        ("t_ms,from,to,diff\n1,0,1,inf\n", "it must be a finite number"),
+        (f"t_ms,from,to,diff\n1,0,1,0x{'f' * 300}\n", "line 2: diff is '0xffff.*; it must be a finite number"),
         ("t_ms,from,to,diff\n", "has no row below"),
     ],
 )
 def test_a_bad_file_is_one_sentence(files, rows, said):
     (files / "bad.csv").write_text(rows)
     with pytest.raises(InputError, match=said):
-        read_columns(["bad.csv"], parse_columns(TDOA), ANCHORS)
+        read_columns(["bad.csv"], parse_columns(TDOA), NAMED)
 
 
 def test_columns_in_two_files_are_refused(files):
     (files / "again.csv").write_text(RANGING)
     with pytest.raises(InputError, match="give one of them"):
-        read_columns(["ranging.csv", "again.csv"], parse_columns(TDOA), ANCHORS)
+        read_columns(["ranging.csv", "again.csv"], parse_columns(TDOA), NAMED)
 
 
 def test_the_command_writes_a_bag_that_every_tool_reads(files, capsys):
@@ -126,3 +127,93 @@ def test_the_command_writes_a_bag_that_every_tool_reads(files, capsys):
 def test_what_is_missing_is_said(files, words, said, capsys):
     assert main([*words, "--out", "our.bag"]) == 2
     assert said in capsys.readouterr().err and not (files / "our.bag").exists()
+
+
+# --- as other tools write them ---
+
+OTHERS = """\
+Zeit;von;nach;Differenz\r
+0,00;NE Ecke;SW Ecke;1,25\r
+0,01;sw ecke;Tuer;-0,5\r
+0,02;Tuer;NE Ecke;
+0,03;Tuer;NE Ecke;NaN\r
+0,04;NE Ecke;Tuer;-\r
+0,05;NE Ecke;SW Ecke;0,75\r
+"""
+NAMES = "name,x,y,z\nNE Ecke,0,0,1\nSW Ecke,5,0,1\nTuer,0,5,2\n"
+
+
+def test_semicolons_commas_names_and_holes_of_a_spreadsheet(files, capsys):
+    (files / "tag.csv").write_text(OTHERS)
+    (files / "names.csv").write_text(NAMES)
+    words = ["tag.csv", "--columns", "time=Zeit,anchor_a=von,anchor_b=nach,tdoa=Differenz", "--survey", "names.csv", "--out", "our.bag"]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert "ids in the bag: NE Ecke is 0, SW Ecke is 1, Tuer is 2" in told
+    flight = read_flight("our.bag")
+    np.testing.assert_allclose(flight.tdoa.d, [1.25, -0.5, 0.75])
+    np.testing.assert_array_equal(flight.tdoa.a, [0, 1, 0])
+    np.testing.assert_array_equal(flight.anchors.positions[flight.anchors.row(2)], [0, 5, 2])
+
+
+@pytest.mark.parametrize(
+    "survey, ids",
+    [
+        (NAMES, {"NE Ecke": 0, "SW Ecke": 1, "Tuer": 2}),
+        ("id,x,y,z\nA7,0,0,1\nA3,5,0,1\nA12,0,5,2\n", {"A7": 7, "A3": 3, "A12": 12}),
+        ("anchors: {left: {position: [0, 0, 1]}, right: {position: [5, 0, 1]}}\n", {"left": 0, "right": 1}),
+        (SURVEY, {}),
+    ],
+)
+def test_names_of_a_survey(files, survey, ids):
+    (files / "named.yaml").write_text(survey)
+    named = read_named("named.yaml")
+    assert named.ids == ids and (not ids or set(named.anchors.ids) == set(ids.values()))
+
+
+def test_gaps_are_skipped_and_counted_and_too_many_are_refused(files, capsys):
+    lines = [f"{10 * k},0,1,{k}" for k in range(30)]
+    lines[4], lines[9] = "40,0,1,broken", "90,,1,5"
+    (files / "gaps.csv").write_text("t_ms,from,to,diff\n" + "\n".join(lines))
+    words = ["gaps.csv", "--columns", TDOA, "--survey", "survey.csv", "--out", "our.bag"]
+    assert main(words) == 0
+    assert "2 of 30 records left out, line 6: diff is 'broken'; it must be a finite number." in capsys.readouterr().out
+    assert len(read_flight("our.bag").tdoa) == 28
+    (files / "gaps.csv").write_text("t_ms,from,to,diff\n" + "\n".join(line.replace(",1,1", ",1,x1") for line in lines))
+    assert main([*words, "--force"]) == 2
+    assert "records of anchor_a, anchor_b, tdoa are like that: more than a gap" in capsys.readouterr().err
+    assert main([*words, "--force", "--salvage"]) == 0
+
+
+def test_sensors_with_clocks_of_their_own_in_one_file(files, capsys):
+    """A time column for each sensor, and stamps of motion capture that count from elsewhere."""
+    rows = ["t_uwb,from,to,diff,t_gyro,gx,gy,gz,t_acc,ax,ay,az,t_cap,x,y,z"]
+    rows += [f"{k},0,1,100,{k + 0.2},1,2,3,{k + 0.2},0,0,1,{k + 1.7e9},1,2,3" for k in range(5)]
+    (files / "all.csv").write_text("\n".join(rows))
+    columns = "tdoa_time=t_uwb,anchor_a=from,anchor_b=to,tdoa=diff:mm,gyro_time=t_gyro,accel_time=t_acc,pose_time=t_cap"
+    columns += "".join(f",pose_{axis}={axis}" for axis in "xyz") + "," + IMU
+    words = ["all.csv", "--columns", columns, "--survey", "survey.csv", "--out", "our.bag"]
+    assert main(words) == 0
+    told = capsys.readouterr()
+    assert "all: 4.2 s" in told.out  # and not 1.7e9
+    assert "truth runs from 1700000000.0 to 1700000004.0 s" in told.err and "--time-offset truth=-1700000000.000" in told.err
+    assert main([*words, "--force", "--time-offset", "truth=-1700000000.0", "--time-offset", "imu=-0.2"]) == 0
+    assert "no time in common" not in capsys.readouterr().err
+    flight = read_flight("our.bag")
+    np.testing.assert_allclose(flight.truth.t, flight.tdoa.t, atol=1e-6)
+    np.testing.assert_allclose(flight.imu.t, flight.tdoa.t, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "offset, said",
+    [
+        ("truth", "'truth' is not SENSOR=SECONDS"),
+        ("camera=1", "'camera=1' is not SENSOR=SECONDS"),
+        ("imu=soon", "'imu=soon' is not SENSOR=SECONDS"),
+        ("imu=1", "ranging holds no imu; it holds tdoa"),
+    ],
+)
+def test_an_offset_that_cannot_be_is_one_sentence(files, offset, said, capsys):
+    words = ["ranging.csv", "--columns", TDOA, "--survey", "survey.csv", "--out", "our.bag", "--time-offset", offset]
+    assert main(words) == 2
+    assert said in capsys.readouterr().err

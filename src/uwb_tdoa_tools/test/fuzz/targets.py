@@ -36,6 +36,7 @@ from uwb_tdoa_tools.planning.noise import antenna_from_yaml
 from uwb_tdoa_tools.planning.places import Places
 from uwb_tdoa_tools.readers import read_survey, read_usd_log, read_util_csv
 from uwb_tdoa_tools.readers.columns import parse_columns, read_columns
+from uwb_tdoa_tools.readers.names import Named
 from uwb_tdoa_tools.readers.tables import number, read_table
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.table import read_others
@@ -179,7 +180,7 @@ def bag_packed(data):
 
 def columns(data):
     asked = parse_columns("time=t:ms,anchor_a=from,anchor_b=to,tdoa=d:mm,gyro_x=gx,gyro_y=gy,gyro_z=gz,accel_x=ax,accel_y=ay,accel_z=az")
-    _finite(read_columns([_file(data)], asked, ANCHORS))
+    _finite(read_columns([_file(data)], asked, Named(ANCHORS)))
 
 
 def marks(data):

@@ -1,17 +1,22 @@
 """A recording of any kind as a bag."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.errors import InputError
+
 from .bag import check_output, write_bag
+
+
+SENSORS = "tdoa", "imu", "truth", "height", "pressure", "velocity"  # streams of a Flight, each on its own clock
 
 
 @dataclass(frozen=True)
 class Converted:
     """flight : name; bag : path; messages : {topic: count}; start, end : s; anchors : how many; tdoa_unknown_anchor :
     measurements of anchors that the survey does not have; left_out : {stream that a bag has no place for: events};
-    meta : of the Flight."""
+    meta : of the Flight; apart : sentences on sensors that never overlap with the TDOAs in time."""
 
     flight: str
     bag: str
@@ -22,6 +27,7 @@ class Converted:
     tdoa_unknown_anchor: int
     left_out: dict
     meta: dict
+    apart: list
 
 
 def convert(read, out, storage="mcap", force=False):
@@ -30,16 +36,49 @@ def convert(read, out, storage="mcap", force=False):
     check_output(out, force)  # before the work, not after it
     flight = read()
     counts = write_bag(flight, out, storage, force)
-    streams = [stream for stream in (flight.tdoa, flight.imu, flight.truth) if stream is not None and len(stream)]
+    together = [stream for name in _held(flight) if _overlaps(stream := getattr(flight, name), flight.tdoa)]
     known = (flight.anchors.index(flight.tdoa.a) >= 0) & (flight.anchors.index(flight.tdoa.b) >= 0)
     return Converted(
         flight=flight.name,
         bag=str(out),
         messages=counts,
-        start=min(float(stream.t[0]) for stream in streams),
-        end=max(float(stream.t[-1]) for stream in streams),
+        start=min(float(stream.t[0]) for stream in together),
+        end=max(float(stream.t[-1]) for stream in together),
         anchors=len(flight.anchors),
         tdoa_unknown_anchor=int(np.count_nonzero(~known)),
         left_out={name: len(columns["t"]) for name, columns in flight.extra.items()},
         meta=flight.meta,
+        apart=_apart(flight),
     )
+
+
+def shifted(flight, offsets):
+    """The Flight with offsets {of SENSORS: s} added to the stamps of what it holds. Raises InputError for a sensor that it does not hold."""
+    changed = {}
+    for sensor, offset in offsets.items():
+        stream = getattr(flight, sensor)
+        if stream is None:
+            raise InputError(f"--time-offset: {flight.name} holds no {sensor}; it holds {', '.join(_held(flight))}.")
+        changed[sensor] = replace(stream, t=stream.t + offset)
+    return replace(flight, **changed)
+
+
+def _held(flight):
+    return [name for name in SENSORS if getattr(flight, name) is not None and len(getattr(flight, name).t)]
+
+
+def _overlaps(one, other):
+    return one.t[-1] >= other.t[0] and one.t[0] <= other.t[-1]
+
+
+def _apart(flight):
+    """Sentences on sensors whose stamps have no time in common with those of the TDOAs: they are on another clock."""
+    begin, end, said = flight.tdoa.t[0], flight.tdoa.t[-1], []
+    for name in _held(flight):
+        t = getattr(flight, name).t
+        if not _overlaps(getattr(flight, name), flight.tdoa):
+            said.append(
+                f"{name} runs from {t[0]:.1f} to {t[-1]:.1f} s, the TDOAs from {begin:.1f} to {end:.1f} s: clocks that have no time in common; "
+                f"--time-offset {name}={begin - t[0]:.3f} lets both begin together, if they did."
+            )
+    return said

@@ -2,20 +2,23 @@
 
 from dataclasses import asdict
 import json
+import math
 import sys
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
-from ..bags.convert import convert
+from ..bags.convert import SENSORS, convert, shifted
 from ..bags.files import STORAGES
-from ..readers import columns, read_survey
+from ..readers import columns
+from ..readers.names import read_named
 from ..scoring.settling import on_one_clock
 
 DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
 IN is a Crazyflie micro-SD event log (versions 1 and 2), a UTIL CSV file (plain or gzip), a bag, or, with --columns, one
-CSV file or several of any other tool. The new bag has imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_static.
+CSV file or several of any other tool (cells divided by commas, semicolons or tabs; anchors by ids or by the names that
+the survey has for them; records with empty cells are left out and counted). The new bag has imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_static.
 It appears only when it is complete.
 """
 
@@ -37,11 +40,17 @@ def parser():
         "convert theirs.bag --topic uwb/tdoa=/dwm/tdoa --topic imu/data=/fcu/imu --survey anchors.yaml --out our.bag",
         "convert ranging.csv --columns time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm --survey anchors.yaml "
         "--out our.bag",
+        "convert ranging.csv mocap.csv --columns time=t,anchor_a=from,anchor_b=to,tdoa=d,pose_x=x,pose_y=y,pose_z=z "
+        "--time-offset truth=-0.4 --survey anchors.csv --out our.bag",
     )
     made.add_argument("input", metavar="IN", nargs="+", help="the recording; its kind is found by its content")
     made.add_argument("--columns", metavar="MAP", help=columns.HELP)
     options.add_reading(made)
     options.add_align(made)
+    made.add_argument(
+        "--time-offset", dest="offsets", action="append", default=[], metavar="SENSOR=SECONDS",
+        help=f"add this to the stamps of a sensor with a clock of its own: {', '.join(SENSORS)}; may be repeated",
+    )  # fmt: skip
     made.add_argument("--out", metavar="BAG", required=True, help="the bag to write, a new directory")
     made.add_argument("--storage", choices=STORAGES, default="mcap", help="default: mcap")
     made.add_argument("--force", action="store_true", help="replace an existing bag")
@@ -50,11 +59,17 @@ def parser():
 
 
 def _convert(args):
-    made = convert(lambda: on_one_clock(_read(args), args.align), args.out, args.storage, args.force)
+    offsets = _offsets(args.offsets)
+    named = _named(args)
+    made = convert(lambda: on_one_clock(shifted(_read(args, named), offsets), args.align), args.out, args.storage, args.force)
     if args.json:
         cli.show(json.dumps(asdict(made), indent=2, default=str))
         return
     cli.show(f"{made.flight}: {made.end - made.start:.1f} s, {made.meta.get('protocol', 'protocol unknown')}")
+    if named and named.ids:
+        cli.show("  ids in the bag: " + ", ".join(f"{name} is {number}" for name, number in named.ids.items()))
+    for remark in made.meta.get("remarks", ()):
+        cli.show(f"  {remark}")
     for topic, count in made.messages.items():
         cli.show(f"  {topic}: {count}")
     for name, count in made.left_out.items():
@@ -64,19 +79,40 @@ def _convert(args):
     if made.tdoa_unknown_anchor:
         cli.show(f"  {made.tdoa_unknown_anchor} measurements name an anchor that the survey does not have")
     cli.show(f"  -> {args.out}")
+    for sentence in made.apart:
+        cli.say("convert", sentence)
 
 
-def _read(args):
-    """The Flight."""
-    reading = options.reading_of(args)
-    if not args.columns:
-        if len(args.input) > 1:
-            raise InputError(f"IN: {len(args.input)} recordings are given; convert one by one, or name --columns.")
-        return reading.one(args.input[0])
-    options.refuse(args, ("namespace", "topics"), "says where topics are in bags, and --columns is of CSV files")
-    if not args.survey:
+def _offsets(texts):
+    """{sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
+    offsets = {}
+    for text in texts:
+        sensor, given, seconds = text.partition("=")
+        try:
+            offset = float(seconds)
+        except ValueError:
+            offset = math.nan
+        if not given or sensor not in SENSORS or sensor in offsets or not abs(offset) < 1e11:
+            raise InputError(f"--time-offset: {text!r} is not SENSOR=SECONDS, where SENSOR, once, is one of {', '.join(SENSORS)}.")
+        offsets[sensor] = offset
+    return offsets
+
+
+def _named(args):
+    """Named anchors for --columns, or None. Raises InputError."""
+    if args.columns and not args.survey:
         raise InputError("--columns: CSV files do not say where the anchors are; give a survey file (--survey FILE).")
-    return columns.read_columns(args.input, columns.parse_columns(args.columns), read_survey(args.survey), args.salvage)
+    return read_named(args.survey) if args.columns else None
+
+
+def _read(args, named):
+    """The Flight."""
+    if args.columns:
+        options.refuse(args, ("namespace", "topics"), "says where topics are in bags, and --columns is of CSV files")
+        return columns.read_columns(args.input, columns.parse_columns(args.columns), named, args.salvage)
+    if len(args.input) > 1:
+        raise InputError(f"IN: {len(args.input)} recordings are given; convert one by one, or name --columns.")
+    return options.reading_of(args).one(args.input[0])
 
 
 if __name__ == "__main__":

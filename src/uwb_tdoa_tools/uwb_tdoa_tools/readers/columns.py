@@ -27,14 +27,19 @@ STREAMS = {  # stream: {our column: (column of the stream, {unit: factor}, the f
     "acc": {f"accel_{axis}": (axis, FORCE) for axis in "xyz"},
     "pose": {f"pose_{axis}": (axis, LENGTH) for axis in "xyz"} | {f"pose_q{k}": (f"q{k}", NUMBER) for k in "xyzw"},
 }
-TIMES = {"tdoa": "tdoa_time", "gyro": "imu_time", "acc": "imu_time", "pose": "pose_time"}  # else "time"
+TIMES = {  # of each stream: the first that is given, else "time"
+    "tdoa": ("tdoa_time",), "gyro": ("gyro_time", "imu_time"), "acc": ("accel_time", "imu_time"), "pose": ("pose_time",),
+}  # fmt: skip
+ANCHORS = "anchor_a", "anchor_b"  # columns that name anchors
+EMPTY = {"", "-", "--", "n/a", "na", "nan", "none", "null"}  # what tools write where they have nothing
+MOST_SKIPPED = 0.1  # of the records of a stream, that are no numbers
 ATTITUDE = {f"pose_q{k}" for k in "xyzw"}
 OPTIONAL = {*ATTITUDE, "tdoa_std"}
 UNITS = {name: units for columns in STREAMS.values() for name, (_, units) in columns.items()}
-UNITS |= {name: TIME for name in ("time", *TIMES.values())}
+UNITS |= {name: TIME for name in ("time", *sorted({name for names in TIMES.values() for name in names}))}
 HELP = (
     "for CSV files of other tools: their columns, OURS=THEIRS[:UNIT],... (anchor_a, anchor_b, tdoa; gyro_x ...; "
-    "accel_x ...; pose_x ...; time, or tdoa_time, imu_time, pose_time)"
+    "accel_x ...; pose_x ...; time, or tdoa_time, imu_time, gyro_time, accel_time, pose_time where a sensor has its own)"
 )
 
 
@@ -59,38 +64,36 @@ def parse_columns(text):
         needed = [*(name for name in STREAMS[stream] if name not in OPTIONAL)]
         if missing := [name for name in needed if name not in columns]:
             raise InputError(f"--columns: {missing[0]} is missing; {', '.join(needed)} belong together.")
-        if not {TIMES[stream], "time"} & columns.keys():
-            raise InputError(f"--columns: {TIMES[stream]}, or time, is missing; name the column with the time.")
+        if not {*TIMES[stream], "time"} & columns.keys():
+            raise InputError(f"--columns: {TIMES[stream][-1]}, or time, is missing; name the column with the time.")
     if len(ATTITUDE & columns.keys()) not in (0, 4):
         raise InputError(f"--columns: {', '.join(sorted(ATTITUDE))} belong together.")
     return columns
 
 
-def read_columns(paths, columns, anchors, salvage=False):
+def read_columns(paths, columns, named, salvage=False):
     """Flight of CSV files with a header line each; each stream is taken from the one file that has its columns.
 
-    A row counts for a stream if its cells are filled: rows of several sensors may be mixed in one file. Anchor ids are
-    whole numbers, or hexadecimal as 0x1A2B. columns : see `parse_columns`; anchors : Anchors; salvage : leave out
-    records that are not finite. Raises InputError, with the line for a cell that is no number.
+    A row counts for a stream if any of its cells is filled: rows of several sensors may be mixed in one file, and each may have a time column
+    of its own. A record with a cell that is empty or no number is left out and counted, in `meta["remarks"]`; if that is more than
+    MOST_SKIPPED of the records, the file is refused. columns : see `parse_columns`; named : Named, the anchors; salvage : leave out
+    records that are not finite, however many. Raises InputError, with the line of the first record that is left out.
     """
-    tables = {path: read_table(path, most=TABLE_CELLS) for path in paths}
-    wanted, streams = {path: {} for path in paths}, {}
+    tables = {path: read_table(path, most=TABLE_CELLS, complete=False) for path in paths}
+    wanted, streams, remarks = {path: {} for path in paths}, {}, []
     for stream, known in STREAMS.items():
         mine = {name: columns[name] for name in known if name in columns}
         if mine:
-            mine["t"] = columns.get(TIMES[stream]) or columns["time"]
+            mine["t"] = next(columns[name] for name in (*TIMES[stream], "time") if name in columns)
             wanted[_having(tables, mine)][stream] = mine
     for path, of_file in wanted.items():
-        for stream, values in _values(path, tables[path], of_file).items():
+        for stream, values in _values(path, tables[path], of_file, named, remarks, salvage).items():
             streams[stream] = {"t" if name == "t" else STREAMS[stream][name][0]: column for name, column in values.items()}
-    for row, (a, b) in enumerate(zip(streams["tdoa"]["a"], streams["tdoa"]["b"])):
-        if not all(value == np.floor(value) and 0 <= value <= 65535 for value in (a, b)):
-            raise InputError(f"{paths[0]}: TDOA {row + 1}: anchors {a:g} and {b:g}; ids are whole numbers 0 ... 65535.")
     streams["tdoa"].update({name: streams["tdoa"][name].astype(np.int64) for name in "ab"})
     if "pose" in streams and "qx" not in streams["pose"]:
         streams["pose"].update({f"q{k}": np.full(len(streams["pose"]["t"]), np.nan) for k in "xyzw"})
-    meta = {"source": ", ".join(map(str, paths)), "format": "CSV, columns as given"}
-    return make_flight(Path(paths[0]).stem, anchors, streams, {}, meta, salvage)
+    meta = {"source": ", ".join(map(str, paths)), "format": "CSV, columns as given", "remarks": remarks}
+    return make_flight(Path(paths[0]).stem, named.anchors, streams, {}, meta, salvage)
 
 
 def _having(tables, mine):
@@ -105,23 +108,39 @@ def _having(tables, mine):
     raise InputError(f"{path}: has no column {min(names - {*table.names})!r}; its columns are {', '.join(table.names)}.")
 
 
-def _values(path, table, streams):
-    """{stream: {our name: (n,) array}}, in our units, of the rows in which a cell of the stream is filled. streams : {stream: columns}
-    that the table has."""
+def _values(path, table, streams, named, remarks, salvage):
+    """{stream: {our name: (n,) array}}, in our units, of the rows in which a cell of the stream is filled and all are numbers, or names of
+    anchors. streams : {stream: columns} that the table has."""
     values, rows = {stream: {name: array("d") for name in mine} for stream, mine in streams.items()}, 0
+    skipped, first = dict.fromkeys(streams, 0), {}
     for rows, (line, cells) in enumerate(table, start=1):
         for stream, mine in streams.items():
             texts = {name: cells[theirs].strip() for name, (theirs, _) in mine.items()}
-            if any(text for name, text in texts.items() if name != "t"):
-                for name, text in texts.items():
-                    values[stream][name].append(_number(path, line, mine[name][0], text))
+            if all(text.lower() in EMPTY for name, text in texts.items() if name != "t"):
+                continue
+            record = {name: named.id_of(text) if name in ANCHORS else _number(text) for name, text in texts.items()}
+            wrong = next((name for name, value in record.items() if value is None), None)
+            if wrong is None:
+                for name, value in record.items():
+                    values[stream][name].append(value)
+            else:
+                skipped[stream] += 1
+                what = "an anchor of the survey, by its name, or an id 0 ... 65535" if wrong in ANCHORS else "a finite number"
+                first.setdefault(stream, f"line {line}: {mine[wrong][0]} is {texts[wrong][:40]!r}; it must be {what}")
     if streams and not rows:
         raise InputError(f"{path}: has no row below its header; record the flight again.")
+    for stream, count in ((stream, count) for stream, count in skipped.items() if count):
+        n, names = count + len(values[stream]["t"]), ", ".join(name for name in streams[stream] if name != "t")
+        if count > MOST_SKIPPED * n and not salvage:
+            raise InputError(f"{path}: {first[stream]} ({count} of {n} records of {names} are like that: more than a gap).")
+        remarks.append(f"{path}: {count} of {n} records left out, {first[stream]}.")
     return {stream: {name: np.array(column) * streams[stream][name][1] for name, column in of.items()} for stream, of in values.items()}
 
 
-def _number(path, line, name, text):
+def _number(text):
+    """A finite number, with a point or a comma, or None."""
     try:
-        return float(int(text, 16)) if text[:2] in ("0x", "0X") else float(text)
-    except (ValueError, OverflowError):
-        raise InputError(f"{path}: line {line}: {name} is {text[:40]!r}; it must be a number.") from None
+        value = float(text.replace(",", "."))
+    except ValueError:
+        return None
+    return value if np.isfinite(value) else None

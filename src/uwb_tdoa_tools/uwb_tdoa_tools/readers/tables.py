@@ -46,11 +46,13 @@ class Rows:
 class Table:
     """(line, {column: text}) of each row of a CSV file. names : the columns of its header."""
 
-    def __init__(self, path, columns, most):
-        self._path, self._most = path, most
-        self._rows = Rows(path, read_bytes(path, TABLE_BYTES), skipinitialspace=True)
+    def __init__(self, path, columns, most, complete=True):
+        self._path, self._most, self._complete = path, most, complete
+        content = read_bytes(path, TABLE_BYTES)
+        header = content[:ROW_CHARACTERS].lstrip().split(b"\n", 1)[0]
+        self._rows = Rows(path, content, skipinitialspace=True, delimiter=max(",;\t", key=lambda each: header.count(each.encode())))
         self._cells = self._each()
-        self.names = next(self._cells, [])
+        self.names = [name.strip() for name in next(self._cells, [])]
         self._columns = columns if columns is not None else [name for name in self.names if name]
         if missing := [name for name in self._columns if name not in self.names]:
             raise InputError(f"{path}: has no column {missing[0]}; it needs columns {', '.join(self._columns)}.")
@@ -61,9 +63,10 @@ class Table:
             count += len(cells)
             if count > self._most:
                 raise InputError(f"{self._path}: has more than {self._most} cells; split it.")
-            if len(cells) <= max(names.values(), default=0):
+            short = len(cells) <= max(names.values(), default=0)
+            if short and self._complete:
                 raise InputError(f"{self._path}: line {self._rows.line}: has fewer cells than the header; complete it.")
-            yield self._rows.line, {name: cells[place] for name, place in names.items()}
+            yield self._rows.line, {name: cells[place] if not short or place < len(cells) else "" for name, place in names.items()}
 
     def _each(self):
         """The rows that are not empty."""
@@ -73,10 +76,11 @@ class Table:
             raise InputError(f"{self._path}: line {self._rows.line}: is no CSV ({error}); correct it there.") from error
 
 
-def read_table(path, columns=None, most=SMALL_TABLE_CELLS) -> Table:
+def read_table(path, columns=None, most=SMALL_TABLE_CELLS, complete=True) -> Table:
     """The Table of a CSV file that has at least the columns, others passed over; default: of all that it has. It may have `most`
-    cells. Raises InputError, also while it is iterated over."""
-    return Table(path, columns, most)
+    cells, divided by what the header has most of: commas, semicolons or tabs. complete : a row with fewer cells than the header is refused;
+    otherwise those that are missing are empty. Raises InputError, also while it is iterated over."""
+    return Table(path, columns, most, complete)
 
 
 def read_numbers(path, columns) -> np.ndarray:

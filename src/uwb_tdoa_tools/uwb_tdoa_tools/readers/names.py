@@ -1,0 +1,79 @@
+"""Anchors that have names: surveys and recordings call them "NE corner" or "A3", messages have numbers."""
+
+from dataclasses import dataclass, field
+import re
+
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+from uwb_tdoa_bias.foundation.survey import read_survey
+
+from .tables import number, read_table
+
+LARGEST_ID = 65535
+
+
+@dataclass(frozen=True)
+class Named:
+    """anchors : Anchors; ids : {name as in the survey: id}, empty if they are called by their ids."""
+
+    anchors: Anchors
+    ids: dict = field(default_factory=dict)
+
+    def id_of(self, text):
+        """The id of an anchor by its name, or by its id, decimal or as 0x1A2B; None if it is neither."""
+        if text in self.ids:
+            return self.ids[text]
+        folded = [number for name, number in self.ids.items() if name.casefold() == text.casefold()]
+        if len(folded) == 1:
+            return folded[0]
+        return None if self.ids else _whole(text)
+
+
+def read_named(path):
+    """Named of a survey file that `read_survey` reads, or one like it with names of any text in place of the ids: a CSV file name,x,y,z or
+    id,x,y,z, or YAML. The id is the number that a name ends with, if all end with different ones; else the line of the survey, from 0 on. Raises
+    InputError."""
+    try:
+        return Named(read_survey(path))
+    except InputError as refused:
+        names, positions, orientations, frame = _entries(path)
+        if not names:
+            raise refused
+    if len(set(names)) < len(names):
+        raise InputError(f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is there twice; every anchor needs its own name.")
+    ends = [re.search(r"(\d{1,5})$", name) for name in names]
+    ids = [int(end[1]) for end in ends if end]
+    if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
+        ids = list(range(len(names)))
+    return Named(Anchors(ids, positions, orientations, frame), dict(zip(names, ids)))
+
+
+def _entries(path):
+    """(names, positions, orientations, frame) of a survey with names; no names if it is none."""
+    unknown, none = [float("nan")] * 4, ([], [], [], "map")
+    try:
+        rows = list(read_table(path))
+    except InputError:
+        rows = []
+    first = next((name for name in ("name", "anchor", "id") if rows and {name, "x", "y", "z"} <= rows[0][1].keys()), None)
+    if first:
+        positions = [[number(path, line, row, axis) for axis in "xyz"] for line, row in rows]
+        return [row[first].strip() for _, row in rows], positions, [unknown] * len(rows), "map"
+    try:
+        content = read_yaml(path)
+        anchors = content["anchors"]
+        names = [str(name) for name in anchors]
+        positions = [one["position"] for one in anchors.values()]
+        return names, positions, [one.get("orientation", unknown) for one in anchors.values()], content.get("frame", "map")
+    except (InputError, KeyError, TypeError, AttributeError):
+        return none
+
+
+def _whole(text):
+    """A whole number 0 ... 65535, decimal or hexadecimal as 0x1A2B, or None."""
+    try:
+        value = float(int(text, 16)) if text[:2] in ("0x", "0X") else float(text)
+    except (ValueError, OverflowError):
+        return None
+    return int(value) if 0 <= value <= LARGEST_ID and value == int(value) else None
