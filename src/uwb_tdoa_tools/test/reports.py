@@ -72,7 +72,7 @@ class Tags(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.seen.append((tag, dict(attrs), list(self.open)))
-        if tag not in ("meta", "br", "img"):
+        if tag not in ("meta", "br", "img", "source"):
             self.open.append((tag, dict(attrs)))
 
     def handle_endtag(self, tag):

@@ -1,10 +1,13 @@
 import shlex
+from types import SimpleNamespace
 
 import pytest
+from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN
 
 pytest.importorskip("rclpy")
 from uwb_tdoa_tools.commands import calibrate, check, demo, localize  # noqa: E402
-from uwb_tdoa_tools.live.demo import next_steps  # noqa: E402
+from uwb_tdoa_tools.live.demo import Case, next_steps  # noqa: E402
+from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
 
 
 @pytest.mark.parametrize(
@@ -27,6 +30,35 @@ def test_the_next_commands_are_commands(given):
         name, *rest = words[words.index("uwb_tdoa_tools") + 1 :]
         args = {"calibrate": calibrate, "check": check, "localize": localize}[name].parser().parse_args(rest)
         assert args.flights == [given[0]] and args.survey == (given[1] if len(given) > 1 else None)
+
+
+class Told:
+    """A Score with nothing but its error."""
+
+    def __init__(self, error):
+        self.error = error
+
+    def row(self):
+        return {"rmse_3d": self.error, "diverged": False}
+
+
+def test_it_says_what_corrects_and_that_nothing_does_unless_it_is_asked_for(tmp_path):
+    case = Case(None, None, None)
+    assert case.corrector() is None and case.correction().startswith("nothing: neither --effects nor --model is given")
+    assert UNPROVEN in Case(SimpleNamespace(anchors=corners()), None, SHIPPED).correction()
+
+
+@pytest.mark.parametrize(
+    ("errors", "said"),
+    [
+        ((0.2, 0.2), "3D RMSE 0.200 m, with nothing corrected: diagnose finds"),
+        ((0.2, 0.15, 0.15), "3D RMSE raw 0.200 m, corrected 0.150 m: -25 %"),
+        ((0.219, 0.228, 0.228), "corrected 0.228 m: +4 %; this correction does not fit this flight: other anchors, another day"),
+    ],
+)
+def test_a_correction_that_does_harm_is_called_that(errors, said):
+    told = demo._told([Told(error) for error in errors])
+    assert said in told and ("does not fit" in told) == (errors[1] > errors[0])
 
 
 def figures(line):

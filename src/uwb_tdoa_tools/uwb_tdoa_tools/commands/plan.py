@@ -102,9 +102,7 @@ def _plan(args):
         found = chart(installation, grid, args.flyable)
     figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
     report.say_summary(figures["map"])
-    figures["addition"] = run.addition(
-        found, anchors, options.installed(args, installation), options.places_of(args, room), args.flyable
-    )
+    figures["addition"] = run.addition(found, anchors, options.installed(args, installation), options.places_of(args, room), args.flyable)
     report.say_flyable(figures["map"], figures["addition"], args.flyable)
     outgoing = run.draw_map(found, installation, args.out)
     if args.check:

@@ -9,7 +9,7 @@ from uwb_tdoa_bias.effects.wording import listed
 from ..channels import CHANNELS
 from ..health import health
 from .markup import grid, paragraphs
-from .pictures import AFTER, BEFORE, COLOURS, drawing, embedded
+from .pictures import AFTER, BEFORE, COLOURS, FULL, WIDTH, drawing, embedded
 from .room import flown
 from .runs import CM, labels
 
@@ -37,26 +37,36 @@ def errors_over_time(diagnosis):
     if len(runs) > MOST:
         note += f" The first {MOST} of {len(runs)} are shown."
     top = CM * max(run.distance.max() for _, each in runs[:MOST] for _, _, run in each)
-    return paragraphs([note], "note") + grid([_errors(name, each, top) for name, each in runs[:MOST]])
+    return paragraphs([note], "note") + "".join(_errors(name, each, top) for name, each in runs[:MOST])
 
 
 def _errors(name, each, top):
     """One picture; each : [(title, colour, Flown)]; top : cm, largest error that is to be seen."""
-    figure, ax = drawing(2.4)
+    largest = listed(f"{CM * run.distance.max():.0f} cm ({title})" for title, _, run in each)
+    wide, narrow = (_drawn_errors(name, each, top, width) for width in (FULL, WIDTH))
+    return embedded(wide, f"Position error over time, {name}: at most {largest}", narrow=narrow)
+
+
+def _drawn_errors(name, each, top, width):
+    figure, ax = drawing(2.4, width)
+    peaks = []
     for title, colour, run in each:
         t, distance, k = run.t, CM * run.distance, int(np.argmax(run.distance))
         ax.plot(*_peaks(t, distance), color=colour, lw=1.2, label=title)
         ax.plot(t[k], distance[k], "o", color=colour, ms=5)
-        right = t[k] > 0.5 * t[-1]
-        place = {"xytext": (-6 if right else 6, 3), "textcoords": "offset points", "ha": "right" if right else "left"}
-        ax.annotate(f"{distance[k]:.0f} cm", (t[k], distance[k]), color=colour, fontweight="bold", **place)
+        peaks.append((t[k], distance[k], colour))
+    for t, distance, colour in peaks:
+        near = [other for other in peaks if other[1] != distance and abs(other[0] - t) < 0.15 * each[0][2].t[-1] and abs(other[1] - distance) < 0.2 * top]
+        below = any(other[1] > distance for other in near)  # of another label that would lie on it
+        right = t > 0.5 * each[0][2].t[-1]
+        place = {"xytext": (-6 if right else 6, -11 if below else 3), "textcoords": "offset points", "ha": "right" if right else "left"}
+        ax.annotate(f"{distance:.0f} cm", (t, distance), color=colour, fontweight="bold", **place)
     ax.set(xlabel="time in the air [s]", ylabel="position error [cm]", ylim=(0.0, 1.15 * top))
     ax.set_title(name, loc="left", fontsize=10)
     ax.grid(alpha=0.25, lw=0.5)
     if len(each) > 1:
         ax.legend(**ABOVE)
-    largest = listed(f"{CM * run.distance.max():.0f} cm ({title})" for title, _, run in each)
-    return embedded(figure, f"Position error over time, {name}: at most {largest}")
+    return figure
 
 
 def _peaks(t, values):
@@ -77,7 +87,9 @@ def residual_series(diagnosis):
         "behind after."
     )
     names = [name for name in before if name in after]
-    return paragraphs([note], "note") + grid([_residuals(name, before[name], after[name]) for name in names])
+    return paragraphs([note], "note") + grid(
+        [_residuals(f"{name}, {diagnosis.flights[0].name}", before[name], after[name]) for name in names]
+    )
 
 
 def _series(flight):
@@ -110,18 +122,26 @@ def pairs(diagnosis):
     names = sorted(before, key=lambda name: -before[name]["count"])[:PAIRS]
     if not names:
         return ""
-    figure, ax = drawing(3.0)
+    sides, of = (before, after), listed(flight.name for flight in diagnosis.flights)
+    caption = (
+        f"Dots: by how much the measurements of a pair are off, their median; bars: how much they scatter about it. Of {of}."
+    )
+    wide, narrow = (_drawn_pairs(names, sides, width) for width in (FULL, WIDTH))
+    return embedded(wide, "Offset and scatter of the residual of every pair of anchors, before and after", caption, narrow)
+
+
+def _drawn_pairs(names, sides, width):
+    before, after = sides
+    figure, ax = drawing(3.0, width)
     for shift, side, colour, title in ((-0.15, before, BEFORE, "before"), (0.15, after, AFTER, "after")):
         bias, spread = (CM * np.array([side[name][key] for name in names]) for key in ("bias", "spread"))
         ax.errorbar(np.arange(len(names)) + shift, bias, spread, fmt="o", ms=4, color=colour, label=title, lw=1.2)
     ax.axhline(0.0, color="k", lw=0.6)
-    ax.set(xticks=np.arange(len(names)), xticklabels=names, xlabel="pair of anchors", ylabel="residual [cm]")
+    ax.set(xticks=np.arange(len(names)), xlabel="pair of anchors", ylabel="residual [cm]")
+    ax.set_xticklabels(names, rotation=0 if width == FULL else 90)
     ax.grid(alpha=0.25, lw=0.5, axis="y")
     ax.legend(**ABOVE)
-    caption = (
-        "Dots: by how much the measurements of a pair are off, their median; bars: how much they scatter about it."
-    )
-    return embedded(figure, "Offset and scatter of the residual of every pair of anchors, before and after", caption)
+    return figure
 
 
 def functions(diagnosis):

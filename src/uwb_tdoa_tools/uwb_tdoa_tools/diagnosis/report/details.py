@@ -7,7 +7,7 @@ from uwb_tdoa_bias.effects.wording import rounded, significant
 from ...scoring.phases import TITLES
 from ..channels import CHANNELS
 from . import curves
-from .entries import entries
+from .entries import entries, for_people
 from .markup import folded, paragraphs, table
 from .runs import CM, labels
 from .words import used
@@ -37,17 +37,16 @@ def _values(diagnosis):
     note = (
         "Standard deviations are those of the fit. A value smaller than two of them is not significant: by itself "
         "it could be chance, beside the others it may still help. Values without one were set, not estimated. "
-        "Coefficients of functions without a name are in the file alone."
+        "Coefficients of functions without a name are in the file alone. Angles are in degrees here, in the file in radians."
     )
     rows = []
     for effect in (effect for effect in diagnosis.effects.effects if not effect.settings):
         known = significant(effect)
         for key, value in effect.values.items():
-            std = effect.std.get(key)
+            std, (unit, factor) = effect.std.get(key), for_people(effect.unit, key)
             sure = "" if std is None else ("yes" if key in known else "no")
-            rows.append(
-                (effect.name, key, rounded(value, std), "" if std is None else rounded(std, std), effect.unit, sure)
-            )
+            spread = None if std is None else factor * std
+            rows.append((effect.name, key, rounded(factor * value, spread), "" if std is None else rounded(spread, spread), unit, sure))
     if not rows:
         return ""
     head = ("effect", "parameter", "value", "standard deviation", "unit", "significant")
@@ -174,5 +173,5 @@ def _health(health):
 
 def _row(item, name):
     near = next(iter((item.get("autocorrelation") or {}).values()), None)
-    offset, scatter = (f"{item[key]:.4f}" for key in ("bias", "spread"))
+    offset, scatter = (f"{item[key]:.2g}" for key in ("bias", "spread"))
     return item[name], item["count"], offset, scatter, f"{item['tails']:.1%}", "" if near is None else f"{near:.2f}"

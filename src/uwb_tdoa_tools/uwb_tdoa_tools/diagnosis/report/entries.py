@@ -1,6 +1,9 @@
 """Findings as a reader wants them: what came into the model together is one entry, with its worth and its doubts."""
 
 from dataclasses import dataclass
+import re
+
+import numpy as np
 
 from uwb_tdoa_bias.effects.wording import listed, measured, significant
 
@@ -9,6 +12,9 @@ from ..over_flights import in_words
 CM = 100.0  # in a metre
 OR = "or"
 LEAST_WORTH = 0.0005  # m; less is no difference
+WORTH_DOING = 0.005  # m of position: what gains less is not asked of anybody
+FAULTS = {"anchor_ids", "pair_sign"}  # effects that are plain mistakes, to be put right whatever they are worth
+DEGREES = float(np.degrees(1.0))  # in a radian
 FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}
 SHOWN = 6  # values
 
@@ -44,8 +50,9 @@ class Entry:
 
     @property
     def matters(self):
-        """Whether the position gains from taking it out, as far as anybody knows."""
-        return self.added and (self.worth is None or self.worth >= LEAST_WORTH)
+        """Whether it is worth doing something about: a fault, or the position gains from taking it out, as far as anybody knows."""
+        fault = any(finding.effect.name in FAULTS for finding in self.findings)
+        return self.added and (fault or self.worth is None or self.worth >= WORTH_DOING)
 
     @property
     def over_flights(self):
@@ -112,6 +119,25 @@ def by_flight(alternatives):
     return [(listed(names, "or"), flight) for flight, names in groups.items()]
 
 
+def for_people(unit, key=""):
+    """(unit, factor) of a value of an effect: angles in degrees. Of units of several kinds, that of the key."""
+    if unit == "m, rad":
+        unit = "m" if key in ("x", "y", "z") else "rad"
+    return (unit.replace("rad", "degrees"), DEGREES) if unit in ("rad", "rad/s") else (unit, 1.0)
+
+
+def by_anchor(effect):
+    """{anchor: {"x", "y", "z" or "": (value, std or None)}} of those values of an Effect that are significant, where each is of one anchor, in
+    the order of anchors; {} of other effects."""
+    out = {}
+    for key in significant(effect):
+        parts = re.fullmatch(r"(\d+)(?:\.([xyz]))?", key)
+        if not parts:
+            return {}
+        out.setdefault(int(parts[1]), {})[parts[2] or ""] = effect.values[key], effect.std.get(key)
+    return dict(sorted(out.items()))
+
+
 def _entry(findings, refused):
     first = findings[0]
     others = {other.effect: other for finding in findings for other in finding.alternatives}
@@ -134,12 +160,13 @@ def _values(finding):
         return f"a function without a name ({effect.shape})"
     told = significant(effect)
     fitted_first = sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0]))
-    shown = [f"{key} = {measured(value, effect.std.get(key))}" for key, value in fitted_first if key in told]
+    unit, factors = effect.unit.replace("rad", "degrees"), {key: for_people(effect.unit, key)[1] for key in effect.values}
+    shown = [f"{key} = {measured(value * factors[key], (effect.std.get(key) or 0.0) * factors[key])}" for key, value in fitted_first if key in told]
     rest, vague = shown[SHOWN:], len(effect.values) - len(shown)
     words = shown[:SHOWN] + ([f"{len(rest)} more"] if rest else [])
     if not words:
         return f"{vague} values, none by itself twice its standard deviation"
-    return f"{', '.join(words)} ({effect.unit})" + (f"; {vague} not significant" if vague else "")
+    return f"{', '.join(words)} ({unit})" + (f"; {vague} not significant" if vague else "")
 
 
 def _why_not(finding, refused):

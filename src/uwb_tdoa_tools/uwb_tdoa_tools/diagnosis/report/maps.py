@@ -6,8 +6,9 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.patches import Circle, Ellipse
+from uwb_tdoa_bias.effects.wording import listed
 
-from .markup import grid
+from .markup import grid, paragraphs
 from .pictures import FOUND, REGION, WIDTH, drawing, embedded, plt
 from .room import CELL, VIEWS, estimated, flown, mean_errors, shifts_and_regions
 
@@ -27,13 +28,15 @@ def maps(diagnosis):
     """Markup: one map before and one after; one alone if nothing has changed, or nobody knows the errors."""
     sides = [(name, flown(side["scores"])) for name, side in (("before", diagnosis.before), ("after", diagnosis.after))]
     if not any(runs for _, runs in sides):
-        return grid([_drawn(diagnosis, "", [], None, Arrows.of(diagnosis, []))])
+        arrows = Arrows.of(diagnosis, [])
+        return paragraphs([_caption(diagnosis, [], arrows.enlarged)], "note") + grid([_drawn(diagnosis, "", [], None, arrows)])
     if not any(finding.added for finding in diagnosis.findings):
         sides = [("", sides[0][1])]
     distances = np.concatenate([run.distance for _, runs in sides for run in runs])
     norm = Normalize(0.0, 100.0 * np.quantile(distances, BRIGHT))
     arrows = Arrows.of(diagnosis, [runs for _, runs in sides])
-    return grid([_drawn(diagnosis, title, runs, norm, arrows) for title, runs in sides])
+    note = paragraphs([_caption(diagnosis, sides[0][1], arrows.enlarged)], "note")  # once for both
+    return note + grid([_drawn(diagnosis, title, runs, norm, arrows) for title, runs in sides])
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ def _drawn(diagnosis, title, runs, norm, arrows):
         figure.colorbar(
             colours, ax=axes, orientation="horizontal", label="position error [cm]", extend="max", aspect=40, pad=0.02
         )
-    return embedded(figure, _alt(diagnosis, title, runs), _caption(diagnosis, runs, arrows.enlarged))
+    return embedded(figure, _alt(diagnosis, title, runs))
 
 
 def _limits(diagnosis, runs):
@@ -166,6 +169,8 @@ def _caption(diagnosis, runs, enlarged):
     times = f", drawn {enlarged} times as long as they are" if enlarged > 1 else ""
     out = ["Triangles: anchors with their numbers."]
     if runs:
+        judged = list(dict.fromkeys(run["flight"] for run in diagnosis.before["runs"]))
+        out.append(f"Flight{'s' if len(judged) > 1 else ''}: {listed(judged)}.")
         out.append(
             "Coloured: the true path, dark where the estimate errs most. Black arrows: mean error in cells of "
             f"{CELL:g} m, from the true place towards the estimate{times}."

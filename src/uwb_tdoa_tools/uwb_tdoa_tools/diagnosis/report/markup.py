@@ -32,9 +32,9 @@ def folded(title, *parts):
 
 
 def listing(items, ordered=False):
-    """A list of (sentences, sentences in small print)."""
+    """A list of (markup, sentences in small print)."""
     name = "ol" if ordered else "ul"
-    rows = "".join(f"<li>{paragraphs(large)}{paragraphs(small, 'note')}</li>" for large, small in items)
+    rows = "".join(f"<li>{large}{paragraphs(small, 'note')}</li>" for large, small in items)
     return f"<{name}>{rows}</{name}>" if rows else ""
 
 

@@ -5,11 +5,12 @@ import io
 from html import escape
 
 from ...scoring.plots import plt
+from .style import NARROW
 
 # Told apart by colour-blind eyes (Okabe and Ito); the purple and the yellow are darker than theirs.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a8437f", "#e69f00", "#56b4e9", "#000000", "#8c8c00")
 AFTER, FOUND, _, REGION, BEFORE = COLOURS[:5]
-WIDTH = 5.6  # in, of one picture
+WIDTH, FULL = 4.4, 10.6  # in, of one picture: so that its letters can be read on a phone; and of one as wide as the page
 PIXELS = 96  # of a page in an inch
 LIGHT = 40_000  # bytes, of a picture that need not be smaller
 SHARP = 130  # dots in an inch of what is drawn as dots
@@ -26,11 +27,20 @@ def drawing(height, width=WIDTH, **options):
         return plt.subplots(figsize=(width, height), layout="constrained", **options)
 
 
-def embedded(figure, alt, caption=""):
+def embedded(figure, alt, caption="", narrow=None):
     """<figure> with a drawn Figure, as SVG, or as PNG where that is smaller and it matters; the Figure is closed.
 
-    alt : what it shows, for who cannot see it; caption : how to read it, if nothing else says so.
+    alt : what it shows, for who cannot see it; caption : how to read it, if nothing else says so; narrow : the same for a narrow screen.
     """
+    source, width = _source(figure)
+    image = f'<img alt="{escape(alt)}" width="{width}" src="{source}">'
+    if narrow is not None:
+        image = f'<picture><source media="(max-width: {NARROW})" srcset="{_source(narrow)[0]}">{image}</picture>'
+    return f"<figure>{image}{f'<figcaption>{escape(caption)}</figcaption>' if caption else ''}</figure>"
+
+
+def _source(figure):
+    """(data URL, pixels of width) of a Figure, which is closed."""
     with plt.rc_context(_FONT):
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # is laid out now, once for both kinds
@@ -40,9 +50,7 @@ def embedded(figure, alt, caption=""):
     width = round(figure.get_figwidth() * PIXELS)
     plt.close(figure)
     kind = min(kinds, key=lambda name: len(kinds[name]))
-    source = f"data:image/{kind};base64,{base64.b64encode(kinds[kind]).decode()}"
-    image = f'<img alt="{escape(alt)}" width="{width}" src="{source}">'
-    return f"<figure>{image}{f'<figcaption>{escape(caption)}</figcaption>' if caption else ''}</figure>"
+    return f"data:image/{kind};base64,{base64.b64encode(kinds[kind]).decode()}", width
 
 
 def _saved(figure, kind, **options):

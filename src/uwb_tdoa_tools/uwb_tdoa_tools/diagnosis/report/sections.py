@@ -2,11 +2,13 @@
 
 from html import escape
 
-from uwb_tdoa_bias.effects.wording import listed
+from uwb_tdoa_bias.effects.wording import listed, measured
 
-from .entries import certainty_in_words, doubt_in_words, undecided_in_words, worth_in_words
+from .entries import LEAST_WORTH, WORTH_DOING, by_anchor, certainty_in_words, doubt_in_words, for_people, undecided_in_words, worth_in_words
 from .markup import bar, folded, listing, paragraphs, section, stacked, table
 from .unclear import by_remedy, untold
+
+MANY = 3  # anchors that a sentence names with their values
 
 
 def head(diagnosis, verdict):
@@ -32,19 +34,50 @@ def to_do(diagnosis, found):
     urgent = [entry for entry in added if entry.matters and entry.advice]
     rest = [entry for entry in found if not entry.matters and entry.advice]
     nameless = [entry.title for entry in added if not entry.advice]
-    parts = [listing([(entry.advice, _known_with(entry)) for entry in urgent], ordered=True)]
+    parts = [listing([(_asked(entry), _known_with(entry)) for entry in urgent], ordered=True)]
     if not urgent:
-        parts += paragraphs(["Nothing that the position is known to gain from."])
+        parts += paragraphs([f"Nothing that the position is known to gain {100.0 * WORTH_DOING:.1f} cm from."])
     if nameless:
         parts += paragraphs([f"Leave to effects.yaml what has no known cause in the hall: {'; '.join(nameless)}."])
     if rest:
-        parts.append("<h3>Seen too, less urgent</h3>")
-        parts += paragraphs(
-            ["Nobody has seen the position gain from taking it out of the measurements, or it cannot be taken out."],
-            "note",
+        note = (
+            f"Nobody has seen the position gain {100.0 * WORTH_DOING:.1f} cm from taking it out of the measurements, or it cannot be taken out."
         )
-        parts.append(listing([(entry.advice, ()) for entry in rest]))
+        parts.append(folded("Seen too, not worth a visit", paragraphs([note], "note"), listing([(_asked(entry), ()) for entry in rest])))
     return section("What to do in the hall", *parts, _apply(diagnosis.applying) if added and diagnosis.applying else "")
+
+
+def _asked(entry):
+    """Markup of its advice: sentences; values of more than MANY anchors as a table."""
+    out = []
+    for finding in entry.findings:
+        anchors, advice = by_anchor(finding.effect), finding.effect.advice()
+        if len(anchors) > MANY and advice:
+            first, _, rest = advice[0].partition(": ")
+            last = rest.rpartition("; ")[2].partition(". ")[2]
+            out += [paragraphs([f"{first}.", *filter(None, [last]), *advice[1:]]), _of_anchors(finding.effect, anchors)]
+        else:
+            out.append(paragraphs(advice))
+    return "".join(out)
+
+
+def _of_anchors(effect, anchors):
+    """A table of values by anchor, lengths in cm."""
+    unit, factor = ("cm", 100.0) if effect.unit == "m" else for_people(effect.unit)
+    parts = sorted({part for values in anchors.values() for part in values})
+    head = ("anchor", *(f"{part} [{unit}]".lstrip() for part in parts))
+    cells = [[_cell(values.get(part), factor) for part in parts] for values in anchors.values()]
+    note = paragraphs([f"What {effect.name} found; where nothing stands it could be chance."], "note")
+    return note + table(head, [(anchor, *row) for anchor, row in zip(anchors, cells)], numbers=range(1, len(head)))
+
+
+def _cell(found, factor):
+    """ "+12.3 ± 0.5" """
+    if found is None:
+        return ""
+    value, std = found
+    text = measured(factor * value, factor * std if std else None)
+    return text if text.startswith("-") else f"+{text}"
 
 
 def _known_with(entry):
@@ -74,7 +107,7 @@ def worth(diagnosis, found):
     """What was found, and what each is worth in centimetres of position. found : [Entry]."""
     if not found:
         return ""
-    largest = max((entry.worth or 0.0 for entry in found if entry.matters), default=0.0)
+    largest = max((entry.worth or 0.0 for entry in found if entry.added), default=0.0)
     head = ("effect", "worth in position", "what else it could be")
     rows = [[_name(entry), _worth(entry, largest), _else(entry)] for entry in found]
     note = [
@@ -103,7 +136,7 @@ def _worth(entry, largest):
         return f"not in effects.yaml: {escape(entry.why_not)}"
     if entry.worth is None:
         return "not known"
-    drawn = bar(entry.worth / largest) if largest > 0.0 and entry.matters else ""
+    drawn = bar(entry.worth / largest) if largest > 0.0 and entry.worth >= LEAST_WORTH else ""
     return f"{drawn}{escape(worth_in_words(entry))}"
 
 

@@ -1,5 +1,6 @@
 """How a page looks: on a laptop, on a phone and on paper."""
 
+NARROW = "44rem"  # a screen that is not wider is a phone
 STYLE = """
 :root { color-scheme: light }
 * { box-sizing: border-box }
@@ -10,6 +11,7 @@ h2 { font-size: 1.2rem; margin: 2.2rem 0 .4rem }
 h3 { font-size: 1rem; margin: 1.4rem 0 .3rem }
 p { margin: .4rem 0 }
 small, .note, figcaption { color: #555; font-size: .875rem }
+details details { border: 0 }
 .verdict { border-left: .5rem solid #767676; background: #f2f5f8; padding: .7rem 1rem; margin: 1rem 0 }
 .verdict p:first-child { font-size: 1.15rem; font-weight: 600 }
 .better { border-color: #0072b2 }
@@ -30,6 +32,7 @@ td.number, th.number { text-align: right; white-space: nowrap; font-variant-nume
 .grid { display: grid; gap: 0 1.5rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 27rem), 1fr)) }
 figure { margin: .8rem 0; min-width: 0 }
 img { display: block; max-width: 100%; height: auto }
+.grid img { width: 100% }
 details { border-top: 1px solid #ccc; padding: .4rem 0 }
 summary { cursor: pointer }
 @media (max-width: 44rem) {
