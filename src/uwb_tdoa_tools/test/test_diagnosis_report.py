@@ -360,8 +360,64 @@ def test_advice_on_what_is_not_added_is_less_urgent(result):
         finding(EFFECTS["outlier_rate"]({"share": 0.1}, {"share": 0.01}), False, None, tried=False),
     ]
     text = said(sections.to_do(result, entries(replace(result, findings=findings))))
-    todo, _, rest = text.partition("Seen too, less urgent")
+    todo, _, rest = text.partition("Seen too, not worth a visit")
     assert "Calibrate" not in todo and "Calibrate the antenna delay" in rest and "10 ± 1 % of the TDOAs" in rest
+
+
+def test_what_gains_less_than_half_a_centimetre_is_asked_of_nobody_unless_it_is_a_fault(result):
+    sign = EFFECTS["pair_sign"]({"0-1": -1.0}, {})
+    for effect, worth, asked in ((delay(), 0.0045, False), (delay(), 0.0055, True), (sign, 0.001, True)):
+        changed = replace(result, findings=[finding(effect, worth=worth)])
+        todo, _, rest = said(sections.to_do(changed, entries(changed))).partition("Seen too, not worth a visit")
+        (sentence,) = effect.advice()
+        assert (sentence in todo, sentence in rest) == (asked, not asked)
+        assert any(line.startswith("do ") for line in changed.as_text().splitlines()) == asked
+
+
+def test_values_of_many_anchors_are_a_table(result):
+    few, many = ({str(k): 0.1 + 0.01 * k for k in range(n)} for n in (3, 5))
+    for values in (few, many):
+        effect = EFFECTS["anchor_delay"](values, dict.fromkeys(values, 0.01))
+        page = sections.to_do(result, entries(replace(result, findings=[finding(effect)])))
+        assert ("<table>" in page) == (len(values) > 3)
+    text = said(page)
+    assert "Calibrate the antenna delay of anchors 0, 1, 2, 3 and 4." in text and "4 +14 ± 1" in text and "[cm]" in text
+    shifts = EFFECTS["anchor_position"]({f"{k}.{axis}": 0.2 for k in range(4) for axis in "xz"}, {f"{k}.x": 0.01 for k in range(4)})
+    text = said(sections.to_do(result, entries(replace(result, findings=[finding(shifts)]))))
+    assert "Survey anchors 0, 1, 2 and 3 again. If the survey proves right" in text and "anchor x [cm] z [cm] 0 +20 ± 1 +20" in text
+
+
+def test_angles_are_in_degrees(result):
+    effect = EFFECTS["imu_misalignment"]({"z": 0.075}, {"z": 0.01})
+    changed = replace(result, findings=[finding(effect)], effects=EffectSet((effect,)))
+    (entry,) = entries(changed)
+    assert entry.values == "z = 4.3 ± 0.6 (degrees)"
+    assert "imu_misalignment z 4.3 0.6 degrees yes" in said(changed.as_html())
+
+
+def test_labels_of_anchors_lie_on_nothing(result, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(maps, "embedded", lambda figure, *_: drawn.append(figure) or "")
+    page = maps.maps(result)
+    assert page.count("Triangles: anchors") == 1 and f"Flight: {result.before['runs'][0]['flight']}." in page
+    assert len(drawn) == 2
+    for figure in drawn:
+        figure.canvas.draw()
+        for ax in figure.axes[:2]:
+            boxes = [text.get_window_extent() for text in ax.texts if text.get_text()]
+            (triangles,) = [line for line in ax.lines if line.get_marker() == "^"]
+            marks = ax.transData.transform(triangles.get_xydata())
+            assert not any(one.overlaps(other) for k, one in enumerate(boxes) for other in boxes[:k])
+            assert not any(box.contains(*mark) for box in boxes for mark in marks)
+        pictures.plt.close(figure)
+
+
+def test_letters_of_pictures_can_be_read_on_a_phone_and_curves_are_as_wide_as_the_page(page):
+    phone, letters = 390.0 - 2 * 16.0, 9.0 * 96.0 / 72.0  # px
+    assert letters * phone / (pictures.WIDTH * pictures.PIXELS) >= 10.0
+    sources = [attributes for tag, attributes, _ in Tags(page).seen if tag == "source"]
+    assert sources and all(item["media"] == "(max-width: 44rem)" for item in sources)
+    assert any(attributes.get("width") == str(round(pictures.FULL * pictures.PIXELS)) for tag, attributes, _ in Tags(page).seen if tag == "img")
 
 
 def test_a_blocked_region_is_on_the_map_and_in_the_list(result):

@@ -10,7 +10,7 @@ from ..channels import CHANNELS
 from ..health import health
 from .markup import grid, paragraphs
 from .pictures import AFTER, BEFORE, COLOURS, FULL, WIDTH, drawing, embedded
-from .room import flown
+from .room import changed, flown
 from .runs import CM, labels
 
 BINS = 300  # of a curve over time; of each the largest is drawn
@@ -23,8 +23,7 @@ ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 2, "frameo
 
 def errors_over_time(diagnosis):
     """Markup: the 3D error of every judged flight before and after, the largest marked."""
-    changed = any(finding.added for finding in diagnosis.findings)
-    sides = [("before", BEFORE, diagnosis.before), ("after", AFTER, diagnosis.after)] if changed else []
+    sides = [("before", BEFORE, diagnosis.before), ("after", AFTER, diagnosis.after)] if changed(diagnosis) else []
     sides = sides or [("error", AFTER, diagnosis.before)]
     curves = [
         [(title, colour, run) for title, colour, side in sides for run in flown(side["scores"][k : k + 1])]
@@ -61,11 +60,11 @@ def _drawn_errors(name, each, top, width):
         right = t > 0.5 * each[0][2].t[-1]
         place = {"xytext": (-6 if right else 6, -11 if below else 3), "textcoords": "offset points", "ha": "right" if right else "left"}
         ax.annotate(f"{distance:.0f} cm", (t, distance), color=colour, fontweight="bold", **place)
-    ax.set(xlabel="time in the air [s]", ylabel="position error [cm]", ylim=(0.0, 1.15 * top))
+    ax.set(xlabel="time in the air [s]", ylabel="position error [cm]", ylim=(0.0, 1.35 * top))
     ax.set_title(name, loc="left", fontsize=10)
     ax.grid(alpha=0.25, lw=0.5)
     if len(each) > 1:
-        ax.legend(**ABOVE)
+        ax.legend(loc="upper right", ncols=2, frameon=False)
     return figure
 
 

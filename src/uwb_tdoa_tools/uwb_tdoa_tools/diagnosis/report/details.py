@@ -80,6 +80,7 @@ def _evidence(diagnosis):
     return paragraphs([note], "note") + table(head, rows, numbers=range(2, len(head)))
 
 
+SIDE_BY_SIDE = 2  # runs that a phone shows beside each other
 FIGURES = (  # key, title, factor
     ("rmse_x", "x", CM), ("rmse_y", "y", CM), ("rmse_z", "z", CM), ("rmse_3d", "3D RMSE", CM),
     ("median_3d", "median", CM), ("max_3d", "largest", CM), ("residual_spread", "scatter of innovations", CM),
@@ -111,16 +112,23 @@ def phases(diagnosis):
     names = [name for name in TITLES if any(name in phases for phases in found[0])]
     if not names:
         return ""
-    rows = [
-        (run, *(_phase(first.get(name), second.get(name)) for name in names))
-        for run, first, second in zip([*labels(diagnosis), "all"], *found)
-    ]
+    runs = labels(diagnosis)
+    columns = dict(zip([*runs, "all"], zip(*found)))
+    if len(runs) == 1:
+        del columns["all"]
     note = (
         "3D RMSE in centimetres, before → after; and NEES, which is 3 if the filter judges itself rightly, more if it is too sure. "
         "Every other error of this page is of the time in the air."
     )
-    head = ("run", *(TITLES[name] for name in names))
-    return paragraphs([note], "note") + table(head, rows, numbers=range(1, len(head)))
+    few = columns if len(columns) <= SIDE_BY_SIDE else {"all": columns["all"]}
+    rest = "" if few is columns else folded("Of each run", _of_phases(names, columns))
+    return paragraphs([note], "note") + _of_phases(names, few) + rest
+
+
+def _of_phases(names, columns):
+    """A row for each phase, a column for each run."""
+    rows = [(TITLES[name], *(_phase(first.get(name), second.get(name)) for first, second in columns.values())) for name in names]
+    return table(("", *columns), rows, numbers=range(1, 1 + len(columns)))
 
 
 def _phase(*sides):

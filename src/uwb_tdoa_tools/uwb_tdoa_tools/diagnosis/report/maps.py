@@ -10,18 +10,19 @@ from uwb_tdoa_bias.effects.wording import listed
 
 from .markup import grid, paragraphs
 from .pictures import FOUND, REGION, WIDTH, drawing, embedded, plt
-from .room import CELL, VIEWS, estimated, flown, mean_errors, shifts_and_regions
+from .room import CELL, VIEWS, changed, estimated, flown, mean_errors, shifts_and_regions
 
 POINTS = 1500  # of all paths
 GAP = 1.0  # s without an estimate that breaks a path
 BESIDE = 0.7  # m between anchors that share a label
-MARGIN = 0.7  # m around anchors and paths
-LONGEST = 0.11  # of the room, of an arrow
+MARGIN = 1.0  # m around anchors and paths
+LONGEST = 0.16  # of the room, of an arrow
+AWAY = 11.0  # points between an anchor and the middle of its label
 KEYS = (1, 2, 5, 10, 20, 50, 100, 200)  # cm
 ENLARGED = (1, 2, 3, 5, 10, 20, 50, 100)
 BRIGHT = 0.95  # quantile of the errors at the end of the colours, and of arrows that are to be seen whole
 COLOURS = LinearSegmentedColormap.from_list("error", plt.get_cmap("viridis_r")(np.linspace(0.06, 1.0, 64)))
-ARROW = {"arrowstyle": "-|>", "color": FOUND, "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
+ARROW = {"arrowstyle": "-|>", "color": FOUND, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
 
 
 def maps(diagnosis):
@@ -30,7 +31,7 @@ def maps(diagnosis):
     if not any(runs for _, runs in sides):
         arrows = Arrows.of(diagnosis, [])
         return paragraphs([_caption(diagnosis, [], arrows.enlarged)], "note") + grid([_drawn(diagnosis, "", [], None, arrows)])
-    if not any(finding.added for finding in diagnosis.findings):
+    if not changed(diagnosis):
         sides = [("", sides[0][1])]
     distances = np.concatenate([run.distance for _, runs in sides for run in runs])
     norm = Normalize(0.0, 100.0 * np.quantile(distances, BRIGHT))
@@ -75,7 +76,7 @@ def _drawn(diagnosis, title, runs, norm, arrows):
         limits = [(low[k], high[k]) for k in view]
         ax.set(aspect="equal", xlim=limits[0], ylim=limits[1], xlabel="x [m]", ylabel=f"{'xyz'[view[1]]} [m]")
         ax.grid(alpha=0.25, lw=0.5)
-        if key is not None:
+        if key is not None and ax is axes[0]:
             ax.quiverkey(key, 0.8, 1.03, 0.01 * arrows.key, f"{arrows.key} cm", labelpos="E", coordinates="axes")
     axes[0].set_title(f"{title}: from above".lstrip(": ").capitalize(), loc="left", fontsize=10)
     axes[1].set_title(f"{title}: from the side".lstrip(": ").capitalize(), loc="left", fontsize=10)
@@ -125,19 +126,25 @@ def _anchors(ax, diagnosis, view, enlarged):
         width, height = 2.0 * enlarged * np.nan_to_num(std[view])
         ax.add_patch(Ellipse(tip, width, height, fc=FOUND, alpha=0.25, ec=FOUND, lw=0.8))
     ax.plot(*anchors.positions[:, view].T, "k^", ms=6, zorder=4)
-    _names(ax, places)
+    _names(ax, places, {anchor: by[view] for anchor, (by, _) in shifts.items()})
 
 
-def _names(ax, places):
-    """Ids beside anchors; those that stand one behind the other share a label."""
-    labels = {}
+def _names(ax, places, shifts):
+    """Ids beside anchors, where their arrows do not point; those that stand one behind the other share a label."""
+    middle, labels = np.mean(list(places.values()), axis=0), {}
     for anchor, place in places.items():
         near = next((known for known in labels if np.linalg.norm(place - known) < BESIDE), tuple(place))
-        labels.setdefault(near, []).append(str(anchor))
-    for place, names in labels.items():
+        labels.setdefault(near, []).append(anchor)
+    for together in labels.values():
+        own = np.array([places[anchor] for anchor in together])
+        way = -np.sum([shifts.get(anchor, (0.0, 0.0)) for anchor in together], axis=0)
+        if not way.any():
+            way = np.array([0.0, np.sign(own.mean(axis=0)[1] - middle[1]) or 1.0])
+        way /= np.linalg.norm(way)
         ax.annotate(
-            ", ".join(names), place, (0, 6), textcoords="offset points", ha="center", fontweight="bold", zorder=5
-        )
+            ", ".join(map(str, together)), own[np.argmax(own @ way)], AWAY * way * [1.0 + 0.4 * (len(together) > 1), 1.0],
+            textcoords="offset points", ha="center", va="center", fontweight="bold", zorder=7,
+        )  # fmt: skip
 
 
 def _arrows(ax, runs, view, enlarged):
@@ -145,7 +152,7 @@ def _arrows(ax, runs, view, enlarged):
     places, errors = mean_errors(runs, view)
     if not len(places):
         return None
-    how = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / enlarged, "width": 0.0045, "minlength": 0.1}
+    how = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / enlarged, "width": 0.008, "headwidth": 4, "headlength": 4.5, "headaxislength": 4, "minlength": 0.1}
     return ax.quiver(*places.T, *errors.T, color="k", zorder=6, **how)
 
 

@@ -61,6 +61,11 @@ def shifts_and_regions(diagnosis):
     return shifts, regions
 
 
+def changed(diagnosis):
+    """Whether errors in the air differ before and after: something was added that does not act near the floor alone."""
+    return any(finding.added and not finding.on_floor for finding in diagnosis.findings)
+
+
 def estimated(flight):
     """(n, 3) m, the path in the air of {channel: ChannelResidual} as estimated, where nobody knows better."""
     rows = next(iter(flight.values())).rows()

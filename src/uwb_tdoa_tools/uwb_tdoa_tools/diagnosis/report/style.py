@@ -33,6 +33,7 @@ td.number, th.number { text-align: right; white-space: nowrap; font-variant-nume
 figure { margin: .8rem 0; min-width: 0 }
 img { display: block; max-width: 100%; height: auto }
 .grid img { width: 100% }
+.grid figure { max-width: 38rem }
 details { border-top: 1px solid #ccc; padding: .4rem 0 }
 summary { cursor: pointer }
 @media (max-width: 44rem) {
