@@ -5,8 +5,8 @@ from pathlib import Path
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_head
-from uwb_tdoa_bias.foundation.survey import read_survey
 
+from .names import read_survey
 from .usd_log import MAGIC, read_usd_log
 from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
 

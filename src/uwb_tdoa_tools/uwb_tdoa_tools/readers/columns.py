@@ -32,7 +32,7 @@ TIMES = {  # of each stream: the first that is given, else "time"
 }  # fmt: skip
 ANCHORS = "anchor_a", "anchor_b"  # columns that name anchors
 EMPTY = {"", "-", "--", "n/a", "na", "nan", "none", "null"}  # what tools write where they have nothing
-MOST_SKIPPED = 0.1  # of the records of a stream, that are no numbers
+MOST_SKIPPED = 0.25  # of the records of a stream, that are empty or no numbers
 ATTITUDE = {f"pose_q{k}" for k in "xyzw"}
 OPTIONAL = {*ATTITUDE, "tdoa_std"}
 UNITS = {name: units for columns in STREAMS.values() for name, (_, units) in columns.items()}

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 import re
 
+from uwb_tdoa_bias.foundation import survey
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
-from uwb_tdoa_bias.foundation.survey import read_survey
 
 from .tables import number, read_table
 
@@ -35,7 +35,7 @@ def read_named(path):
     id,x,y,z, or YAML. The id is the number that a name ends with, if all end with different ones; else the line of the survey, from 0 on. Raises
     InputError."""
     try:
-        return Named(read_survey(path))
+        return Named(survey.read_survey(path))
     except InputError as refused:
         names, positions, orientations, frame = _entries(path)
         if not names:
@@ -47,6 +47,11 @@ def read_named(path):
     if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
         ids = list(range(len(names)))
     return Named(Anchors(ids, positions, orientations, frame), dict(zip(names, ids)))
+
+
+def read_survey(path):
+    """Anchors of a survey file, see `read_named`: of those with names, under the ids that these get."""
+    return read_named(path).anchors
 
 
 def _entries(path):
