@@ -62,7 +62,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     effects.write_text(EFFECTS)
     parameters, corrector = {
         "shipped": (
-            ["--params-file", f"{SOURCES}/uwb_tdoa_bias/config/bias_node.yaml"],
+            ["--params-file", f"{SOURCES}/uwb_tdoa_bias/config/bias_node.yaml", "-p", "model_file:=default"],
             Corrector(flight.anchors, network=Network(MODEL.with_name("default.onnx"))),
         ),
         "effects": (["-p", f"effects_file:={effects}"], Corrector(flight.anchors, EffectSet.from_yaml(effects))),
