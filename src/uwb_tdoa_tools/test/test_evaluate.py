@@ -193,7 +193,7 @@ def test_corrects_with_nothing_unless_told_and_says_what_is_known_of_the_shipped
     assert row["rmse_3d"] == pytest.approx(evaluate(flight, network=load_network(SHIPPED))[0].row()["rmse_3d"], abs=1e-4)
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if line.startswith("correcting")] == [
-        "correcting with: nothing (neither --effects nor --model is given)",
+        "correcting with: nothing (neither effects nor a network are in use)",
         "correcting with: anchor_delay",
         f"correcting with: default ({UNPROVEN})",
     ]

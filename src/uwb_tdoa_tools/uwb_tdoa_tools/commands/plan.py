@@ -44,8 +44,7 @@ def parser():
 
     where = made.add_argument_group("where")
     add, either = where.add_argument, where.add_mutually_exclusive_group()
-    room = "X0 X1 Y0 Y1 [Z0 Z1], m: from wall to wall, from floor to ceiling (default: what the anchors span)"
-    add("--room", metavar="M", nargs="+", **number, help=room)
+    add("--room", metavar="M", nargs="+", **number, help="X0 X1 Y0 Y1 [Z0 Z1], m, to walls, floor and ceiling (default: what the anchors span)")
     either.add_argument("--height", metavar="M", **number, help="one slice there (default: at half the room's height)")
     either.add_argument("--volume", action="store_true", help="the whole room")
     add("--step", metavar="M", **number, help="size of a cell (default: 100 along a slice, 50 in a volume)")
@@ -73,10 +72,8 @@ def parser():
     add("--improve", choices=("move", "add"), help="better places: move all anchors, or add one")
     add("--count", metavar="N", type=int, help="with --improve move: how many anchors (default: as there are)")
     add("--objective", choices=OBJECTIVES, default="worst", help="what to improve where it flies (default: worst)")
-    flown = "X0 X1 Y0 Y1 Z0 Z1 that is flown (default: the room less 0.8, 0.6 m)"
-    add("--fly", metavar="M", nargs=6, **number, help=flown)
-    allowed = "where anchors may be, YAML, places: [[x0, y0, z0, x1, y1, z1]] (default: the walls)"
-    add("--places", metavar="FILE", help=allowed)
+    add("--fly", metavar="M", nargs=6, **number, help="X0 X1 Y0 Y1 Z0 Z1 that is flown (default: the room less 0.8, 0.6 m)")
+    add("--places", metavar="FILE", help="where anchors may be, YAML, places: [[x0, y0, z0, x1, y1, z1]] (default: the walls)")
     add("--starts", metavar="N", type=int, default=16, help=f"layouts to search from {default}")
     return made
 
