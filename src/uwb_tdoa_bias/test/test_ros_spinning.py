@@ -149,7 +149,7 @@ def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
             return self.busy
 
     assert Turns([Slow(0.0, False)]).take() is None
-    assert Turns([Slow(0.0, True), Slow(0.0, False)]).take() == pytest.approx(PERIOD)
+    assert PERIOD <= Turns([Slow(0.0, True), Slow(0.0, False)]).take() <= 0.01  # a busy computer takes its time
     assert 0.004 <= Turns([Slow(0.005, True)]).take() <= 0.01
     assert Turns([Slow(0.05, True)]).take() == 0.01
 

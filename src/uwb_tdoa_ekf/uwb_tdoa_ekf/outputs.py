@@ -6,7 +6,6 @@ import time
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
-import numpy as np
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation.later import rotations
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS as STATUS_QOS

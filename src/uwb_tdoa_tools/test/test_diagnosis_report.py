@@ -384,7 +384,7 @@ def test_values_of_many_anchors_are_a_table(result):
     assert "Calibrate the antenna delay of anchors 0, 1, 2, 3 and 4." in text and "4 +14 ± 1" in text and "[cm]" in text
     shifts = EFFECTS["anchor_position"]({f"{k}.{axis}": 0.2 for k in range(4) for axis in "xz"}, {f"{k}.x": 0.01 for k in range(4)})
     text = said(sections.to_do(result, entries(replace(result, findings=[finding(shifts)]))))
-    assert "Survey anchors 0, 1, 2 and 3 again. If the survey proves right" in text and "anchor x [cm] z [cm] 0 +20 ± 1 +20" in text
+    assert "Measure anchors 0, 1, 2 and 3 again before you move them. If the survey proves right" in text and "anchor x [cm] z [cm] 0 +20 ± 1 +20" in text
 
 
 def test_angles_are_in_degrees(result):

@@ -113,7 +113,7 @@ def test_report_of_one_flight(flight, bag, tmp_path, capsys):
     assert row["rmse_3d"] == pytest.approx(evaluate(flight)[0].row()["rmse_3d"], abs=1e-4)  # stamps are rounded to ns
     assert told["pooled"]["rmse_3d"] == row["rmse_3d"] and told["pooled"]["diverged"] == 0
     first, *table = capsys.readouterr().out.splitlines()
-    assert first == "correcting with: nothing"
+    assert first == "correcting with: nothing (neither effects nor a network are in use)"
     assert table[0].split()[:5] == ["flight", "x", "y", "z", "3D"]
     assert table[1].startswith(flight.name) and f"{row['rmse_3d']:.3f}" in table[1]
 

@@ -82,7 +82,7 @@ def anchors(recording):
         return
     off = furthest(recording.anchors, recording.recorded)
     evidence = f"the same ids are up to {off:.2f} m apart" if np.isfinite(off) else "no id in common"
-    line = "convert BAG --survey SURVEY --out NEW.bag  # puts the survey into the bag"
+    line = "replay a bag that `convert --survey` has made of this bag: it holds the anchors of the survey"
     yield Finding(
         "survey_differs",
         WARNING,

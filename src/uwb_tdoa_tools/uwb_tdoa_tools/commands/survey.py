@@ -25,6 +25,7 @@ to --out.
 
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
 
+
 def main(argv=None):
     """The executable. Returns the exit code."""
     return cli.run(_survey, parser(), argv)

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import LabelEffect
 from uwb_tdoa_bias.effects.wording import listed, measured, significant
 
 from ..over_flights import in_words
@@ -13,7 +14,6 @@ CM = 100.0  # in a metre
 OR = "or"
 LEAST_WORTH = 0.0005  # m; less is no difference
 WORTH_DOING = 0.005  # m of position: what gains less is not asked of anybody
-FAULTS = {"anchor_ids", "pair_sign"}  # effects that are plain mistakes, to be put right whatever they are worth
 DEGREES = float(np.degrees(1.0))  # in a radian
 FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}
 SHOWN = 6  # values
@@ -51,7 +51,7 @@ class Entry:
     @property
     def matters(self):
         """Whether it is worth doing something about: a fault, or the position gains from taking it out, as far as anybody knows."""
-        fault = any(finding.effect.name in FAULTS for finding in self.findings)
+        fault = any(isinstance(finding.effect, LabelEffect) for finding in self.findings)  # a plain mistake, to be put right whatever it is worth
         return self.added and (fault or self.worth is None or self.worth >= WORTH_DOING)
 
     @property
