@@ -36,6 +36,12 @@ def test_one_that_nobody_told_where_it_is_has_no_place(tmp_path):
     assert judge(flown)["why"] == "refused to arm"  # the start was NaN, and this one stays there
 
 
+def test_one_whose_estimate_becomes_no_number_in_flight_is_lost_and_ends_nothing(tmp_path):
+    ends = STATE.replace("{\n  for", "{\n  static int calls;\n  wrong |= ++calls > 450;\n  for", 1)
+    flown = fly(Task(HALL, seed=2, told="place", peer=str(built(tmp_path, SOURCE + ends)), path=Circles(turns=1, turn_time=4.0)))
+    assert judge(flown)["said_lost"] is not None and not judge(flown)["landed"] and np.isnan(flown.odometry.p[-1]).all()
+
+
 def test_what_a_library_remembers_of_one_flight_is_not_in_the_next(tmp_path):
     counting = "void tdoa_peer_state(double *at, double *v, double *q) { static int calls; at[0] = ++calls; }"
     library = built(tmp_path, SOURCE + counting)

@@ -82,7 +82,7 @@ class TheirFilter:
         self._peer, self._anchors = Peer(library, own=True), anchors
         q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
         self._peer.start(anchors.positions, np.full(3, np.nan) if place is None else place, q)
-        self._states = []
+        self._states, self._newest = [], None
 
     def take(self, measured):
         """Take what arrived: Measured, of which other sensors are passed over."""
@@ -95,13 +95,13 @@ class TheirFilter:
         if len(events):
             self._peer.run(events[np.argsort(events["t"], kind="stable")])
             self._states.append((events["t"].max(), *self._peer.state()))
+            if all(np.isfinite(part).all() for part in self._states[-1]):
+                self._newest = self._states[-1]
 
     @property
     def pose(self):
         """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate that is one, or None."""
-        if not self._states or not all(np.isfinite(part).all() for part in self._states[-1]):
-            return None
-        return self._states[-1]
+        return self._newest
 
     @property
     def odometry(self):
