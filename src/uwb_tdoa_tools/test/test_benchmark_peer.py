@@ -1,5 +1,6 @@
 """Another filter beside ours: a tiny library, compiled here."""
 
+import ctypes
 import shutil
 import subprocess
 
@@ -85,3 +86,22 @@ def test_the_documented_interface_is_the_one_that_is_called():
     page = (ROOT / "docs" / "speed.md").read_text()
     declared = [line for line in peer.__doc__.splitlines() if line.startswith("    ")]
     assert len(declared) == 6 and all(line.strip().partition(";  ")[0].split("(")[0] in page for line in declared)
+
+
+def test_the_stand_in_for_matrices_inverts_and_multiplies(tmp_path):
+    (tmp_path / "inverse.c").write_text(
+        '#include "arm_math.h"\n'
+        "void product(float *a, float *out, int n) {\n"
+        "  float i[256], t[256];\n"
+        "  matrix A = {n, n, a}, I = {n, n, i}, T = {n, n, t}, O = {n, n, out};\n"
+        "  arm_mat_inverse_f32(&A, &I); arm_mat_trans_f32(&I, &T); arm_mat_trans_f32(&T, &I); arm_mat_mult_f32(&A, &I, &O);\n"
+        "  arm_mat_scale_f32(&O, 2, &O);\n}"
+    )
+    library = tmp_path / "inverse.so"
+    include = f"-I{ROOT / 'docs' / 'peer'}"
+    subprocess.run([CC, "-shared", "-fPIC", include, "-o", library, tmp_path / "inverse.c", "-lm"], check=True)
+    a = np.random.default_rng(1).normal(size=(9, 9)).astype(np.float32)
+    a[0, 0] = 0.0  # a pivot is needed
+    out = np.zeros((9, 9), np.float32)
+    ctypes.CDLL(str(library)).product(*(ctypes.c_void_p(x.ctypes.data) for x in (a, out)), 9)
+    assert np.allclose(out, 2.0 * np.eye(9), atol=1e-4)
