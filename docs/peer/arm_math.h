@@ -39,22 +39,20 @@ static inline arm_status arm_mat_mult_f32(const matrix *a, const matrix *b, matr
   return ARM_MATH_SUCCESS;
 }
 
-/* Gauss-Jordan elimination with pivots, up to 16 x 16 */
+/* Gauss-Jordan elimination, up to 16 x 16. Rows are not exchanged: CMSIS 5 does not, either (its search for a larger pivot
+   looks at the same element again), and the robust filter inverts triangular matrices, where that matters. */
 static inline arm_status arm_mat_inverse_f32(const matrix *a, matrix *out) {
   int n = a->numRows;
   float m[16][32];
   for (int i = 0; i < n; i++)
     for (int j = 0; j < n; j++) { m[i][j] = a->pData[i * n + j]; m[i][n + j] = i == j; }
   for (int c = 0; c < n; c++) {
-    int pivot = c;
-    for (int r = c + 1; r < n; r++) if (fabsf(m[r][c]) > fabsf(m[pivot][c])) pivot = r;
-    if (m[pivot][c] == 0) return ARM_MATH_SINGULAR;
-    for (int j = 0; j < 2 * n; j++) { float t = m[c][j]; m[c][j] = m[pivot][j]; m[pivot][j] = t; }
     float d = m[c][c];
-    for (int j = 0; j < 2 * n; j++) m[c][j] /= d;
+    if (d == 0) return ARM_MATH_SINGULAR;
+    for (int j = c; j < 2 * n; j++) m[c][j] /= d;
     for (int r = 0; r < n; r++) {
       float f = m[r][c];
-      if (r != c) for (int j = 0; j < 2 * n; j++) m[r][j] -= f * m[c][j];
+      if (r != c) for (int j = c; j < 2 * n; j++) m[r][j] -= f * m[c][j];
     }
   }
   for (int i = 0; i < n; i++) for (int j = 0; j < n; j++) out->pData[i * n + j] = m[i][n + j];

@@ -1,5 +1,5 @@
 /* The Kalman filter of the Crazyflie firmware as a peer of `bench --peer` and, with -DFLY, of `fly --peer` (docs/speed.md).
-   With -DROBUST it is the M-estimation of the first paper, else the firmware's standard update. */
+   With -DROBUST=1 it is the M-estimation of the first paper, else the firmware's standard update. */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
@@ -7,6 +7,10 @@
 #include "mm_tdoa.h"
 #include "mm_tdoa_robust.h"
 #include "outlierFilterTdoa.h"
+
+#ifndef ROBUST
+#define ROBUST 0
+#endif
 
 typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
 static kalmanCoreData_t core;
@@ -36,11 +40,13 @@ void tdoa_peer_start(const double *where, int32_t count, const double *p, const 
   memset(gyro_sum, 0, sizeof gyro_sum); memset(accel_sum, 0, sizeof accel_sum);
   kalmanCoreDefaultParams(&params);
   params.initialYaw = 2 * atan2(q[2], q[3]);  /* level */
-  if (!isnan(p[0])) {  /* NaN: nobody says where it stands */
+  int told = !isnan(p[0]);
+  if (told) {
     params.initialX = p[0]; params.initialY = p[1]; params.initialZ = p[2];
   }
 #ifdef FLY  /* at rest, and what is said is right to 0.1 m and 0.1 rad */
-  if (!isnan(p[0])) params.stdDevInitialPosition_xy = params.stdDevInitialPosition_z = 0.1f;
+  params.stdDevInitialPosition_xy = told ? 0.1f : 3.0f;  /* else somewhere in the hall: with the 100 m of the firmware the state is NaN */
+  if (told) params.stdDevInitialPosition_z = 0.1f;
   params.stdDevInitialAttitude_yaw = 0.1f;
 #else  /* it flies already */
   params.stdDevInitialPosition_xy = params.stdDevInitialPosition_z = 0.3f;
@@ -70,11 +76,8 @@ void tdoa_peer_run(const tdoa_peer_event *e, int32_t count) {
       kalmanCoreAddProcessNoise(&core, &params, now);
     } else {
       tdoaMeasurement_t tdoa = {.anchorPositions = {place(e->a), place(e->b)}, .distanceDiff = e->d, .stdDev = 0.15f};
-#ifdef ROBUST
-      kalmanCoreRobustUpdateWithTdoa(&core, &tdoa, &outliers);
-#else
-      kalmanCoreUpdateWithTdoa(&core, &tdoa, now, &outliers);
-#endif
+      if (ROBUST) kalmanCoreRobustUpdateWithTdoa(&core, &tdoa, &outliers);
+      else kalmanCoreUpdateWithTdoa(&core, &tdoa, now, &outliers);
     }
     kalmanCoreFinalize(&core);
   }

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, REFUSED, WAITING, Mission, Rules
+from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, PULL, REFUSED, WAITING, Mission, Rules
 from uwb_tdoa_tools.flying.path import Circles
 
 LEVEL = np.array([0.0, 0.0, math.sin(0.2), math.cos(0.2)])  # yaw 0.4
@@ -14,14 +14,14 @@ class Said:
     """An estimate that says what it is told to."""
 
     def __init__(self, mission):
-        self.mission, self.t = mission, 0.0
+        self.mission, self.t, self.sinks = mission, 0.0, 0.0
 
     def until(self, end, deviation=0.1, support=0.0, stale=False):
-        """What was wanted at `end`, s."""
+        """What was wanted at `end`, s. Its height falls at `sinks`, m/s."""
         wanted = None
         while self.t < end - 1e-9:
             t = round(self.t, 9)
-            pose = None if stale else (t, np.zeros(3), np.zeros(3), LEVEL)
+            pose = None if stale else (t, np.array([0.0, 0.0, -self.sinks * t]), np.zeros(3), LEVEL)
             wanted = self.mission.decide(t, pose, deviation, support)
             self.t += STEP
         return wanted
@@ -56,7 +56,15 @@ def test_it_is_up_flies_its_circles_and_sinks(said):
     np.testing.assert_allclose(halfway, [1.0, 2.0, 1.23], atol=0.02)  # one of two circles
     np.testing.assert_allclose(said.until(11.0 + 16.0 + 0.01)[0, 2], 0.43, atol=5e-3)
     sinking = said.until(30.0)
-    assert np.isnan(sinking[0, 2]) and sinking[1, 2] < 0.0 and said.mission.state == FLYING  # to wherever the ground is
+    assert sinking[1, 2] < 0.0 and said.mission.state == FLYING  # to wherever the ground is
+
+
+def test_an_estimate_that_does_not_come_down_is_pulled_down_and_another_is_not(said):
+    high = said.until(30.0)[0, 2]
+    assert high == pytest.approx(-PULL) and said.until(31.0)[0, 2] == high  # of an estimate of 0: no lower than that
+    falling = Said(Mission(Circles(), (1.0, 2.0), 0.03))
+    falling.sinks = 0.15
+    assert falling.until(30.0)[0, 2] == pytest.approx(-0.15 * 29.99, abs=1e-6)
 
 
 def test_what_it_stands_on_ends_it_near_the_end_alone(said):

@@ -26,6 +26,7 @@ class Rules:
     longest_sink: float = 10.0
 
 
+PULL = 0.15  # m, most by which the height that is wanted while it comes down is below the estimated height
 USUAL = 2.0  # s over which it learns what support it feels in the air, where there is none: its accelerometer has an offset
 
 
@@ -41,6 +42,7 @@ class Mission:
         self.state, self.started, self.ended, self.lost = WAITING, None, None, None
         self.yaw = self._first_yaw = 0.0
         self._usual = 0.0  # support, of the weight
+        self._descent = None  # (s, m) where it began to come down on whatever is there
 
     def decide(self, t, pose, deviation, support):
         """What the controller is to do at t, s: (3, 3) position, velocity, acceleration, NaN where it does not matter; None for rotors
@@ -74,9 +76,17 @@ class Mission:
         if self.state != LOST:
             self._sinking = t if along < self._path.duration else self._sinking
             self.yaw = self._first_yaw + self._path.turned(along)
-            return self._path.at(np.array([along]))[0]
+            wanted = self._path.at(np.array([along]))[0]
+            return self._descend(t, wanted, pose[1][2]) if math.isnan(wanted[0, 2]) else wanted
         wanted = np.zeros((3, 3))
         wanted[0], wanted[1, 2] = math.nan, -rules.sink
+        return wanted
+
+    def _descend(self, t, wanted, height):
+        """Wanted, with a height, m, that falls at half of the wanted velocity, where the estimated height does not fall as fast: an
+        estimated velocity that is wrong by a constant does not keep it in the air."""
+        begun, first = self._descent = self._descent or (t, height)
+        wanted[0, 2] = min(height, max(first + 0.5 * wanted[1, 2] * (t - begun), height - PULL))
         return wanted
 
     @property
