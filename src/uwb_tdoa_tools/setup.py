@@ -62,7 +62,6 @@ setup(
             "record = uwb_tdoa_tools.executables:record",
             "replay = uwb_tdoa_tools.executables:replay",
             "simulate = uwb_tdoa_tools.executables:simulate",
-            "study = uwb_tdoa_tools.executables:study",
             "survey = uwb_tdoa_tools.executables:survey",
             "train = uwb_tdoa_tools.executables:train",
             "vehicle_node = uwb_tdoa_tools.executables:vehicle_node",

@@ -2,9 +2,9 @@
 
 from functools import lru_cache
 
+from mistakes import arriving
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.studies.checking.live import arriving
 
 # Errors of TDOAs that a calibrated installation has. Turning, so that every axis of the gyroscope tells something.
 QUICK = dict(duration=30.0, imu_rate=400.0, truth_rate=50.0, yaw="rotating", yaw_rate=0.4, speed=1.2, floor_time=2.0)

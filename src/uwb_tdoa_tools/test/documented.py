@@ -11,7 +11,7 @@ import subprocess
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 LISTED = ("ls", "grep")  # what the blocks use besides
-BLOCK = re.compile(r"^```(?:sh|bash)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`((?:\./dev|ros2) [^`]+)`")
 PLACEHOLDERS = ("PACKAGE NAME", "PKG EXE")
 
@@ -22,7 +22,7 @@ def commands(page, names, folder):
     folder : an empty one to run in; gets ./dev and a DATA that is as measured flights are.
     """
     text = page.read_text()
-    scripts = [block for block in BLOCK.findall(text) if _is_shell(block, names)]
+    scripts = [block for language, block in BLOCK.findall(text) if language in ("", "sh", "bash") and _is_shell(block, names)]
     scripts += [line for line in INLINE.findall(text) if not any(word in line for word in PLACEHOLDERS)]
     notes = folder / "notes"
     notes.touch()

@@ -7,7 +7,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_tools.checking.against_truth import against_truth, of_truth
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import constellation
-from uwb_tdoa_tools.studies.checking.mistakes import MISTAKES
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from mistakes import MISTAKES
+from known_effects import clean_flight
 
 from checking_flights import QUICK, recording
 

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from uwb_tdoa_tools.checking import motion_rules
 from uwb_tdoa_tools.checking.motion_rules import TrueMotion
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.studies.diagnosis.bank import CLEAN, clean_flight
+from known_effects import CLEAN, clean_flight
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_tools.checking.numbers import numbers
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
-from uwb_tdoa_tools.studies.diagnosis.faults import FAULTS
+from known_effects import clean_flight
+from number_faults import FAULTS
 
 HARD = ("pair_late",)  # hidden by the noise in most draws
 QUICK = ("tdoa_rounded", "ids_exchanged", "truth_leap")

@@ -5,8 +5,8 @@ import pytest
 
 from uwb_tdoa_tools.checking import pair_rules
 from uwb_tdoa_tools.checking.known_path import KnownPath
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
-from uwb_tdoa_tools.studies.diagnosis.faults import FAULTS
+from known_effects import clean_flight
+from number_faults import FAULTS
 
 T = np.arange(600) / 20.0
 TRUE = 3.0 * np.sin(0.5 * T)

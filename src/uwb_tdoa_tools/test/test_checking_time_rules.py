@@ -9,8 +9,8 @@ from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.checking.known_path import KnownPath
 from uwb_tdoa_tools.checking.time_rules import tdoas
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
-from uwb_tdoa_tools.studies.diagnosis.faults import FAULTS
+from known_effects import clean_flight
+from number_faults import FAULTS
 
 
 @pytest.fixture(scope="module")

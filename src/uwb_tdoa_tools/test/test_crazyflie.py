@@ -13,10 +13,8 @@ import pytest
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.crazyflie.log_blocks import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
 from uwb_tdoa_tools.crazyflie.streamed import BLOCKS, PAIRS, Link, as_received, messages, streamed
-from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.studies.crazyflie import table
 
 
 @pytest.fixture(scope="module")
@@ -85,15 +83,6 @@ def test_the_estimate_loses_little(flight):
     direct = evaluate(flight, FilterConfig())[0].row()["rmse_3d"]
     for link in (Link(), Link(half=True, lost=0.05)):
         assert evaluate(streamed(flight, link), FilterConfig())[0].row()["rmse_3d"] < direct + 0.03
-
-
-@pytest.mark.slow
-def test_measured_logs_lose_little(shared_data):
-    flights = inputs.Reading(shared_data / "surveys").flights([shared_data / "flights" / "0426"])
-    tdoa2 = [f for f in flights if f.meta["protocol"] == "tdoa2"][:2]
-    lines = list(table([replace(f, extra={}) for f in tdoa2]))[2:]
-    direct, *others, naive = (float(line.split("|")[4]) for line in lines)
-    assert all(error < direct + 0.02 for error in others) and naive > min(others)
 
 
 def test_the_example_says_what_is_missing():

@@ -11,7 +11,7 @@ from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.regression.select import select
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import candidates_of
-from uwb_tdoa_tools.studies.diagnosis.bank import AIDED, SIZES, clean_flight, effect_of, names_found
+from known_effects import AIDED, SIZES, clean_flight, effect_of, names_found
 
 TRUTH = GroundTruth()
 

@@ -9,7 +9,7 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute, effects_of
 from uwb_tdoa_tools.diagnosis.calibration import LEFT, calibrate
 from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 
 DELAYS = {"1": 0.3, "4": -0.2, "6": 0.25}
 

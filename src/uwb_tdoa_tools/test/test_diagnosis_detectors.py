@@ -8,7 +8,7 @@ from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+from known_effects import clean_flight, effect_of
 
 OF_NOISE = ("outlier_rate", "noise_level", "noise_correlation")
 

@@ -9,7 +9,7 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.deviations import with_deviations
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.readers import inputs
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 
 MEASURED = {  # recordings on which nothing was chosen, and how far off their surveys are put, m
     "util/const1-trial2-tdoa2.csv.gz": 0.1,

@@ -11,7 +11,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.diagnose import main
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import Nothing
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+from known_effects import clean_flight, effect_of
 
 
 @pytest.fixture(scope="module")

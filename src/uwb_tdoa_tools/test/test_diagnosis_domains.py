@@ -8,7 +8,7 @@ from uwb_tdoa_bias.effects.samples import samples_at
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.domains import Seen
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.channels.extra import extra_at
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 
 
 def temperature(t):

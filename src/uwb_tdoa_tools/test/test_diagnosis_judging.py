@@ -1,11 +1,13 @@
 from dataclasses import fields, replace
 
+from known_effects import clean_flight, effect_of
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
+from uwb_tdoa_bias.effects.samples import Track
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import poses_of, run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
@@ -13,8 +15,6 @@ from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.judging import Baseline, Case, _gain_interval, borne_out, compare, cross_fitted, judge, score, useful, why_not
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
-from uwb_tdoa_tools.studies.diagnosis.grammar import Undeclared
 
 TRUTH = GroundTruth()
 NONE = EffectSet()
@@ -97,8 +97,10 @@ def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights)
 
 
 def test_what_no_node_can_take_out_is_not_tried():
-    late = Undeclared("gyro", "axis", (0,), "acceleration", "trend", 0.3, (0.0, 2.0), (0.5, 0.2, 0.5))
-    flight = late.inject(clean_flight(100, 30.0))
+    flight = clean_flight(100, 30.0)
+    acceleration = np.linalg.norm(Track(flight.truth).motion(flight.imu.t).acceleration, axis=1)
+    turned = np.outer(np.nan_to_num(0.15 * np.minimum(acceleration - 1.0, 1.5)), [1.0, 0.0, 0.0])
+    flight = replace(flight, imu=replace(flight.imu, gyro=flight.imu.gyro + turned))
     found = attribute([flight], TRUTH)
     kept = useful(found, [flight], Baseline(NONE))
     assert [candidate.label for candidate in kept.candidates] == ["gyro.x over acceleration"]

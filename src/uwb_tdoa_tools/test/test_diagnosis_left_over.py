@@ -8,7 +8,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report.left_over import left_over
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 
 
 @pytest.fixture(scope="module")

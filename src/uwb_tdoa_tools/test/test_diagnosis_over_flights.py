@@ -7,7 +7,7 @@ from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.over_flights import ALL, ALONE, DIFFERS, GROWS, Share, course, in_words, shares
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+from known_effects import clean_flight, effect_of
 
 
 def several(*values, std=0.05):

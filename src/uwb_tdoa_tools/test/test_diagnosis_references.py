@@ -9,8 +9,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import REFERENCES, GroundTruth, Heights, Marks, Nothing
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
-from uwb_tdoa_tools.studies.surveying import marks_of
+from known_effects import clean_flight, effect_of, marks_of
 
 NONSENSE = np.array([100.0, -50.0, 7.0])
 

@@ -17,7 +17,7 @@ from uwb_tdoa_tools.diagnosis.regression.select import rank, select
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term, candidates_of, columns_of
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+from known_effects import clean_flight, effect_of
 
 PAIRS = np.array([[k, (k + 1) % 8] for k in range(8)])
 

@@ -4,7 +4,7 @@ import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.diagnosis import diagnose, repairing
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+from known_effects import clean_flight, effect_of
 
 IDS, SIGN = EFFECTS["anchor_ids"]({"1": 4, "4": 1}), EFFECTS["pair_sign"]({"2-3": -1.0, "5-6": -1.0})
 DELAY = EFFECTS["anchor_delay"]({"4": 0.1})

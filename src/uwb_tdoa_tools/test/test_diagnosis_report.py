@@ -22,7 +22,7 @@ from uwb_tdoa_tools.diagnosis.report.style import STYLE
 from uwb_tdoa_tools.diagnosis.report.unclear import by_remedy, untold
 from uwb_tdoa_tools.diagnosis.report.verdict import verdict
 from uwb_tdoa_tools.diagnosis.report.words import TERMS, abbreviations
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 ELSEWHERE = Alternative("pair_offset", 0.95, None, "TDoA3")

@@ -11,7 +11,7 @@ from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.regression.scan import Scan
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight, effect_of
+from known_effects import clean_flight, effect_of
 
 TRUTH = GroundTruth()
 

@@ -120,7 +120,7 @@ def documented(tmp_path_factory):
                     assert words[0] == EVERY[words[1]].partition(".")[0], (where, words)
                     found.append((where, words[1], words[2:]))
                 else:
-                    assert verb in ("test", "build", "shell", "help", "launch", "bag", "service"), (where, verb)
+                    assert verb in ("test", "build", "shell", "study", "help", "launch", "bag", "service"), (where, verb)
             else:
                 found.append((where, first, words))
     return found

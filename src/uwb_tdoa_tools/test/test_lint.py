@@ -6,7 +6,7 @@ import pytest
 
 from documented import ROOT
 
-SOURCES = [str(ROOT / "src" / name / name) for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")]
+SOURCES = [str(ROOT / name) for name in ("src/uwb_tdoa_bias/uwb_tdoa_bias", "src/uwb_tdoa_ekf/uwb_tdoa_ekf", "src/uwb_tdoa_tools/uwb_tdoa_tools", "studies")]
 # Module docstrings, blank lines, indentation, quotes. What a docstring says, and how it begins, is not for a linter.
 DOCSTRINGS = "D100 D104 D201 D202 D204 D207 D300 D301 D412 D414".split()
 
@@ -15,7 +15,7 @@ DOCSTRINGS = "D100 D104 D201 D202 D204 D207 D300 D301 D412 D414".split()
 def test_flake8(monkeypatch):
     main = pytest.importorskip("ament_flake8.main").main_with_errors
     monkeypatch.chdir(ROOT / "src")
-    files = [str(ROOT / name) for name in ("src", "docs", "conftest.py")]
+    files = [str(ROOT / name) for name in ("src", "studies", "docs", "conftest.py")]
     code, errors = main(argv=["--config", str(ROOT / ".ci" / "flake8.ini"), *files])
     assert code == 0, "\n".join(errors)
 

@@ -9,7 +9,7 @@ from uwb_tdoa_bias.effects import Track, aid_samples
 from uwb_tdoa_bias.foundation.flight import Height
 from uwb_tdoa_tools.readers.optical_flow import COUNTS, NEAREST_RANGE, velocity_of
 from uwb_tdoa_tools.scoring.metrics import airborne
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 
 
 @pytest.fixture(scope="module")

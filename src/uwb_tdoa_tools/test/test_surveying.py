@@ -15,7 +15,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
 from uwb_tdoa_tools.diagnosis.self_survey import delay_effect, tdoa_std_of
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 from uwb_tdoa_tools.surveying.marks import read_marks
 from uwb_tdoa_tools.surveying.placing import place
 from uwb_tdoa_tools.surveying.survey import survey

@@ -13,7 +13,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
 from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark
 from uwb_tdoa_tools.diagnosis.references import Odometry, OdometryPath
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
+from known_effects import clean_flight
 from uwb_tdoa_tools.surveying.blocked import large, with_blocked
 from uwb_tdoa_tools.surveying.distances import read_distances
 from uwb_tdoa_tools.surveying.paths import read_paths

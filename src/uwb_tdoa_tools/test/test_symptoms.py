@@ -5,7 +5,7 @@ import re
 from documented import ROOT
 import pytest
 from spoken import rules, sentences
-from uwb_tdoa_tools.studies.diagnosis.faults import FAULTS
+from number_faults import FAULTS
 
 PAGE = (ROOT / "docs" / "symptoms.md").read_text()
 TABLE = PAGE.partition("## What the nodes say\n")[2].partition("\n## ")[0]

@@ -1,6 +1,5 @@
 """As much of a model as flights left out bear out."""
 
-import argparse
 from functools import partial
 
 import pytest
@@ -9,7 +8,6 @@ from training_flights import flight
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.scoring.borne_out import SHARES, BorneOut, choose
-from uwb_tdoa_tools.studies.training import splits
 from uwb_tdoa_tools.training import shrinking, structured
 
 OPTIONS = structured.Options(centres=10, link_centres=10)
@@ -54,23 +52,3 @@ def test_two_processes_give_the_same_to_the_bit():
         over = partial(parallel.over, jobs=jobs)
         told.append(shrinking.bear_out("structured", flights, shrinking.uncorrected(flights, over), 0, OPTIONS, over=over))
     assert told[0] == told[1] and set(told[0].errors) == {one.name for one in flights}
-
-
-def test_splits_are_done_once_and_summed_up(tmp_path, monkeypatch, capsys):
-    made, flights = [], [flight(seed) for seed in range(2)]
-
-    def split(flights, plain, seed, fit, kinds):
-        for kind in kinds:
-            made.append((kind, seed))
-            told = {"left_out": splits._text(errors((1, 0.9, 0.8, 0.7))), "judged": splits._text(errors((1, 0.9, 0.9, 1.2)))}
-            yield {"seed": seed, "kind": kind, **told}
-
-    monkeypatch.setattr(splits, "split", split)
-    monkeypatch.setattr(splits.inputs.Reading, "flights", lambda *_: flights)
-    monkeypatch.setattr(splits.shrinking, "uncorrected", lambda _: {})
-    parser = argparse.ArgumentParser()
-    splits.add_options(parser.add_argument)
-    for count in ("1", "2"):
-        splits.run(parser.parse_args(["x", "--out", str(tmp_path / "rows"), "--models", "structured", "--splits", count]))
-    assert made == [("structured", 0), ("structured", 1)]
-    assert "| structured | 2 | -20.0% | 0.0% | -20.0% | 1.20 | 2 of 2 | 30.0% | 1.00 |" in capsys.readouterr().out

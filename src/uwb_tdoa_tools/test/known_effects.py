@@ -1,0 +1,106 @@
+"""Simulated flights without any effect, every effect at a small and at a large size to put into them, places known on their paths, and what is
+found by name."""
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_tools.diagnosis.constraints import Mark
+from uwb_tdoa_tools.scoring.metrics import airborne
+from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
+
+PATHS = ("sines", "rising_circle", "square", "sines", "rising_circle")
+# Without effects: white noise, outliers within the nominal 2 %, an inertial sensor without bias.
+CLEAN = {"bias": False, "multipath": False, "imu_errors": ImuErrors(gyro_bias=0.0, accel_bias=0.0)}
+
+# {effect: (small, large)}: parameters; N is the number of some anchor, P of some pair.
+SIZES = {
+    "anchor_delay": ({"N": 0.05}, {"N": 0.3}),
+    "pair_offset": ({"P": 0.05}, {"P": 0.3}),
+    "anchor_position": ({"N.x": 0.08}, {"N.x": 0.3, "N.y": -0.2, "N.z": 0.2}),
+    "tag_lever_arm": ({"z": 0.05}, {"x": 0.1, "y": -0.1, "z": 0.2}),
+    "tdoa_time_offset": ({"offset": 0.01}, {"offset": 0.05}),
+    "truth_time_offset": ({"offset": 0.01}, {"offset": 0.05}),
+    "truth_frame": ({"z": 0.04}, {"x": 0.1, "y": 0.1, "z": 0.1, "roll": 0.02, "pitch": 0.02, "yaw": 0.05}),
+    "range_scale": ({"scale": 0.01}, {"scale": 0.05}),
+    "range_bias": ({"quadratic": 0.002}, {"quadratic": 0.01}),
+    "received_power_bias": ({"scale": 0.5}, {"scale": 2.0}),
+    "antenna_pattern": ({"tag": 0.08}, {"tag": 0.3, "anchor": 0.3}),
+    "anchor_clock_drift": ({"N": 0.0015}, {"N": 0.01}),
+    "nlos": ({"N.delay": 0.15, "N.start": 20.0, "N.end": 32.0}, {"N.delay": 0.6, "N.start": 20.0, "N.end": 32.0}),
+    "floor_multipath": (
+        {"0.delay": 0.8, "2.delay": 0.8, "0.height": 0.15, "2.height": 0.15},
+        {"0.delay": 3.3, "2.delay": 2.8, "5.delay": 3.6, "7.delay": 3.3, **{f"{i}.height": 0.15 for i in (0, 2, 5, 7)}},
+    ),
+    "gyro_bias": ({"z": 0.005}, {"x": 0.03, "y": -0.03, "z": 0.05}),
+    "gyro_scale": ({"z": 0.03}, {"z": 0.1}),
+    "accel_bias": ({"x": 0.08}, {"x": 0.3, "y": -0.3, "z": 0.2}),
+    "accel_scale": ({"z": 0.01}, {"z": 0.05}),
+    "imu_misalignment": ({"x": 0.01}, {"x": 0.05, "y": -0.05, "z": 0.05}),
+    "imu_gravity": ({"excess": 0.06}, {"excess": 0.3}),
+    "noise_level": ({"P": 0.1}, {"P": 0.3}),
+    "noise_correlation": ({"std": 0.08, "time": 0.5}, {"std": 0.2, "time": 0.5}),
+    "outlier_rate": ({"share": 0.05}, {"share": 0.15}),
+    "height_offset": ({"offset": 0.02}, {"offset": 0.1}),
+    "height_scale": ({"scale": 0.02}, {"scale": 0.1}),
+    "floor_step": (
+        {"1.height": 0.1, "1.start": 20.0, "1.end": 32.0}, {"1.height": 0.5, "1.start": 20.0, "1.end": 32.0},
+    ),
+    "barometer_drift": ({"rate": 0.01}, {"rate": 0.05}),
+    "velocity_scale": ({"scale": 0.03}, {"scale": 0.15}),
+    "velocity_misalignment": ({"yaw": 0.03}, {"yaw": 0.3}),
+    "velocity_delay": ({"offset": 0.04}, {"offset": 0.15}),
+    "velocity_slip": (
+        {"1.share": 0.3, "1.start": 20.0, "1.end": 26.0}, {"1.share": 1.0, "1.start": 20.0, "1.end": 26.0},
+    ),
+}  # fmt: skip
+AIDED = tuple(name for name in SIZES if set(EFFECTS[name].channels) <= set(AIDS))  # effects on height, pressure, velocity
+MARK_TIME, MARK_STD = 2.0, 0.05  # s, m
+NOISES = {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
+
+
+def clean_flight(seed, duration=50.0, aided=False):
+    """A simulated flight without any effect. aided : with height, pressure and velocity."""
+    return simulate(
+        SimulationConfig(
+            seed=seed,
+            duration=duration,
+            trajectory=PATHS[seed % 5],
+            yaw=("along_track", "rotating")[seed % 2],
+            protocol=("tdoa2", "tdoa3")[seed // 2 % 2],
+            **CLEAN,
+            **(NOISES if aided else {}),
+        )
+    )
+
+
+def effect_of(name, large, seed):
+    """The effect at a size, on an anchor or pair that the seed chooses."""
+    rng = np.random.default_rng([seed, len(name)])
+    anchor = int(rng.integers(8))
+    pair = f"{anchor}-{(anchor + 1) % 8}"  # is heard in both protocols
+    values = SIZES[name][int(large)]
+    return EFFECTS[name]({key.replace("N", str(anchor)).replace("P", pair): value for key, value in values.items()})
+
+
+def marks_of(flight, count, rng):
+    """[Mark] at places of the ground truth, MARK_TIME long, evenly over the airborne part, MARK_STD off."""
+    truth, (begin, end) = flight.truth, airborne(flight.truth)
+    out = []
+    for first in np.linspace(begin + MARK_TIME, end - 2.0 * MARK_TIME, count):
+        inside = (truth.t >= first) & (truth.t <= first + MARK_TIME)
+        place = truth.p[inside].mean(axis=0) + MARK_STD * rng.standard_normal(3)
+        since = first - flight.tdoa.t[0]
+        out.append(Mark(flight.name, since, since + MARK_TIME, tuple(place), MARK_STD))
+    return out
+
+
+def names_found(attribution):
+    """Names of effects, the most certain first, functions without a name as channel/covariate."""
+    findings = attribution.findings()
+    declared = sorted(
+        (finding for finding in findings if finding.declared),
+        key=lambda f: -f.evidence.get("held_out_gain", f.evidence.get("standard_errors", 0.0)),
+    )
+    unnamed = [finding.effect for finding in findings if not finding.declared]
+    return [f.effect.name for f in declared] + [f"{effect.channel}/{effect.covariate}" for effect in unnamed]

@@ -1,1 +1,0 @@
-"""What re-makes the figures of the documentation; users do not need it."""

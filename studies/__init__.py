@@ -1,0 +1,7 @@
+"""What re-makes the figures of the documentation. Not installed: `./dev study NAME` runs it from the repository."""
+
+from pathlib import Path
+import sys
+
+# Flights, faults and mistakes with which the tests work, too.
+sys.path.append(str(Path(__file__).resolve().parents[1] / "src" / "uwb_tdoa_tools" / "test"))

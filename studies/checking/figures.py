@@ -1,0 +1,118 @@
+"""Mistakes of drivers, surveys and clocks put into flights, and what `check` says of them; and of the flights as they
+are."""
+
+from functools import partial
+import json
+from pathlib import Path
+
+from mistakes import MISTAKES, arriving
+import numpy as np
+
+from uwb_tdoa_ekf.streams import ERROR
+from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools.checking.check import check
+from uwb_tdoa_tools.checking.recording import of_flight
+from uwb_tdoa_tools.checking.tdoa_rules import furthest
+from uwb_tdoa_tools.readers import inputs, read_survey
+from uwb_tdoa_tools.readers.streams import protocol
+
+ANOTHER = 0.3  # m that an anchor of another room is elsewhere at least
+
+
+def add_options(add):
+    """add : add_argument of a parser."""
+    add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
+    add("--survey", required=True, metavar="DIR", help="folder of all surveys")
+    add(
+        "--only",
+        nargs="+",
+        metavar="MISTAKE",
+        choices=[*MISTAKES, "nothing"],
+        help=f"of {', '.join(MISTAKES)}, nothing",
+    )
+    add("--json", metavar="FILE", help="write what was said of each")
+    add("--jobs", type=int, metavar="N", help="flights at once")
+
+
+def run(args):
+    """Print the table."""
+    reading = inputs.Reading(args.survey)
+    found = reading.find(args.flights)
+    surveys = [(path.name, read_survey(path)) for path in sorted(Path(args.survey).glob("anchor_?*"))]
+    kinds = [(survey, protocol(reading.read((path, survey)).tdoa)) for path, survey in found]
+    tasks = [(number, recording, _partner(number, found, kinds)) for number, recording in enumerate(found)]
+    judge = partial(judge_flight, reading=reading, surveys=surveys, only=args.only)
+    rows = []
+    for said in parallel.over(judge, tasks, args.jobs):
+        rows += said
+        if args.json:
+            Path(args.json).write_text(json.dumps(rows, indent=1))
+    print(table(rows))
+
+
+def _partner(number, found, kinds):
+    """(path, survey) of another flight with the same survey and protocol, or None: whose tag may fly along."""
+    same = [recording for k, recording in enumerate(found) if k != number and kinds[k] == kinds[number]]
+    return same[number % len(same)] if same else None
+
+
+def judge_flight(task, reading, surveys, only=None):
+    """[{"flight", "live", "mistake", "said": {rule: severity}, "named": bool}] of one flight: (number, recording,
+    partner).
+
+    Every other flight is judged as a bag recorded live, with the times at which its messages arrived, the others as a
+    log that knows nothing but stamps."""
+    number, recording, partner = task
+    flight = of_flight(reading.read(recording))
+    other = of_flight(reading.read(partner)) if partner else None
+    live = number % 2 == 0
+    rooms = [anchors for _, anchors in surveys if furthest(anchors, flight.anchors) > ANOTHER]
+    rows = []
+    for name in ["nothing", *MISTAKES] if only is None else only:
+        mistake = MISTAKES.get(name)
+        if mistake and not possible(mistake, flight, other, rooms):
+            continue
+        rng = np.random.default_rng([number, *name.encode()])
+        arrives = live or (mistake is not None and "live" in mistake.needs)
+        made = arriving(flight, number) if arrives else flight
+        if mistake:
+            second = rooms[int(rng.integers(len(rooms)))] if mistake.needs == "rooms" else other
+            made = mistake.make(made, rng, second)
+        report = check(made, [] if mistake and mistake.alone else surveys)
+        said = {finding.rule: finding.severity for finding in report.findings}
+        named = any(rule in said for rule in mistake.named) if mistake else ERROR not in said.values()
+        rows.append({"flight": flight.name, "live": arrives, "mistake": name, "said": said, "named": named})
+    return rows
+
+
+def possible(mistake, flight, other, rooms):
+    """Whether a flight can have the mistake."""
+    return not (
+        ("imu" in mistake.needs and flight.imu is None)
+        or (mistake.needs in ("tdoa2", "tdoa3") and mistake.needs != protocol(flight.tdoa))
+        or (mistake.needs == "other" and other is None)
+        or (mistake.needs == "rooms" and not rooms)
+    )
+
+
+def table(rows):
+    """Markdown: a line for each mistake, with how often it was named, and what was said besides that is not said
+    without it."""
+    lines = ["| mistake | named | flights | what else was said |", "| --- | ---: | ---: | --- |"]
+    for name in dict.fromkeys(row["mistake"] for row in rows):
+        mine = [row for row in rows if row["mistake"] == name]
+        usual = _of_flights(rows) if name in MISTAKES else {}
+        besides = {}
+        for row in mine:
+            expected = set(MISTAKES[name].named) if name in MISTAKES else set()
+            for rule in row["said"].keys() - expected - usual.get(row["flight"], set()):
+                besides[rule] = besides.get(rule, 0) + 1
+        text = MISTAKES[name].text if name in MISTAKES else "nothing: no error is said"
+        said = ", ".join(f"{rule} {count}" for rule, count in sorted(besides.items(), key=lambda item: -item[1]))
+        lines.append(f"| {text} | {sum(row['named'] for row in mine)} | {len(mine)} | {said} |")
+    return "\n".join(lines)
+
+
+def _of_flights(rows):
+    """{flight: rules that stand without any mistake}."""
+    return {row["flight"]: set(row["said"]) for row in rows if row["mistake"] == "nothing"}

@@ -1,0 +1,250 @@
+"""diagnosis: the figures of docs/diagnosis.md. Every part prints its figures and writes them, with all cases, to
+PART.json in the output folder; bank, blind and injected draw what was found first for what was put in, too."""
+
+from functools import partial
+import importlib.util
+import json
+from pathlib import Path
+import time
+
+import numpy as np
+from tqdm import tqdm
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
+from uwb_tdoa_tools.parallel import over, whole_number
+from uwb_tdoa_tools.results_file import ResultsFile
+from uwb_tdoa_tools.scoring.plots import plt
+from uwb_tdoa_tools.surveying.blocked import with_blocked
+from uwb_tdoa_tools.surveying.survey import survey
+from uwb_tdoa_tools.surveying.tape import Tape
+
+from . import bank, blind, faults, floor, measured, referenced, undeclared
+
+PARTS = (
+    "bank", "aids", "no-truth", "undeclared", "blind", "several", "faults", "injected", "measured", "measured-aids", "floor", "references", "speed",
+)  # fmt: skip
+SEVERAL_MEASURED, SEVERAL_SIMULATED = 3, 4  # flights with the same effect: no measured group of one protocol has more
+
+
+def add_options(add):
+    """The options of the study."""
+    add("part", choices=PARTS, help="what to run")
+    add("--out", metavar="DIR", type=Path, required=True, help="where to write")
+    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, cases of blind and several, or costly draws of each of the faults (default: 5)")
+    add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind, several, faults and no-truth (default: %(default)s)")
+    add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
+    add("--jobs", metavar="N", type=whole_number, default=1, help="cases of blind and several at once (default: %(default)s)")
+    add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
+
+
+def run(args):
+    """Run a part, and write and print its figures."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    on_data = dict.fromkeys(("faults", "injected", "measured", "measured-aids", "floor", "references"), ("data",))
+    for option in {"undeclared": ("cases",), **on_data}.get(args.part, ()):
+        if getattr(args, option) is None:
+            raise InputError(f"--{option}: {args.part} needs it.")
+    started = time.monotonic()
+    result = {
+        "bank": _bank,
+        "aids": _aids,
+        "no-truth": _no_truth,
+        "undeclared": _undeclared,
+        "blind": _blind,
+        "several": _several,
+        "faults": _faults,
+        "injected": _injected,
+        "measured": _measured,
+        "measured-aids": _measured_aids,
+        "floor": _floor,
+        "references": _references,
+        "speed": _speed,
+    }[args.part](args)
+    result["seconds"] = round(time.monotonic() - started, 1)
+    (args.out / f"{args.part}.json").write_text(json.dumps(result, indent=1, default=float))
+    print(json.dumps(result["figures"], indent=1, default=float))
+
+
+def _each(cases, function):
+    out = []
+    for case in tqdm(cases, unit="case", disable=None):
+        out.append(function(*case))
+    return out
+
+
+def _bank(args):
+    results = _each(
+        bank.cases(args.seeds), lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed)}
+    )
+    _confusion(results, args.out / "confusion.png")
+    return {"figures": bank.figures(results), "cases": results}
+
+
+def _aids(args):
+    results = _each(
+        bank.cases(args.seeds, aided=True),
+        lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed, aided=True)},
+    )
+    return {"figures": bank.figures(results), "cases": results}
+
+
+def _no_truth(args):
+    cases = [case for case in bank.cases(min(args.seeds, 2), first=args.first) if case[0] == "large"]
+    cases += [case for case in bank.cases(args.seeds, first=args.first) if case[0] == "clean"]
+    results = _each(cases, lambda kind, effects, seed: {"kind": kind, **bank.case_without_truth(effects, seed)})
+    return {"figures": bank.figures_without_truth(results), "cases": results}
+
+
+def _undeclared(args):
+    spec = importlib.util.spec_from_file_location("undeclared_cases", args.cases)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    results = _each(
+        [(name, case, seed) for name, case in module.CASES.items() for seed in range(400, 400 + args.seeds)],
+        undeclared.run,
+    )
+    return {"figures": undeclared.figures(results), "cases": results}
+
+
+def _blind(args):
+    """In measured flights if there are any, else in simulated ones and in those with nothing."""
+    results = _drawn(args, partial(blind.run, _source(args)))
+    figures = blind.figures(results)
+    if args.data is None:
+        clean = list(blind.false_alarms(args.seeds, args.first))
+        figures["false alarms"] = bank.share(bool(r["said"]) for r in clean)
+    _confusions(results, args.out / "blind.png")
+    return {"figures": figures, "cases": results}
+
+
+def _several(args):
+    """One, two and, where there are enough, three of the flights with the same effect, judged on one more."""
+    number = SEVERAL_SIMULATED if args.data is None else SEVERAL_MEASURED
+    results = _drawn(args, partial(blind.several, _source(args), number))
+    figures = {f"flights diagnosed: {k + 1}": blind.figures([case[k] for case in results]) for k in range(number - 1)}
+    return {"figures": figures, "cases": results}
+
+
+def _source(args):
+    return blind.Simulated() if args.data is None else blind.Measured(args.data, args.out)
+
+
+def _drawn(args, function):
+    """What a function of a seed returns, of the first seeds for which that is not None; kept as it comes."""
+    results, seed = [], args.first
+    with ResultsFile(args.out / f"{args.part}.jsonl", {"data": str(args.data)}) as done:
+        while len(results) < args.seeds:
+            seeds = range(seed, seed + args.seeds - len(results))
+            missing = [one for one in seeds if str(one) not in done]
+            for one, result in zip(missing, over(function, missing, args.jobs, unit="case")):
+                done[str(one)] = result
+            results += [done[str(one)] for one in seeds if done[str(one)] is not None]
+            seed = seeds.stop
+    return results
+
+
+def _faults(args):
+    results = list(tqdm(faults.cases(args.data, args.seeds, args.first), unit="draw", disable=None))
+    named = {"named in the flights as they are": faults.as_they_are(args.data)}
+    return {"figures": {**faults.figures(results), **named}, "cases": results}
+
+
+def _injected(args):
+    results = measured.injected(args.data, lambda cases, function: _each(cases, function))
+    _confusion(results, args.out / "injected.png")
+    figures = {
+        "cases": len(results),
+        "found on top": bank.share(r["hit"] for r in results),
+        "found, or named as an alternative": bank.share(r["hit"] or r["put_in"][0] in r["ambiguous"] for r in results),
+        "found, or named at all": bank.share(r["hit"] or r["put_in"][0] in r["ambiguous"] + r["imitators"] for r in results),
+        "effects named at all, mean": float(np.mean([len({*r["found"], *r["ambiguous"], *r["imitators"]}) for r in results])),
+    }
+    return {"figures": figures, "cases": results}
+
+
+def _measured(args):
+    results = _each([(name,) for name in measured.SPLITS], lambda name: measured.run(args.data, name, args.out))
+    return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
+
+
+def _measured_aids(args):
+    results = _each([(name,) for name in measured.AIDED], lambda name: measured.run(args.data, name, args.out, AIDS))
+    return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
+
+
+def _floor(args):
+    return {"figures": floor.figures(args.data), "cases": []}
+
+
+def _references(args):
+    results = _each(referenced.cases(), lambda *case: referenced.run(args.data, *case))
+    return {"figures": referenced.figures(results), "cases": results}
+
+
+def _speed(args):
+    """Seconds of one core: 120 s of one flight with its ground truth, and two flights of a minute with less."""
+    effect = bank.effect_of("anchor_delay", True, 1)
+    flight = effect.inject(bank.clean_flight(500, 126.0))
+    two = [effect.inject(bank.clean_flight(seed, 60.0, aided=True)) for seed in (502, 503)]
+    bare = [one.without(*AIDS) for one in two]
+    calls = {
+        "120 s of flight": lambda: diagnose([flight]),
+        "survey, two of a minute": lambda: with_blocked(survey(bare, Tape()), bare),
+        "diagnose --no-truth, two of a minute": lambda: diagnose(bare, reference=Nothing()),
+        "diagnose --reference heights, two of a minute": lambda: diagnose(two, reference=Heights()),
+    }
+    short = bank.clean_flight(501, 40.0, aided=True)
+    diagnose([short], reference=Heights()), survey([short.without(*AIDS)], Tape())  # compiles
+    figures = {}
+    for name, call in calls.items():
+        started = time.process_time()
+        call()
+        figures[name] = round(time.process_time() - started, 1)
+    return {"figures": figures, "cases": []}
+
+
+def _confusions(results, path):
+    """What was put in, and the first thing said, by channel, subset, covariate and shape."""
+    figure, axes = plt.subplots(2, 2, figsize=(14, 13), layout="constrained")
+    for k, (ax, key) in enumerate(zip(axes.ravel(), ("stream", "subset", "covariate", "shape"))):
+        pairs = [(r[key], (r["first"][k] or "none said") if r["first"] else "nothing") for r in results]
+        rows, columns = (sorted({pair[side] for pair in pairs}) for side in range(2))
+        count = np.zeros((len(rows), len(columns)))
+        for one, other in pairs:
+            count[rows.index(one), columns.index(other)] += 1
+        _matrix(ax, count, rows, columns)
+        ax.set_title(key)
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+def _matrix(ax, count, rows, columns):
+    """Counts, coloured by their share of the row."""
+    share = count / np.maximum(count.sum(axis=1, keepdims=True), 1)
+    ax.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    for row, column in zip(*np.nonzero(count)):
+        colour = "w" if share[row, column] > 0.5 else "k"
+        ax.text(column, row, int(count[row, column]), ha="center", va="center", color=colour)
+    ax.set(xticks=range(len(columns)), yticks=range(len(rows)), xlabel="found first", ylabel="put in")
+    ax.set_xticklabels(columns, rotation=90)
+    ax.set_yticklabels(rows)
+
+
+def _confusion(results, path):
+    """Rows: what was put in; columns: the first thing found; small and large together."""
+    names = [name for name in bank.SIZES if name not in bank.AIDED]
+    columns = [*names, "something without a name", "nothing"]
+    count = np.zeros((len(names) + 1, len(columns)))
+    for r in results:
+        if r["kind"] == "pair":
+            continue
+        row = names.index(r["put_in"][0]) if r["put_in"] else len(names)
+        first = (r["found"] or ["nothing"])[0]
+        count[row, columns.index(first) if first in columns else len(names)] += 1
+    figure, ax = plt.subplots(figsize=(11, 10), layout="constrained")
+    _matrix(ax, count, [*names, "nothing"], columns)
+    figure.savefig(path, dpi=80)
+    plt.close(figure)

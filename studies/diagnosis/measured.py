@@ -1,0 +1,156 @@
+"""The measured flights: as they are, and with effects put in on top."""
+
+import json
+import time
+
+from known_effects import AIDED as ON_AIDS
+from known_effects import SIZES, effect_of
+import numpy as np
+
+from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.findings import usable
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.readers import inputs
+from uwb_tdoa_tools.scoring.phases import NEAR_THE_FLOOR
+
+_T2, _T3 = "flights/0425/TDOA2/0425-traj", "flights/0425/TDOA3/0425-traj"
+# {name: (to fit, to judge)}; a swap of both judges the others.
+SPLITS = {
+    "0425 a": (
+        [_T2 + "1", _T2 + "2", _T2 + "6", _T3 + "13", _T3 + "17"],
+        [_T2 + "3", _T2 + "7", _T2 + "10", _T3 + "14", _T3 + "21"],
+    ),
+    "0425 b": (
+        [_T2 + "3", _T2 + "7", _T2 + "10", _T3 + "14", _T3 + "21"],
+        [_T2 + "1", _T2 + "2", _T2 + "6", _T3 + "13", _T3 + "17"],
+    ),
+    "0426 a": (
+        [f"flights/0426/0426-traj{k}" for k in (1, 3, 5, 9)],
+        [f"flights/0426/0426-traj{k}" for k in (2, 7, 11, 13, 15)],
+    ),
+    "0426 b": (
+        [f"flights/0426/0426-traj{k}" for k in (2, 7, 11, 13, 15)],
+        [f"flights/0426/0426-traj{k}" for k in (1, 3, 5, 9)],
+    ),
+    "0422 a": (["flights/0422/0422-log00"], ["flights/0422/0422-log02"]),
+    "0422 b": (["flights/0422/0422-log02"], ["flights/0422/0422-log00"]),
+    "0607": (["flights/0607/tdoa2-obs-log1"], []),
+    "const1": (
+        ["util/const1-trial1-tdoa2.csv.gz"],
+        [f"util/const1-trial{k}.csv.gz" for k in ("1-tdoa3", "2-tdoa2", "3-tdoa2")],
+    ),
+    "const3": (
+        [f"util/const3-trial{k}-tdoa2.csv.gz" for k in (1, 2)],
+        [f"util/const3-trial{k}-tdoa2.csv.gz" for k in (3, 4)],
+    ),
+    "const4 trial 1": (
+        ["util/const4-trial1-tdoa2-traj1.csv.gz"],
+        [f"util/const4-trial1-tdoa2-traj{k}.csv.gz" for k in (2, 3)],
+    ),
+    "const4 trial 3": (
+        ["util/const4-trial3-tdoa2-traj1.csv.gz"],
+        [f"util/const4-trial3-tdoa2-traj{k}.csv.gz" for k in (2, 3)],
+    ),
+}
+AIDED = ("0425 a", "0425 b")  # all of whose flights hold height and pressure
+INTO = (
+    "flights/0425/TDOA2/0425-traj2",
+    "flights/0425/TDOA3/0425-traj17",
+    "flights/0426/0426-traj3",
+    "flights/0426/0426-traj5",
+)
+PRESENT = (
+    "outlier_rate",
+    "noise_correlation",
+    "floor_multipath",
+)  # in every measured flight
+
+
+def load(data, paths, aids=()):
+    """Flights of paths below the folder `data`, with those of their AIDS that are named."""
+    flights = inputs.Reading(data / "surveys").flights([data / path for path in paths])
+    return [flight.without(*(name for name in AIDS if name not in aids)) for flight in flights]
+
+
+def folder_of(name):
+    """Name of the folder of a split's results."""
+    return name.replace(" ", "-")
+
+
+def _phases(content):
+    """{phase: [3D RMSE m before, after]} of what is not in the air, of all judged flights."""
+    before, after = (content[side]["pooled"]["phases"] for side in ("before", "after"))
+    return {name: [_rounded(side[name]["rmse_3d"]) for side in (before, after)] for name in NEAR_THE_FLOOR if name in before}
+
+
+def _rounded(value):
+    return None if value is None else round(value, 3)
+
+
+def run(data, name, out, aids=()):
+    """Diagnose one split; writes its report and effects.yaml. aids : streams that are used where flights hold them. Returns
+    dict of the summary and all findings."""
+    fit, judge = SPLITS[name]
+    started = time.monotonic()
+    result = diagnose(load(data, fit, aids), load(data, judge, aids))
+    folder = out / folder_of(name)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "report.html").write_text(result.as_html())
+    result.effects.to_yaml(folder / "effects.yaml")
+    content = result.as_json()
+    (folder / "diagnosis.json").write_text(json.dumps(content, indent=1, allow_nan=False))
+    sides = {side: [row["rmse_3d"] for row in content[side]["runs"]] for side in ("before", "after")}
+    summary = {
+        "mean 3D before": round(float(np.mean(sides["before"])), 3),
+        "after": round(float(np.mean(sides["after"])), 3),
+        "gain 95 %": content["after"]["pooled"].get("rmse_3d_gain_ci"),
+        "diverged": sum(row["diverged"] for row in content["after"]["runs"]),
+        "phases before, after": _phases(content),
+        "found": [f["effect"] for f in content["findings"]],
+        "without a name": [f"{t['channel']}/{t['covariate']}/{t['form']}" for t in content["unattributed"]],
+    }
+    runs = [
+        [row["flight"], row["rmse_3d"], other["rmse_3d"]]
+        for row, other in zip(content["before"]["runs"], content["after"]["runs"])
+    ]
+    return {
+        "split": name,
+        "summary": summary,
+        "runs": runs,
+        "judged_on": content["judged_on"],
+        "seconds": time.monotonic() - started,
+    }
+
+
+def injected(data, each):
+    """Put large effects into measured flights whose own effects were diagnosed before: [dict], as of the bank, with "hit"
+    and "imitators": what explains as much, less plausibly."""
+    cases = [(path, name) for path in INTO for name in SIZES if name not in (*PRESENT, *ON_AIDS)]
+    known = {}
+
+    def one(path, name):
+        if path not in known:
+            flight = load(data, [path])[0]
+            known[path] = flight, usable(attribute([flight], GroundTruth()).effects)
+        flight, base = known[path]
+        effect = effect_of(name, True, len(path) + len(name))
+        injected_flight = effect.inject(flight, np.random.default_rng(1))
+        findings = attribute([injected_flight], GroundTruth(), base, undeclared=False).findings()
+        names = [f.effect.name for f in findings]
+        same = next((f.effect for f in findings if f.effect.name == name), None)
+        hit = same is not None and bool(set(same.values) & set(effect.values))
+        others = [other for f in findings for other in f.alternatives]
+        rivals, imitators = (sorted({o.effect for o in others if (o.gap is None) == less}) for less in (False, True))
+        return {
+            "kind": "large",
+            "flight": flight.name,
+            "put_in": [name],
+            "found": names,
+            "ambiguous": rivals,
+            "imitators": imitators,
+            "hit": hit,
+        }
+
+    return each(cases, one)

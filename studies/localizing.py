@@ -1,0 +1,87 @@
+"""localizing: what localize says of recordings, as they are and with mistakes put into them, against their ground truth.
+
+A flight is within what is stated if its position is within twice the stated standard deviation for 95 % of the time, where the tag
+was not lost."""
+
+from dataclasses import replace
+from functools import partial
+import json
+from pathlib import Path
+
+from mistakes import MISTAKES
+import numpy as np
+
+from uwb_tdoa_tools import options, parallel
+from uwb_tdoa_tools.checking.recording import of_flight
+from uwb_tdoa_tools.localizing.belief import GOOD, believe
+from uwb_tdoa_tools.localizing.estimate import Estimator
+from uwb_tdoa_tools.scoring.metrics import position_errors
+
+NOTHING, ALIKE = "nothing", 0.95  # no mistake; share of the time
+
+
+def add_options(add):
+    """add : add_argument of a parser."""
+    options.add_recordings(type("", (), {"add_argument": staticmethod(add)}))
+    add("--mistakes", action="store_true", help="with the mistakes of `study checking`, too")
+    add("--json", metavar="FILE", help="write what was said of each")
+    add("--jobs", type=int, metavar="N", help="flights at once")
+
+
+def run(args):
+    """Print a table: a row for recordings as they are, and one for those with mistakes."""
+    reading, rows = options.reading_of(args), []
+    for told in parallel.over(partial(judge, reading=reading, mistakes=args.mistakes), reading.find(args.flights), args.jobs):
+        rows += told
+        if args.json:
+            Path(args.json).write_text(json.dumps(rows, indent=1))
+    print("| recordings | number | good | of these within what is stated | not good | of these within |\n|---|" + 5 * "---:|")
+    for what, some in (("as they are", [r for r in rows if r["mistake"] == NOTHING]), ("with a mistake", [r for r in rows if r["mistake"] != NOTHING])):
+        if some:
+            print(f"| {what} | {len(some)} | {summary(some)} |")
+    for row in rows:
+        if row["verdict"] == GOOD and not row["within"]:
+            print(f"{row['flight']}, {row['mistake']}: called good, off by {row['rmse']:.2f} m at a stated {row['std']:.2f} m")
+
+
+def summary(rows):
+    """Cells of the table."""
+    good, others = ([row for row in rows if (row["verdict"] == GOOD) is what] for what in (True, False))
+    return " | ".join(str(number) for some in (good, others) for number in (len(some), sum(row["within"] for row in some)))
+
+
+def judge(recording, reading, mistakes=False):
+    """[{"flight", "mistake", "verdict", "within", "rmse", "std"}] of a recording (path, survey); m."""
+    flight, rows = reading.read(recording), []
+    for name in (NOTHING, *(MISTAKES if mistakes else ())):
+        changed = _with(flight, name)
+        if changed is not None:
+            rows.append({"flight": flight.name, "mistake": name, **_judged(changed)})
+    return rows
+
+
+def _with(flight, name):
+    """The Flight with a mistake of that name; None where it cannot be made."""
+    if name == NOTHING:
+        return flight
+    mistake = MISTAKES[name]
+    if mistake.needs == "rooms" or (mistake.needs == "imu" and flight.imu is None):
+        return None
+    try:
+        made = mistake.make(of_flight(flight), np.random.default_rng(1), None)
+    except AttributeError:  # needs another recording, or a sensor that is not there
+        return None
+    return replace(flight, tdoa=made.tdoa, imu=made.imu, anchors=made.anchors)
+
+
+def _judged(flight):
+    """What is said of a Flight, without its truth, and what is true."""
+    run = Estimator()(flight)
+    told = believe(replace(flight, truth=None), run)
+    t, error, _ = position_errors(run.odometry, flight.truth, flight.truth.t[0], flight.truth.t[-1])
+    known = ~np.any([(t >= begin) & (t <= end) for begin, end in told.lost] or [np.zeros(len(t), bool)], axis=0)
+    off = np.linalg.norm(error[known], axis=1)
+    if not len(off):
+        return {"verdict": told.level, "within": False, "rmse": None, "std": None}
+    within = bool(np.mean(off <= told.figures["within"]) >= ALIKE)
+    return {"verdict": told.level, "within": within, "rmse": float(np.sqrt(np.mean(off**2))), "std": told.figures["std"]}

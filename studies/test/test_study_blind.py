@@ -1,0 +1,135 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
+from known_effects import clean_flight
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
+from uwb_tdoa_tools.diagnosis.findings import Finding
+from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative
+
+from studies.diagnosis import blind, grammar
+from studies.diagnosis.claims import claims, truth_of
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return clean_flight(102, 17.0)
+
+
+@pytest.fixture(scope="module")
+def drawn(flight):
+    return [grammar.draw(seed, flight) for seed in range(60)]
+
+
+def test_a_seed_is_an_effect_and_another_seed_another(flight, drawn):
+    assert grammar.draw(3, flight) == drawn[3]
+    assert len({effect.name for effect in drawn}) > 55
+
+
+def test_the_grammar_uses_all_its_words(drawn):
+    assert {effect.shape for effect in drawn} == set(grammar.SHAPES)
+    assert {effect.stream for effect in drawn} == set(grammar.STREAMS)
+    assert {effect.subset for effect in drawn} == {*grammar.SUBSETS, "axis"}
+
+
+def test_an_effect_changes_its_part_of_its_stream_and_nothing_else(flight, drawn):
+    for effect in drawn[:25]:
+        changed = effect.inject(flight)
+        moved = changed.tdoa.d != flight.tdoa.d
+        if effect.stream == "tdoa":
+            assert changed.imu is flight.imu
+            a, b = flight.tdoa.a, flight.tdoa.b
+            if effect.subset == "anchor":
+                assert not (moved & (a != effect.who[0]) & (b != effect.who[0])).any()
+            elif effect.subset in ("pair", "direction"):
+                assert not (moved & ~(np.isin(a, effect.who) & np.isin(b, effect.who))).any()
+        else:
+            assert not moved.any()
+            same = [name for name in ("gyro", "accel") if np.array_equal(getattr(changed.imu, name), getattr(flight.imu, name))]
+            assert effect.stream not in same and len(same) == 1
+
+
+@pytest.mark.parametrize("shape", grammar.SHAPES)
+def test_a_shape_is_as_large_as_it_says(shape):
+    effect = grammar.Undeclared("tdoa", "all", (), "height", shape, 0.4, (1.0, 2.0), (0.5, 0.2, 0.5))
+    course = effect.course(np.linspace(1.0, 2.0, 400))
+    assert np.ptp(course) == pytest.approx(0.8 if shape == "periodic" else 0.4, rel=0.02)
+
+
+def finding(effect, alternatives=()):
+    return Finding(effect, effect.channels[0], {"criterion": 50.0}, 0.1, alternatives)
+
+
+def test_a_claim_is_what_was_put_in(flight):
+    true = truth_of(grammar.Undeclared("tdoa", "anchor", (3,), "x", "step", 0.4, (1.0, 2.0), (0.5, 0.2, 0.5)), flight)
+    found = SmoothTerm({"3.c0": 0.0, "3.c1": 0.4}, {}, "", "tdoa", "y", "anchor", (0.0, 1.0, 2.0), "step")
+    (said,) = claims([finding(found)])
+    assert said.names(true) and said.shape == true.shape and not said.depends_as(true)
+    (said,) = claims([finding(found, (Alternative("tdoa of anchor 3 over x", 0.95, 4.0, ""),))])
+    assert said.depends_as(true)
+
+
+def test_what_follows_an_anchor_is_said_as_its_pair_where_no_other_pair_follows(flight):
+    def true(first, a, b):
+        effect = grammar.Undeclared("tdoa", "all", (), grammar.NAMES, "step", 0.4, (first, first), (0.5, 0.2, 0.5))
+        return truth_of(effect, replace(flight, tdoa=replace(flight.tdoa, a=a, b=b)))
+
+    a = np.arange(len(flight.tdoa)) % 8
+    b = (a + 1) % 8
+    (said,) = claims([finding(EFFECTS["pair_offset"]({"4-5": 0.4}))])
+    assert said.names(true(4, a, b)) and said.depends_as(true(4, a, b))
+    assert not said.names(true(3, a, b))
+    assert true(4, *np.random.default_rng(0).permutation(np.stack([a, b]), axis=1)).subset == "all"
+
+
+def test_what_has_a_name_in_the_catalogue_is_said_by_that(flight):
+    late = grammar.Undeclared("tdoa", "anchor", (3,), "time", "transient", 0.4, (1.0, 2.0), (0.5, 0.2, 0.5))
+    (said,) = claims([finding(EFFECTS["nlos"]({"3.delay": 0.4, "3.start": 1.0, "3.end": 2.0}))])
+    assert said.names(truth_of(late, flight)) and said.depends_as(truth_of(late, flight))
+
+
+def test_a_shifted_frame_is_a_function_of_the_direction_to_every_anchor_and_a_turned_one_is_not(flight):
+    late = grammar.Undeclared("tdoa", "arrivals", (), "elevation", "trend", 0.4, (-0.5, 0.5), (0.5, 0.2, 0.5))
+    shifted, turned = (claims([finding(EFFECTS["truth_frame"]({key: 0.1}))])[0] for key in ("z", "yaw"))
+    assert shifted.names(truth_of(late, flight)) and shifted.depends_as(truth_of(late, flight))
+    assert not turned.names(truth_of(late, flight))
+    (arm,) = claims([finding(EFFECTS["tag_lever_arm"]({"z": 0.1}))])
+    in_tag = truth_of(replace(late, covariate="bearing_in_tag"), flight)
+    assert arm.names(in_tag) and arm.depends_as(in_tag) and not arm.depends_as(truth_of(late, flight))
+
+
+def test_cases_cost_what_they_must():
+    drawn = (blind.case(blind.Simulated(), seed) for seed in range(20))
+    effect, flown, plain, base, where = next(one for one in drawn if one is not None)
+    assert all(blind.rmse(one, base) - blind.rmse(none, base) >= blind.LEAST_COST for one, none in zip(flown, plain))
+
+
+def test_of_several_flights_all_but_the_last_are_diagnosed_and_the_last_one_judges(monkeypatch):
+    seen = []
+
+    def diagnose(flights, base):
+        seen.append(flights)
+        return SimpleNamespace(findings=[], effects=base)
+
+    monkeypatch.setattr(blind, "diagnose", diagnose)
+    source = blind.Simulated()
+    seed = next(seed for seed in range(20) if blind.case(source, seed, 3) is not None)
+    _, flown, flights, _, _ = blind.case(source, seed, 3)
+    one, two = blind.several(source, 3, seed)
+    assert [[flight.name for flight in some] for some in seen[::2]] == [[flown[0].name], [flown[0].name, flown[1].name]]
+    assert all(np.array_equal(some[0].tdoa.d, flights[0].tdoa.d) for some in seen[1::2])  # as they are
+    assert one["rmse"] == two["rmse"] and one["rmse"][:2] == [blind.rmse(flights[2], EffectSet()), blind.rmse(flown[2], EffectSet())]
+    assert one["removed"] == two["removed"] == 0.0 and one["place"] is two["place"] is None
+
+
+@pytest.mark.parametrize("covariate", ["speed", "x", "previous_anchor", "interval"])
+def test_what_is_told_is_removed(flight, covariate):
+    limits = (2, 2) if covariate == "previous_anchor" else (0.01, 0.05) if covariate == "interval" else (0.0, 1.0)
+    subset, who = ("all", ()) if covariate == "previous_anchor" else ("anchor", (3,))
+    effect = grammar.Undeclared("tdoa", subset, who, covariate, "trend", 1.0, limits, (0.5, 0.2, 0.5))
+    flown = effect.inject(flight)
+    plain, before = (blind.rmse(one, EffectSet()) for one in (flight, flown))
+    assert before > 1.5 * plain
+    assert blind.told(effect, flown, plain, EffectSet()) < plain + 0.25 * (before - plain)

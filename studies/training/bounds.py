@@ -1,0 +1,69 @@
+"""What any model of the pose could reach at most, and how much of the errors comes again at the same place."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from uwb_tdoa_bias.correction.corrector import NETWORK, Correction
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_tools.scoring.metrics import Score, airborne, position_at
+from uwb_tdoa_tools.training.labels import LARGEST
+
+CELL = 0.3  # m, size of the cells in which residuals of two flights are compared
+
+
+def rmse(flight, corrector=None):
+    """3D RMSE of the filter's estimate on a Flight, m."""
+    return Score(flight.name, run_offline(flight, corrector=corrector).odometry, flight.truth).row()["rmse_3d"]
+
+
+def oracle(flight, window):
+    """A stand-in for a Corrector that knows the error of each TDOA from the ground truth, smoothed over `window` s.
+
+    The running median of a pair's own errors: a bound for every model that follows the error no faster than this.
+    """
+    data, anchors, truth = flight.tdoa, flight.anchors, flight.truth
+    a, b = anchors.index(data.a), anchors.index(data.b)
+    p = position_at(data.t, truth)
+    error = data.d - tdoa(p, anchors.positions[a], anchors.positions[b])
+    first, last = airborne(truth)
+    bias, sane = np.zeros(len(data)), (np.abs(error) <= LARGEST) & (data.t >= first) & (data.t <= last)
+    pair = a * len(anchors) + b
+    for one in np.unique(pair):
+        rows = np.flatnonzero(pair == one)
+        good = rows[sane[rows]]
+        starts, ends = (np.searchsorted(data.t[good], data.t[rows] + half) for half in (-0.5 * window, 0.5 * window))
+        bias[rows] = [np.median(error[good[i:k]]) if k > i else 0.0 for i, k in zip(starts, ends)]
+    table = {key: value for key, value in zip(zip(data.t, data.a, data.b, data.d), bias)}
+
+    def correct(t, a, b, d):
+        keys = zip(t, anchors.ids[a], anchors.ids[b], d)
+        told = np.array([table[key] for key in keys]) if len(t) else np.zeros(0)
+        return Correction.flat(d, told, np.zeros(len(t)), np.full(len(t), NETWORK, dtype=np.uint8))
+
+    def nothing(*pose):
+        return None
+
+    return SimpleNamespace(
+        idle=False, lag=np.inf, effects=EffectSet(), weighed=EffectSet(), correct=correct, add_pose=nothing, reset=nothing
+    )
+
+
+def repeatability(one, other):
+    """How much of the errors of two flights is alike at the same place: (correlation, cells compared), over the medians
+    per pair of anchors and cell of 0.3 m that both flew through. one, other : Labels."""
+    maps = []
+    for labels in (one, other):
+        s = labels.samples
+        cell = np.floor(s.p / CELL).astype(int)
+        keys = np.column_stack([s.anchors.ids[s.a], s.anchors.ids[s.b], cell])
+        kinds, which = np.unique(keys, axis=0, return_inverse=True)
+        order = np.argsort(which.ravel(), kind="stable")
+        parts = np.split(labels.error[order], np.cumsum(np.bincount(which.ravel()))[:-1])
+        maps.append({tuple(kind): np.median(part) for kind, part in zip(kinds.tolist(), parts) if len(part) >= 5})
+    shared = sorted(set(maps[0]) & set(maps[1]))
+    if len(shared) < 20:
+        return float("nan"), len(shared)
+    return float(np.corrcoef(*([each[key] for key in shared] for each in maps))[0, 1]), len(shared)
