@@ -6,8 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.flight import AIDS, Velocity
-from uwb_tdoa_bias.foundation.pressure import altitude_of, pressure_at
+from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.foundation.sensors import Velocity
+from uwb_tdoa_bias.foundation.sensors.pressure import altitude_of, pressure_at
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import VERDICTS
 from uwb_tdoa_tools import options

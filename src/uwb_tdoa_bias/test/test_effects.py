@@ -13,10 +13,10 @@ from uwb_tdoa_bias.effects import (
     EFFECTS, AidCorrector, AnchorDelay, EffectSet, ImuCorrector, LabelEffect, Samples, SmoothTerm, TagLeverArm, Track, aid_samples,
 )  # fmt: skip
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Height, Pressure, Tdoas, Truth, Velocity
+from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas, Truth
+from uwb_tdoa_bias.foundation.sensors import DIAGNOSED, Height, Pressure, Velocity
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_bias.effects.aid_error import values_of
-from uwb_tdoa_bias.foundation.pressure import pressure_at
+from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -323,7 +323,7 @@ def felt(seed, n=400):
     p = np.stack([np.sin(0.7 * t + phase[0]), np.cos(0.5 * t + phase[1]), 1.5 + 0.5 * np.sin(0.9 * t + phase[2])], axis=1)
     angles = np.stack([0.1 * np.sin(t + phase[3]), 0.1 * np.cos(t + phase[4]), 0.3 * t], axis=1)
     truth = Truth(t, p, Rotation.from_euler("xyz", angles).as_quat())
-    samples = {stream: aid_samples(stream, t, Track(truth), t[0]) for stream in AIDS}
+    samples = {stream: aid_samples(stream, t, Track(truth), t[0]) for stream in DIAGNOSED}
     streams = {
         "height": Height(t, samples["height"].reading[:, 0]),
         "pressure": Pressure(t, pressure_at(samples["pressure"].reading[:, 0])),
@@ -347,7 +347,7 @@ def test_regressors_on_aids_are_what_inject_adds(effect, seed):
     values, (stream,) = some_values(effect, rng), effect.channels
     made, keys = effect(values), [key for key in values if not key.endswith(("start", "end"))]
     changed = getattr(made.inject(flight), stream)
-    before, after = values_of(getattr(flight, stream)), values_of(changed)
+    before, after = getattr(flight, stream).values, changed.values
     if not np.array_equal(changed.t, flight.truth.t):  # stamps moved: what it reads at the old ones
         after = np.stack([np.interp(flight.truth.t, changed.t, column) for column in after.T], axis=1)
     predicted = effect({k: v for k, v in values.items() if k not in keys}).regressors(samples[stream], keys) @ [
@@ -363,8 +363,8 @@ def test_what_is_put_into_an_aid_is_taken_out_of_it_or_out_of_the_residual(effec
     (stream,), made = effect.channels, effect(some_values(effect, np.random.default_rng(0), 0.1))
     back = getattr(EffectSet((made,)).correct_streams(made.inject(flight)), stream)
     assert not np.array_equal(getattr(made.inject(flight), stream).t, back.t) == (effect.name == "velocity_delay")
-    left = values_of(back) - EffectSet((made,)).uncorrected(samples[stream])
-    np.testing.assert_allclose(left, values_of(getattr(flight, stream)), atol=1e-6)
+    left = back.values - EffectSet((made,)).uncorrected(samples[stream])
+    np.testing.assert_allclose(left, getattr(flight, stream).values, atol=1e-6)
     np.testing.assert_allclose(back.t, flight.truth.t, atol=1e-9)
     with pytest.raises(InputError, match=f"holds no {stream}"):
         made.inject(flight.without(stream))
@@ -376,11 +376,11 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
     corrector = AidCorrector([EFFECTS[name](each) for name, each in values.items()])
     t, v, std = np.arange(n) / 25.0, rng.standard_normal((n, 3)), rng.uniform(0.1, 0.2, (n, 3))
     v[:, 2], std[:, 2] = np.nan, np.inf
-    late, turned, wider = corrector.correct("velocity", t, v, std)
+    late, turned, wider = corrector.correct("velocity", Velocity(t, v, std)).columns
     expected = Rotation.from_euler("z", 1.5).apply(np.where(np.isfinite(v), v, 0.0)) / 1.1
     np.testing.assert_allclose(turned[:, :2], expected[:, :2], atol=1e-12)
     np.testing.assert_allclose(late, t - 0.02)
     assert np.isinf(wider[:, 2]).all() and (wider[:, :2] < 0.2).all()
-    single = [corrector.correct("velocity", *(column[k : k + 1] for column in (t, v, std))) for k in range(n)]
+    single = [corrector.correct("velocity", Velocity(*(column[k : k + 1] for column in (t, v, std)))).columns for k in range(n)]
     for column, whole in enumerate((late, turned, wider)):
         np.testing.assert_allclose(np.concatenate([each[column] for each in single]), whole, atol=1e-12)

@@ -1,7 +1,8 @@
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Height, Pressure, Tdoas, Velocity
+from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas
+from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
 
 NONE = np.zeros(0)
 

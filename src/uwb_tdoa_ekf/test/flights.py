@@ -6,9 +6,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth, Velocity
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_bias.foundation.pressure import pressure_at
+from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, structured
 
 GRAVITY = 9.81

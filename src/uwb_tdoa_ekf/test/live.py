@@ -8,7 +8,7 @@ from uwb_tdoa_ekf.core.aids import STREAMS
 from uwb_tdoa_ekf.estimator import VERDICTS, Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
-IMU, TDOA, HEIGHT, PRESSURE, VELOCITY = range(5)
+IMU, TDOA, FIRST_AID = range(3)
 
 
 def messages(flight):
@@ -20,23 +20,21 @@ def messages(flight):
 
 def send(estimator, flight, stream, i):
     """Give one message to the estimator."""
-    imu, tdoa, height, pressure, velocity = (getattr(flight, name) for name in ("imu", "tdoa", *STREAMS))
+    imu, tdoa = flight.imu, flight.tdoa
     if stream == IMU:
         estimator.add_imu(imu.t[i], imu.gyro[i], imu.accel[i])
     elif stream == TDOA:
         estimator.add_tdoa(tdoa.t[i], int(tdoa.a[i]), int(tdoa.b[i]), tdoa.d[i])
-    elif stream == HEIGHT:
-        estimator.add_height(height.t[i], height.range[i])
-    elif stream == PRESSURE:
-        estimator.add_pressure(pressure.t[i], pressure.pressure[i])
     else:
-        estimator.add_velocity(velocity.t[i], velocity.v[i], velocity.std[i])
+        name = STREAMS[stream - FIRST_AID]
+        part = getattr(flight, name)
+        estimator.add(name, type(part)(*(column[i : i + 1] for column in part.columns)))
 
 
 def arriving(flight, rng, imu_delay=0.0, tdoa_delay=0.0, imu_jitter=0.0, tdoa_jitter=0.0):
     """The messages in the order in which they come in after such delays: constant, and uniform from 0 to jitter, s."""
-    delay, jitter = (imu_delay, tdoa_delay, 0.0, 0.0, 0.0), (imu_jitter, tdoa_jitter, 0.0, 0.0, 0.0)
-    return sorted(messages(flight), key=lambda m: m[0] + delay[m[1]] + jitter[m[1]] * rng.random())
+    delay, jitter = {IMU: imu_delay, TDOA: tdoa_delay}, {IMU: imu_jitter, TDOA: tdoa_jitter}
+    return sorted(messages(flight), key=lambda m: m[0] + delay.get(m[1], 0.0) + jitter.get(m[1], 0.0) * rng.random())
 
 
 def feed(estimator, flight, order=None, advance=None):

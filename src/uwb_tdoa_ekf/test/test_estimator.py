@@ -2,7 +2,7 @@ from dataclasses import replace
 
 from flights import corners, fly, position_at, with_aids
 from hypothesis import given, settings, strategies as st
-from live import assert_same_as_offline, HEIGHT, IMU, TDOA, arriving, assert_same, feed, joined, messages, send
+from live import FIRST_AID, assert_same_as_offline, IMU, TDOA, arriving, assert_same, feed, joined, messages, send
 import numpy as np
 import pytest
 
@@ -74,10 +74,13 @@ def test_batches_are_what_their_messages_are_one_by_one(seed):
     while cut <= flight.imu.t[-1]:
         before, cut = cut, cut + rng.choice([0.001, 0.01, 0.1])
         for name in ("imu", "tdoa", *AIDS):
-            columns = [column for key, column in vars(getattr(flight, name)).items() if key != "variance"]
-            some = (columns[0] >= before) & (columns[0] < cut)
-            if some.any():
-                getattr(estimator, f"add_{name}")(*(column[some] for column in columns))
+            part = getattr(flight, name)
+            some = (part.t >= before) & (part.t < cut)
+            columns = [column[some] for key, column in vars(part).items() if key != "variance"]
+            if some.any() and name in AIDS:
+                estimator.add(name, type(part)(*columns))
+            elif some.any():
+                getattr(estimator, f"add_{name}")(*columns)
         parts.append(estimator.advance()[0])
     expected = run_offline(flight)
     assert_same(joined([*parts, estimator.finish()[0]]), expected.odometry)
@@ -88,7 +91,7 @@ def test_an_aid_that_stops_is_waited_for_for_half_of_the_lag_and_after_a_second_
     flight = with_aids(fly(3, 6.0))
     estimator, behind = Estimator(flight.anchors), {}
     for t, stream, i in messages(flight):
-        if stream in (IMU, TDOA) or (stream == HEIGHT and t < 2.0):
+        if stream in (IMU, TDOA) or (stream == FIRST_AID and t < 2.0):
             send(estimator, flight, stream, i)
             odometry, _ = estimator.advance()
             if len(odometry):

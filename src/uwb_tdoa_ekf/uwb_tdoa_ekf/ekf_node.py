@@ -1,8 +1,7 @@
 """ekf_node: inertial samples and corrected TDOAs in, odometry out.
 
-imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray), /tf_static; if they are there: height
-(sensor_msgs/Range, REP 117), pressure (sensor_msgs/FluidPressure), velocity (geometry_msgs/TwistWithCovarianceStamped, in the
-body frame), velocity/odometry (the twist of another nav_msgs/Odometry), initialpose (geometry_msgs/PoseWithCovarianceStamped)
+imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray), /tf_static; if they are there: SENSORS,
+initialpose (geometry_msgs/PoseWithCovarianceStamped)
   -> odometry (nav_msgs/Odometry), /tf (tf2_msgs/TFMessage), uwb/residual (TdoaResidual: one for each TdoaCorrected),
      status (EstimatorStatus: whether the odometry may be flown by), /diagnostics (diagnostic_msgs/DiagnosticArray).
 Service ~/reset (std_srvs/Trigger): start anew.
@@ -15,11 +14,10 @@ import math
 import sys
 import time
 
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from rclpy.time import Time
-from sensor_msgs.msg import FluidPressure, Imu, Range
+from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
 from uwb_tdoa_bias.foundation import ros
@@ -29,10 +27,10 @@ from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
 from uwb_tdoa_bias.foundation.ros_frames import FramesInput, unknown_frame
 from uwb_tdoa_bias.foundation.ros_parameters import files_of, refuse_unknown, say_unused
 from uwb_tdoa_bias.foundation.ros_streams import Streams, Turns
-from uwb_tdoa_bias.foundation.ros_wire import Wire
+from uwb_tdoa_bias.foundation.ros_wire import Wire, message_class
+from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
-from .core import aids
 from .core.config import RENAMED
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import STREAMS, VERDICTS, Estimator, invalid
@@ -55,17 +53,12 @@ TOPICS = {
         )
     ],
     "tdoa": [("uwb/tdoa_corrected", TdoaCorrected, "anchor_a", "anchor_b", "raw", "corrected", "bias_std", "variance", "bias_slope", "bias_state")],
-    "height": [("height", Range, "range", "min_range", "max_range")],
-    "pressure": [("pressure", FluidPressure, "fluid_pressure")],
-    "velocity": [
-        ("velocity", TwistWithCovarianceStamped, "twist.twist.linear", "twist.covariance"),
-        ("velocity/odometry", Odometry, "twist.twist.linear", "twist.covariance"),
-    ],
+} | {
+    name: [(topic, message_class(kind), *sensor.fields) for topic, kind in sensor.topics] for name, sensor in SENSORS.items()
 }  # fmt: skip
 MOST_FRAMES = 100  # of the IMU that are remembered: names on a topic may be anything
 MOST_NAMED = 3  # of them in a sentence
 EARLY = 5000  # messages kept while there are no anchors
-UNKNOWN_VARIANCE = 1e6  # (m/s)^2, at which and above a velocity is not measured
 
 
 class EkfNode(ros.StreamNode):
@@ -88,7 +81,7 @@ class EkfNode(ros.StreamNode):
         self._aid_corrector = AidCorrector(self._effects.effects)
         self._estimator = None
         self._epoch, self._clock = ros.Epoch(), self.get_clock()
-        self._attitude, self._last_tdoa = None, -math.inf  # quaternion and covariance of the newest odometry; time.monotonic(), s
+        self._attitude, self._last_tdoa = None, -math.inf  # quaternion and covariance of the newest odometry; of a TDOA or range, time.monotonic(), s
         self._received_before = {}  # messages by topic, by the last report
         self._early = deque()  # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one message each
         self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
@@ -117,12 +110,9 @@ class EkfNode(ros.StreamNode):
     def _subscribe(self, handed):
         """Streams of everything that the filter takes. handed : topics that a node of this process hands over."""
         streams = Streams(self, self._epoch, self._advance)
-        self._takers = {
-            "imu": self._take_imu, "tdoa": self._take_tdoa, "height": self._take_height,
-            "pressure": self._take_pressure, "velocity": self._take_velocity,
-        }  # fmt: skip
+        self._takers = {"imu": self._take_imu, "tdoa": self._take_tdoa} | {name: partial(self._take_sensor, name) for name in SENSORS}
         for stream, topics in TOPICS.items():
-            if stream in aids.STREAMS and not getattr(self._config, f"use_{stream}"):
+            if stream in SENSORS and not getattr(self._config, f"use_{stream}"):
                 continue
             for topic, kind, *fields in topics:
                 streams.add(Wire(kind, *fields), topic, partial(self._receive, stream), topic in handed)
@@ -217,7 +207,7 @@ class EkfNode(ros.StreamNode):
         """Messages of a stream, see Streams."""
         n = len(part[1])
         self._health.received[stream] += n
-        if stream == "tdoa":
+        if stream in ("tdoa", *LOCATING):
             self._last_tdoa = time.monotonic()
         if self._estimator is not None:
             self._takers[stream](*part)
@@ -261,23 +251,10 @@ class EkfNode(ros.StreamNode):
         variance = rows["bias_std"] ** 2 + rows["variance"]
         self._estimator.add_tdoa(t, a, b, rows["corrected"], variance, rows["bias_slope"], rows["bias_state"])
 
-    def _take_height(self, frame, t, rows, arrival):
-        distance = rows["range"].astype(float)
-        inside = (rows["min_range"] <= distance) & (distance <= rows["max_range"])  # or it is out of range, says REP 117
-        self._estimator.add_height(*self._corrected("height", t, np.where(inside, distance, math.inf)))
-
-    def _take_pressure(self, frame, t, rows, arrival):
-        self._estimator.add_pressure(*self._corrected("pressure", t, rows["fluid_pressure"]))
-
-    def _take_velocity(self, frame, t, rows, arrival):
-        variance = rows["twist.covariance"][:, [0, 7, 14]]
-        known = (variance >= 0.0) & (variance < UNKNOWN_VARIANCE)
-        std = np.sqrt(np.where(known, variance, math.inf))
-        self._estimator.add_velocity(*self._corrected("velocity", t, rows["twist.twist.linear"], std))
-
-    def _corrected(self, stream, *columns):
-        """Stamps and values of heights, pressures or velocities without the effects."""
-        return columns if self._aid_corrector.idle else self._aid_corrector.correct(stream, *columns)
+    def _take_sensor(self, name, frame, t, rows, arrival):
+        """Messages of one of the SENSORS."""
+        sensor = SENSORS[name]
+        self._estimator.add(name, self._aid_corrector.correct(name, sensor.read(t, {field: rows[field] for field in sensor.fields})))
 
     def _publish(self, odometry, residuals):
         if len(odometry.t):
@@ -366,7 +343,7 @@ class EkfNode(ros.StreamNode):
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
         values |= {"imu_waiting": waiting["imu"], "odometry published": self.outputs.published}
         values |= {name: counts[name] for name in ("recoveries", "restarts")}
-        for aid in aids.STREAMS:
+        for aid in SENSORS:
             values |= {f"{aid}_received": self._health.received[aid], f"{aid}_waiting": waiting[aid]}
             values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}
         values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
@@ -379,7 +356,8 @@ class EkfNode(ros.StreamNode):
 
 def main(argv=None):
     """Run the node; returns the exit code."""
-    return ros.run(EkfNode, __doc__, argv)
+    topics = (f"{topic} ({kind.replace('/msg', '')})" for sensor in SENSORS.values() for topic, kind in sensor.topics)
+    return ros.run(EkfNode, __doc__.replace("SENSORS", ",\n".join(topics)), argv)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,10 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.sensors import LOCATING
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, StampGate
 
-from .aid_rows import ROWS
+from .aid_rows import aid_rows
 from .core import aids
 from .core.config import FilterConfig
 from .core.engine import LOST_TIME, feed, tell_pose
@@ -28,10 +29,11 @@ VERDICTS = {
 STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
+LEADING = IMU_STREAM, TDOA_STREAM, *map(STREAMS.index, LOCATING)  # by whose stamps time goes on
 RATE_SAMPLES = 10  # inertial samples from whose stamps their rate is known
 MOST_POSES = 100  # that were told and wait for their time
 MOST_WAITING = 2000  # messages of a stream: 2 s at 1 kHz; those of one stamp for ever, or a nanosecond apart, would never be passed
-SILENT = 1.0  # s of stamps after which height, pressure or velocity is not waited for any more, until it is back
+SILENT = 1.0  # s of stamps after which a sensor is not waited for any more, until it is back
 OF_AIDS = 0.5  # share of `lag` for which they are waited for: bias_node's `hold` must outlast that by far
 
 
@@ -78,7 +80,7 @@ class Estimator:
     """Time-ordered buffer, filter and accounts.
 
     Messages wait until every stream has passed them and are used in stamp order. A stream that is silent is waited for
-    for `lag` seconds of stamps, an aid (height, pressure, velocity) for half of that, and only if it was there a second ago;
+    for `lag` seconds of stamps, one of the SENSORS for half of that, and only if it was there a second ago;
     `reorder` more for late siblings, unless they have come in order so far (Order). What is older than what was used is late.
     A stream that falls back in time starts the filter anew; a single stamp far from its neighbours only counts as late, or as
     invalid if it lies ahead.
@@ -171,25 +173,10 @@ class Estimator:
         self._refused += [(*one, INVALID) for one in refused]
         self._add(TDOA_STREAM, rows, usable)
 
-    def add_height(self, t, distance):
-        """Take ranges along the body's -z in the order of their arrival: t (n,) s; distance (n,) m, inf or NaN where nothing
-        was in range (REP 117). Or one: numbers."""
-        self._add_aid(aids.HEIGHT, t, np.atleast_1d(distance))
-
-    def add_pressure(self, t, pressure):
-        """Take static air pressures in the order of their arrival: t (n,) s; pressure (n,) Pa. Or one: numbers."""
-        self._add_aid(aids.PRESSURE, t, np.atleast_1d(pressure))
-
-    def add_velocity(self, t, v, std):
-        """Take velocities in the body frame in the order of their arrival: t (n,) s; v (n, 3) m/s; std (n, 3) m/s, inf for a
-        component that is not measured. Or one: a number, (3,), (3,)."""
-        self._add_aid(aids.VELOCITY, t, np.atleast_2d(v), np.atleast_2d(std))
-
-    def _add_aid(self, kind, t, *columns):
-        name = aids.STREAMS[kind]
+    def add(self, name, stream):
+        """Take a Stream of one of the SENSORS, its rows in the order of their arrival."""
         if getattr(self.config, f"use_{name}"):
-            rows, usable = ROWS[name](self.config, np.atleast_1d(t), *columns)
-            self._add(FIRST_AID + kind, rows, usable)
+            self._add(STREAMS.index(name), *aid_rows(name, stream, self.anchors))
 
     def tell_pose(self, t, p, covariance, yaw=math.nan, yaw_std=math.nan):
         """Take a pose that somebody tells: t s; p (3,) m, NaN where it is not known; covariance (3, 3) m^2; yaw and yaw_std rad,
@@ -227,7 +214,7 @@ class Estimator:
     def advance(self):
         """Use every message that nothing earlier can precede any more, and of more than MOST_WAITING the first. Returns (Odometry, Residuals), possibly empty."""
         stamps = [gate.newest for gate in self._gates]
-        newest = max(stamps[IMU_STREAM], stamps[TDOA_STREAM])
+        newest = max(stamps[stream] for stream in LEADING)
         passed = []  # by each stream that is waited for
         for stream, (t, order) in enumerate(zip(stamps, self._orders)):
             if stream < FIRST_AID:

@@ -28,7 +28,7 @@ class Run:
     """Result of one recording. odometry : Odometry; residuals : Residuals, one per TDOA of the flight, in its order;
     bias, bias_std : (n,) m, what was taken from each raw TDOA; recoveries : how often the filter lost and found the
     tag; yaw_offset : rad, from initial_yaw to the start of the yaw hypothesis that was right; aids : {stream: (m,) of
-    RESIDUAL, one per measurement}, for height, pressure and velocity where the flight has them."""
+    RESIDUAL, one per measurement}, for those of the SENSORS that the flight has."""
 
     odometry: Odometry
     residuals: Residuals

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .estimator import Estimator
 from .frames import pose_and_twist, rotation_std
@@ -23,9 +24,8 @@ def warm_up():
         t, none = 0.01 * some, np.zeros((len(some), 3))
         estimator.add_imu(t, none, none + (0.0, 0.0, 9.81))
         estimator.add_tdoa(t, some % 4, (some + 1) % 4, np.zeros(len(some)))
-        estimator.add_height(t, np.ones(len(some)))
-        estimator.add_pressure(t, np.full(len(some), 1e5))
-        estimator.add_velocity(t, none, none + 0.1)
+        for name, sensor in SENSORS.items():
+            estimator.add(name, sensor.read(t, {field: np.ones((len(some), k) if k > 1 else len(some)) for field, k in sensor.fields.items()}))
         odometry, _ = estimator.advance()
     pose_and_twist(odometry, *estimator.rates_at(odometry.t))
     rotation_std(odometry.q[-1:], odometry.covariance[-1:])

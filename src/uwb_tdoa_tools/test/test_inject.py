@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, true_samples
-from uwb_tdoa_bias.effects.aid_error import values_of
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.foundation.sensors import DIAGNOSED
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.inject import main
@@ -45,8 +44,8 @@ def test_injected_effect_is_what_the_model_takes_out(flight, effect):
     changed = effect.inject(flight, np.random.default_rng(1))
     streams = [(flight.tdoa.t, changed.tdoa.t), (flight.tdoa.d, changed.tdoa.d), (flight.truth.t, changed.truth.t)]
     streams += [(flight.tdoa.a, changed.tdoa.a), (flight.imu.gyro, changed.imu.gyro), (flight.imu.accel, changed.imu.accel)]
-    streams += [(getattr(flight, name).t, getattr(changed, name).t) for name in AIDS]
-    streams += [(values_of(getattr(flight, name)), values_of(getattr(changed, name))) for name in AIDS]
+    streams += [(getattr(flight, name).t, getattr(changed, name).t) for name in DIAGNOSED]
+    streams += [(getattr(flight, name).values, getattr(changed, name).values) for name in DIAGNOSED]
     assert any(not np.array_equal(before, after) for before, after in streams)
     if effect.name in ("noise_level", "noise_correlation", "outlier_rate"):
         return  # nothing to take out

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import Track, aid_samples
-from uwb_tdoa_bias.foundation.flight import Height
+from uwb_tdoa_bias.foundation.sensors import Height
 from uwb_tdoa_tools.readers.optical_flow import COUNTS, NEAREST_RANGE, velocity_of
 from uwb_tdoa_tools.scoring.metrics import airborne
 from known_effects import clean_flight

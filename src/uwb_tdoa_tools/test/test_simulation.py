@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.pressure import altitude_of
+from uwb_tdoa_bias.foundation.sensors.pressure import altitude_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import YAW_PROFILES
 from uwb_tdoa_tools.simulation.constellations import CONSTELLATIONS

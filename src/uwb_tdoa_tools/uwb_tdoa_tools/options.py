@@ -16,7 +16,7 @@ from uwb_tdoa_bias.correction.network import UNPROVEN, load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
-from uwb_tdoa_ekf.core.aids import STREAMS
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
 from .localizing.estimate import Estimator
@@ -28,7 +28,7 @@ from .surveying.marks import read_marks
 from .surveying.tape import Tape
 
 TOPICS = (  # that are read from bags
-    "uwb/tdoa", "uwb/anchors", "imu/data", "height", "pressure", "velocity", "ground_truth/pose", "odometry",
+    "uwb/tdoa", "uwb/anchors", "imu/data", *(sensor.topics[0][0] for sensor in SENSORS.values()), "ground_truth/pose", "odometry",
 )  # fmt: skip
 
 
@@ -87,8 +87,8 @@ def add_estimator(parser):
         help="one filter parameter, before --config",
     )  # fmt: skip
     add(
-        "--without", metavar="AID", action="append", default=[], choices=STREAMS,
-        help=f"not to be used though it is there: {', '.join(STREAMS)}; may be repeated",
+        "--without", metavar="AID", action="append", default=[], choices=tuple(SENSORS),
+        help=f"not to be used though it is there: {', '.join(SENSORS)}; may be repeated",
     )  # fmt: skip
     add("--smooth", action="store_true", help="smooth: use what came after each estimate too")
 

@@ -1,4 +1,6 @@
-"""Takes the effects out of heights, pressures and velocities, and of their stamps, at once or one by one."""
+"""Takes the effects out of what other sensors measure, and out of their stamps, at once or one by one."""
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,13 +28,17 @@ class AidCorrector:
                 undo = model.inverse() if undo is None else model.inverse().after(undo)
         return undo
 
-    def correct(self, stream, t, values, std=None):
-        """t (n,) s; values (n,) or (n, 3), std as of the stream of a Flight. Returns what is given, corrected: a list."""
-        undo, t = self._undo[stream], t - self._late[stream]
-        if std is None:
-            return [t, values if undo is None else undo(values[:, None])[:, 0]]
+    def correct(self, name, stream):
+        """The Stream of a sensor, corrected."""
+        undo = self._undo[name]
+        if self._late[name]:
+            stream = replace(stream, t=stream.t - self._late[name])
         if undo is None:
-            return [t, values, std]
+            return stream
+        std = getattr(stream, "std", None)
+        if std is None:
+            return stream.with_values(undo(stream.values))
         known = np.isfinite(std)  # what was not measured may be anything
         variance = np.where(known, std, UNKNOWN) ** 2 @ undo.matrix.T**2
-        return [t, undo(np.where(known, values, 0.0)), np.where(variance < UNKNOWN, np.sqrt(variance), np.inf)]
+        std = np.where(variance < UNKNOWN, np.sqrt(variance), np.inf)
+        return replace(stream.with_values(undo(np.where(known, stream.values, 0.0))), std=std)

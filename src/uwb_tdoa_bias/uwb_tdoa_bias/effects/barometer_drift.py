@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .aid_error import need_stream, values_of, with_values
+from .aid_error import need_stream
 from .base import Effect
 from .wording import significant, size
 
@@ -38,7 +38,7 @@ class BarometerDrift(Effect):
     def inject(self, flight, rng=None):
         part = need_stream(self, flight, "pressure")
         extra = self.values.get("rate", 0.0) * (part.t - float(flight.tdoa.t[0]))
-        return replace(flight, pressure=with_values(part, values_of(part) + extra[:, None]))
+        return replace(flight, pressure=part.sensed(part.values + extra[:, None]))
 
     def advice(self):
         if not significant(self):

@@ -1,6 +1,6 @@
 """`effects.yaml`: which effects are in the model, with which values."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -130,8 +130,7 @@ class EffectSet:
         for stream in AIDS if not corrector.idle else ():
             part = getattr(flight, stream)
             if part is not None:
-                columns = [getattr(part, field.name) for field in fields(part)]
-                flight = replace(flight, **{stream: type(part)(*corrector.correct(stream, *columns))})
+                flight = replace(flight, **{stream: corrector.correct(stream, part)})
         return flight
 
     @classmethod

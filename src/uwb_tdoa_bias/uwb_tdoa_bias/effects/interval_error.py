@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..foundation.errors import InputError
-from .aid_error import need_stream, values_of, with_values
+from .aid_error import need_stream
 from .base import Effect, need_truth
 from .samples import Track, aid_samples
 from .wording import measured, significant
@@ -72,7 +72,7 @@ class IntervalEffect(Effect):
         extra = self.uncorrected(samples)
         if not np.isfinite(extra).all():
             raise InputError(f"{flight.name}: has no attitude in its ground truth, which {self.name} needs.")
-        return replace(flight, **{stream: with_values(part, values_of(part) + extra)})
+        return replace(flight, **{stream: part.sensed(part.values + extra)})
 
     def told(self, unit, factor=1.0):
         """[(signed size, its words, when, in words)] of those sizes that the data tell, the most certain first."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..foundation.anchors import Anchors
 from ..foundation.later import rotations
+from ..foundation.sensors import SENSORS
 from .motion import POSE_LAG, Motion, motion_at, preceding
 
 STEP = 0.1  # s over which the velocity at an instant is taken
@@ -111,7 +112,7 @@ class ImuSamples:
 
 @dataclass(frozen=True)
 class AidSamples:
-    """A height, a pressure or a velocity, as effects see it.
+    """Measurements of a sensor, as effects see them.
 
     channel : name of the stream; t (n,) s; p (n, 3) m, world; start : s, as of Samples.
     reading (n, k): what it should have read: of a range finder over the ground at z = 0, m; of a barometer the height, m; of
@@ -190,7 +191,7 @@ def true_samples(flight):
 
 def aid_samples(stream, t, track, start=0.0, vibration=None):
     """AidSamples of a stream at stamps t (n,), s, of a Track. start, vibration : see there."""
-    before, reading, after = (_reading(stream, track, t + late) for late in (-0.5 * STEP, 0.0, 0.5 * STEP))
+    before, reading, after = (SENSORS[stream].compared.reading(track, t + late) for late in (-0.5 * STEP, 0.0, 0.5 * STEP))
     change = (after - before) / STEP
     return AidSamples(
         stream, t, track.positions(t), start, reading, change, _up(track, t), track.motion(t), vibration
@@ -200,10 +201,3 @@ def aid_samples(stream, t, track, start=0.0, vibration=None):
 def _up(track, t):
     q = track.attitudes(t)
     return 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
-
-
-def _reading(stream, track, t):
-    if stream == "velocity":
-        return rotations.Rotation.from_quat(track.attitudes(t)).inv().apply(track.velocities(t))
-    z = track.positions(t)[:, 2]
-    return (z / _up(track, t) if stream == "height" else z)[:, None]

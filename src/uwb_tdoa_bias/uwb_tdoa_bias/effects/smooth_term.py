@@ -9,6 +9,7 @@ import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
+from ..foundation.sensors import DIAGNOSED, SENSORS
 from .base import Effect, known_anchors, once_per_anchors
 from .samples import tile
 from .domain import FADE, bounded, share
@@ -20,7 +21,7 @@ from .smooth_words import sentences
 DEGREE = 2
 GONE = 4 * FADE  # share of the width of a domain beyond which nothing is left of a function
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
-AID_CHANNELS = ("height", "pressure", *(f"velocity.{axis}" for axis in "xyz"))
+AID_CHANNELS = tuple(name + axis for name in DIAGNOSED for axis in SENSORS[name].compared.axes)
 FORMS = ("common", "arrival", "anchor", "pair", "direction")
 OF_LINKS = ("pair", "direction")  # forms with a function for a pair of anchors
 TYPICAL = {"tdoa": 0.1, "gyro": 0.1, "accel": 0.5}  # m, rad/s, m/s^2

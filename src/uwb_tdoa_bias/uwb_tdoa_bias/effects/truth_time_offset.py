@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..foundation.geometry import tdoa_jacobian
+from ..foundation.sensors import DIAGNOSED
 from .base import need_truth
 from .stamp_error import StampEffect
 from .wording import significant, size
@@ -24,7 +25,7 @@ class TruthTimeOffset(StampEffect):
     reference = "UTIL web page: motion-capture poses logged on board have about 10 ms of radio latency"
     needs_reference = True
     portable = False
-    channels = ("tdoa", "gyro", "height", "pressure", "velocity")  # on the accelerometer it is less than its vibration
+    channels = ("tdoa", "gyro", *DIAGNOSED)  # on the accelerometer it is less than its vibration
 
     def regressors(self, samples, keys):
         if samples.channel != "tdoa":  # the truth of that stamp is an earlier one: the sensor reads what comes later

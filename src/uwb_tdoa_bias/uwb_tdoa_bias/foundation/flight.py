@@ -1,13 +1,14 @@
 """Flight: the numpy arrays of one recording. Every reader returns one, every tool takes one."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, make_dataclass, replace
 
 import numpy as np
 
 from .anchors import Anchors
 from .foreign_text import harmless
+from .sensors import SENSORS
 
-AIDS = "height", "pressure", "velocity"  # streams of a Flight that the filter can do without
+AIDS = tuple(SENSORS)  # streams of a Flight that the filter can do without
 
 
 @dataclass(frozen=True)
@@ -56,42 +57,13 @@ class Truth:
         return len(self.t)
 
 
-@dataclass(frozen=True)
-class Height:
-    """Ranges along the body's -z. t : (n,) s; range : (n,) m; inf or NaN where there was none (REP 117)."""
-
-    t: np.ndarray
-    range: np.ndarray
-
-    def __len__(self):
-        return len(self.t)
+_Felt = make_dataclass(
+    "_Felt", [(name, sensor.stream | None, None) for name, sensor in SENSORS.items()], frozen=True, kw_only=True
+)
 
 
 @dataclass(frozen=True)
-class Pressure:
-    """Static air pressure. t : (n,) s; pressure : (n,) Pa."""
-
-    t: np.ndarray
-    pressure: np.ndarray
-
-    def __len__(self):
-        return len(self.t)
-
-
-@dataclass(frozen=True)
-class Velocity:
-    """Velocities in the body frame. t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not measured."""
-
-    t: np.ndarray
-    v: np.ndarray
-    std: np.ndarray
-
-    def __len__(self):
-        return len(self.t)
-
-
-@dataclass(frozen=True)
-class Flight:
+class Flight(_Felt):
     """One recording. All stamps are of one clock, in s; every stream keeps its own; within a stream stamps never fall.
 
     name : short and unique, e.g. "0425-traj1"; whatever is given, it is `harmless`
@@ -101,9 +73,7 @@ class Flight:
     truth : Truth or None
     extra : other streams of the log by name, each a dict of column name to (n,) array with a "t" among them, file units
     meta : where it came from: source file, format, protocol ("tdoa2", "tdoa3"), ...
-    height : Height or None
-    pressure : Pressure or None
-    velocity : Velocity or None
+    for each of SENSORS, by name : its Stream or None
     """
 
     name: str
@@ -113,9 +83,6 @@ class Flight:
     truth: Truth | None = None
     extra: dict = field(default_factory=dict)
     meta: dict = field(default_factory=dict)
-    height: Height | None = None
-    pressure: Pressure | None = None
-    velocity: Velocity | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "name", harmless(self.name))

@@ -35,6 +35,12 @@ CODES = {
 }  # fmt: skip
 
 
+def message_class(kind):
+    """Class of a type of ours like "pkg/msg/Name"."""
+    package, _, name = kind.partition("/msg/")
+    return getattr(import_module(f"{package}.msg"), name)
+
+
 class Unreadable(ValueError):
     """A message cannot be read; the text says why."""
 

@@ -1,11 +1,12 @@
-"""What a tag feels beside inertia and radio: height, pressure, velocity. One AID is one measurement of one of them."""
+"""What a tag feels beside inertia and TDOAs: one AID is one measurement of one of the SENSORS. Their updates are in files of their names."""
 
 from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from . import barometer, height, velocity
 
-STREAMS = "height", "pressure", "velocity"  # by kind
-HEIGHT, PRESSURE, VELOCITY = range(3)  # value[0] in m; value[0] in m of standard altitude; value in m/s, with its std
+STREAMS = tuple(SENSORS)  # by kind
+HEIGHT, PRESSURE, VELOCITY = map(STREAMS.index, ("height", "pressure", "velocity"))
 
 
 @compiled

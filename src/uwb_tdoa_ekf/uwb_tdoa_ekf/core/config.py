@@ -2,13 +2,15 @@
 
 import math
 import warnings
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields, make_dataclass
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.robust_loss import LOSSES
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.foundation.sensors.sensor import parameter
 
 ROBUST = ("innovation", "gate", "m_estimation")
 CHOICES = {"robust": ROBUST, "loss": LOSSES}  # parameters that are one of a few names
@@ -20,95 +22,86 @@ RENAMED = {  # old name: present name; the old ones work until the release after
 }
 
 
-def _parameter(default, text, high=None, low=0.0, with_low=False, fixed=False):
-    """A field of FilterConfig. text : unit and meaning, as in ekf_node.yaml; a number must be above `low`, or may be
-    that too, and at most `high`; fixed : cannot change while the filter runs."""
-    limits = {"low": low, "high": high, "with_low": with_low}
-    return field(default=default, metadata={"text": text, "fixed": fixed, **limits})
+@dataclass(frozen=True)
+class _OfTdoas:
+    # The measurement
+    tdoa_std: float = parameter(
+        0.25, "m; deviation of a TDOA from its prediction, uncorrected systematic part included", high=100.0
+    )
+    tdoa_correlation_length: float = parameter(
+        6.0, "n successive TDOAs tell as much as n / this independent ones; 1.0 for white noise", high=1000.0
+    )
+    adapt_noise: bool = parameter(True, "learn the noise of each anchor beyond tdoa_std from the innovations")
+    noise_memory: float = parameter(0.5, "s over which it is learned", high=1000.0)
+    robust: str = parameter(
+        "innovation", "against outliers: innovation (weight from the whitened innovation), gate, m_estimation"
+    )
+    loss: str = parameter(
+        "geman_mcclure", "weight function of innovation and m_estimation: geman_mcclure, huber, cauchy"
+    )
+    measurement_scale: float = parameter(2.5, "standard deviations of a measurement at which the loss bends", high=1e8)
+    state_scale: float = parameter(2.5, "the same for the prior's share in m_estimation", high=1e8)
+    iterations: int = parameter(2, "re-weightings per update of m_estimation", high=100)
+    gate: float = parameter(3.0, "standard deviations beyond which gate rejects", high=1e8)
+
+    # The motion
+    use_imu: bool = parameter(True, "false: constant velocity, for a tag without an IMU", fixed=True)
+    motion_noise: float = parameter(1.5, "m/s^2/sqrt(Hz); random acceleration of the tag while no IMU says better", high=1000.0)
+    imu_timeout: float = parameter(0.1, "s without an IMU sample after which motion_noise takes over", high=10.0)
+    accel_noise: float = parameter(0.1, "m/s^2/sqrt(Hz); accelerometer, motors running", high=100.0)
+    gyro_noise: float = parameter(0.005, "rad/s/sqrt(Hz); gyroscope", high=10.0)
+    accel_bias_walk: float = parameter(0.01, "m/s^3/sqrt(Hz); how fast the accelerometer's bias wanders", high=100.0)
+    gyro_bias_walk: float = parameter(1e-4, "rad/s^2/sqrt(Hz); how fast the gyroscope's bias wanders", high=10.0)
+    accel_prior_std: float = parameter(
+        1.5, "m/s^2; deviation of the specific force from hovering, per axis, known before it is measured", high=1000.0
+    )
+    vibration_gain: float = parameter(
+        4.0, "variance of a vibrating accelerometer's error over that of its vibration; 0.0: it has none", high=1000.0, with_low=True
+    )
+    workspace_margin: float = parameter(
+        1.0, "m beyond the anchors' extent; a tag further out is drawn back while less is known of its place", high=10000.0, fixed=True
+    )
+    zero_velocity: bool = parameter(True, "a tag whose TDOAs stay what they are, or whose inertial sensors neither shake nor turn, stands still")
+    recover: bool = parameter(True, "find the tag anew, untold where it is, when the TDOAs agree on another place that it can have come to")
+    compensate_changes: bool = parameter(False, "take out the delay of an anchor that is found to have changed in flight")
+
+    # The start
+    initial_yaw: float = parameter(0.0, "rad; yaw of the body at the start", high=7.0, low=-7.0)
+    initial_yaw_std: float = parameter(
+        6.3, "rad; its deviation; above 0.6 it is unknown: four yaws are followed until motion tells", high=100.0
+    )
+    initial_accel_bias_std: float = parameter(0.1, "m/s^2; of the accelerometer's bias about 0", high=100.0)
+    initial_gyro_bias_std: float = parameter(0.01, "rad/s; of the gyroscope's bias about 0", high=10.0)
+    start_window: float = parameter(0.5, "s of TDOAs from which the start position is found", high=10.0)
+    start_timeout: float = parameter(1.0, "s after which a start from contradicting TDOAs is better than none", high=1000.0)
+
+
+# What else the tag feels
+_PARAMETERS = [(name, type(each.default), each) for sensor in SENSORS.values() for name, each in sensor.parameters.items()]
+_OfSensors = make_dataclass("_OfSensors", _PARAMETERS, bases=(_OfTdoas,), frozen=True)
 
 
 @dataclass(frozen=True)
-class FilterConfig:
+class FilterConfig(_OfSensors):
     """Tuning of the filter. The node's parameters have the same names."""
 
-    # The measurement
-    tdoa_std: float = _parameter(
-        0.25, "m; deviation of a TDOA from its prediction, uncorrected systematic part included", high=100.0
-    )
-    tdoa_correlation_length: float = _parameter(
-        6.0, "n successive TDOAs tell as much as n / this independent ones; 1.0 for white noise", high=1000.0
-    )
-    adapt_noise: bool = _parameter(True, "learn the noise of each anchor beyond tdoa_std from the innovations")
-    noise_memory: float = _parameter(0.5, "s over which it is learned", high=1000.0)
-    robust: str = _parameter(
-        "innovation", "against outliers: innovation (weight from the whitened innovation), gate, m_estimation"
-    )
-    loss: str = _parameter(
-        "geman_mcclure", "weight function of innovation and m_estimation: geman_mcclure, huber, cauchy"
-    )
-    measurement_scale: float = _parameter(2.5, "standard deviations of a measurement at which the loss bends", high=1e8)
-    state_scale: float = _parameter(2.5, "the same for the prior's share in m_estimation", high=1e8)
-    iterations: int = _parameter(2, "re-weightings per update of m_estimation", high=100)
-    gate: float = _parameter(3.0, "standard deviations beyond which gate rejects", high=1e8)
-
-    # The motion
-    use_imu: bool = _parameter(True, "false: constant velocity, for a tag without an IMU", fixed=True)
-    motion_noise: float = _parameter(1.5, "m/s^2/sqrt(Hz); random acceleration of the tag while no IMU says better", high=1000.0)
-    imu_timeout: float = _parameter(0.1, "s without an IMU sample after which motion_noise takes over", high=10.0)
-    accel_noise: float = _parameter(0.1, "m/s^2/sqrt(Hz); accelerometer, motors running", high=100.0)
-    gyro_noise: float = _parameter(0.005, "rad/s/sqrt(Hz); gyroscope", high=10.0)
-    accel_bias_walk: float = _parameter(0.01, "m/s^3/sqrt(Hz); how fast the accelerometer's bias wanders", high=100.0)
-    gyro_bias_walk: float = _parameter(1e-4, "rad/s^2/sqrt(Hz); how fast the gyroscope's bias wanders", high=10.0)
-    accel_prior_std: float = _parameter(
-        1.5, "m/s^2; deviation of the specific force from hovering, per axis, known before it is measured", high=1000.0
-    )
-    vibration_gain: float = _parameter(
-        4.0, "variance of a vibrating accelerometer's error over that of its vibration; 0.0: it has none", high=1000.0, with_low=True
-    )
-    workspace_margin: float = _parameter(
-        1.0, "m beyond the anchors' extent; a tag further out is drawn back while less is known of its place", high=10000.0, fixed=True
-    )
-    zero_velocity: bool = _parameter(True, "a tag whose TDOAs stay what they are, or whose inertial sensors neither shake nor turn, stands still")
-    recover: bool = _parameter(True, "find the tag anew, untold where it is, when the TDOAs agree on another place that it can have come to")
-    compensate_changes: bool = _parameter(False, "take out the delay of an anchor that is found to have changed in flight")
-
-    # The start
-    initial_yaw: float = _parameter(0.0, "rad; yaw of the body at the start", high=7.0, low=-7.0)
-    initial_yaw_std: float = _parameter(
-        6.3, "rad; its deviation; above 0.6 it is unknown: four yaws are followed until motion tells", high=100.0
-    )
-    initial_accel_bias_std: float = _parameter(0.1, "m/s^2; of the accelerometer's bias about 0", high=100.0)
-    initial_gyro_bias_std: float = _parameter(0.01, "rad/s; of the gyroscope's bias about 0", high=10.0)
-    start_window: float = _parameter(0.5, "s of TDOAs from which the start position is found", high=10.0)
-    start_timeout: float = _parameter(1.0, "s after which a start from contradicting TDOAs is better than none", high=1000.0)
-
-    # What else the tag feels
-    use_height: bool = _parameter(True, "use ranges of a range finder that looks down along the body's -z, if there are any", fixed=True)
-    height_std: float = _parameter(0.02, "m; of a range: unevenness of the ground and offset of the sensor, alike for 0.5 s", high=10.0)
-    height_arm: float = _parameter(0.0, "m; from the range finder up to the origin of the body, along the body's z", high=10.0, low=-10.0)
-    ground_height: float = _parameter(0.0, "m; height of the ground in the world, but for steps", high=10000.0, low=-10000.0)
-    use_pressure: bool = _parameter(True, "use pressures of a barometer, if there are any", fixed=True)
-    pressure_std: float = _parameter(0.1, "m; noise of one pressure, as altitude", high=100.0)
-    pressure_walk: float = _parameter(0.1, "m/sqrt(s); how fast the offset of the altitude wanders: weather, prop wash, warming up", high=100.0)
-    pressure_drift: float = _parameter(0.02, "m/s; how fast it drifts, as is known before it is measured", high=100.0)
-    use_velocity: bool = _parameter(True, "use velocities in the body frame, if there are any", fixed=True)
-    fixed_height: float = _parameter(0.0, "m; height of a tag that stays on its floor", high=10000.0, low=-10000.0)
-    fixed_height_std: float = _parameter(0.0, "m; its standard deviation; 0.0: the tag does not stay there", high=10.0, with_low=True)
+    fixed_height: float = parameter(0.0, "m; height of a tag that stays on its floor", high=10000.0, low=-10000.0)
+    fixed_height_std: float = parameter(0.0, "m; its standard deviation; 0.0: the tag does not stay there", high=10.0, with_low=True)
 
     # The output
-    odometry_rate: float = _parameter(200.0, "Hz of stamps; at most this often", high=1e6)
+    odometry_rate: float = parameter(200.0, "Hz of stamps; at most this often", high=1e6)
 
     def __post_init__(self):
-        for parameter in fields(self):
-            name, value = parameter.name, getattr(self, parameter.name)
+        for each in fields(self):
+            name, value = each.name, getattr(self, each.name)
             if name in CHOICES:
                 if value not in CHOICES[name]:
                     raise InputError(f"{name}: {value!r} is not one of {', '.join(CHOICES[name])}.")
-            elif parameter.type is bool:
+            elif each.type is bool:
                 if not isinstance(value, bool):
                     raise InputError(f"{name}: {value!r} must be true or false.")
             else:
-                object.__setattr__(self, name, _number(parameter, value))
+                object.__setattr__(self, name, _number(each, value))
 
     @classmethod
     def from_parameters(cls, parameters, warn=None):

@@ -123,12 +123,26 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
         if not was_running:
             _wait_for_start(ekf, anchors, tuning, t, records)
         return
+    _look_for_rest(ekf, anchors, tuning, t, records)
+    late = _update(ekf, anchors, tuning, tdoa, residual, records)
+    known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
+    _settle(ekf, anchors, tuning, t, not late, abs(residual.innovation - known) < INLIER, records)
+
+
+@compiled
+def _look_for_rest(ekf, anchors, tuning, t, records):
+    """Before an update stamped t, s: whether the tag is at rest."""
     if tuning.zero_velocity:
         if t >= ekf.next_look:
             rest.look(ekf, anchors, tuning, initialization.recent(ekf, rest.LOOK_WINDOW), t, records)
         if not tuning.use_imu or t - ekf.imu.t > tuning.imu_timeout:
             rest.hold(ekf, t, records)
-    late = _update(ekf, anchors, tuning, tdoa, residual, records)
+
+
+@compiled
+def _settle(ekf, anchors, tuning, t, counts, agrees, records):
+    """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the tag is elsewhere. counts : what was measured
+    tells that; agrees : with the best hypothesis."""
     _stay_in_workspace(ekf, t, records)
     if tuning.fixed_height_std > 0.0 and t >= ekf.next_floor:
         ekf.next_floor = t + rest.PERIOD
@@ -137,10 +151,8 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
     hypotheses.select(ekf, t)
     if ekf.best // YAWS != followed // YAWS:  # at another place
         history.add_reset(ekf, t, records)
-    known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
-    agrees = 1.0 if abs(residual.innovation - known) < INLIER else 0.0
-    if not late:
-        ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (agrees - ekf.consistency)
+    if counts:
+        ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * ((1.0 if agrees else 0.0) - ekf.consistency)
     ekf.last_tdoa = t
     if ekf.consistency > initialization.AGREE:
         ekf.sure = t

@@ -5,8 +5,8 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_tdoa_bias.foundation.ros import Rate
+from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 
-from ..core import aids
 from ..streams import ERROR as SEVERE
 from .volume import VolumeCheck
 
@@ -17,16 +17,6 @@ LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before 
 MOST_SAID = 3  # sentences in one text; all of them are among the values
 REPEATS = 2  # reports in a row in which that is so of an aid; optical flow contradicts everything else for a second at times
 
-REMEDY = {  # of each aid, what to check
-    "height": "its unit, height_arm and ground_height",
-    "pressure": "and shield it from wind",
-    "velocity": "its unit and how it is turned (velocity_misalignment in effects_file), and look for slip",
-}
-INVALID = {  # what a message of each must hold
-    "height": "out of range, or less than 0 m",
-    "pressure": "give Pa, some 1e5 on the ground",
-    "velocity": "give m/s and a covariance that is neither 0 nor unknown for all components",
-}
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -41,7 +31,7 @@ class Health:
         self.behind = None  # s from the stamp of the newest odometry to the present time of ROS
         self._use_imu, self._lag = config.use_imu, lag
         self._volume = VolumeCheck(volume)
-        self._imu_rate, self._tdoa_rate = Rate(), Rate()
+        self._imu_rate, self._tdoa_rate, self._located_rate = Rate(), Rate(), Rate()
         self._aids_before = {}  # messages of each, received and not used, by the last report
         self._aids_bad = {}  # reports in a row in which most messages of an aid were not used for a reason
         self._aids_heard = {}  # messages of each so far, and since when no more of them, time.monotonic(), s
@@ -57,8 +47,9 @@ class Health:
         """
         now = time.monotonic()
         imu_rate, tdoa_rate = self._imu_rate.of(self.received["imu"]), self._tdoa_rate.of(self.received["tdoa"])
+        located = self._located_rate.of(self.received["tdoa"] + sum(self.received[name] for name in LOCATING))
         running = estimator is not None and estimator.running
-        if running or not tdoa_rate:
+        if running or not located:
             self._starting = None
         elif self._starting is None:
             self._starting = now
@@ -66,7 +57,7 @@ class Health:
             judgement = ERROR, refused
         elif estimator is None:
             judgement = ERROR, "no anchors yet: publish them on uwb/anchors, reliable and transient local"
-        elif not tdoa_rate:
+        elif not located:
             judgement = ERROR, "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the tag's driver"
         elif self._use_imu and not imu_rate:
             judgement = ERROR, "no samples on imu/data: check the IMU's driver, or set use_imu to false"
@@ -103,31 +94,31 @@ class Health:
         return *judgement, values | at_position
 
     def _judge_aids(self, now, counts):
-        """Whether height, pressure and velocity that were there still are, and are used."""
+        """Whether sensors that were there still are, and are used."""
         judgement = OK, "running"
-        for aid in aids.STREAMS:
+        for aid, sensor in SENSORS.items():
             received = self.received[aid]
             before, since = self._aids_heard.get(aid, (0, now))
             if received != before:
                 since = now
             self._aids_heard[aid] = received, since
             reasons = {
-                "rejected": f"contradict everything else and are not used: check the sensor, {REMEDY[aid]}",
+                "rejected": f"contradict everything else and are not used: check the sensor, {sensor.remedy}",
                 "late": f"are late: check its stamps, or raise lag (now {self._lag} s)",
-                "invalid": f"are invalid: {INVALID[aid]}",
+                "invalid": f"are invalid: {sensor.invalid}",
             }
             totals = {"received": received} | {reason: counts[f"{aid}_{reason}"] for reason in reasons}
             before = self._aids_before.get(aid, dict.fromkeys(totals, 0))
             recent = {name: total - before[name] for name, total in totals.items()}
             self._aids_before[aid] = totals
             if received and now - since > STOPPED:
-                judgement = WARN, f"no messages on {aid} any more: done without; check the sensor and its driver"
+                judgement = WARN, f"no messages on {sensor.topics[0][0]} any more: done without; check the sensor and its driver"
                 continue
             for reason, words in reasons.items():
                 bad = recent[reason] > LARGEST_UNUSED * recent["received"]
                 repeats = self._aids_bad[aid, reason] = self._aids_bad.get((aid, reason), 0) + 1 if bad else 0
                 if repeats >= REPEATS:
-                    judgement = WARN, f"more than half of the messages on {aid} {words}"
+                    judgement = WARN, f"more than half of the messages on {sensor.topics[0][0]} {words}"
         return judgement
 
     def _judge_use(self, counts):

@@ -15,7 +15,7 @@ from targets import CORPUS, MESSAGES, bag_of  # noqa: E402
 from test_survey import survey_lines  # noqa: E402
 from uwb_tdoa_bias.correction.network import MODELS  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
-from uwb_tdoa_bias.foundation.flight import Height, Pressure, Velocity  # noqa: E402
+from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity  # noqa: E402
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402

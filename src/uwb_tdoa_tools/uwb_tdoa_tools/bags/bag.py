@@ -4,9 +4,7 @@ Topic (in a bag always absolute)   type                              what
 /imu/data                          sensor_msgs/msg/Imu               Flight.imu, frame base_link
 /uwb/tdoa                          uwb_tdoa_msgs/msg/Tdoa            Flight.tdoa
 /uwb/anchors                       uwb_tdoa_msgs/msg/AnchorArray     Flight.anchors, once, transient local
-/height                            sensor_msgs/msg/Range             Flight.height, frame base_link
-/pressure                          sensor_msgs/msg/FluidPressure     Flight.pressure, frame base_link
-/velocity                          geometry_msgs/msg/TwistWithCovarianceStamped  Flight.velocity, frame base_link
+/height, /pressure, ...            those of SENSORS                  Flight.height, Flight.pressure, ..., frame base_link
 /ground_truth/pose                 geometry_msgs/msg/PoseStamped     Flight.truth
 /tf_static                         tf2_msgs/msg/TFMessage            frames anchor_<id>, once, transient local; of sensors, if there are
 
@@ -27,9 +25,10 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_bias.foundation.foreign_text import printable
+from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
+from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_bias.foundation.version import written_by
 
-from ..readers.streams import LARGEST_NUMBER
 from . import messages as bag_messages, placing
 from .files import check_output, is_bag, new_bag, open_bag, readable, remarks_of
 from .integrity import metadata
@@ -41,20 +40,6 @@ __all__ = [
     "write_bag", "write_odometry",
 ]  # fmt: skip
 
-_AIDS = {  # topic and field of Flight: its type, messages of it, a row of a message, what may be in rows, it of rows
-    "height": (
-        "sensor_msgs/msg/Range", bag_messages.height_messages, bag_messages.height_row, bag_messages.height_sound,
-        bag_messages.height_of,
-    ),
-    "pressure": (
-        "sensor_msgs/msg/FluidPressure", bag_messages.pressure_messages, bag_messages.pressure_row, bag_messages.sound,
-        bag_messages.pressure_of,
-    ),
-    "velocity": (
-        "geometry_msgs/msg/TwistWithCovarianceStamped", bag_messages.velocity_messages, bag_messages.velocity_row,
-        bag_messages.velocity_sound, bag_messages.velocity_of,
-    ),
-}  # fmt: skip
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
 _TOLD = "source", "format", "protocol"  # of that meta: texts that are read again, to be told; nothing is computed with them
 
@@ -102,7 +87,7 @@ def write_bag(flight, out, storage="mcap", force=False):
     Raises InputError; also for stamps that a ROS message cannot hold.
     """
     store = typestore()
-    present = [(name, getattr(flight, name)) for name in ("tdoa", "imu", "truth", *_AIDS)]
+    present = [(name, getattr(flight, name)) for name in ("tdoa", "imu", "truth", *SENSORS)]
     starts = [bag_messages.nanoseconds(name, s.t[:1])[0] for name, s in present if s is not None and len(s)]
     if not starts:
         raise InputError(f"{flight.name}: holds no message; there is nothing to write.")
@@ -111,9 +96,9 @@ def write_bag(flight, out, storage="mcap", force=False):
     topics = _of_anchors(flight.anchors, first, store, antenna)
     if flight.imu is not None:
         topics["/imu/data"] = "sensor_msgs/msg/Imu", _STREAM_QOS, bag_messages.imu_messages(flight.imu, store)
-    for name, (msgtype, outgoing, *_) in _AIDS.items():
-        if getattr(flight, name) is not None:
-            topics[f"/{name}"] = msgtype, _STREAM_QOS, outgoing(getattr(flight, name), store)
+    for name, sensor in SENSORS.items():
+        if (felt := getattr(flight, name)) is not None:
+            topics[f"/{sensor.topics[0][0]}"] = sensor.message, _STREAM_QOS, bag_messages.sensor_messages(sensor, felt, store)
     topics["/uwb/tdoa"] = "uwb_tdoa_msgs/msg/Tdoa", _STREAM_QOS, bag_messages.tdoa_messages(flight.tdoa, store, antenna)
     if flight.truth is not None:
         poses = bag_messages.pose_messages(flight.truth, flight.anchors.frame, store)
@@ -190,6 +175,8 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth
             stamps, rows, falls, frames[topic] = _table(path, reader, found, row)
             if falls:
                 meta.setdefault("reordered", {})[topic] = falls
+            if not len(stamps):
+                return None
             whole = sound(rows).all(axis=1)
             if not whole.all():
                 if not salvage:
@@ -199,6 +186,11 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth
             return make(stamps, rows) if len(stamps) else None
 
         tdoa = stream("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of)
+        felt = {
+            name: stream(sensor.topics[0][0], sensor.message, *bag_messages.of_sensor(sensor)) for name, sensor in SENSORS.items()
+        }
+        if tdoa is None and any(felt[name] is not None for name in LOCATING):
+            tdoa = bag_messages.tdoas_of(np.empty(0), np.empty((0, 4)))
         if tdoa is None:
             count = reader.unreadable[name_of("uwb/tdoa")]
             why = f"{count} that are there cannot be read" if count else _others(connections, namespace)
@@ -208,7 +200,6 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth
         if anchors is None:
             raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
         imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
-        aids = {name: stream(name, msgtype, row, make, sound) for name, (msgtype, _, row, sound, make) in _AIDS.items()}
         tree = placing.read_frames(path, reader)
         places = {topic: placing.placed(tree, topic, frames[topic]) for topic in ("imu/data", "uwb/tdoa")}
         remarks += [remark for _, remark in places.values() if remark]
@@ -221,7 +212,7 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth
         meta["antenna"] = place[1].tolist()
     if remarks:
         meta["remarks"] = remarks
-    return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, **aids)
+    return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, **felt)
 
 
 def read_odometry(path, namespace="", salvage=False, topics=None):

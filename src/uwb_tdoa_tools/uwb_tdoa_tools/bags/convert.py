@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS
 
 from .bag import check_output, write_bag
 
 
-SENSORS = "tdoa", "imu", "truth", "height", "pressure", "velocity"  # streams of a Flight, each on its own clock
+SENSORS = "tdoa", "imu", "truth", *AIDS  # streams of a Flight, each on its own clock
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.limits import DEFINITION_BYTES
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 OUR_PACKAGE = "uwb_tdoa_msgs"
-OUR_TYPES = ("Tdoa", "TdoaCorrected", "TdoaResidual", "Anchor", "AnchorArray", "EstimatorStatus")
+OUR_TYPES = (
+    "Tdoa", "TdoaCorrected", "TdoaResidual", "Anchor", "AnchorArray", "EstimatorStatus",
+    *(of.message.rpartition("/")[2] for of in SENSORS.values() if of.message.startswith(OUR_PACKAGE)),
+)  # fmt: skip
 ADDED = {  # fields that our types were given since they were first recorded, the latest last, and what is meant where they lack
     f"{OUR_PACKAGE}/msg/Tdoa": ({"variance": 0.0},),
     f"{OUR_PACKAGE}/msg/TdoaCorrected": ({"variance": 0.0}, {"bias_slope": np.zeros(6), "bias_state": np.zeros(6)}),

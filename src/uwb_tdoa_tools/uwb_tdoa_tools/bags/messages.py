@@ -5,19 +5,18 @@ What was not measured is marked as the messages say: an orientation of (0, 0, 0,
 covariances of 0 for unknown.
 """
 
-import math
+from functools import reduce
 
 import numpy as np
+from rosbags.interfaces import Nodetype
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Height, Imu, Pressure, Tdoas, Truth, Velocity
+from uwb_tdoa_bias.foundation.flight import Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER, UNKNOWN_VARIANCE
 from uwb_tdoa_ekf.frames import to_odometry
 
-from ..readers.streams import LARGEST_NUMBER
 
 BODY_FRAME, ANTENNA_FRAME = "base_link", "uwb_antenna"
-FIELD_OF_VIEW, LONGEST_RANGE = 0.47, 1000.0  # rad, m, of a sensor_msgs/Range: typical, and a bound that bounds nothing
-UNKNOWN_VARIANCE = 1e12  # of what is not measured: covariances of messages are to be finite
 
 
 def nanoseconds(name, t):
@@ -57,69 +56,54 @@ def imu_of(stamps, rows):
     return Imu(stamps, rows[:, 0:3], rows[:, 3:6])
 
 
-def height_messages(height, store):
-    """Yield (stamp ns, sensor_msgs/Range); what was out of range is +inf, NaN stays (REP 117)."""
-    Message = store.types["sensor_msgs/msg/Range"]
-    for stamp, value in zip(nanoseconds("height", height.t).tolist(), height.range.tolist()):
-        header = _header(store, stamp, BODY_FRAME)
-        yield stamp, Message(header, Message.INFRARED, FIELD_OF_VIEW, 0.0, LONGEST_RANGE, value, 0.0)
+def sensor_messages(sensor, stream, store):
+    """Yield (stamp ns, message) of the Stream of a Sensor; what it says nothing of is 0."""
+    content = {field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:])) for field, values in sensor.content(stream).items()}
+    for k, stamp in enumerate(nanoseconds(sensor.name, stream.t).tolist()):
+        message = _blank(store, sensor.message)
+        message.header = _header(store, stamp, BODY_FRAME)
+        for field, values in content.items():
+            *way, last = field.split(".")
+            _set(reduce(getattr, way, message), last, values[k])
+        yield stamp, message
 
 
-def height_row(message):
-    value = message.range
-    if math.isfinite(value) and not message.min_range <= value <= message.max_range:  # says REP 117
-        value = math.inf
-    return stamp_of(message.header), value
+def _blank(store, kind):
+    """A message of a type with nothing but zeros."""
+    values = {}
+    for name, (node, what) in store.get_msgdef(kind).fields:
+        if node == Nodetype.NAME:
+            values[name] = _blank(store, what)
+        elif node == Nodetype.BASE:
+            values[name] = "" if what[0] == "string" else 0
+        else:
+            values[name] = np.zeros(what[1])
+    return store.types[kind](**values)
 
 
-def height_sound(rows):
-    return np.ones(rows.shape, dtype=bool)  # REP 117: what is not finite says that nothing was in range
+def _set(holder, name, value):
+    """Write a number, an array, or the numbers of a Vector3 into a field."""
+    old = getattr(holder, name)
+    if hasattr(old, "x"):
+        old.x, old.y, old.z = value.tolist()
+    else:
+        setattr(holder, name, np.ascontiguousarray(value) if np.ndim(value) else value.item())
 
 
-def height_of(stamps, rows):
-    return Height(stamps, rows[:, 0])
+def of_sensor(sensor):
+    """(row of a message, Stream of stamps and rows, which numbers of rows may be there), as `read_bag` takes them, of a Sensor."""
+
+    def row(message):
+        return stamp_of(message.header), *(number for field in sensor.fields for number in _numbers(reduce(getattr, field.split("."), message)))
+
+    def sound_ones(rows):
+        return np.column_stack(list(sensor.sound(sensor.split(rows)).values()))
+
+    return row, lambda stamps, rows: sensor.read(stamps, sensor.split(rows)), sound_ones
 
 
-def pressure_messages(pressure, store):
-    """Yield (stamp ns, sensor_msgs/FluidPressure)."""
-    Message = store.types["sensor_msgs/msg/FluidPressure"]
-    for stamp, value in zip(nanoseconds("pressure", pressure.t).tolist(), pressure.pressure.tolist()):
-        yield stamp, Message(_header(store, stamp, BODY_FRAME), value, 0.0)
-
-
-def pressure_row(message):
-    return stamp_of(message.header), message.fluid_pressure
-
-
-def pressure_of(stamps, rows):
-    return Pressure(stamps, rows[:, 0])
-
-
-def velocity_messages(velocity, store):
-    """Yield (stamp ns, geometry_msgs/TwistWithCovarianceStamped); rates are not measured."""
-    types = store.types
-    Message, Vector3 = types["geometry_msgs/msg/TwistWithCovarianceStamped"], types["geometry_msgs/msg/Vector3"]
-    Twist, Stamped = types["geometry_msgs/msg/Twist"], types["geometry_msgs/msg/TwistWithCovariance"]
-    variance = np.full((len(velocity), 6), UNKNOWN_VARIANCE)
-    variance[:, :3] = np.minimum(velocity.std**2, UNKNOWN_VARIANCE)
-    for stamp, v, row in zip(nanoseconds("velocity", velocity.t).tolist(), velocity.v.tolist(), variance):
-        twist = Twist(Vector3(*v), Vector3(0.0, 0.0, 0.0))
-        yield stamp, Message(_header(store, stamp, BODY_FRAME), Stamped(twist, np.diag(row).ravel()))
-
-
-def velocity_row(message):
-    v, variance = message.twist.twist.linear, message.twist.covariance[[0, 7, 14]].tolist()
-    std = [math.sqrt(value) if 0.0 <= value < UNKNOWN_VARIANCE else math.inf for value in variance]
-    return stamp_of(message.header), v.x, v.y, v.z, *std
-
-
-def velocity_sound(rows):
-    unknown = np.isinf(rows[:, 3:6])
-    return np.hstack([sound(rows[:, 0:3]) | unknown, np.ones(unknown.shape, dtype=bool)])
-
-
-def velocity_of(stamps, rows):
-    return Velocity(stamps, rows[:, 0:3], rows[:, 3:6])
+def _numbers(value):
+    return _point(value) if hasattr(value, "x") else np.ravel(value).tolist()
 
 
 def tdoa_messages(tdoa, store, antenna=None):

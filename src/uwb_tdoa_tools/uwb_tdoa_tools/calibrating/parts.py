@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import Flight
+from uwb_tdoa_bias.foundation.flight import AIDS, Flight
 
-STREAMS = "tdoa", "imu", "truth", "height", "pressure", "velocity"
+STREAMS = "tdoa", "imu", "truth", *AIDS
 
 
 def between(flight: Flight, first: float, last: float) -> Flight:

@@ -4,11 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, most_severe_first
 
 from ..readers.streams import protocol
 from . import coverage, imu_rules, labels, tdoa_rules, wiring
 from .case import Case
+from .sensor_rules import sensors
 from .survey_fit import displacement
 from .tdoa_rules import SAME, furthest
 
@@ -58,9 +60,11 @@ class Report:
 def check(recording, others=()):
     """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one."""
     streams = fed(recording)
-    found = streams.findings()
+    found = [*(streams.findings() if len(recording.tdoa) else ()), *sensors(recording)]
     for rule in (*labels.RULES, *wiring.RULES):
         found += rule(recording)
+    if not len(recording.tdoa):  # of ranges alone: nothing else is there to be tried
+        return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)
     names = {finding.rule for finding in found}
     places, explained = np.empty((0, 3)), set()
     if names & HOPELESS:
@@ -159,6 +163,9 @@ def _facts(recording, streams):
         if windows:
             step = float(np.median([window.stamps.step for window in windows]))
             facts[name] = f"{1.0 / step:.0f} {unit}" if step > 0.0 else "no rate"
+    for name, stream in recording.felt.items():
+        step = float(np.median(np.diff(stream.t))) if len(stream) > 1 else 0.0
+        facts[name] = f"{SENSORS[name].plural} {1.0 / step:.0f} Hz" if step > 0.0 else f"{SENSORS[name].plural}, no rate"
     if streams.tdoa:
         windows = list(streams.tdoa)
         facts["duration"] = f"{windows[-1].stamps.end - windows[0].stamps.begin:.1f} s"

@@ -6,6 +6,7 @@ import sys
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .. import cli
 from ..bags.bag import check_output, write_bag
@@ -78,9 +79,9 @@ def parser():
     imu.add_argument("--vibration", metavar="M/S2", type=float, default=0.0, help="noise of motors (default: 0)")
 
     add = made.add_argument_group("what else the vehicle feels, with white noise of this standard deviation").add_argument
-    add("--height-noise", metavar="M", type=float, help="write ranges to the floor, along the body's -z")
-    add("--pressure-noise", metavar="M", type=float, help="write pressures; in metres of altitude")
-    add("--velocity-noise", metavar="M/S", type=float, help="write velocities in the body frame")
+    for name, sensor in SENSORS.items():
+        unit, words = sensor.noise
+        add(f"--{name}-noise", metavar=unit, type=float, help=words)
     return made
 
 

@@ -42,8 +42,7 @@ class OurFilter:
             self._estimator.add_tdoa(t, a, b, known.corrected, known.std**2 + tdoa.variance, known.slope, known.state)
         for stream, part in measured.aids.items():
             if len(part.t):
-                columns = (part.t - self._offset(stream), *list(vars(part).values())[1:])
-                getattr(self._estimator, f"add_{stream}")(*(columns if self._of_aids.idle else self._of_aids.correct(stream, *columns)))
+                self._estimator.add(stream, self._of_aids.correct(stream, part))
         odometry, _ = self._estimator.advance()
         if len(odometry):
             self._parts.append(odometry)

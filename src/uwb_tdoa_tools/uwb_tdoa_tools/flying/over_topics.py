@@ -3,48 +3,38 @@
 import math
 from types import SimpleNamespace
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistWithCovariance, TwistWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 import numpy as np
 from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import FluidPressure, Imu, Range
+from sensor_msgs.msg import Imu
 from uwb_tdoa_bias.anchors_node import markers, transforms
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS
 from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
-from uwb_tdoa_bias.foundation.ros_wire import Wire
+from uwb_tdoa_bias.foundation.ros_wire import Wire, message_class
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.estimator import Odometry
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
-from ..bags.messages import BODY_FRAME, FIELD_OF_VIEW, LONGEST_RANGE, UNKNOWN_VARIANCE
+from ..bags.messages import BODY_FRAME
 from .estimates import NOTHING
-from .sensors import VELOCITY_STD
 from .vehicle import ATTITUDE, POSITION
 
 FARTHEST, FASTEST = 1e3, 100.0  # m, m/s; what is beyond is no odometry of a hall
 CLOSEST = 0.5e-3  # s between odometries that are kept: anybody may publish one for each nanosecond
 LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
 MARKER_SIZE = 0.12  # m
-VARIANCES = [VELOCITY_STD**2] * 3 + [UNKNOWN_VARIANCE] * 3  # of a velocity and a rate
-STREAMS = {  # {stream: (topic, message, {field: column of its part})}
-    "imu": ("imu/data", Imu(), {"angular_velocity": "gyro", "linear_acceleration": "accel"}),
-    "tdoa": ("uwb/tdoa", Tdoa(), {"anchor_a": "a", "anchor_b": "b", "distance_difference": "d", "variance": "variance"}),
-    "height": (
-        "height",
-        Range(radiation_type=Range.INFRARED, field_of_view=FIELD_OF_VIEW, min_range=0.0, max_range=LONGEST_RANGE),
-        {"range": "range"},
+STREAMS = {  # {stream: (topic, class of its messages, {field: values} of its part)}
+    "imu": ("imu/data", Imu, lambda imu: {"angular_velocity": imu.gyro, "linear_acceleration": imu.accel}),
+    "tdoa": (
+        "uwb/tdoa", Tdoa, lambda of: {"anchor_a": of.a, "anchor_b": of.b, "distance_difference": of.d, "variance": of.variance}
     ),
-    "pressure": ("pressure", FluidPressure(), {"fluid_pressure": "pressure"}),
-    "velocity": (
-        "velocity",
-        TwistWithCovarianceStamped(twist=TwistWithCovariance(covariance=np.diag(VARIANCES).ravel())),
-        {"twist.twist.linear": "v"},
-    ),
-    "truth": ("ground_truth/pose", PoseStamped(), {"pose": "pose"}),
-}
+    "truth": ("ground_truth/pose", PoseStamped, lambda truth: {"pose": truth.pose}),
+} | {name: (of.topics[0][0], message_class(of.message), of.content) for name, of in SENSORS.items()}  # fmt: skip
 
 
 class OverTopics:
@@ -179,13 +169,11 @@ class OverTopics:
 
 
 class _Output:
-    """A stream of which only some fields differ from one message to the next. subscribers : how many hear it."""
+    """A stream of which only some fields are not 0. subscribers : how many hear it."""
 
-    def __init__(self, node, topic, message, columns, frame=BODY_FRAME):
-        message.header.frame_id = frame
-        self._columns, self._wire = columns, Wire(type(message), *columns)
-        self._frame, self._template = frame, self._wire.template(message)
-        self._output = StreamOutput(node, type(message), topic)
+    def __init__(self, node, topic, kind, content, frame=BODY_FRAME):
+        self._content, self._kind, self._frame, self._template = content, kind, frame, None
+        self._output = StreamOutput(node, kind, topic)
 
     @property
     def subscribers(self):
@@ -193,8 +181,13 @@ class _Output:
 
     def publish(self, seconds, nanoseconds, part):
         """Publish the rows of a part of a stream, with stamps of these seconds and nanoseconds (n,) each."""
+        content = self._content(part)
+        if self._template is None:
+            blank = self._kind()
+            blank.header.frame_id = self._frame
+            self._template = Wire(self._kind, *content).template(blank)
         rows = self._template.rows(len(seconds))
         rows["sec"], rows["nanosec"] = seconds, nanoseconds
-        for field, name in self._columns.items():
-            rows[field] = getattr(part, name)
+        for field, values in content.items():
+            rows[field] = values
         self._output.publish(self._frame, self._template, rows)

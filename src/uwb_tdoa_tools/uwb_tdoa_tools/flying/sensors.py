@@ -7,10 +7,11 @@ from scipy.signal import butter, lfilter
 
 from uwb_tdoa_bias.effects import EFFECTS, Samples
 from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.pressure import pressure_at
 from uwb_tdoa_bias.foundation.radio import arrival_bias
+from uwb_tdoa_bias.foundation.sensors.pressure import SITE, pressure_at
+from uwb_tdoa_bias.foundation.sensors.sensor import RATE
+from uwb_tdoa_bias.foundation.sensors.velocity import LEAST_STD
 
-from ..simulation.aids import LEAST_STD, RATE, SITE
 from ..simulation.ranging import outliers, tag_link, tdoa_noise
 from ..simulation.schedule import make_schedule
 from .loop import IMU_RATE

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth, Velocity
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .loop import IMU_RATE, interval, poses_at
 from .sensors import AIDS, Inertial, Radio, gusts, random
@@ -18,12 +19,11 @@ WEIGHED = 0.05  # largest relative error of the mass that its controller believe
 TABLE_RADIUS = 0.4  # m
 LIFTED = 0.5  # m, by which hands lift it
 RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects see
-STREAMS = {"height": Height, "pressure": Pressure, "velocity": Velocity}
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What came in one turn. imu : Imu; tdoa : Tdoas; aids : {stream: Height, Pressure or Velocity}, of those that the world has."""
+    """What came in one turn. imu : Imu; tdoa : Tdoas; aids : {name: Stream}, of those that the world has."""
 
     imu: Imu
     tdoa: Tdoas
@@ -127,7 +127,7 @@ class Simulator:
         new, p, q = self._poses(name, sensor.t, lately)
         v = np.broadcast_to(self.state[VELOCITY], p.shape)
         inside = Rotation.from_quat(q).inv().apply(v) if len(q) else v
-        return STREAMS[name](sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground))
+        return SENSORS[name].stream(sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground))
 
     def _disturbed(self, measured):
         """Measured, with the world's effects in it, put there as `inject` does."""

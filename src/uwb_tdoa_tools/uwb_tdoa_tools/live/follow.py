@@ -18,7 +18,7 @@ STEP = 80_000_000  # ns: a TDOA that is older than the newest by more has come o
 START_STEP, START = 40_000_000, 1_000_000_000
 # ns: the same for so long after the first pose: less than bias_node's `pose_lag`. Before it knows of a pose it passes TDOAs on.
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
-AID_SILENT = 1_000_000_000  # ns after which ekf_node does without heights, pressures and velocities: its SILENT
+AID_SILENT = 1_000_000_000  # ns after which ekf_node does without one of the SENSORS: its SILENT
 AID_SHARE = 0.5  # of its `lag`, for which it waits for them, and all TDOAs with it: its OF_AIDS
 LAG = 0.25  # s, its `lag` if nothing else is known
 SILENCE = 5.0  # s after which a topic is not waited for any more, until it speaks again
@@ -52,7 +52,7 @@ class Follower:
         self._tdoas.note(stamp)
 
     def note_aid(self, topic, stamp):
-        """A height, pressure or velocity with this stamp, ns, has been played, for the filter."""
+        """What one of the SENSORS measured, with this stamp, ns, has been played, for the filter."""
         self._tdoas.note_aid(topic, stamp)
 
     def wait(self, stamp, stop):

@@ -6,6 +6,7 @@ import rclpy
 from rclpy.parameter_client import AsyncParameterClient
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .follow import AID_SHARE, LAG, STEP
 from .processes import Diagnostics
@@ -18,8 +19,7 @@ PATIENCE = {"bias_node": "hold", "ekf_node": "lag"}  # parameters, s of stamps
 TROUBLE = {  # {node: {key in its diagnostics: words}}
     "bias_node": {"released before their pose": "TDOAs corrected before their pose was there"},
     "ekf_node": {
-        "late": "TDOAs late", "imu_late": "IMU samples late", "height_late": "heights late",
-        "pressure_late": "pressures late", "velocity_late": "velocities late",
+        "late": "TDOAs late", "imu_late": "IMU samples late", **{f"{name}_late": f"{of.plural} late" for name, of in SENSORS.items()},
     },
 }  # fmt: skip
 RECEIVED = {  # {node: {key in its diagnostics: what it counts}}

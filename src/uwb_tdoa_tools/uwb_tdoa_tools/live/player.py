@@ -10,6 +10,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .follow import is_stamped, stamp_of
 
@@ -46,8 +47,8 @@ def is_tdoa(publisher):
 
 
 def is_aid(publisher):
-    """Whether it publishes heights, pressures or velocities for ekf_node."""
-    return publisher.topic_name.endswith(("/height", "/pressure", "/velocity", "/velocity/odometry"))
+    """Whether it publishes what one of the SENSORS measures, for ekf_node."""
+    return publisher.topic_name.endswith(tuple(f"/{topic}" for sensor in SENSORS.values() for topic, _ in sensor.topics))
 
 
 class Player:

@@ -5,6 +5,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.estimator import VERDICTS
 
 from ..bags.files import open_bag
@@ -25,8 +26,8 @@ PATIENCE = {"bias_node": {"hold": 9.975}, "ekf_node": {"lag": 10.0}}  # s of sta
 RELIABLE = {
     "bias_node": ("/uwb/tdoa.subscription", "/odometry.subscription", "/uwb/tdoa_corrected.publisher"),
     "ekf_node": (
-        "/imu/data.subscription", "/uwb/tdoa_corrected.subscription", "/height.subscription", "/pressure.subscription",
-        "/velocity.subscription", "/odometry.publisher",
+        "/imu/data.subscription", "/uwb/tdoa_corrected.subscription", *(f"/{of.topics[0][0]}.subscription" for of in SENSORS.values()),
+        "/odometry.publisher",
     ),
 }  # fmt: skip
 DEPTH = 1_000_000  # messages that may wait in a subscription

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import Velocity
+from uwb_tdoa_bias.foundation.sensors import Velocity
 
 COUNTS = 4.7  # of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, told in tenths: 4.2 to 4.9
 READING_TIME = 0.01  # s that one reading counts over

@@ -3,14 +3,15 @@
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight, Height, Imu, Pressure, Tdoas, Truth
-from uwb_tdoa_bias.foundation.pressure import pressure_at
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.sensors import Height, Pressure
+from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
+from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
 from .optical_flow import velocity_of
 
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
-LARGEST_NUMBER = 1e30  # of anything, in whatever unit: what is computed of it stays finite
 LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
 SALVAGE = "read what is sound of it with --salvage"
 DAY = 86400.0  # s
@@ -69,7 +70,7 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False, truth=True):
         velocity = velocity if len(velocity.t) else None
     if not meta["remarks"]:
         del meta["remarks"]
-    return Flight(name, anchors, tdoas, imu, poses, extra, meta, height, pressure, velocity)
+    return Flight(name, anchors, tdoas, imu, poses, extra, meta, height=height, pressure=pressure, velocity=velocity)
 
 
 def _sound(key, columns, meta, salvage):

@@ -1,11 +1,12 @@
 """What a simulated flight is: one frozen dataclass."""
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, make_dataclass, replace
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .constellations import constellation
 from .imu import ImuErrors
@@ -16,8 +17,12 @@ from .trajectories import TRAJECTORIES
 YAW_PROFILES = ("fixed", "along_track", "rotating")
 
 
+NOISES = tuple(f"{name}_noise" for name in SENSORS)
+_Noises = make_dataclass("_Noises", [(name, float | None, None) for name in NOISES], frozen=True)
+
+
 @dataclass(frozen=True)
-class SimulationConfig:
+class SimulationConfig(_Noises):
     """One simulated flight. The same config gives the same flight, bit for bit; every part draws from its own stream,
     so that switching one error off leaves the others as they were. Raises InputError for what cannot be simulated.
 
@@ -60,11 +65,9 @@ class SimulationConfig:
     multipath : late arrivals near the floor (default True)
     outlier_probability : share of TDOAs that are outliers, 0 for none (default 0.01)
 
-    What else the vehicle feels, at 25 Hz each
-    ------------------------------------------
-    height_noise : standard deviation of a range finder along the body's -z, m (default None: there is none)
-    pressure_noise : standard deviation of a barometer, m of altitude (default None: there is none)
-    velocity_noise : standard deviation of each component of a velocity in the body frame, m/s (default None: there is none)
+    What else the vehicle feels
+    ---------------------------
+    <name>_noise : of each of SENSORS, standard deviation in its unit (default None: there is none)
     """
 
     seed: int = 0
@@ -94,9 +97,6 @@ class SimulationConfig:
     tag_lever_arm: tuple = (0.0, 0.0, 0.0)
     multipath: bool = True
     outlier_probability: float = 0.01
-    height_noise: float | None = None
-    pressure_noise: float | None = None
-    velocity_noise: float | None = None
 
     def __post_init__(self):
         for name, choices in (("trajectory", TRAJECTORIES), ("yaw", YAW_PROFILES), ("protocol", PROTOCOLS)):
@@ -119,9 +119,7 @@ class SimulationConfig:
             ("noise_std", 0.0, 100.0),
             ("anchor_delay_std", 0.0, 100.0),
             ("outlier_probability", 0.0, 1.0),
-            ("height_noise", 0.0, 100.0),
-            ("pressure_noise", 0.0, 100.0),
-            ("velocity_noise", 0.0, 100.0),
+            *((noise, 0.0, 100.0) for noise in NOISES),
         ):
             value = getattr(self, name)
             if value is not None and not lowest <= value <= highest:

@@ -1,14 +1,14 @@
 """Kinds of measurement: each with its residual, its rows in a fit, and what it may depend on. One channel, one file."""
 
+from uwb_tdoa_bias.foundation.sensors import DIAGNOSED
+
 from .accel import Accel
+from .aid import Aid
 from .base import Channel, ChannelResidual, Comparison, Rows
 from .gyro import Gyro
-from .height import Height
-from .pressure import Pressure
 from .tdoa import Tdoa
-from .velocity import Velocity
 
-CHANNELS = {channel.name: channel for channel in (Tdoa(), Gyro(), Accel(), Height(), Pressure(), Velocity())}
+CHANNELS = {channel.name: channel for channel in (Tdoa(), Gyro(), Accel(), *map(Aid, DIAGNOSED))}
 
 __all__ = ["CHANNELS", "Channel", "ChannelResidual", "Comparison", "Rows", "residuals"]
 

@@ -1,13 +1,12 @@
-"""What heights, pressures and velocities share: residuals of their medians over cells."""
+"""What the SENSORS beside inertia and TDOAs say: residuals of their medians over cells."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
 from uwb_tdoa_bias.effects import AidSamples, SmoothTerm, aid_samples
-from uwb_tdoa_bias.effects.aid_error import values_of
 from uwb_tdoa_bias.effects.covariates import OF_IMU, sensor_covariate
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .base import Channel, ChannelResidual, Rows
 from .figures import figures
@@ -55,12 +54,11 @@ class AidResidual(ChannelResidual):
 
 
 class Aid(Channel):
-    """A channel of a stream of the same name that a flight may have."""
+    """The channel of one of the SENSORS, with what its Compared says as attributes."""
 
-    axes: ClassVar[tuple] = ("",)  # what is added to its name in labels
-    floating: ClassVar[bool] = False
-    of_attitude: ClassVar[bool] = True
-    positions: ClassVar[tuple] = (2,)  # coordinates that the reference must know
+    def __init__(self, name):
+        self.name = name
+        vars(self).update(vars(SENSORS[name].compared))
 
     @property
     def labels(self):
@@ -113,8 +111,8 @@ class Aid(Channel):
 
     def _values(self, part):
         """(n, k) of a stream, NaN for what was not measured."""
-        values = values_of(part)
-        return np.where(np.isfinite(values), values, np.nan)
+        values, std = part.values, getattr(part, "std", 0.0)
+        return np.where(np.isfinite(values) & np.isfinite(std), values, np.nan)
 
 
 def _median(values):

@@ -1,0 +1,68 @@
+"""Every sensor of the registry keeps what its record promises; what each says in particular is in tests of its own."""
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas
+from uwb_tdoa_bias.foundation.sensors import DIAGNOSED, LOCATING, SENSORS, Height, Velocity
+from uwb_tdoa_bias.foundation.sensors.sensor import Stream
+
+N = 5
+T = np.arange(N) / 25.0
+STREAMS = {  # measurements that are possible
+    "height": Height(T, np.linspace(0.5, 2.0, N)),
+    "pressure": SENSORS["pressure"].stream(T, np.linspace(98e3, 99e3, N)),
+    "velocity": Velocity(T, np.ones((N, 3)), np.full((N, 3), 0.5)),
+}
+
+
+def of_message(sensor, stream):
+    """{field: values} that are read of the messages that are written for a stream: what is not written is 0."""
+    content = sensor.content(stream)
+    return {name: np.broadcast_to(content.get(name, 0.0), (N, k) if k > 1 else (N,)) for name, k in sensor.fields.items()}
+
+
+def test_a_flight_has_a_stream_of_each():
+    flight = Flight("f", None, Tdoas(T, T, T, T), **STREAMS)
+    assert AIDS == tuple(SENSORS) == tuple(STREAMS)
+    assert all(getattr(flight, name) is stream and getattr(flight.without(name), name) is None for name, stream in STREAMS.items())
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_what_is_written_is_read(name):
+    sensor, stream = SENSORS[name], STREAMS[name]
+    assert sensor.name == name and isinstance(stream, sensor.stream) and issubclass(sensor.stream, Stream)
+    fields = of_message(sensor, stream)
+    for one, other in zip(sensor.read(T, fields).columns, stream.columns):
+        np.testing.assert_array_equal(one, other)
+    table = np.column_stack(list(fields.values()))  # as a table of a bag holds them
+    for one, other in zip(sensor.read(T, sensor.split(table)).columns, stream.columns):
+        np.testing.assert_array_equal(one, other)
+    assert all(values.all() for values in sensor.sound(fields).values())
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_values_that_effects_change(name):
+    stream = STREAMS[name]
+    assert stream.values.shape in ((N, 1), (N, 3)) and len(stream) == N
+    np.testing.assert_allclose(stream.with_values(stream.values + 0.1).values, stream.values + 0.1)
+    assert stream.sensed(stream.values).t is stream.t
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_what_the_filter_gets(name):
+    rows, usable = SENSORS[name].measured(STREAMS[name])
+    assert usable.all() and rows.keys() <= {"value", "std", "anchor"} and np.isfinite(rows["value"]).all()
+    if name != "velocity":  # NaN is no measurement, wherever it stands
+        *_, broken = SENSORS[name].measured(STREAMS[name].with_values(np.full((N, 1), np.nan)))
+        assert not broken.any()
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_its_parameters_begin_with_the_switch(name):
+    first, *_ = SENSORS[name].parameters.values()
+    assert next(iter(SENSORS[name].parameters)) == f"use_{name}" and first.default is True and first.metadata["fixed"]
+
+
+def test_registries_of_a_part():
+    assert LOCATING == () and set(DIAGNOSED) == {"height", "pressure", "velocity"}

@@ -1,0 +1,12 @@
+"""What the SENSORS of a recording got wrong, by their own rules."""
+
+from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_ekf.streams import ERROR, Finding
+
+
+def sensors(recording):
+    """Findings about the Streams of a Recording."""
+    for name, stream in recording.felt.items():
+        for rule in SENSORS[name].rules:
+            if (found := rule(stream, recording.anchors)) is not None:
+                yield Finding(found.rule, ERROR, found.cause, found.evidence, found.remedy, found.value)
