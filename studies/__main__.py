@@ -5,7 +5,7 @@ import sys
 
 from uwb_tdoa_tools import cli
 
-from studies import aids, calibrating, crazyflie, localizing, noise, recalibrating, scale, situations, surveying
+from studies import aids, calibrating, crazyflie, localizing, noise, ranges, recalibrating, scale, situations, surveying
 from studies.checking import figures as checking
 from studies.checking import in_flight
 from studies.closed_loop import experiment
@@ -28,6 +28,7 @@ STUDIES = {
     "localizing": localizing,
     "noise": noise,
     "random-splits": splits,
+    "ranges": ranges,
     "recalibrating": recalibrating,
     "scale": scale,
     "situations": situations,
@@ -51,6 +52,7 @@ of measured flights: flights/, util/, surveys/.
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
+  ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
   scale            processor time and memory over flights, anchors and effects (docs/speed.md)
   situations       where a tag can be and what can happen to it, simulated (docs/reliability.md)
@@ -86,6 +88,7 @@ def parser():
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
         "./dev study noise --data DATA --split const1",
         "./dev study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
+        "./dev study ranges --flights 5",
         "./dev study recalibrating --data DATA --only const1",
         "./dev study scale --out scale/",
         "./dev study situations --resume situations.jsonl",

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas
-from uwb_tdoa_bias.foundation.sensors import DIAGNOSED, LOCATING, SENSORS, Height, Velocity
+from uwb_tdoa_bias.foundation.sensors import DIAGNOSED, LOCATING, SENSORS, Height, Ranges, Velocity
 from uwb_tdoa_bias.foundation.sensors.sensor import Stream
 
 N = 5
@@ -13,6 +14,7 @@ STREAMS = {  # measurements that are possible
     "height": Height(T, np.linspace(0.5, 2.0, N)),
     "pressure": SENSORS["pressure"].stream(T, np.linspace(98e3, 99e3, N)),
     "velocity": Velocity(T, np.ones((N, 3)), np.full((N, 3), 0.5)),
+    "range": Ranges(T, np.array([7, 2, 7, 2, 7]), np.linspace(1.0, 4.0, N), np.full(N, 0.01)),
 }
 
 
@@ -65,4 +67,27 @@ def test_its_parameters_begin_with_the_switch(name):
 
 
 def test_registries_of_a_part():
-    assert LOCATING == () and set(DIAGNOSED) == {"height", "pressure", "velocity"}
+    assert LOCATING == ("range",) and set(DIAGNOSED) == {"height", "pressure", "velocity"}
+
+
+# --- two-way ranging ---
+
+
+@pytest.mark.parametrize("d, variance, usable", [(0.0, 0.0, True), (-0.1, 0.0, False), (1e4, 0.0, False), (1.0, -1.0, False), (1.0, np.inf, False)])
+def test_which_ranges_are_measurements(d, variance, usable):
+    one = Ranges(np.zeros(1), np.zeros(1, int), np.array([d]), np.array([variance]))
+    assert SENSORS["range"].measured(one)[1].tolist() == [usable]
+
+
+def found(ranges):
+    anchors = Anchors([2, 7], [[0.0, 0.0, 0.0], [6.0, 8.0, 0.0]], [[np.nan] * 4] * 2)
+    return [mistake.rule for rule in SENSORS["range"].rules if (mistake := rule(ranges, anchors))]
+
+
+def test_rules_name_what_is_wrong_with_ranges_and_nothing_else():
+    sound = STREAMS["range"]
+    assert found(sound) == []
+    assert found(Ranges(T, np.array([7, 2, 7, 3, 7]), sound.d, sound.variance)) == ["range_unknown"]
+    assert found(sound.with_values(1000.0 * sound.values)) == ["range_unit", "range_invalid"]
+    assert found(sound.with_values(sound.values / 299792458.0)) == ["range_unit"]
+    assert found(sound.with_values(-sound.values)) == ["range_unit", "range_invalid"]

@@ -4,12 +4,14 @@ from dataclasses import replace
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
 
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
+from uwb_tdoa_ekf.core.verdicts import USED  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
@@ -66,6 +68,17 @@ def assert_equal_to_offline(flight, told, recorded):
     assert live.row()["rmse_3d"] == pytest.approx(offline.row()["rmse_3d"], abs=1e-3)
     assert told["bias_node"]["released before their pose"] == told["ekf_node"]["late"] == "0"
     assert told["ekf_node"]["TDOAs received"] == str(len(flight.tdoa))
+
+
+@pytest.mark.slow
+def test_ranges_beside_tdoas_are_played_and_used_as_off_line(tmp_path):
+    write_bag(simulate(SimulationConfig(seed=4, duration=12.0, range_noise=0.1)), tmp_path / "flight.bag")
+    flight = read_bag(tmp_path / "flight.bag")
+    _, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path)
+    assert_equal_to_offline(flight, told, recorded)
+    _, run = evaluate(flight, network=load_network(SHIPPED))
+    assert told["ekf_node"]["range_received"] == str(len(flight.range)) and told["ekf_node"]["range_late"] == "0", said
+    assert abs(int(told["ekf_node"]["range_used"]) - np.sum(run.aids["range"]["verdict"] == USED)) <= 2
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.noise import RadioNoise
-from uwb_tdoa_tools.planning.pairing import PAIRINGS, Pairing, all_pairs, common_reference, ring
+from uwb_tdoa_tools.planning.pairing import PAIRINGS, Pairing, all_pairs, common_reference, every_range, ring
 from uwb_tdoa_tools.planning.precision import NORMAL_99, bound, dilution, ellipses, information, position_error
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation.constellations import constellation, corners, facing
@@ -63,6 +63,8 @@ CASES = {
     "ring, uncorrelated": (lambda n: ring(n, shared=False), 0.0),
     "common reference": (common_reference, 0.0),
     "all pairs": (all_pairs, 0.0),
+    "ranges": (every_range, 0.0),
+    "ranges with link noise": (every_range, 0.2),
 }
 
 

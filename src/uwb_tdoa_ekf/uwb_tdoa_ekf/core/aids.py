@@ -6,7 +6,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from . import barometer, height, velocity
 
 STREAMS = tuple(SENSORS)  # by kind
-HEIGHT, PRESSURE, VELOCITY = map(STREAMS.index, ("height", "pressure", "velocity"))
+HEIGHT, PRESSURE, VELOCITY, RANGE = map(STREAMS.index, ("height", "pressure", "velocity", "range"))
 
 
 @compiled

@@ -8,7 +8,7 @@ from uwb_tdoa_bias.effects.slope import N_STATES
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
-from . import aids, barometer, curvature, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, rest, robust, systematic, workspace
+from . import aids, barometer, curvature, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, ranges, rest, robust, systematic, workspace
 from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, Output
 from .sensor_functions import take_out
 from .startup import INLIER
@@ -25,7 +25,7 @@ STRAIGHT = 1.0  # m or m/s of the state, within which the slope of a bias tells 
 
 RECORDS_OF_TDOA = 1 + 3 + 1 + 6 + 1 + 1  # in a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, a start or a recovery
 RECORDS_OF_REST = 3  # one per axis
-RECORDS_OF_AID = 3  # one per component of a velocity
+RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per component
 
 
 @compiled
@@ -53,7 +53,7 @@ def run(memory, tuning, measurements, output):
             _on_tdoa(ekf, anchors, parameters, tdoa[k], output.residuals[k], output.history)
             k += 1
         else:
-            _on_aid(ekf, parameters, aid[m], output.aids[m], output.history)
+            _on_aid(ekf, anchors, parameters, aid[m], output.aids[m], output.history)
             m += 1
         if ekf.running and t >= ekf.next_odometry:
             ekf.next_odometry = (math.floor(t * parameters.odometry_rate + 1e-6) + 1.0) / parameters.odometry_rate
@@ -130,6 +130,33 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
 
 
 @compiled
+def _on_range(ekf, anchors, tuning, aid, residual, records):
+    """The distance to an anchor, one of AID; as a TDOA with the one before it tells the start."""
+    if ranges.is_repeat(ekf, aid):
+        residual.verdict = REPEATED
+        return
+    if ranges.pair(ekf, aid):
+        initialization.remember(ekf, ekf.paired[0], anchors)
+    t, was_running = aid.t, ekf.running
+    if not was_running or not _advance(ekf, tuning, t, records):
+        if not was_running:
+            _wait_for_start(ekf, anchors, tuning, t, records)
+        return
+    _look_for_rest(ekf, anchors, tuning, t, records)
+    anchor, innovation = anchors[aid.anchor], ekf.innovation
+    for h in range(HYPOTHESES):
+        hypothesis = ekf.hypotheses[h]
+        if not hypotheses.alive(hypothesis):
+            continue
+        ranges.compare(hypothesis, anchor.position, aid, tuning, innovation)
+        innovation.repeated, innovation.curvature = rest.repetition(ekf, t), 0.0
+        _assimilate(ekf, h, tuning, t, residual, records)
+        if h == ekf.best:
+            systematic.observe(ekf.information, anchor, anchor, innovation, t, ekf.last_tdoa)
+    _settle(ekf, anchors, tuning, t, True, abs(residual.innovation) < INLIER, records)
+
+
+@compiled
 def _look_for_rest(ekf, anchors, tuning, t, records):
     """Before an update stamped t, s: whether the tag is at rest."""
     if tuning.zero_velocity:
@@ -161,10 +188,12 @@ def _settle(ekf, anchors, tuning, t, counts, agrees, records):
 
 
 @compiled
-def _on_aid(ekf, tuning, aid, residual, records):
+def _on_aid(ekf, anchors, tuning, aid, residual, records):
     residual.innovation = residual.variance = np.nan
     residual.weight, residual.verdict = 0.0, STARTUP
-    if ekf.running and _advance(ekf, tuning, aid.t, records):
+    if aid.kind == aids.RANGE:
+        _on_range(ekf, anchors, tuning, aid, residual, records)
+    elif ekf.running and _advance(ekf, tuning, aid.t, records):
         aids.observe(ekf, tuning, aid, residual, records)
     else:
         aids.note(ekf, aid)

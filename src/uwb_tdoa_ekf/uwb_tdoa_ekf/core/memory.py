@@ -129,6 +129,7 @@ EKF = _record(
     ("height", HEIGHT),
     ("barometer", BAROMETER),
     ("velocity", VELOCITY),
+    ("ranged", AID, 1),  # the last distance to an anchor
     ("next_floor", float),  # s, stamp before which not to say again that the tag is at its fixed height
     ("plausibility", PLAUSIBILITY),  # of the inertial samples,
     ("distrusted", bool),  # which are not used, because they cannot be right
@@ -160,6 +161,7 @@ EKF = _record(
     # Scratch: nothing below outlives an event.
     ("transition", TRANSITION),
     ("innovation", INNOVATION),
+    ("paired", TDOA, 1),
     ("pairs", PAIR, MOST_PAIRS),
     ("still_covariance", float, (3, 3)),
 )
@@ -222,7 +224,7 @@ def new_memory(positions, functions=(), floor=None):
     ekf.imu.t = ekf.plausibility.contradicted = -np.inf
     for stamp in ("heard", "changed", "used", "judged", "pulls_since", "ignored_until"):
         ekf.height[stamp] = -np.inf
-    ekf.barometer.heard = ekf.barometer.agreed = ekf.velocity.heard = ekf.next_floor = -np.inf
+    ekf.barometer.heard = ekf.barometer.agreed = ekf.velocity.heard = ekf.ranged["t"][0] = ekf.next_floor = -np.inf
     for name in ("accel", "slow_accel", "mean_accel"):
         ekf.imu[name][2] = GRAVITY
     ekf.hypotheses["log_weight"][1:] = -np.inf

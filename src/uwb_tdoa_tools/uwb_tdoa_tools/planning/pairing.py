@@ -14,15 +14,17 @@ class Pairing:
     a, b : (M,) rows of the anchors, d_ab = |p - b| - |p - a|
     shared : the TDOAs of a round use one reception per anchor, whose error they share; otherwise every TDOA has its own
     times : how often each TDOA comes in a round (default 1)
+    ranges : not differences but the distances to the anchors of `a` themselves, each measured once a round
     """
 
     a: np.ndarray
     b: np.ndarray
     shared: bool
     times: float = 1.0
+    ranges: bool = False
 
     def incidence(self):
-        """(M, N) matrix of -1 at a and +1 at b."""
+        """(M, N) matrix of -1 at a and +1 at b; of ranges the identity."""
         rows = np.arange(len(self.a))
         matrix = np.zeros((len(rows), 1 + max(self.a.max(), self.b.max())))
         matrix[rows, self.a], matrix[rows, self.b] = -1.0, 1.0
@@ -35,6 +37,8 @@ class Pairing:
         anchor's reception of the other anchor's packet, which the tag's TDOA also contains). Source: eqs. 4 and 5 of
         Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference."""
         own = link_std**2 * np.eye(len(self.a))
+        if self.ranges:
+            return variance[:, self.a, None] * np.eye(len(self.a)) + own
         if self.shared:
             d = self.incidence()
             return (d * variance[:, None, :]) @ d.T + own
@@ -55,6 +59,11 @@ def all_pairs(n):
     """TDOA3: any anchor with any other, each TDOA with an error of its own; weighted to N TDOAs a round."""
     a, b = np.triu_indices(n, 1)
     return Pairing(a, b, False, 2.0 / (n - 1))
+
+
+def every_range(n):
+    """Two-way ranging: the distance to every anchor; N ranges."""
+    return Pairing(np.arange(n), np.arange(n), False, ranges=True)
 
 
 PAIRINGS = {

@@ -48,6 +48,8 @@ def weigh(ranges, variance, pairing, link_std=0.0):
     matrix: W - w w' / sum(w) with W = S^-1, that of N ranges with one unknown offset, the tag's clock. A closed ring,
     whose covariance D S D' is singular, holds the same and nothing more."""
     own = link_std**2
+    if pairing.ranges:
+        return _product(ranges, ranges / (variance + own)[..., None])
     if not pairing.shared:
         v = ranges[:, pairing.b] - ranges[:, pairing.a]
         weight = pairing.times / (variance[:, pairing.a] + variance[:, pairing.b] + own)
@@ -65,6 +67,9 @@ def _from_sizes(gradient, variance, installation):
     With F = D S D' + own, dF_i = D diag(g_i) D' and P = D' F^-1 D, half the trace is g_i' (P o P) g_j / 2.
     """
     pairing, own = installation.pairing, installation.link_std**2
+    if pairing.ranges:
+        g = gradient / (variance + own)[..., None]
+        return 0.5 * _product(g, g)
     if not pairing.shared:
         weight = 1.0 / (variance[:, pairing.a] + variance[:, pairing.b] + own)
         g = (gradient[:, pairing.a] + gradient[:, pairing.b]) * weight[..., None]

@@ -1,0 +1,91 @@
+"""Two-way ranging: distances to anchors."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .sensor import Mistake, Sensor, Stream, finite, parameter
+
+FARTHEST = 1000.0  # m
+BEYOND = 5.0  # times the extent of the anchors that most distances are at most
+MOST = 0.5  # share of the distances
+
+
+@dataclass(frozen=True)
+class Ranges(Stream):
+    """Distances to anchors. t : (n,) s; anchor : (n,) ids; d : (n,) m; variance : (n,) m^2, of the noise as the tag knows it, 0 where it
+    does not."""
+
+    t: np.ndarray
+    anchor: np.ndarray
+    d: np.ndarray
+    variance: np.ndarray
+
+    @property
+    def values(self):
+        return self.d[:, None]
+
+    def with_values(self, values):
+        return replace(self, d=values[:, 0])
+
+
+def _measured(ranges):
+    rows = {"anchor": ranges.anchor, "value": ranges.d[:, None], "std": np.sqrt(np.maximum(ranges.variance, 0.0))[:, None]}
+    return rows, (ranges.d >= 0.0) & (ranges.d < FARTHEST) & (ranges.variance >= 0.0) & np.isfinite(ranges.variance)
+
+
+def _simulated(config, room, motion, turn, noise):
+    """Each anchor in its turn."""
+    row = np.arange(len(motion.p)) % len(config.anchors)
+    antenna = motion.p + turn.apply(config.tag_lever_arm)
+    d = np.linalg.norm(antenna - config.anchors.positions[row], axis=1) + config.range_noise * noise()
+    return config.anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(d))
+
+
+def _unknown(ranges, anchors):
+    share = np.mean(~np.isin(ranges.anchor, anchors.ids))
+    if share > 0.0:
+        strange = np.setdiff1d(ranges.anchor, anchors.ids)
+        evidence = f"{100.0 * share:.0f} % of the ranges are to {', '.join(map(str, strange[:5]))}; the survey has {', '.join(map(str, anchors.ids[:10]))}"
+        remedy = "--survey FILE  # with all anchors, under the ids that the tag reports"
+        return Mistake("range_unknown", "ranges are to anchors that the survey does not list", evidence, remedy, float(share))
+
+
+def _unit(ranges, anchors):
+    extent, middle = float(np.linalg.norm(np.ptp(anchors.positions, axis=0))), float(np.median(ranges.d))
+    if middle > BEYOND * extent or middle < 0.001 * extent:
+        evidence = f"their median is {middle:.4g} m, and the anchors are {extent:.1f} m apart at most"
+        remedy = "publish metres: divide millimetres by 1000, multiply seconds by 299792458"
+        return Mistake("range_unit", "ranges are in another unit than metres", evidence, remedy, middle)
+
+
+def _impossible(ranges, anchors):
+    share = float(np.mean(~_measured(ranges)[1]))
+    if share > MOST:
+        evidence = f"{100.0 * share:.0f} % of the ranges are less than 0, no numbers, or more than {FARTHEST:g} m"
+        return Mistake("range_invalid", "most ranges cannot be distances", evidence, "publish |p - a| in metres, 0 or more", share)
+
+
+SENSOR = Sensor(
+    name="range",
+    plural="ranges",
+    stream=Ranges,
+    message="uwb_tdoa_msgs/msg/AnchorRange",
+    fields={"anchor": 1, "distance": 1, "variance": 1},
+    columns=lambda fields: (np.asarray(fields["anchor"]).astype(np.int64), fields["distance"], fields["variance"]),
+    content=lambda ranges: {"anchor": ranges.anchor, "distance": ranges.d, "variance": ranges.variance},
+    sound=finite,
+    measured=_measured,
+    simulated=_simulated,
+    noise=("M", "write distances to anchors, as of two-way ranging"),
+    parameters={
+        "use_range": parameter(True, "use distances to anchors, as of two-way ranging, if there are any", fixed=True),
+        "range_std": parameter(0.1, "m; of a distance to an anchor, uncorrected systematic part included", high=100.0),
+    },
+    invalid="give ids of uwb/anchors, and distances in metres, 0 or more",
+    remedy="its unit, and the anchors' positions",
+    topic="uwb/range",
+    rate=100.0,
+    locates=True,
+    rules=(_unknown, _unit, _impossible),
+)

@@ -1,0 +1,42 @@
+"""Two-way ranging: the distance to an anchor. Two of them, one after the other, are a TDOA: the filter starts and finds itself again by these."""
+
+import math
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+from .update import project
+
+APART = 0.2  # s; two ranges that are further apart are no TDOA
+
+
+@compiled
+def pair(ekf, aid):
+    """Make the TDOA of a range, one of AID, and the one before; returns whether they are one."""
+    before, made = ekf.ranged[0], ekf.paired[0]
+    told = before.anchor != aid.anchor and aid.t - before.t < APART
+    made.t, made.a, made.b, made.d = aid.t, before.anchor, aid.anchor, aid.value[0] - before.value[0]
+    made.variance = aid.std[0] ** 2 + before.std[0] ** 2
+    made.slope[:], made.state[:] = 0.0, 0.0
+    ekf.ranged[0] = aid
+    return told
+
+
+@compiled
+def is_repeat(ekf, aid):
+    """Whether a range, one of AID, is the one before: somebody has sent it twice."""
+    before = ekf.ranged[0]
+    return before.t == aid.t and before.anchor == aid.anchor and before.value[0] == aid.value[0]
+
+
+@compiled
+def compare(hypothesis, position, aid, tuning, innovation):
+    """Fill in what the distance to an anchor at `position` (3,) m says to a HYPOTHESIS."""
+    x = hypothesis.x
+    dx, dy, dz = x[0] - position[0], x[1] - position[1], x[2] - position[2]
+    distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
+    innovation.entries = 3
+    for k, along in enumerate((dx, dy, dz)):
+        innovation.states[k], innovation.row[k] = k, along / distance
+    innovation.value = aid.value[0] - distance
+    innovation.noise_variance = tuning.range_std**2 + aid.std[0] ** 2
+    project(hypothesis.P, innovation)

@@ -1,0 +1,62 @@
+"""ranges: simulated flights with distances to anchors, alone and beside TDOAs, against the bound of `plan` for one round."""
+
+from dataclasses import replace
+
+import numpy as np
+from tqdm import tqdm
+
+from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools.planning.installation import Installation
+from uwb_tdoa_tools.planning.noise import FixedNoise
+from uwb_tdoa_tools.planning.pairing import every_range
+from uwb_tdoa_tools.planning.precision import bound, information, position_error
+from uwb_tdoa_tools.scoring.evaluation import evaluate
+from uwb_tdoa_tools.scoring.metrics import airborne, position_at
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+
+STD = 0.1  # m, of a range and of a TDOA, white
+PATHS = "sines", "circle", "square", "rising_circle", "sines"
+KNOWN = FilterConfig(tdoa_std=STD, range_std=STD, tdoa_correlation_length=1.0)  # of what is simulated
+NONE = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
+SETS = {
+    "ranges": lambda flight: replace(flight, tdoa=NONE),
+    "TDOAs": lambda flight: flight.without("range"),
+    "both": lambda flight: flight,
+}
+
+
+def add_options(add):
+    """add : add_argument of a parser."""
+    add("--flights", type=int, default=5, metavar="N", help="simulated flights of each set (default 5)")
+
+
+def run(args):
+    """Print the table."""
+    print("| what | filter | mean 3D RMSE | bound of one round | largest ratio | NEES |\n|---|---|---:|---:|---:|---:|")
+    flights = [flown(seed) for seed in range(args.flights)]
+    for what, taken in SETS.items():
+        for words, config in (("defaults", FilterConfig()), ("told the noise", KNOWN)):
+            rows = [evaluate(taken(flight), config)[0].row() for flight in tqdm(flights, unit="flight", disable=None)]
+            print(line(what, words, rows, [bound_of(flight) for flight in flights]), flush=True)
+
+
+def flown(seed: int) -> Flight:
+    """A simulated flight with both, without errors that persist."""
+    noise = dict(noise_std=STD, range_noise=STD, bias=False, multipath=False)
+    return simulate(SimulationConfig(seed=seed, trajectory=PATHS[seed % len(PATHS)], duration=40.0, imu_rate=500.0, truth_rate=100.0, **noise))
+
+
+def bound_of(flight: Flight) -> float:
+    """m: root mean square of the bound of `plan` for one range to each anchor, over the airborne part."""
+    first, last = airborne(flight.truth)
+    places = position_at(np.arange(first, last, 0.5), flight.truth)
+    installation = Installation(flight.anchors, FixedNoise(STD), every_range(len(flight.anchors)))
+    return float(np.sqrt(np.mean(position_error(bound(information(places, installation))) ** 2)))
+
+
+def line(what: str, words: str, rows: list, bounds: list) -> str:
+    """A row of the table, of rows of scores, and bounds, m, of the flights."""
+    errors, nees = (np.array([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean"))
+    ratio = np.max(errors / bounds)
+    return f"| {what} | {words} | {errors.mean():.3f} m | {np.mean(bounds):.3f} m | {ratio:.2f} | {nees.mean():.2f} |"

@@ -1,0 +1,39 @@
+"""Ranges against the bound of one round."""
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools.scoring.evaluation import evaluate
+
+from studies import ranges
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return ranges.flown(1)
+
+
+def test_the_bound_of_ranges_is_that_of_their_geometry(flight):
+    """Of a place: the inverse of what the directions to all anchors say."""
+    place = flight.truth.p[len(flight.truth) // 2]
+    away = place - flight.anchors.positions
+    unit = away / np.linalg.norm(away, axis=1, keepdims=True)
+    of_place = np.sqrt(np.trace(np.linalg.inv(unit.T @ unit / ranges.STD**2)))
+    assert ranges.bound_of(flight) == pytest.approx(of_place, rel=0.2)
+
+
+@pytest.mark.parametrize("what", ranges.SETS)
+def test_no_set_is_worse_than_the_bound_of_one_round(flight, what):
+    row = evaluate(ranges.SETS[what](flight), FilterConfig())[0].row()
+    assert row["rmse_3d"] < 1.2 * ranges.bound_of(flight)
+
+
+def test_told_the_noise_both_are_better_than_each(flight):
+    error = {what: evaluate(taken(flight), ranges.KNOWN)[0].row()["rmse_3d"] for what, taken in ranges.SETS.items()}
+    assert error["both"] < 1.02 * min(error["ranges"], error["TDOAs"])
+
+
+def test_a_row_has_means_and_the_largest_ratio():
+    rows = [{"rmse_3d": 0.1, "nees_mean": 1.0}, {"rmse_3d": 0.3, "nees_mean": 2.0}]
+    assert ranges.line("ranges", "defaults", rows, [0.2, 0.2]) == "| ranges | defaults | 0.200 m | 0.200 m | 1.50 | 1.50 |"
