@@ -44,7 +44,11 @@ def run(args):
 def flown(seed: int) -> Flight:
     """A simulated flight with both, without errors that persist."""
     noise = dict(noise_std=STD, range_noise=STD, bias=False, multipath=False)
-    return simulate(SimulationConfig(seed=seed, trajectory=PATHS[seed % len(PATHS)], duration=40.0, imu_rate=500.0, truth_rate=100.0, **noise))
+    return simulate(
+        SimulationConfig(
+            seed=seed, trajectory=PATHS[seed % len(PATHS)], duration=40.0, imu_rate=500.0, truth_rate=100.0, **noise
+        )
+    )
 
 
 def bound_of(flight: Flight) -> float:

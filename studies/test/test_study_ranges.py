@@ -36,4 +36,6 @@ def test_told_the_noise_both_are_better_than_each(flight):
 
 def test_a_row_has_means_and_the_largest_ratio():
     rows = [{"rmse_3d": 0.1, "nees_mean": 1.0}, {"rmse_3d": 0.3, "nees_mean": 2.0}]
-    assert ranges.line("ranges", "defaults", rows, [0.2, 0.2]) == "| ranges | defaults | 0.200 m | 0.200 m | 1.50 | 1.50 |"
+    assert (
+        ranges.line("ranges", "defaults", rows, [0.2, 0.2]) == "| ranges | defaults | 0.200 m | 0.200 m | 1.50 | 1.50 |"
+    )

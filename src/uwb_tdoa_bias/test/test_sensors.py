@@ -21,13 +21,18 @@ STREAMS = {  # measurements that are possible
 def of_message(sensor, stream):
     """{field: values} that are read of the messages that are written for a stream: what is not written is 0."""
     content = sensor.content(stream)
-    return {name: np.broadcast_to(content.get(name, 0.0), (N, k) if k > 1 else (N,)) for name, k in sensor.fields.items()}
+    return {
+        name: np.broadcast_to(content.get(name, 0.0), (N, k) if k > 1 else (N,)) for name, k in sensor.fields.items()
+    }
 
 
 def test_a_flight_has_a_stream_of_each():
     flight = Flight("f", None, Tdoas(T, T, T, T), **STREAMS)
     assert AIDS == tuple(SENSORS) == tuple(STREAMS)
-    assert all(getattr(flight, name) is stream and getattr(flight.without(name), name) is None for name, stream in STREAMS.items())
+    assert all(
+        getattr(flight, name) is stream and getattr(flight.without(name), name) is None
+        for name, stream in STREAMS.items()
+    )
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -73,7 +78,10 @@ def test_registries_of_a_part():
 # --- two-way ranging ---
 
 
-@pytest.mark.parametrize("d, variance, usable", [(0.0, 0.0, True), (-0.1, 0.0, False), (1e4, 0.0, False), (1.0, -1.0, False), (1.0, np.inf, False)])
+@pytest.mark.parametrize(
+    "d, variance, usable",
+    [(0.0, 0.0, True), (-0.1, 0.0, False), (1e4, 0.0, False), (1.0, -1.0, False), (1.0, np.inf, False)],
+)
 def test_which_ranges_are_measurements(d, variance, usable):
     one = Ranges(np.zeros(1), np.zeros(1, int), np.array([d]), np.array([variance]))
     assert SENSORS["range"].measured(one)[1].tolist() == [usable]

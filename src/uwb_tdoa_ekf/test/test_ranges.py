@@ -95,7 +95,9 @@ def test_the_jacobian_is_that_of_the_distance():
 
     compared(x)
     row = innovation["row"][:3].copy()
-    assert innovation["value"] == pytest.approx(4.0 - np.linalg.norm(x - anchor)) and innovation["noise_variance"] == pytest.approx(0.01)
+    assert innovation["value"] == pytest.approx(4.0 - np.linalg.norm(x - anchor)) and innovation[
+        "noise_variance"
+    ] == pytest.approx(0.01)
     slope = [(compared(x + step) - compared(x - step)) / 2e-6 for step in 1e-6 * np.eye(3)]
     np.testing.assert_allclose(row, -np.array(slope), atol=1e-8)
 

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.sensors import SENSORS, Stream
 
 from .core.aids import STREAMS
 from .core.memory import AID
 
 
-def aid_rows(name, stream, anchors):
+def aid_rows(name: str, stream: Stream, anchors: Anchors) -> tuple[np.ndarray, np.ndarray]:
     """(n,) of AID, and (n,) bool: usable; of the Stream of a sensor among Anchors."""
     columns, usable = SENSORS[name].measured(stream)
     rows = np.zeros(len(stream), AID)

@@ -7,7 +7,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.sensors import LOCATING
+from uwb_tdoa_bias.foundation.sensors import LOCATING, Stream
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, StampGate
 
 from .aid_rows import aid_rows
@@ -173,7 +173,7 @@ class Estimator:
         self._refused += [(*one, INVALID) for one in refused]
         self._add(TDOA_STREAM, rows, usable)
 
-    def add(self, name, stream):
+    def add(self, name: str, stream: Stream) -> None:
         """Take a Stream of one of the SENSORS, its rows in the order of their arrival."""
         if getattr(self.config, f"use_{name}"):
             self._add(STREAMS.index(name), *aid_rows(name, stream, self.anchors))

@@ -72,7 +72,7 @@ def assert_equal_to_offline(flight, told, recorded):
 
 @pytest.mark.slow
 def test_ranges_beside_tdoas_are_played_and_used_as_off_line(tmp_path):
-    write_bag(simulate(SimulationConfig(seed=4, duration=12.0, range_noise=0.1)), tmp_path / "flight.bag")
+    write_bag(simulate(SimulationConfig(seed=4, duration=16.0, range_noise=0.1)), tmp_path / "flight.bag")
     flight = read_bag(tmp_path / "flight.bag")
     _, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path)
     assert_equal_to_offline(flight, told, recorded)

@@ -1,4 +1,4 @@
-"""What a tag feels beside inertia and TDOAs: one AID is one measurement of one of the SENSORS. Their updates are in files of their names."""
+"""What a tag feels beside inertia and TDOAs: one AID is one measurement of one of the SENSORS."""
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.sensors import SENSORS

@@ -168,8 +168,8 @@ def _look_for_rest(ekf, anchors, tuning, t, records):
 
 @compiled
 def _settle(ekf, anchors, tuning, t, counts, agrees, records):
-    """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the tag is elsewhere. counts : what was measured
-    tells that; agrees : with the best hypothesis."""
+    """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the tag is elsewhere. counts :
+    what was measured tells that; agrees : with the best hypothesis."""
     _stay_in_workspace(ekf, t, records)
     if tuning.fixed_height_std > 0.0 and t >= ekf.next_floor:
         ekf.next_floor = t + rest.PERIOD

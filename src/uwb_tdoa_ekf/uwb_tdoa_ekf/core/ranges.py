@@ -1,6 +1,11 @@
-"""Two-way ranging: the distance to an anchor. Two of them, one after the other, are a TDOA: the filter starts and finds itself again by these."""
+"""Two-way ranging: the distance to an anchor.
+
+Two distances, one after the other, are a TDOA: by such TDOAs the filter starts, and finds a tag again that it has lost.
+"""
 
 import math
+
+import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
@@ -10,7 +15,7 @@ APART = 0.2  # s; two ranges that are further apart are no TDOA
 
 
 @compiled
-def pair(ekf, aid):
+def pair(ekf: np.void, aid: np.void) -> bool:
     """Make the TDOA of a range, one of AID, and the one before; returns whether they are one."""
     before, made = ekf.ranged[0], ekf.paired[0]
     told = before.anchor != aid.anchor and aid.t - before.t < APART
@@ -22,14 +27,14 @@ def pair(ekf, aid):
 
 
 @compiled
-def is_repeat(ekf, aid):
+def is_repeat(ekf: np.void, aid: np.void) -> bool:
     """Whether a range, one of AID, is the one before: somebody has sent it twice."""
     before = ekf.ranged[0]
     return before.t == aid.t and before.anchor == aid.anchor and before.value[0] == aid.value[0]
 
 
 @compiled
-def compare(hypothesis, position, aid, tuning, innovation):
+def compare(hypothesis: np.void, position: np.ndarray, aid: np.void, tuning: np.void, innovation: np.void) -> None:
     """Fill in what the distance to an anchor at `position` (3,) m says to a HYPOTHESIS."""
     x = hypothesis.x
     dx, dy, dz = x[0] - position[0], x[1] - position[1], x[2] - position[2]

@@ -5,6 +5,7 @@ What was not measured is marked as the messages say: an orientation of (0, 0, 0,
 covariances of 0 for unknown.
 """
 
+from collections.abc import Iterator
 from functools import reduce
 
 import numpy as np
@@ -12,6 +13,7 @@ from rosbags.interfaces import Nodetype
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.sensors import Sensor, Stream
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER, UNKNOWN_VARIANCE
 from uwb_tdoa_ekf.frames import to_odometry
 
@@ -56,7 +58,7 @@ def imu_of(stamps, rows):
     return Imu(stamps, rows[:, 0:3], rows[:, 3:6])
 
 
-def sensor_messages(sensor, stream, store):
+def sensor_messages(sensor: Sensor, stream: Stream, store) -> Iterator[tuple]:
     """Yield (stamp ns, message) of the Stream of a Sensor; what it says nothing of is 0."""
     content = {field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:])) for field, values in sensor.content(stream).items()}
     for k, stamp in enumerate(nanoseconds(sensor.name, stream.t).tolist()):
@@ -90,7 +92,7 @@ def _set(holder, name, value):
         setattr(holder, name, np.ascontiguousarray(value) if np.ndim(value) else value.item())
 
 
-def of_sensor(sensor):
+def of_sensor(sensor: Sensor) -> tuple:
     """(row of a message, Stream of stamps and rows, which numbers of rows may be there), as `read_bag` takes them, of a Sensor."""
 
     def row(message):

@@ -1,10 +1,14 @@
 """What the SENSORS of a recording got wrong, by their own rules."""
 
+from collections.abc import Iterator
+
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
+from .recording import Recording
 
-def sensors(recording):
+
+def sensors(recording: Recording) -> Iterator[Finding]:
     """Findings about the Streams of a Recording."""
     for name, stream in recording.felt.items():
         for rule in SENSORS[name].rules:

@@ -14,6 +14,8 @@ def measure(config, room, trajectory):
             continue
         t = np.arange(1, int(config.duration * sensor.rate) + 1) / sensor.rate
         motion, random = trajectory.motion(t), config.random(f"{name} noise")
-        columns = sensor.simulated(config, room, motion, Rotation.from_quat(motion.q), lambda *shape: random.standard_normal((len(t), *shape)))
+        columns = sensor.simulated(
+            config, room, motion, Rotation.from_quat(motion.q), lambda *shape: random.standard_normal((len(t), *shape))
+        )
         out[name] = sensor.stream(t, *columns)
     return out

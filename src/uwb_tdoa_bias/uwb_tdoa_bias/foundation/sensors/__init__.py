@@ -7,7 +7,9 @@ from .ranges import Ranges
 from .sensor import Sensor, Stream
 from .velocity import Velocity
 
-SENSORS = {each.SENSOR.name: each.SENSOR for each in (height, pressure, velocity, ranges)}  # by name, in the order of their kinds in the filter
+SENSORS = {
+    each.SENSOR.name: each.SENSOR for each in (height, pressure, velocity, ranges)
+}  # by name, in the order of their kinds in the filter
 
 LOCATING = tuple(name for name, sensor in SENSORS.items() if sensor.locates)  # from which alone the filter can start
 DIAGNOSED = tuple(name for name, sensor in SENSORS.items() if sensor.compared is not None)  # channels of the diagnosis

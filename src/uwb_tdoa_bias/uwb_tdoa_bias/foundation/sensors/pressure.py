@@ -13,12 +13,12 @@ LOWEST, HIGHEST = 3e4, 1.2e5  # Pa, of air in which something flies or rolls
 SITE = 200.0  # m above the sea, of z = 0 in simulations
 
 
-def pressure_at(altitude):
+def pressure_at(altitude: np.ndarray) -> np.ndarray:
     """Pa at an altitude above the sea, m; numbers or arrays."""
     return SEA_LEVEL * (1.0 - altitude / SCALE) ** EXPONENT
 
 
-def altitude_of(pressure):
+def altitude_of(pressure: np.ndarray) -> np.ndarray:
     """m above the sea of a pressure, Pa; numbers or arrays."""
     return SCALE * (1.0 - (pressure / SEA_LEVEL) ** (1.0 / EXPONENT))
 
@@ -31,16 +31,20 @@ class Pressure(Stream):
     pressure: np.ndarray
 
     @property
-    def values(self):
+    def values(self) -> np.ndarray:
         return altitude_of(self.pressure)[:, None]
 
-    def with_values(self, values):
+    def with_values(self, values: np.ndarray) -> "Pressure":
         return replace(self, pressure=pressure_at(values[:, 0]))
 
 
-def _measured(of):
+def _measured(of: Pressure) -> tuple[dict, np.ndarray]:
     usable = (of.pressure > LOWEST) & (of.pressure < HIGHEST)
     return {"value": altitude_of(np.where(usable, of.pressure, SEA_LEVEL))[:, None]}, usable
+
+
+def _simulated(config, room, motion, turn, noise) -> tuple:
+    return (pressure_at(SITE + motion.p[:, 2] + config.pressure_noise * noise()),)
 
 
 SENSOR = Sensor(
@@ -53,12 +57,14 @@ SENSOR = Sensor(
     content=lambda of: {"fluid_pressure": of.pressure},
     sound=finite,
     measured=_measured,
-    simulated=lambda config, room, motion, turn, noise: (pressure_at(SITE + motion.p[:, 2] + config.pressure_noise * noise()),),
+    simulated=_simulated,
     noise=("M", "write pressures; in metres of altitude"),
     parameters={
         "use_pressure": parameter(True, "use pressures of a barometer, if there are any", fixed=True),
         "pressure_std": parameter(0.1, "m; noise of one pressure, as altitude", high=100.0),
-        "pressure_walk": parameter(0.1, "m/sqrt(s); how fast the offset of the altitude wanders: weather, prop wash, warming up", high=100.0),
+        "pressure_walk": parameter(
+            0.1, "m/sqrt(s); how fast the offset of the altitude wanders: weather, prop wash, warming up", high=100.0
+        ),
         "pressure_drift": parameter(0.02, "m/s; how fast it drifts, as is known before it is measured", high=100.0),
     },
     invalid="give Pa, some 1e5 on the ground",

@@ -4,17 +4,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..anchors import Anchors
 from .sensor import Mistake, Sensor, Stream, finite, parameter
 
 FARTHEST = 1000.0  # m
 BEYOND = 5.0  # times the extent of the anchors that most distances are at most
 MOST = 0.5  # share of the distances
+MOST_NAMED = 8  # anchors in a sentence
 
 
 @dataclass(frozen=True)
 class Ranges(Stream):
-    """Distances to anchors. t : (n,) s; anchor : (n,) ids; d : (n,) m; variance : (n,) m^2, of the noise as the tag knows it, 0 where it
-    does not."""
+    """Distances to anchors. t : (n,) s; anchor : (n,) ids; d : (n,) m; variance : (n,) m^2, of the noise as the tag knows
+    it, 0 where it does not."""
 
     t: np.ndarray
     anchor: np.ndarray
@@ -22,19 +24,23 @@ class Ranges(Stream):
     variance: np.ndarray
 
     @property
-    def values(self):
+    def values(self) -> np.ndarray:
         return self.d[:, None]
 
-    def with_values(self, values):
+    def with_values(self, values: np.ndarray) -> "Ranges":
         return replace(self, d=values[:, 0])
 
 
-def _measured(ranges):
-    rows = {"anchor": ranges.anchor, "value": ranges.d[:, None], "std": np.sqrt(np.maximum(ranges.variance, 0.0))[:, None]}
+def _measured(ranges: Ranges) -> tuple[dict, np.ndarray]:
+    rows = {
+        "anchor": ranges.anchor,
+        "value": ranges.d[:, None],
+        "std": np.sqrt(np.maximum(ranges.variance, 0.0))[:, None],
+    }
     return rows, (ranges.d >= 0.0) & (ranges.d < FARTHEST) & (ranges.variance >= 0.0) & np.isfinite(ranges.variance)
 
 
-def _simulated(config, room, motion, turn, noise):
+def _simulated(config, room, motion, turn, noise) -> tuple:
     """Each anchor in its turn."""
     row = np.arange(len(motion.p)) % len(config.anchors)
     antenna = motion.p + turn.apply(config.tag_lever_arm)
@@ -42,16 +48,21 @@ def _simulated(config, room, motion, turn, noise):
     return config.anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(d))
 
 
-def _unknown(ranges, anchors):
+def _unknown(ranges: Ranges, anchors: Anchors) -> Mistake | None:
+    """Ids that the survey does not list."""
     share = np.mean(~np.isin(ranges.anchor, anchors.ids))
     if share > 0.0:
         strange = np.setdiff1d(ranges.anchor, anchors.ids)
-        evidence = f"{100.0 * share:.0f} % of the ranges are to {', '.join(map(str, strange[:5]))}; the survey has {', '.join(map(str, anchors.ids[:10]))}"
+        heard, known = (", ".join(map(str, ids)) for ids in (strange[:MOST_NAMED], anchors.ids[:MOST_NAMED]))
+        evidence = f"{100.0 * share:.0f} % of the ranges are to {heard}; the survey begins with {known}"
         remedy = "--survey FILE  # with all anchors, under the ids that the tag reports"
-        return Mistake("range_unknown", "ranges are to anchors that the survey does not list", evidence, remedy, float(share))
+        return Mistake(
+            "range_unknown", "ranges are to anchors that the survey does not list", evidence, remedy, float(share)
+        )
 
 
-def _unit(ranges, anchors):
+def _unit(ranges: Ranges, anchors: Anchors) -> Mistake | None:
+    """Another unit than metres."""
     extent, middle = float(np.linalg.norm(np.ptp(anchors.positions, axis=0))), float(np.median(ranges.d))
     if middle > BEYOND * extent or middle < 0.001 * extent:
         evidence = f"their median is {middle:.4g} m, and the anchors are {extent:.1f} m apart at most"
@@ -59,11 +70,14 @@ def _unit(ranges, anchors):
         return Mistake("range_unit", "ranges are in another unit than metres", evidence, remedy, middle)
 
 
-def _impossible(ranges, anchors):
+def _impossible(ranges: Ranges, anchors: Anchors) -> Mistake | None:
+    """Values that are no distances."""
     share = float(np.mean(~_measured(ranges)[1]))
     if share > MOST:
         evidence = f"{100.0 * share:.0f} % of the ranges are less than 0, no numbers, or more than {FARTHEST:g} m"
-        return Mistake("range_invalid", "most ranges cannot be distances", evidence, "publish |p - a| in metres, 0 or more", share)
+        return Mistake(
+            "range_invalid", "most ranges cannot be distances", evidence, "publish |p - a| in metres, 0 or more", share
+        )
 
 
 SENSOR = Sensor(

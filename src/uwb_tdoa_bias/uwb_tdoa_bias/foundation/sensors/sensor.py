@@ -39,9 +39,14 @@ class Stream:
 class Compared:
     """How the diagnosis compares a sensor with poses; see diagnosis/channels/aid.py of uwb_tdoa_tools.
 
-    reading : callable of (Track, t (n,)) -> (n, k), what should have been read; needs : what a flight must have for it, words; negligible : unit of the stream, a constant error below it is nothing; floating : a
-    constant tells nothing; of_attitude : the attitude must be known; axes : what is added to its name in labels; positions :
-    coordinates that the reference must know."""
+    reading : callable of (Track, t (n,)) -> (n, k), what should have been read
+    needs : what a flight must have for it, words
+    negligible : unit of the stream, a constant error below it is nothing
+    floating : a constant tells nothing
+    of_attitude : the attitude must be known
+    axes : what is added to its name in labels
+    positions : coordinates that the reference must know
+    """
 
     reading: Callable
     needs: str
@@ -55,7 +60,8 @@ class Compared:
 
 @dataclass(frozen=True)
 class Mistake:
-    """What a rule of `check` finds: its name, what is wrong, the numbers that show it, a line to copy, and the number that decided."""
+    """What a rule of `check` finds: its name, what is wrong, the numbers that show it, a line to copy, and the number that
+    decided."""
 
     rule: str
     cause: str
@@ -66,8 +72,8 @@ class Mistake:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A kind of measurement. `name` is that of its stream in a Flight, of its counters on /diagnostics, of its use_<name> and of `--without`;
-    core/ of uwb_tdoa_ekf has its update of the filter.
+    """A kind of measurement. `name` is that of its stream in a Flight, of its counters on /diagnostics, of its use_<name>
+    and of `--without`; core/ of uwb_tdoa_ekf has its update of the filter.
 
     plural : words for several measurements
     stream : class of its Stream
@@ -75,9 +81,10 @@ class Sensor:
     columns : callable of {field: (n,) or (n, k)} -> columns of the Stream, without stamps
     content : callable of a Stream -> {field: value, (n,) or (n, k)} of its messages; what is not among them is 0
     sound : callable of {field: (n,) or (n, k)} -> the same of bool: which of these numbers a recording may hold
-    measured : callable of a Stream -> ({field of an AID: (n,) or (n, k)}, usable (n,) bool); see core/memory.py of uwb_tdoa_ekf
-    simulated : callable of (SimulationConfig, Room, motion, turn, noise) -> columns, without stamps: what it says in truth, and white
-        noise. motion : of the body; turn : its Rotations; noise(...) : standard normal numbers (n, ...)
+    measured : callable of a Stream -> ({field of an AID: (n,) or (n, k)}, usable (n,) bool); AID: core/memory.py of
+        uwb_tdoa_ekf
+    simulated : callable of (SimulationConfig, Room, motion, turn, noise) -> columns, without stamps: what it says in truth,
+        and white noise. motion : of the body; turn : its Rotations; noise(...) : standard normal numbers (n, ...)
     noise : (unit, words) of the std of that, for the options of `simulate`
     parameters : {name: `parameter`} of the filter; use_<name> is the first
     invalid, remedy : what a message must hold; what to check where it contradicts everything else

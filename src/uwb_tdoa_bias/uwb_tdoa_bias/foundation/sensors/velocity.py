@@ -15,40 +15,41 @@ LEAST_STD = 0.01  # m/s, that a simulated velocity says of itself
 
 @dataclass(frozen=True)
 class Velocity(Stream):
-    """Velocities in the body frame. t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not measured."""
+    """Velocities in the body frame. t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not
+    measured."""
 
     t: np.ndarray
     v: np.ndarray
     std: np.ndarray
 
     @property
-    def values(self):
+    def values(self) -> np.ndarray:
         return self.v
 
-    def with_values(self, values):
+    def with_values(self, values: np.ndarray) -> "Velocity":
         return replace(self, v=values)
 
 
-def _columns(fields):
+def _columns(fields: dict) -> tuple:
     variance = fields["twist.covariance"][:, [0, 7, 14]]
     known = (variance >= 0.0) & (variance < UNMEASURED)
     return fields["twist.twist.linear"], np.sqrt(np.where(known, variance, np.inf))
 
 
-def _content(velocity):
+def _content(velocity: Velocity) -> dict:
     variance = np.full((len(velocity), 6), UNKNOWN_VARIANCE)  # rates are not measured
     variance[:, :3] = np.minimum(velocity.std**2, UNKNOWN_VARIANCE)
     return {"twist.twist.linear": velocity.v, "twist.covariance": (variance[:, :, None] * np.eye(6)).reshape(-1, 36)}
 
 
-def _sound(fields):
+def _sound(fields: dict) -> dict:
     _, std = _columns(fields)
     sound = finite(fields)
     linear, covariance = sound
     return {linear: sound[linear] | np.isinf(std), covariance: np.ones(sound[covariance].shape, dtype=bool)}
 
 
-def _measured(velocity):
+def _measured(velocity: Velocity) -> tuple[dict, np.ndarray]:
     v, std = velocity.v, velocity.std
     known = np.isfinite(std)
     sane = np.where(known, (np.abs(v) < FASTEST) & (std > 0.0), True).all(axis=1)
@@ -56,7 +57,7 @@ def _measured(velocity):
     return rows, sane & known.any(axis=1) & ~np.isnan(std).any(axis=1)
 
 
-def _simulated(config, room, motion, turn, noise):
+def _simulated(config, room, motion, turn, noise) -> tuple:
     v = turn.inv().apply(motion.v) + config.velocity_noise * noise(3)
     return v, np.full(v.shape, max(config.velocity_noise, LEAST_STD))
 
