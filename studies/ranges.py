@@ -1,4 +1,5 @@
-"""ranges: simulated flights with distances to anchors, alone and beside TDOAs, against the bound of `plan` for one round."""
+"""ranges: simulated flights with distances to anchors, alone and beside TDOAs, against the bound of `plan` for one round;
+and what faulty ranges do beside TDOAs."""
 
 from dataclasses import replace
 
@@ -26,6 +27,16 @@ SETS = {
 }
 
 
+FAULTS = {  # what becomes of Ranges, beside TDOAs with errors that persist
+    "sound": lambda ranges, rng: ranges,
+    "3 m too long": lambda ranges, rng: replace(ranges, d=ranges.d + 3.0),
+    "twice as long": lambda ranges, rng: replace(ranges, d=2.0 * ranges.d),
+    "millimetres": lambda ranges, rng: replace(ranges, d=1000.0 * ranges.d),
+    "anything from 0 to 10 m": lambda ranges, rng: replace(ranges, d=rng.uniform(0.0, 10.0, len(ranges))),
+    "ids shuffled": lambda ranges, rng: replace(ranges, anchor=rng.permutation(ranges.anchor)),
+}
+
+
 def add_options(add):
     """add : add_argument of a parser."""
     add("--flights", type=int, default=5, metavar="N", help="simulated flights of each set (default 5)")
@@ -39,11 +50,28 @@ def run(args):
         for words, config in (("defaults", FilterConfig()), ("told the noise", KNOWN)):
             rows = [evaluate(taken(flight), config)[0].row() for flight in tqdm(flights, unit="flight", disable=None)]
             print(line(what, words, rows, [bound_of(flight) for flight in flights]), flush=True)
+    print("\n| ranges beside TDOAs | mean 3D RMSE | largest over that without |\n|---|---:|---:|")
+    flights = [flown(seed, persistent=True) for seed in range(args.flights)]
+    without = np.array([rmse(flight.without("range")) for flight in flights])
+    print(f"| none | {without.mean():.3f} m | 1.00 |")
+    for words, fault in FAULTS.items():
+        errors = np.array([rmse(spoiled(flight, fault, seed)) for seed, flight in enumerate(flights)])
+        print(f"| {words} | {errors.mean():.3f} m | {np.max(errors / without):.2f} |", flush=True)
 
 
-def flown(seed: int) -> Flight:
-    """A simulated flight with both, without errors that persist."""
-    noise = dict(noise_std=STD, range_noise=STD, bias=False, multipath=False)
+def rmse(flight: Flight) -> float:
+    """m, 3D, in the air, by the filter with its defaults."""
+    return evaluate(flight)[0].row()["rmse_3d"]
+
+
+def spoiled(flight: Flight, fault, seed: int) -> Flight:
+    """The Flight with one of FAULTS in its ranges."""
+    return replace(flight, range=fault(flight.range, np.random.default_rng(seed)))
+
+
+def flown(seed: int, persistent: bool = False) -> Flight:
+    """A simulated flight with both. persistent : its TDOAs have errors that persist, too."""
+    noise = dict(noise_std=STD, range_noise=STD, bias=persistent, multipath=persistent)
     return simulate(
         SimulationConfig(
             seed=seed, trajectory=PATHS[seed % len(PATHS)], duration=40.0, imu_rate=500.0, truth_rate=100.0, **noise

@@ -34,6 +34,13 @@ def test_told_the_noise_both_are_better_than_each(flight):
     assert error["both"] < 1.02 * min(error["ranges"], error["TDOAs"])
 
 
+@pytest.mark.parametrize("name", [name for name in ranges.FAULTS if name != "sound"])
+def test_faulty_ranges_do_no_harm_beside_tdoas(flight, name):
+    wrong = ranges.spoiled(flight, ranges.FAULTS[name], 0)
+    assert not all(np.array_equal(*both) for both in zip(wrong.range.columns, flight.range.columns))
+    assert ranges.rmse(wrong) < 1.1 * ranges.rmse(flight.without("range")) + 0.005
+
+
 def test_a_row_has_means_and_the_largest_ratio():
     rows = [{"rmse_3d": 0.1, "nees_mean": 1.0}, {"rmse_3d": 0.3, "nees_mean": 2.0}]
     assert (
