@@ -61,7 +61,7 @@ def test_an_empty_file_is_nothing(text):
         ("a: \x07", "is no YAML"),
         ("[" * 30 + "]" * 30, "deeper than 20 levels"),
         ("[" * 5000, "deeper than 20 levels"),
-        ("[" + "1," * 100_001 + "1]", "more than 100000 entries"),
+        ("[" + "1," * 200_001 + "1]", "more than 200000 entries"),
         (b"a: \xff", "byte 3 is not UTF-8"),
         ("a: 1".encode("utf-16"), "byte 0 is not UTF-8"),
     ],
@@ -85,7 +85,7 @@ def test_files(tmp_path):
     path.write_bytes("\ufeffa: ü\n".encode())
     assert read_yaml(path) == {"a": "ü"}
     path.write_text("a" * (YAML_BYTES + 1))
-    with pytest.raises(InputError, match="has 1000001 bytes"):
+    with pytest.raises(InputError, match="has 2000001 bytes"):
         read_yaml(path)
     with pytest.raises(InputError, match=r"f.yaml: cannot be read as YAML \(Is a directory|cannot be read"):
         read_yaml(tmp_path)

@@ -17,7 +17,7 @@ def test_memory_grows_with_the_number_of_anchors_not_with_its_square():
 
 def late(n, heard, row, since, slices, size=0.8, seed=1):
     """The Change that is found last in slices of a tag that hears the nearest anchors; one is late from slice `since` on."""
-    rng, anchors, detector = np.random.default_rng(seed), row_of(n).positions, ChangeDetector(n)
+    rng, anchors, detector = np.random.default_rng(seed), row_of(n).positions, ChangeDetector()
     found = None
     for k in range(slices):
         p = np.array([2.0 * np.cos(0.3 * k), 2.0 * np.sin(0.3 * k), np.sin(0.5 * k)])

@@ -108,8 +108,9 @@ def test_a_pair_is_one_in_either_order_and_its_value_that_of_the_first():
 
 @pytest.mark.parametrize("late", [0.0, 3.3])
 def test_on_the_ground_it_is_found_whether_or_not_anchors_are_late(late):
-    anchors, bounds, prior = new_memory(POSITIONS).anchors, np.empty((2, 3)), np.zeros((4, 3))
-    set_bounds(anchors, 1.0, bounds)
+    memory, bounds, prior = new_memory(POSITIONS), np.empty((2, 3)), np.zeros((4, 3))
+    anchors = memory.anchors
+    set_bounds(memory.record.extent, 1.0, bounds)
     prior[0], prior[1:] = bounds.mean(axis=0), np.eye(3) / 25.0
     for seed in range(10):
         p = np.array([*np.random.default_rng(seed).uniform([1.5, 1.5], [5.5, 6.5]), 0.03])
@@ -124,7 +125,7 @@ def test_on_the_ground_it_is_found_whether_or_not_anchors_are_late(late):
 def test_what_is_known_of_late_anchors_places_it_better_than_what_they_have_in_common():
     floor = np.where(LOW, 3.4, 0.3) + 0.1 * np.arange(8)
     memory, bounds, prior = new_memory(POSITIONS, floor=(floor, 0.05, np.nan)), np.empty((2, 3)), np.zeros((4, 3))
-    set_bounds(memory.anchors, 1.0, bounds)
+    set_bounds(memory.record.extent, 1.0, bounds)
     prior[0], prior[1:] = bounds.mean(axis=0), np.eye(3) / 25.0
     off = {ALIKE: [], KNOWN: []}
     for seed in range(10):

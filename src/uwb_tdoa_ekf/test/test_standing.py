@@ -16,7 +16,7 @@ def weighed(ekf, pairs, anchors, tuning, x, covariance):
 def placed(p, elsewhere, late=0.0, seed=0, memory=None):
     """(position (3,), standard deviations (3,), on the ground?) of a tag at rest at p, if a start has found it `elsewhere`."""
     memory = memory or new_memory(POSITIONS)
-    set_bounds(memory.anchors, 1.0, memory.record.workspace)
+    set_bounds(memory.record.extent, 1.0, memory.record.workspace)
     x, covariance = np.array([*elsewhere, 0.0, 0.0, 0.0]), 0.04 * np.eye(6)
     lead = weighed(memory.ekf, heard(p, late=late, seed=seed), memory.anchors, TUNING, x, covariance)
     return x[:3], np.sqrt(np.diag(covariance)[:3]), lead > 0.0

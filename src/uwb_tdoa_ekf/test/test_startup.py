@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
 from uwb_tdoa_ekf.core.startup import APART, INLIER, level, locate, share_of_inliers, split
 from uwb_tdoa_ekf.core.workspace import set_bounds
@@ -40,9 +41,9 @@ def window_of(t, a, b, d):
 def places(tdoas, positions, count=2, std=STD):
     """(x (count, 6), covariance (count, 6, 6), cost (count,), share) as of `locate`."""
     x, covariance, cost, workspace = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count), np.empty((2, 3))
-    anchors = new_memory(positions).anchors
-    set_bounds(anchors, 1.0, workspace)
-    share = locate(window_of(*tdoas), anchors, workspace, std, np.nan, np.nan, x, covariance, cost)
+    memory, tuning = new_memory(positions), FilterConfig(tdoa_std=std).tuning()[0]
+    set_bounds(memory.record.extent, 1.0, workspace)
+    share = locate(window_of(*tdoas), memory.anchors, workspace, tuning, np.nan, np.nan, x, covariance, cost)
     return x, covariance, cost, share
 
 

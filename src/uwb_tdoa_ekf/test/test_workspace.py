@@ -14,7 +14,7 @@ MARGIN = 1.0  # m
 
 def bounds_of(positions):
     bounds = np.empty((2, 3))
-    set_bounds(new_memory(positions).anchors, MARGIN, bounds)
+    set_bounds(new_memory(positions).record.extent, MARGIN, bounds)
     return bounds
 
 

@@ -41,7 +41,7 @@ def test_a_chart_says_the_same_as_its_parts():
     np.testing.assert_allclose(found.error, np.linalg.norm(found.std, axis=1))
     np.testing.assert_array_equal(found.flyable, found.hull & (found.ambiguous == 0))
     assert 0 < found.flyable.sum() < found.hull.sum() < len(points)
-    volume = found.volume(installation)
+    volume = found.volume(installation.anchors, installation.dimensions)
     np.testing.assert_array_equal(volume.contains(points), found.flyable)
     assert volume.belongs_to(corners())
 

@@ -10,7 +10,7 @@ from .errors import InputError
 from .safe_yaml import read_yaml
 from .version import written_by
 
-MOST = 1000  # anchors; memory and time grow with their square
+MOST = 10_000  # anchors, as many as a message holds
 FARTHEST = 1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
 
 

@@ -12,7 +12,7 @@ TABLE_BYTES = 50_000_000  # CSV of other tools
 TABLE_CELLS = 8_000_000  # of a recording in it: a quarter of an hour at 1 kHz
 SMALL_TABLE_CELLS = 400_000  # of other tables, whose rows become objects
 ROW_CHARACTERS = 100_000  # of one row of any CSV
-SURVEY_BYTES = YAML_BYTES = 1_000_000
+SURVEY_BYTES = YAML_BYTES = 2_000_000  # 10 000 anchors with their orientations have 1 200 000
 MODEL_BYTES = 4_000_000  # ONNX: a million weights
 ARRAYS_BYTES = 100_000_000  # of all arrays of an .npz file, unpacked; four million cells have 20 MB
 
@@ -21,7 +21,7 @@ MAP_MARKERS = 5_000  # of a position bias map: memory takes their number squared
 NAME_LENGTH = 100  # characters of a flight, a model, ...
 
 # YAML.
-YAML_NODES, YAML_DEPTH = 100_000, 20
+YAML_NODES, YAML_DEPTH = 200_000, 20
 
 # ONNX.
 MODEL_NODES = 2_000  # operators, and as many constants: onnxruntime takes 0.2 s to load so many, but 4 s for 10 000

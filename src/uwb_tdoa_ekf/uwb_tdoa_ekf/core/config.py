@@ -13,7 +13,8 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_bias.foundation.sensors.sensor import parameter
 
 ROBUST = ("innovation", "gate", "m_estimation")
-CHOICES = {"robust": ROBUST, "loss": LOSSES}  # parameters that are one of a few names
+SIDES = "unknown", "below", "above", "-x", "+x", "-y", "+y"
+CHOICES = {"robust": ROBUST, "loss": LOSSES, "tag_side": SIDES}  # parameters that are one of a few names
 RENAMED = {  # old name: present name; the old ones work until the release after 0.1
     "tdoa_correlation": "tdoa_correlation_length",
     "vibration_trust": "accel_prior_std",
@@ -60,6 +61,12 @@ class _OfTdoas:
     )
     workspace_margin: float = parameter(
         1.0, "m beyond the anchors' extent; a tag further out is drawn back while less is known of its place", high=10000.0, fixed=True
+    )
+    radio_reach: float = parameter(
+        30.0, "m; a tag is looked for within that of each anchor it hears, or as far as these are apart, if that is more", high=10000.0
+    )
+    tag_side: str = parameter(
+        "unknown", "of anchors that lie in a plane: on which side of it the tag is, below, above, or along an axis of the world, -x, +x, -y, +y"
     )
     zero_velocity: bool = parameter(True, "a tag whose TDOAs stay what they are, or whose inertial sensors neither shake nor turn, stands still")
     recover: bool = parameter(True, "find the tag anew, untold where it is, when the TDOAs agree on another place that it can have come to")

@@ -18,12 +18,13 @@ from .verdicts import COMPENSATED, REJECTED, REPEATED, STARTUP, USED
 
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged
 INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
+UNSURE_TIME = 0.5  # s of TDOAs, after a silence in which a tag got lost, in which it is looked for anew
 LOST_TIME = 30.0  # s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter starts anew
 MAX_STEP = 0.05  # s, longest single prediction
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 STRAIGHT = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
-RECORDS_OF_TDOA = 1 + 3 + 1 + 6 + 1 + 1  # in a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, a start or a recovery
+RECORDS_OF_TDOA = 1 + 4 + 1 + 6 + 1 + 2  # in a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, starts or recoveries
 RECORDS_OF_REST = 3  # one per axis
 RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per component
 
@@ -123,8 +124,9 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
         if not was_running:
             _wait_for_start(ekf, anchors, tuning, t, records)
         return
-    _look_for_rest(ekf, anchors, tuning, t, records)
+    _look_around(ekf, anchors, tuning, t, records)
     late = _update(ekf, anchors, tuning, tdoa, residual, records)
+    initialization.relocate(ekf, anchors, tuning, t, records)
     known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
     _settle(ekf, anchors, tuning, t, not late, abs(residual.innovation - known) < INLIER, records)
 
@@ -142,7 +144,7 @@ def _on_range(ekf, anchors, tuning, aid, residual, records):
         if not was_running:
             _wait_for_start(ekf, anchors, tuning, t, records)
         return
-    _look_for_rest(ekf, anchors, tuning, t, records)
+    _look_around(ekf, anchors, tuning, t, records)
     anchor, innovation = anchors[aid.anchor], ekf.innovation
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -157,13 +159,17 @@ def _on_range(ekf, anchors, tuning, aid, residual, records):
 
 
 @compiled
-def _look_for_rest(ekf, anchors, tuning, t, records):
-    """Before an update stamped t, s: whether the tag is at rest."""
+def _look_around(ekf, anchors, tuning, t, records):
+    """Before an update stamped t, s: whether the tag is at rest, which anchors are heard, and whether a silence left the place open."""
     if tuning.zero_velocity:
         if t >= ekf.next_look:
             rest.look(ekf, anchors, tuning, initialization.recent(ekf, rest.LOOK_WINDOW), t, records)
         if not tuning.use_imu or t - ekf.imu.t > tuning.imu_timeout:
             rest.hold(ekf, t, records)
+    if t >= ekf.next_bounds:
+        initialization.look_around(ekf, anchors, tuning, t)
+    if t - ekf.last_tdoa > tuning.start_window and initialization.is_unsure(ekf):
+        ekf.unsure_until = t + UNSURE_TIME
 
 
 @compiled
@@ -183,8 +189,9 @@ def _settle(ekf, anchors, tuning, t, counts, agrees, records):
     ekf.last_tdoa = t
     if ekf.consistency > initialization.AGREE:
         ekf.sure = t
-    if tuning.recover and ekf.consistency < INCONSISTENT and t >= ekf.next_search:
-        initialization.recover(ekf, anchors, tuning, t, records)
+    unsure = t < ekf.unsure_until
+    if tuning.recover and (unsure or ekf.consistency < INCONSISTENT) and t >= ekf.next_search:
+        initialization.recover(ekf, anchors, tuning, t, unsure, records)
 
 
 @compiled
@@ -206,8 +213,12 @@ def _wait_for_start(ekf, anchors, tuning, t, records):
         ekf.first_tdoa = t
     ekf.last_tdoa = t
     waited = t - ekf.first_tdoa
-    if waited > 0.9 * tuning.start_window and t >= ekf.next_search:
+    if t < ekf.next_search:
+        return
+    if waited > 0.9 * tuning.start_window:
         initialization.start(ekf, anchors, tuning, t, waited > tuning.start_timeout, records)
+    if t >= ekf.next_search:
+        initialization.start_slowly(ekf, anchors, tuning, t, records)
 
 
 @compiled
@@ -336,6 +347,8 @@ def _stay_in_workspace(ekf, t, records):
     for h in range(HYPOTHESES):
         if not hypotheses.alive(ekf.hypotheses[h]):
             continue
+        if workspace.stay_on_side(ekf.hypotheses[h], ekf.side) and h == ekf.best:
+            history.add_reset(ekf, t, records)
         for axis in range(3):
             outside = workspace.constrain(ekf.hypotheses[h], ekf.innovation, ekf.workspace, axis)
             if outside and h == ekf.best:
@@ -361,6 +374,7 @@ def _report(ekf, tuning, t, row):
     row.x[:] = best.x
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
+    workspace.add_circle(ekf, tuning.fixed_height_std > 0.0 or t - ekf.height.used < height.LONGEST_GAP, best.x, row.covariance)
     systematic.fill(ekf.information, best.P, tuning.tdoa_correlation_length, row.persistent)
     row.covariance[:3, :3] += row.persistent
 

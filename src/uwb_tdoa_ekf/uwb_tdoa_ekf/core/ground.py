@@ -222,7 +222,7 @@ def explain(pairs, anchors, workspace, prior, tuning, z, z_std, lateness, x, cov
     ground most are late by the same, as that is the way by what reflects, some by anything, and some in time (a mixture). KNOWN: the
     error of an anchor is about its floor_delay. Iteratively re-weighted least squares.
     """
-    rows, places = _heard(pairs, anchors)
+    rows, places = heard(pairs, anchors)
     n = 3 + len(rows) + 1
     system, u = np.empty((n, n + 1)), np.zeros(n)
     u[:3] = x
@@ -256,7 +256,7 @@ def explain(pairs, anchors, workspace, prior, tuning, z, z_std, lateness, x, cov
 
 
 @compiled
-def _heard(pairs, anchors):
+def heard(pairs, anchors):
     """Rows of the anchors that are heard, and for each pair the places of its two anchors among these (k, 2)."""
     rows, places, count = np.empty(MOST_ANCHORS, np.int64), np.full((len(pairs), 2), -1), 0
     for k in range(len(pairs)):

@@ -16,6 +16,10 @@ MINIMUM = 12  # TDOAs a search needs
 AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
 CLEARLY_MORE = 0.2  # share by which a recovery must explain more than the filter does
 RECOVERY_WINDOW = 0.3  # s of TDOAs that a recovery rests on: a tag that leaves a floor must not wait for those of the floor
+SLOW_TDOAS, SLOW_STAMPS, SLOWEST = 20, 3, 30.0  # TDOAs and stamps, and s, that a start looks back where few TDOAs come
+UNKNOWN, BETTER = 2.0, 0.5  # m, deviation of a place that is hardly known; share of its variance that is clearly less
+LONGEST_GAP = 0.6  # share of the time of these within which none came: beyond, they are those of a tag that has just been switched on
+LISTEN_PERIOD = 1.0  # s between two looks at who is heard
 SEARCH_PERIOD = 0.1  # s between two searches
 TILT_STD = 0.1  # rad, at the start
 WRONG_POSITION = 1.0  # m, that inertial samples which are wrong have made
@@ -55,13 +59,13 @@ def start(ekf, anchors, tuning, t, anyhow, history):
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    workspace.set_bounds(anchors, tuning.workspace_margin, ekf.workspace)
+    _find_surroundings(ekf, window, anchors, tuning)
     x, covariance, cost = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES)
     accel = _mean_accel(ekf.imu, tuning)
     z, z_std = _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
-    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance, cost)
+    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
     near = np.empty((2, 3))
-    workspace.set_bounds(anchors, standing.NEAR, near)
+    workspace.surround(ekf, standing.NEAR, near)
     near[0, 2] = min(near[0, 2], tuning.ground_height)
     standing.sort(x, covariance, cost, near)
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
@@ -88,6 +92,94 @@ def start(ekf, anchors, tuning, t, anyhow, history):
 
 
 @compiled
+def start_slowly(ekf, anchors, tuning, t, history):
+    """The same where few TDOAs come: from the last SLOW_TDOAS or SLOW_STAMPS of them, if these tell one position, and in any case when
+    there are so many."""
+    window, stamps = _last(ekf, t)
+    enough = len(window) >= SLOW_TDOAS or (stamps >= SLOW_STAMPS and len(window) > 2 * stamps)
+    span, gap = t - window[0].t, 0.0
+    for i in range(1, len(window)):
+        gap = max(gap, window[i].t - window[i - 1].t)
+    if not (enough or len(window) >= MINIMUM) or span < tuning.start_window or gap > LONGEST_GAP * span:
+        return
+    _find_surroundings(ekf, window, anchors, tuning)
+    x, covariance, cost = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES)
+    accel = _mean_accel(ekf.imu, tuning)
+    z, z_std = _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
+    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
+    near = np.empty((2, 3))
+    workspace.surround(ekf, standing.NEAR, near)
+    near[0, 2] = min(near[0, 2], tuning.ground_height)
+    standing.sort(x, covariance, cost, near)
+    if not (enough or (share >= AGREE and workspace.contains(ekf.workspace, x[0]))):
+        return
+    if np.trace(covariance[0, :3, :3]) > APART**2:
+        split(x, covariance, cost)
+        standing.sort(x, covariance, cost, near)
+    _begin(ekf, tuning, t, x, covariance, cost, tuning.initial_yaw, tuning.initial_yaw_std)
+    ekf.resting, ekf.rest_since = False, t
+    add_reset(ekf, t, history)
+
+
+@compiled
+def is_unsure(ekf):
+    """Whether the place of the tag is hardly known."""
+    return np.trace(ekf.hypotheses[ekf.best].P[:3, :3]) > UNKNOWN**2
+
+
+@compiled
+def relocate(ekf, anchors, tuning, t, history):
+    """Of a tag that few TDOAs come from, and whose place is hardly known by now: go where its last TDOAs tell it is, if they tell that better
+    than the filter. So far from where the TDOAs are linearized these do together what each of them does not alone."""
+    if not is_unsure(ekf) or len(recent(ekf, tuning.start_window)) >= MINIMUM:
+        return
+    best, window = ekf.hypotheses[ekf.best], _last(ekf, t)[0]
+    x, covariance, cost = np.empty((2, 6)), np.empty((2, 6, 6)), np.empty(2)
+    q = best.x[6:10]
+    z, z_std = _known_height(ekf, tuning, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
+    _find_surroundings(ekf, window, anchors, tuning)
+    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
+    told = np.trace(covariance[0, :3, :3])
+    if cost[1] < np.inf:
+        told += np.sum((x[1, :3] - x[0, :3]) ** 2)
+    if share < AGREE or told > BETTER * np.trace(best.P[:3, :3]) or not workspace.contains(ekf.workspace, x[0]):
+        return
+    for h in range(HYPOTHESES):
+        hypothesis = ekf.hypotheses[h]
+        hypothesis.P[:6, :] = 0.0
+        hypothesis.P[:, :6] = 0.0
+        _put(hypothesis, x[0], covariance[0])
+    add_reset(ekf, t, history)
+
+
+@compiled
+def _last(ekf, t):
+    """The last SLOW_TDOAs, or as many more as have SLOW_STAMPS, none older than SLOWEST: (n,) of TDOA, and how many stamps they have."""
+    first, stamps = ekf.kept - 1, 1
+    while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > t - SLOWEST:
+        new = ekf.window[first - 1].t != ekf.window[first].t
+        if ekf.kept - first >= SLOW_TDOAS and stamps >= SLOW_STAMPS and new:
+            break
+        first -= 1
+        stamps += new
+    return ekf.window[first : ekf.kept], stamps
+
+
+@compiled
+def _find_surroundings(ekf, window, anchors, tuning):
+    """Where a tag is expected that hears the anchors of a window (n,) of TDOA."""
+    workspace.listen(ekf, window, anchors, tuning.radio_reach, tuning.tag_side)
+    workspace.surround(ekf, tuning.workspace_margin, ekf.workspace)
+
+
+@compiled
+def look_around(ekf, anchors, tuning, t):
+    """Follow a running tag from the surroundings of some anchors to those of others, at stamp t, s."""
+    ekf.next_bounds = t + LISTEN_PERIOD
+    _find_surroundings(ekf, recent(ekf, LISTEN_PERIOD), anchors, tuning)
+
+
+@compiled
 def place(ekf, anchors, tuning, t, pose, history):
     """Go to the pose that one of POSE tells; begin there, if the filter does not run.
 
@@ -100,7 +192,7 @@ def place(ekf, anchors, tuning, t, pose, history):
         x[:] = best.x[:6]
         covariance[:, :] = best.P[:6, :6]
     else:
-        workspace.set_bounds(anchors, tuning.workspace_margin, ekf.workspace)
+        workspace.surround(ekf, tuning.workspace_margin, ekf.workspace)
         for k in range(3):
             x[k] = 0.5 * (ekf.workspace[0, k] + ekf.workspace[1, k])
             covariance[k, k] = (0.5 * (ekf.workspace[1, k] - ekf.workspace[0, k])) ** 2
@@ -172,37 +264,57 @@ def _turn(hypothesis, yaw, std):
 
 
 @compiled
-def recover(ekf, anchors, tuning, t, history):
+def recover(ekf, anchors, tuning, t, anywhere, history):
     """If the window agrees on a position and the filter on another one, go there; attitude and biases stay.
 
-    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter was right, and no farther.
+    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter was right, and no farther. One that may be
+    `anywhere` does, and to several places, if there are several.
     """
     window = recent(ekf, min(tuning.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    x, covariance = np.empty((1, 6)), np.empty((1, 6, 6))
+    places = PLACES if anywhere else 1
+    x, covariance, cost = np.empty((places, 6)), np.empty((places, 6, 6)), np.empty(places)
     q = ekf.hypotheses[ekf.best].x[6:10]
     z, z_std = _known_height(ekf, tuning, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
-    share = locate(window, anchors, ekf.workspace, tuning.tdoa_std, z, z_std, x, covariance, np.empty(1))
+    _find_surroundings(ekf, window, anchors, tuning)
+    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
     explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
-    if not workspace.contains(ekf.workspace, x[0]) or share < AGREE_ANYHOW or share < CLEARLY_MORE + explained:
+    if not workspace.contains(ekf.workspace, x[0]) or share < AGREE_ANYHOW:
         return
-    if tuning.use_imu and not ekf.distrusted and t - ekf.imu.t < tuning.imu_timeout:
+    if anywhere and cost[places - 1] < np.inf:
+        _reopen(ekf, cost)
+    elif share < CLEARLY_MORE + explained:
+        return
+    if not anywhere and tuning.use_imu and not ekf.distrusted and t - ekf.imu.t < tuning.imu_timeout:
         since, away = t - ekf.sure, 0.0
         for k in range(3):
             away += (x[0, k] - ekf.hypotheses[ekf.best].x[k]) ** 2
         if math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
             return
     for h in range(HYPOTHESES):
-        hypothesis = ekf.hypotheses[h]
+        hypothesis, place = ekf.hypotheses[h], min(h // YAWS, places - 1)
+        if cost[place] == np.inf:
+            place = 0
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
-        _put(hypothesis, x[0], covariance[0])
+        _put(hypothesis, x[place], covariance[place])
     ekf.consistency, ekf.late_as_known = 1.0, False
     ekf.rest_since = t
     ekf.recoveries += 1
     add_reset(ekf, t, history)
+
+
+@compiled
+def _reopen(ekf, cost):
+    """Follow the yaws of the best hypothesis at each place again, whose probabilities are exp(-cost) (PLACES,)."""
+    of_best = ekf.best // YAWS
+    for yaw in range(YAWS):
+        one = ekf.hypotheses[of_best * YAWS + yaw]
+        other = ekf.hypotheses[(1 - of_best) * YAWS + yaw]
+        other.x[:], other.P[:], other.log_weight = one.x, one.P, one.log_weight - cost[1 - of_best]
+        one.log_weight -= cost[of_best]
 
 
 @compiled

@@ -144,8 +144,15 @@ EKF = _record(
     ("shaking", float),  # m^2/s^4, power of the vibration of a tag that is not at rest, over some seconds
     ("lift", float, 3),  # m/s, that the inertial sensor has felt lately at rest, in the world
     ("sure", float),  # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
-    ("workspace", float, (2, 3)),  # m, lower and upper bounds, see workspace.py
+    ("extent", float, (2, 3)),  # m, lower and upper bounds: of all anchors,
+    ("within", float, (2, 3)),  # of the reach of those that were heard lately,
+    ("workspace", float, (2, 3)),  # and of where the tag is expected, see workspace.py
+    ("side", float, 3),  # on which the tag is of anchors in a plane, see workspace.told_side
+    ("flat", float, 3),  # 1.0 for axes along which these are at one coordinate, while nobody tells on which side of that the tag is
+    ("middle", float, 3),  # m, of the anchors heard lately
+    ("next_bounds", float),  # s, stamp before which not to look anew who is heard
     ("information", float, (3, 3)),  # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py
+    ("unsure_until", float),  # s, stamp until which the tag may be anywhere, as its place was hardly known before
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),
     ("first_tdoa", float),  # s, stamps: of the first TDOA since the filter stopped, and the last one
@@ -215,11 +222,13 @@ def new_memory(positions, functions=(), floor=None):
     `EffectSet.on_floor`."""
     memory = Memory(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
     memory.anchors["position"] = positions
+    memory.record.extent[:] = np.min(positions, axis=0), np.max(positions, axis=0)
+    memory.record.within[:] = [[-np.inf] * 3, [np.inf] * 3]
     for stamp in ("learned", "judged", "heard"):
         memory.anchors[stamp] = -np.inf
     ekf = memory.record
     memory.anchors["floor_delay"], memory.anchors["floor_std"], ekf["floor_place"][:] = floor or (np.nan, 0.0, np.nan)
-    for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge", "next_look", "sure"):
+    for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge", "next_look", "next_bounds", "sure", "unsure_until"):
         ekf[stamp] = -np.inf
     ekf.imu.t = ekf.plausibility.contradicted = -np.inf
     for stamp in ("heard", "changed", "used", "judged", "pulls_since", "ignored_until"):

@@ -16,7 +16,7 @@ from .hypotheses import alive
 from .memory import HYPOTHESES
 from .startup import locate
 from .update import update_state
-from .workspace import set_bounds
+from .workspace import surround
 
 NEAR = 1.0  # m beyond the anchors
 EXPLANATIONS = 4  # elsewhere, and on the ground with each lateness of ground.explain
@@ -47,7 +47,7 @@ def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
     position[0] = x[:3]
     cost[0] = ground.explain(pairs, anchors, bounds, prior, tuning, z, z_std, ground.IN_TIME, position[0], each[0])
     starts, near = np.empty((4, 2)), np.empty((2, 3))
-    set_bounds(anchors, NEAR, near)
+    surround(ekf, NEAR, near)
     near[0, 2] = min(near[0, 2], tuning.ground_height)
     cost[0] += _absurdity(near, x)
     position[0], each[0] = x[:3], covariance[:3, :3]
@@ -88,8 +88,8 @@ def _on_ground(ekf, pairs, anchors, prior, tuning, z, z_std, starts, cost, posit
         floor, floor_std = z, z_std
     trial, its = np.empty(3), np.empty((3, 3))
     known = False
-    for i in range(len(anchors)):
-        known = known or not math.isnan(anchors[i].floor_delay)
+    for row in ground.heard(pairs, anchors)[0]:
+        known = known or not math.isnan(anchors[row].floor_delay)
     for lateness in range(EXPLANATIONS - 1):
         k = 1 + lateness
         cost[k] = np.inf
@@ -138,6 +138,15 @@ def is_near_ground(hypothesis, tuning):
 
 
 @compiled
+def _expected_late(pairs, anchors):
+    """How many anchors of (k,) of PAIR are expected to be late because the tag is low."""
+    late = 0.0
+    for row in ground.heard(pairs, anchors)[0]:
+        late += anchors[row].late
+    return late
+
+
+@compiled
 def land(ekf, pairs, anchors, tuning, still, stands, t, records):
     """If (k,) of PAIR tell at stamp t, s, that a tag is on the ground, go there. Returns whether.
 
@@ -145,7 +154,7 @@ def land(ekf, pairs, anchors, tuning, still, stands, t, records):
     HOVER_STD, of one that is not still the height alone.
     """
     best = ekf.hypotheses[ekf.best]
-    if not is_near_ground(best, tuning) or not (still or np.sum(anchors["late"]) > FEWEST_LATE):
+    if not is_near_ground(best, tuning) or not (still or _expected_late(pairs, anchors) > FEWEST_LATE):
         return False
     prior, wide = np.empty((4, 3)), best.P[:3, :3].copy()
     for k in range(3):
@@ -184,7 +193,7 @@ def land(ekf, pairs, anchors, tuning, still, stands, t, records):
 def find_again(ekf, pairs, window, anchors, tuning, t, records):
     """A tag lies still at stamp t, s, but inertial samples have told that it moves: they were wrong, and it may be anywhere."""
     x, covariance = np.empty((1, 6)), np.empty((1, 6, 6))
-    locate(window, anchors, ekf.workspace, tuning.tdoa_std, np.nan, np.nan, x, covariance, np.empty(1))
+    locate(window, anchors, ekf.workspace, tuning, np.nan, np.nan, x, covariance, np.empty(1))
     weigh(ekf, pairs, anchors, tuning, np.nan, np.nan, x[0], covariance[0])
     _put(ekf, x[0, :3], covariance[0, :3, :3], t, records)
     ekf.resting, ekf.rest_since = True, t

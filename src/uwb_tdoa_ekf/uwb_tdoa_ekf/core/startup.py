@@ -1,4 +1,8 @@
-"""Where is the tag? A position and velocity from a short window of TDOAs and nothing else."""
+"""Where is the tag? A position and velocity from a short window of TDOAs and nothing else.
+
+In a room the search begins in the middle and the corners of its workspace. Where that is large a coarse grid over it says where else to
+begin. TDOAs that are older than a usual window, of a tag that hears few, tell less, as the tag may have moved by any acceleration since.
+"""
 
 import math
 
@@ -9,8 +13,14 @@ from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
 from .ground import solve
+from .workspace import reflect, rows_heard, told_side
 
-STARTS = 9  # the middle of the workspace and the corners of the half-size box around it
+STARTS = 9  # the middle of the workspace and the corners of the half-size box around it,
+GRID_STARTS = 7  # and the best places of a grid over one that is larger than
+LARGE = 20.0  # m, along x or y
+GRID_STEP, GRID_POINTS, GRID_LEVEL = 2.0, 600, 4.0  # m, between its places at least; how many at a height at most; m between heights at most
+GRID_TDOAS = 60  # of the window, that it looks at
+GRID_LOSS, GRID_APART = 1.5, 2.5  # grid steps: scale of the loss, and between two of the best places
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
 SPEED = 1.0  # m/s, standard deviation of the velocity before anything is known
@@ -23,39 +33,51 @@ SPLIT = 0.8  # standard deviations from the middle of a place to each of two tha
 
 
 @compiled
-def locate(window, anchors, workspace, std, z, z_std, x, covariance, cost):
+def locate(window, anchors, workspace, tuning, z, z_std, x, covariance, cost):
     """Robust multilateration over a window, with constant velocity.
 
-    window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see workspace.py; std : m, of
-    one TDOA; z, z_std : m, a height that is known otherwise and its standard deviation, or NaN. Writes position and velocity at the last
+    window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see workspace.py; tuning : one of
+    TUNING; z, z_std : m, a height that is known otherwise and its standard deviation, or NaN. Writes position and velocity at the last
     stamp to x (k, 6), their covariance to `covariance` (k, 6, 6), and minus the logarithm of the probability of each place, less that of
-    the first, to cost (k,): the most probable one first, then others that are APART, with inf where there are none.
-    Returns the share of TDOAs that agree with the first, 0 to 1.
+    the first, to cost (k,): the most probable one first, then others that are APART, with inf where there are none. In a large workspace
+    the covariance of the last one holds those for which there is no room. Returns the share of TDOAs that agree with the first, 0 to 1.
 
     Graduated Geman-McClure: Gauss-Newton from several starts while the loss narrows; the start with the least final
     loss wins. A tag is in its workspace and slow until proven otherwise: without that prior, the late arrivals on a
     floor are explained best by a tag ten metres up. The covariance counts one independent error per anchor heard, not
     per TDOA, because errors persist over the window, and grows with the disagreement that is left.
     """
+    std, ageing = tuning.tdoa_std, np.zeros(len(window))
+    for i in range(len(window)):
+        age = max(0.0, window[len(window) - 1].t - window[i].t - tuning.start_window)
+        ageing[i] = tuning.motion_noise**2 * age**3 / 3.0 / std**2
     mean, prior_std = np.zeros(6), np.full(6, SPEED)
     for k in range(3):
         mean[k], prior_std[k] = 0.5 * (workspace[0, k] + workspace[1, k]), 0.5 * (workspace[1, k] - workspace[0, k])
     if not math.isnan(z):
         mean[2], prior_std[2], prior_std[5] = z, z_std, SPEED
     prior_information = 1.0 / prior_std**2
-    correlation_length = _correlation_length(window, len(anchors))
-    trials, losses, residuals, system = np.zeros((STARTS, 6)), np.zeros(STARTS), np.zeros(len(window)), np.zeros((6, 7))
-    for start in range(STARTS):
+    rows = rows_heard(window)
+    correlation_length = max(1.0, len(window) / max(1.0, len(rows) - 1.0))
+    trials, losses = np.zeros((STARTS + GRID_STARTS, 6)), np.full(STARTS + GRID_STARTS, np.inf)
+    residuals, system = np.zeros(len(window)), np.zeros((6, 7))
+    side = told_side(rows, anchors, tuning.tag_side)
+    large = max(prior_std[0], prior_std[1]) > 0.5 * LARGE
+    starts = STARTS + (_best_of_grid(window, anchors, mean, prior_std, ageing, trials[STARTS:]) if large else 0)
+    for start in range(starts):
         trial = trials[start]
-        trial[:] = mean
+        if start < STARTS:
+            trial[:] = mean
         for k in range(3):
-            if start > 0:
+            if 0 < start < STARTS:
                 trial[k] += 0.5 * prior_std[k] * (1.0 if ((start - 1) >> k) & 1 else -1.0)
         for sweep in range(SWEEPS):
             scale = max(COARSE * 0.7**sweep, FINE)
-            _normal_equations(window, anchors, trial, scale, system, residuals)
+            reflect(trial, side)
+            _normal_equations(window, anchors, trial, ageing, scale, system, residuals)
             _step(trial, system, correlation_length * max(std, 0.5 * scale) ** 2 * prior_information, mean)
-        loss = _normal_equations(window, anchors, trial, FINE, system, residuals)
+        reflect(trial, side)
+        loss = _normal_equations(window, anchors, trial, ageing, FINE, system, residuals)
         far = np.sum(((trial - mean) / prior_std) ** 2)
         losses[start] = 0.5 * (len(window) / correlation_length * loss * (FINE / std) ** 2 + far)
     share, least = 0.0, np.min(losses)
@@ -63,7 +85,7 @@ def locate(window, anchors, workspace, std, z, z_std, x, covariance, cost):
         start = np.argmin(losses)
         cost[place] = losses[start] - least if losses[start] - least < IMPROBABLE else np.inf
         x[place] = trials[start]
-        _normal_equations(window, anchors, x[place], NO_SCALE, system, residuals)
+        _normal_equations(window, anchors, x[place], ageing, NO_SCALE, system, residuals)
         variance = correlation_length * max(std, 1.5 * np.median(np.abs(residuals))) ** 2
         for k in range(6):
             system[k, k] += variance * prior_information[k]
@@ -72,10 +94,66 @@ def locate(window, anchors, workspace, std, z, z_std, x, covariance, cost):
         covariance[place] = both[:, 6:] * variance
         if place == 0:
             share = np.mean(np.abs(residuals) < INLIER)
-        for other in range(STARTS):
+        for other in range(starts):
             if np.sum((trials[other, :3] - x[place, :3]) ** 2) < APART**2:
                 losses[other] = np.inf
+    if large:
+        _hold_others(trials, losses - least, x, covariance, cost)
     return share
+
+
+@compiled
+def _hold_others(trials, costs, x, covariance, cost):
+    """Spread the last of the places x (k, 6) that is one over the others (m, 6) that are left, whose costs (m,) are inf where they are not."""
+    last = 0
+    for place in range(len(x)):
+        if cost[place] < np.inf:
+            last = place
+    total = math.exp(-cost[last])
+    for other in range(len(costs)):
+        total += math.exp(-costs[other]) if costs[other] < IMPROBABLE else 0.0
+    for other in range(len(costs)):
+        if costs[other] < IMPROBABLE:
+            share = math.exp(-costs[other]) / total
+            for i in range(3):
+                for j in range(3):
+                    covariance[last, i, j] += share * (trials[other, i] - x[last, i]) * (trials[other, j] - x[last, j])
+    cost[last] = min(cost[last], -math.log(total))
+
+
+@compiled
+def _best_of_grid(window, anchors, mean, prior_std, ageing, places):
+    """Fill in places (k, 6), at rest, of a grid over `mean` +- `prior_std` (6,) that explain a window best, apart from each other. Returns
+    how many."""
+    step = max(GRID_STEP, math.sqrt(4.0 * prior_std[0] * prior_std[1] / GRID_POINTS))
+    counts, origin, steps = np.empty(3, np.int64), np.empty(3), np.empty(3)
+    for k in range(3):
+        counts[k] = max(2 if k == 2 else 1, int(math.ceil(2.0 * prior_std[k] / (GRID_LEVEL if k == 2 else step))))
+        steps[k] = 2.0 * prior_std[k] / counts[k]
+        origin[k] = mean[k] - prior_std[k] + 0.5 * steps[k]
+    losses, p, row = np.empty(counts[0] * counts[1] * counts[2]), np.empty(3), np.empty(3)
+    apart = max(1, len(window) // GRID_TDOAS)
+    for i in range(len(losses)):
+        p[0] = origin[0] + steps[0] * (i % counts[0])
+        p[1] = origin[1] + steps[1] * (i // counts[0] % counts[1])
+        p[2] = origin[2] + steps[2] * (i // (counts[0] * counts[1]))
+        losses[i] = 0.0
+        for j in range(len(window) - 1, -1, -apart):
+            r = window[j].d - linearized_tdoa(p, anchors[window[j].a].position, anchors[window[j].b].position, row)
+            losses[i] += geman_mcclure_loss(r / math.sqrt(1.0 + ageing[j]), GRID_LOSS * step)
+    for place in range(len(places)):
+        i = np.argmin(losses)
+        if losses[i] == np.inf:
+            return place
+        places[place, 0] = origin[0] + steps[0] * (i % counts[0])
+        places[place, 1] = origin[1] + steps[1] * (i // counts[0] % counts[1])
+        places[place, 2] = origin[2] + steps[2] * (i // (counts[0] * counts[1]))
+        for other in range(len(losses)):
+            away = (origin[0] + steps[0] * (other % counts[0]) - places[place, 0]) ** 2
+            away += (origin[1] + steps[1] * (other // counts[0] % counts[1]) - places[place, 1]) ** 2
+            if away < (GRID_APART * step) ** 2:
+                losses[other] = np.inf
+    return len(places)
 
 
 @compiled
@@ -104,7 +182,7 @@ def split(x: np.ndarray, covariance: np.ndarray, cost: np.ndarray) -> None:
 def share_of_inliers(window, anchors, x):
     """Share of the window's TDOAs that agree with position and velocity x (6,) at its end, 0 to 1."""
     residuals = np.empty(len(window))
-    _normal_equations(window, anchors, x, NO_SCALE, np.empty((6, 7)), residuals)
+    _normal_equations(window, anchors, x, np.zeros(len(window)), NO_SCALE, np.empty((6, 7)), residuals)
     return np.mean(np.abs(residuals) < INLIER)
 
 
@@ -122,16 +200,6 @@ def level(accel, yaw, x):
 
 
 @compiled
-def _correlation_length(window, anchors):
-    """TDOAs of the window that tell as much as one independent of the others, of which each anchor heard but the first
-    gives one."""
-    heard = np.zeros(anchors)
-    for i in range(len(window)):
-        heard[window[i].a] = heard[window[i].b] = 1.0
-    return max(1.0, len(window) / max(1.0, np.sum(heard) - 1.0))
-
-
-@compiled
 def _step(trial, system, prior_information, mean):
     """One Gauss-Newton step of `trial` (6,), with a prior about `mean` (6,)."""
     for k in range(6):
@@ -144,10 +212,10 @@ def _step(trial, system, prior_information, mean):
 
 
 @compiled
-def _normal_equations(window, anchors, x, scale, system, residuals):
+def _normal_equations(window, anchors, x, ageing, scale, system, residuals):
     """Weighted normal equations of the window at x (6,): information matrix and gradient to `system` (6, 7).
 
-    Returns the mean Geman-McClure loss, 0 to 1; writes the residuals (n,), m."""
+    ageing : (n,) variance of where the tag was, per axis, beyond what x says, over that of a TDOA, by which its residual counts less. Returns the mean Geman-McClure loss, 0 to 1; writes the residuals (n,), m."""
     system[:, :] = 0.0
     loss, n = 0.0, len(window)
     p, row = np.empty(3), np.empty(6)
@@ -157,6 +225,11 @@ def _normal_equations(window, anchors, x, scale, system, residuals):
         for k in range(3):
             p[k] = x[k] + tau * x[3 + k]
         r = tdoa.d - linearized_tdoa(p, anchors[tdoa.a].position, anchors[tdoa.b].position, row)
+        if ageing[i] > 0.0:
+            share = 1.0 / math.sqrt(1.0 + ageing[i] * (row[0] ** 2 + row[1] ** 2 + row[2] ** 2))
+            r *= share
+            for k in range(3):
+                row[k] *= share
         for k in range(3):
             row[3 + k] = tau * row[k]
         residuals[i] = r

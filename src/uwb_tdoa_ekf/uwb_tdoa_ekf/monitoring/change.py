@@ -7,8 +7,9 @@ that began then, as a step or as a ramp, with none: what a delay would make of t
 them. The ratio is counted in units of the mean square of the errors before the onset, so that a flight with worse errors than
 the kernel expects needs a larger change.
 
-Memory grows with the number of anchors, not with its square: what a delay does to a slice is kept for the anchors that were
-heard in it, and for the slices in which an onset is looked for.
+Memory and time go with the anchors that are heard, not with those that are installed: an anchor has a column from the first slice in which
+it is heard to the last one that is remembered. What a delay does to a slice is kept for the anchors that were heard in it, and for the
+slices in which an onset is looked for.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from .slices import LENGTH, MOST
+from .slices import LENGTH
 
 MEAN_STD = 0.15  # m, of a delay that is the same everywhere,
 PLACE_STD, PLACE_LENGTH = 0.2, 0.9  # m, of one that depends on the place, and how far it is alike,
@@ -54,38 +55,50 @@ class Change:
 class ChangeDetector:
     """Takes Slices in the order of their stamps; `find` tests them; what it found is taken out by `take_out`."""
 
-    def __init__(self, anchors):
-        """anchors : their number."""
-        room, heard = CAPACITY, min(anchors, MOST)
+    def __init__(self):
+        room = CAPACITY
+        self._rows, self._columns = np.empty(0, int), {}  # of the anchors with a column, and the column of each row
         self._t, self._p = np.zeros(room), np.zeros((room, 3))
-        self._delays, self._freedom = np.zeros((room, anchors)), np.zeros(room)  # without what was taken out; combinations measured
-        self._factor, self._white = np.zeros((room, room)), np.zeros((room, anchors))  # Cholesky factor; whitened errors
+        self._delays, self._freedom = np.zeros((room, 0)), np.zeros(room)  # without what was taken out; combinations measured
+        self._factor, self._white = np.zeros((room, room)), np.zeros((room, 0))  # Cholesky factor; whitened errors
         self._squares = np.zeros(room)  # normalised squares
-        self._response = np.zeros((WINDOW, heard, heard))  # of the latest slices, in turn, for the anchors that were heard,
-        self._place = np.full((WINDOW, anchors), -1)  # and where an anchor is among them
+        self._response = np.zeros((WINDOW, 0, 0))  # of the latest slices, in turn, for the anchors that were heard,
+        self._place = np.full((WINDOW, 0), -1)  # and where the anchor of a column is among them
         self._known, self._count, self._added = [], 0, 0
 
     def add(self, piece):
         """Take a Slice."""
         if self._count == CAPACITY:
             self._forget_oldest(CAPACITY // 4)
-        k, n = self._count, len(piece.rows)
+        k, n, columns = self._count, len(piece.rows), self._columns_of(piece.rows)
         self._count, self._added = k + 1, self._added + 1
         self._t[k], self._p[k], self._freedom[k] = piece.t, piece.p, np.trace(piece.response)
         self._delays[k] = 0.0
-        self._delays[k, piece.rows] = piece.delays - piece.response @ self.delays_at(piece.t)[piece.rows]
+        self._delays[k, columns] = piece.delays - piece.response @ self.delays_at(piece.t, piece.rows)
         turn = self._turn(k)
         self._place[turn] = -1
-        self._place[turn, piece.rows] = np.arange(n)
+        self._place[turn, columns] = np.arange(n)
         self._response[turn, :n, :n] = piece.response
         self._whiten(k)
 
-    def delays_at(self, t):
-        """(N,) m: what was taken out, at stamp t, s."""
-        total = np.zeros(self._delays.shape[1])
+    def delays_at(self, t, rows):
+        """(k,) m: what was taken out of the anchors in rows (k,), at stamp t, s."""
+        total = np.zeros(len(rows))
         for change in self._known:
-            total[change.row] += change.at(t)
+            total[np.asarray(rows) == change.row] += change.at(t)
         return total
+
+    def _columns_of(self, rows):
+        """(k,) columns of anchors, by their rows (k,), with new ones for those that have none; room for so many in a slice."""
+        new = [row for row in rows.tolist() if row not in self._columns]
+        if new:
+            self._columns |= {row: len(self._rows) + k for k, row in enumerate(new)}
+            self._rows = np.concatenate([self._rows, new]).astype(int)
+            self._delays, self._white = (np.pad(array, ((0, 0), (0, len(new)))) for array in (self._delays, self._white))
+            self._place = np.pad(self._place, ((0, 0), (0, len(new))), constant_values=-1)
+        if (more := len(rows) - self._response.shape[1]) > 0:
+            self._response = np.pad(self._response, ((0, 0), (0, more), (0, more)))
+        return np.array([self._columns[row] for row in rows.tolist()], int)
 
     def find(self, after):
         """The Change that explains the latest slices best, of onsets later than `after`, s; None without enough of them."""
@@ -96,21 +109,21 @@ class ChangeDetector:
         value, ratio, scale = self._compare(first)
         ratio[onsets:][np.abs(value[onsets:]) > FASTEST_DRIFT] = 0.0
         ratio[onsets:] /= CLEARLY
-        shape, row = np.unravel_index(np.argmax(ratio), ratio.shape)
-        best, scale, later = float(ratio[shape, row]), scale[shape], slice(first + shape % onsets, self._count)
+        shape, column = np.unravel_index(np.argmax(ratio), ratio.shape)
+        best, scale, later = float(ratio[shape, column]), scale[shape], slice(first + shape % onsets, self._count)
         explained = best * scale * (CLEARLY if shape >= onsets else 1.0)
         left = (np.sum(self._white[later] ** 2) - explained) / max(np.sum(self._freedom[later]) * scale, 1e-9)
-        rival = float(np.max(np.delete(ratio, row, axis=1), initial=0.0))
-        since, value = self._t[first + shape % onsets] - 0.5 * LENGTH, float(value[shape, row])
+        rival = float(np.max(np.delete(ratio, column, axis=1), initial=0.0))
+        since, value = self._t[first + shape % onsets] - 0.5 * LENGTH, float(value[shape, column])
         size, slope = (value, 0.0) if shape < onsets else (0.0, value)
-        return Change(int(row), float(since), size, slope, best, rival, float(left))
+        return Change(int(self._rows[column]), float(since), size, slope, best, rival, float(left))
 
     def refined(self, change):
         """The step that was taken out last, with the size that it has by now, or None; takes that out instead."""
         first = self._first(change.since)
         if change.slope or self._t[first] - change.since > LENGTH or self._count - first <= YOUNGEST:
             return None
-        more = float(self._compare(first)[0][0, change.row])
+        more = float(self._compare(first)[0][0, self._columns[change.row]])
         better = replace(change, size=change.size + more)
         self._known.remove(change)
         self._known.append(better)
@@ -123,11 +136,12 @@ class ChangeDetector:
         self._subtract(change)
 
     def _subtract(self, change):
+        column = self._columns[change.row]
         for k in range(self._first(change.since), self._count):  # later than any onset that is found
             place, response = self._place[self._turn(k)], self._response[self._turn(k)]
-            if place[change.row] >= 0:
+            if place[column] >= 0:
                 heard = np.flatnonzero(place >= 0)
-                self._delays[k, heard] -= response[place[heard], place[change.row]] * change.at(self._t[k])
+                self._delays[k, heard] -= response[place[heard], place[column]] * change.at(self._t[k])
             self._whiten(k)
 
     def _turn(self, k):
@@ -168,6 +182,11 @@ class ChangeDetector:
         for array in (self._t, self._p, self._delays, self._freedom):
             array[: CAPACITY - n] = array[n:].copy()
         self._count = CAPACITY - n
+        known = np.isin(self._rows, [change.row for change in self._known])
+        kept = np.flatnonzero((self._delays[: self._count] != 0.0).any(axis=0) | (self._place >= 0).any(axis=0) | known)
+        self._rows = self._rows[kept]
+        self._columns = {row: k for k, row in enumerate(self._rows.tolist())}
+        self._delays, self._white, self._place = (array[:, kept] for array in (self._delays, self._white, self._place))
         for k in range(self._count):
             self._whiten(k)
 

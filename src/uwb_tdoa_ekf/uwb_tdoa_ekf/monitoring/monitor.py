@@ -7,6 +7,7 @@ gone.
 
 from itertools import starmap
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,8 @@ MOST_LEFT = 1.0  # and of the errors since then, over those before, what it may 
 SMALLEST_CHANGE = 0.15  # m; less does not matter, and what has come back to that has gone
 SILENT, FEWEST = 4, 40  # slices without an anchor, and the TDOAs of the others in them
 OFTEN = 0.5  # share of the slices in which it was heard before
+FORGET = 60  # slices between two looks at which of the anchors were passed long ago
+NEARER = 0.8  # share of the distance of the farthest anchor that is heard, within which another must be
 TOGETHER = 4  # slices in which a swap is looked for
 NAMED, HELD = 4, 8  # slices in a row that must say so until a swap is named, and something else until it is no longer
 CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
@@ -32,6 +35,14 @@ BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}  # rad/s and m/s^2, by w
 
 NO_ODOMETRY = [np.empty(0), *[np.empty((0, 3))] * 4]  # t, p, v, gyro_bias, accel_bias
 NO_RESIDUALS = [np.empty(0), *[np.empty(0, int)] * 2, np.empty(0)]  # t, a, b, innovation
+
+
+class Heard(NamedTuple):
+    """slices : in which an anchor was heard; last : number of the last one; farthest : m, of the tag when it was."""
+
+    slices: int = 0
+    last: int = 0
+    farthest: float = 0.0
 
 
 class Monitor:
@@ -43,14 +54,13 @@ class Monitor:
         self._forget()
 
     def _forget(self):
-        n = len(self._anchors)
         self._odometry, self._residuals = [NO_ODOMETRY], [NO_RESIDUALS]  # of the present slice and later
         self._end = self._last = None  # s, stamps: at which the present slice ends, and of what was added last
-        self._detector = ChangeDetector(n)
+        self._detector = ChangeDetector()
         self._changes = {}  # row: Changes of an anchor that is not what it was
         self._latest_change = None  # while its size is still found out
         self._latest = []  # of the last slices: rows a, b (n,), measured d (n,) m, place (3,) m
-        self._slices, self._heard, self._missing = 0, np.zeros(n), np.zeros(n)  # slices: all, with each, lately without it
+        self._slices, self._heard = 0, {}  # slices of all; row: Heard
         self._counts = []  # TDOAs of the last slices
         self._swapped, self._silent = (), ()  # rows
         self._instead = (), 0  # rows of another swap, or of none, and slices in a row that say so
@@ -66,10 +76,11 @@ class Monitor:
     @property
     def delays(self):
         """Of the anchors that are not what they were, at the present stamp: (N,) m, and their variances (N,) m^2."""
-        delays, variances = self._detector.delays_at(self._end), np.zeros(len(self._anchors))
+        delays, variances = np.zeros((2, len(self._anchors)))
         changed = [*self._changes]
+        delays[changed] = self._detector.delays_at(self._end, changed)
         variances[changed] = [delays[row] ** 2 / found[-1].ratio for row, found in self._changes.items()]
-        return np.where(np.isin(np.arange(len(delays)), changed), delays, 0.0), variances
+        return delays, variances
 
     def add(self, odometry, residuals):
         """Take Odometry and the Residuals that came with it."""
@@ -115,8 +126,8 @@ class Monitor:
         """One slice that ends at `end`, s: its columns."""
         _, a, b, innovation = residuals
         a, b = self._anchors.index(a), self._anchors.index(b)
-        self._listen(a, b)
         t, p, v, gyro_bias, accel_bias = odometry
+        self._listen(a, b, p.mean(axis=0) if len(t) else None)
         if self._moving_since is None and (np.linalg.norm(v, axis=1) > MOVING).any():
             self._moving_since = end
         if self._moving_since is None or not (len(t) and len(a)):
@@ -135,8 +146,8 @@ class Monitor:
             self._latest_change = change
         elif self._latest_change is not None:
             self._latest_change = self._detector.refined(self._latest_change)
-        delays = self._detector.delays_at(end)
-        self._changes = {row: found for row, found in self._changes.items() if abs(delays[row]) > SMALLEST_CHANGE}
+        delays = self._detector.delays_at(end, [*self._changes])
+        self._changes = {row: found for (row, found), delay in zip(self._changes.items(), delays) if abs(delay) > SMALLEST_CHANGE}
 
     def _look_for_swap(self, a, b, innovation, place):
         """Whether this slice looks like one: it is named once several do."""
@@ -150,16 +161,30 @@ class Monitor:
             self._swapped = found
         return bool(found)
 
-    def _listen(self, a, b):
-        """Which anchors are not heard any more, while others are?"""
-        heard = np.bincount(np.concatenate([a, b]), minlength=len(self._anchors)) > 0
+    def _listen(self, a, b, place):
+        """Which anchors are not heard any more, while others are? Not those that the tag has left behind: one must be nearer to its place
+        (3,), m, None: not known, than where the anchor was heard, or than those that are."""
+        rows = np.unique(np.concatenate([a, b])).tolist()
         self._slices += 1
-        self._heard += heard
-        self._missing = np.where(heard, 0, self._missing + 1)
         self._counts = [*self._counts[1 - SILENT :], len(a)]
-        often = self._heard > OFTEN * np.maximum(self._slices - self._missing, SILENT)
-        silent = (self._missing >= SILENT) & often & (sum(self._counts) >= FEWEST)
-        self._silent = tuple(np.flatnonzero(silent).tolist())
+        away = {} if place is None else self._distances([*{*rows, *self._heard}], place)
+        for row in rows:
+            was = self._heard.get(row, Heard())
+            self._heard[row] = Heard(was.slices + 1, self._slices, max(was.farthest, away.get(row, 0.0)))
+        reach = NEARER * max((away.get(row, 0.0) for row in rows), default=0.0)
+        silent = [row for row, was in self._heard.items() if self._is_silent(was, away.get(row, 0.0), reach)]
+        if self._slices % FORGET == 0:  # of a hall, those that were passed
+            self._heard = {row: was for row, was in self._heard.items() if self._was_often(was) or self._slices - was.last < FORGET}
+        self._silent = tuple(sorted(silent)) if sum(self._counts) >= FEWEST else ()
+
+    def _is_silent(self, was, away, reach):
+        return self._slices - was.last >= SILENT and self._was_often(was) and away <= max(was.farthest, reach)
+
+    def _was_often(self, was):
+        return was.slices > OFTEN * max(was.last, SILENT)
+
+    def _distances(self, rows, place):
+        return dict(zip(rows, np.linalg.norm(self._anchors.positions[rows] - place, axis=1).tolist()))
 
     def _follow_biases(self, end, bias):
         if end < self._moving_since + CALIBRATE:
@@ -181,7 +206,7 @@ class Monitor:
         return [f"anchor {self._anchors.ids[row]} is not heard any more: check its power and sight" for row in self._silent]
 
     def _sentence(self, row, found):
-        size = float(self._detector.delays_at(self._end)[row])
+        size = float(self._detector.delays_at(self._end, [row])[0])
         again = [change for change in found if change.at(self._end) * size > 0.0]  # further in the same direction
         if found[-1].slope or len(again) > 1:
             what = f"its clock drifts ({size / (self._end - again[0].since):+.3f} m/s)"

@@ -35,7 +35,7 @@ class Slice:
 def reduced(t, p, positions, a, b, innovation):
     """The Slice of TDOAs between the anchors (rows) a and b (n,), with innovations (n,) m; positions : (N, 3) m."""
     value = np.clip(innovation, -CLIP, CLIP)
-    rows, a, b, value = _heard_most(len(positions), a, b, value)
+    rows, a, b, value = _heard_most(a, b, value)
     n = len(rows)
     heard = np.bincount(a, minlength=n) + np.bincount(b, minlength=n)
     both = np.bincount(a * n + b, minlength=n * n).reshape(n, n)
@@ -50,12 +50,12 @@ def reduced(t, p, positions, a, b, innovation):
     return Slice(t, p, rows, both[:, 0], both[:, 1:])
 
 
-def _heard_most(anchors, a, b, value):
+def _heard_most(a, b, value):
     """(rows, a, b, value): the anchors that are heard, MOST at most, and the TDOAs between them, with places among these rows."""
-    heard = np.bincount(np.concatenate([a, b]), minlength=anchors)
-    rows = np.sort(np.argsort(-heard, kind="stable")[: min(MOST, np.count_nonzero(heard))])
-    place = np.full(anchors, -1)
-    place[rows] = np.arange(len(rows))
-    a, b = place[a], place[b]
+    rows, both = np.unique(np.concatenate([a, b]), return_inverse=True)
+    often = np.sort(np.argsort(-np.bincount(both, minlength=len(rows)), kind="stable")[:MOST])
+    place = np.full(len(rows), -1)
+    place[often] = np.arange(len(often))
+    a, b = place[both[: len(a)]], place[both[len(a) :]]
     kept = (a >= 0) & (b >= 0)
-    return rows, a[kept], b[kept], value[kept]
+    return rows[often], a[kept], b[kept], value[kept]

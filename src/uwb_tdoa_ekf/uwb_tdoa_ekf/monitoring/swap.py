@@ -19,8 +19,9 @@ def swapped(positions, a, b, d, p):
     positions : (N, 3) m; a, b : (n,) rows; d : (n,) m, measured; p : (n, 3) m, where the filter had the tag. A filter that
     has enough other anchors stays where the tag is.
     """
+    rows, both = np.unique(np.concatenate([a, b]), return_inverse=True)
+    a, b, positions, n = both[: len(a)], both[len(a) :], positions[rows], len(rows)  # of those that are heard
     error = np.abs(d - tdoa(p, positions[a], positions[b]))
-    n = len(positions)
     total = np.bincount(a, error, n) + np.bincount(b, error, n)
     mean = total / np.maximum(np.bincount(a, minlength=n) + np.bincount(b, minlength=n), 1)
     best, pair = LARGE, ()
@@ -35,5 +36,5 @@ def swapped(positions, a, b, d, p):
         left = np.abs(d - tdoa(p, exchanged[a], exchanged[b]))
         then = np.median(left[concerned])
         if now > LARGE and GAIN * then < now and then < best and np.quantile(left, SHARE) < WITHIN:
-            best, pair = then, (min(i, k), max(i, k))
+            best, pair = then, (int(rows[min(i, k)]), int(rows[max(i, k)]))
     return pair

@@ -1,5 +1,6 @@
 """Counters of the values of a stream of TDOAs, and what they amount to over a window."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ GRIDS = np.array(
     [1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01]
 )  # m, to which a driver might round; the radio's tick is 4.69 mm
 ON_GRID = 1e-6  # m
+PAIRS, PROBES = 4096, 16  # pairs that are remembered, of all that a tag hears in a minute; places that one may have, of which it takes the oldest
 
 # places in the counters; those of the grids come after
 (KNOWN, UNKNOWN, SELF, INVALID, IMPOSSIBLE, DUPLICATES, SUCCESSIVE, REPEATED, LEAPS, RETURNS, OPPOSED, EVEN, SUM, HIGH,
@@ -24,16 +26,17 @@ GRID = 15
 
 
 class TdoaCounters(NamedTuple):
-    """stamps : see stamps.py; counts; heard (N,) per anchor; d, before, t (N, N) : last value, the one before and the
-    last stamp of each pair, which outlive a window; baseline (N, N) : m."""
+    """stamps : see stamps.py; counts; heard (N,) per anchor; pair, d, before, t (PAIRS,) : of each pair of anchors heard lately the
+    number, last value, the one before and the last stamp, which outlive a window; positions (N, 3) : m."""
 
     stamps: np.ndarray
     counts: np.ndarray
     heard: np.ndarray
+    pair: np.ndarray
     d: np.ndarray
     before: np.ndarray
     t: np.ndarray
-    baseline: np.ndarray
+    positions: np.ndarray
 
 
 class TdoaWindow(NamedTuple):
@@ -70,10 +73,8 @@ class TdoaWindow(NamedTuple):
 
 def new_tdoa(anchors):
     """TdoaCounters of a stream of which nothing was received; anchors : Anchors."""
-    n, p = len(anchors), anchors.positions
-    baseline = np.linalg.norm(p[:, None] - p[None, :], axis=2)
-    pairs = (np.full((n, n), np.nan) for _ in range(3))
-    return TdoaCounters(new_stamps(), np.zeros(GRID + len(GRIDS)), np.zeros(n), *pairs, baseline)
+    pairs = np.full(PAIRS, -1), *(np.full(PAIRS, np.nan) for _ in range(3))
+    return TdoaCounters(new_stamps(), np.zeros(GRID + len(GRIDS)), np.zeros(len(anchors)), *pairs, np.array(anchors.positions))
 
 
 @compiled
@@ -109,7 +110,10 @@ def _count(counters, t, a, b, d):
     c[SUM] += abs(d)
     counters.heard[a] += 1.0
     counters.heard[b] += 1.0
-    if abs(d) > counters.baseline[a, b] + BEYOND:
+    square = 0.0
+    for k in range(3):
+        square += (counters.positions[a, k] - counters.positions[b, k]) ** 2
+    if abs(d) > math.sqrt(square) + BEYOND:
         c[IMPOSSIBLE] += 1.0
     if abs(d) > c[HIGH]:
         c[HIGH], c[HIGH_HITS] = abs(d), 1.0
@@ -124,25 +128,60 @@ def _count(counters, t, a, b, d):
 @compiled
 def _compare(counters, t, a, b, d):
     """Against what was received of this pair before, and of the same in the other order."""
-    c = counters.counts
-    since = t - counters.t[a, b]
-    if since == 0.0 and d == counters.d[a, b]:
+    c, pair, other = counters.counts, _place(counters, a, b), _find(counters, b, a)
+    since = t - counters.t[pair]
+    if since == 0.0 and d == counters.d[pair]:
         c[DUPLICATES] += 1.0
         return
     if 0.0 <= since < FOLLOWING:
         c[SUCCESSIVE] += 1.0
-        if d == counters.d[a, b]:
+        if d == counters.d[pair]:
             c[REPEATED] += 1.0
-        if abs(d - counters.d[a, b]) > LEAP:
+        if abs(d - counters.d[pair]) > LEAP:
             c[LEAPS] += 1.0
-            if abs(d - counters.before[a, b]) < 0.5 * LEAP:
+            if abs(d - counters.before[pair]) < 0.5 * LEAP:
                 c[RETURNS] += 1.0
-    if 0.0 <= t - counters.t[b, a] < FOLLOWING and abs(d) > LEAP:
+    if other >= 0 and 0.0 <= t - counters.t[other] < FOLLOWING and abs(d) > LEAP:
         c[OPPOSED] += 1.0
-        if abs(d - counters.d[b, a]) < abs(d + counters.d[b, a]):
+        if abs(d - counters.d[other]) < abs(d + counters.d[other]):
             c[EVEN] += 1.0
-    counters.before[a, b] = counters.d[a, b]
-    counters.d[a, b], counters.t[a, b] = d, t
+    counters.before[pair] = counters.d[pair]
+    counters.d[pair], counters.t[pair] = d, t
+
+
+@compiled
+def _slot(number, probe):
+    return ((number * 2654435761) % 4294967296 // (4294967296 // PAIRS) + probe) % PAIRS
+
+
+@compiled
+def _find(counters, a, b):
+    """Place of a pair of rows, -1 if it is not remembered."""
+    number = a * len(counters.heard) + b
+    for probe in range(PROBES):
+        if counters.pair[_slot(number, probe)] == number:
+            return _slot(number, probe)
+    return -1
+
+
+@compiled
+def _place(counters, a, b):
+    """Place of a pair of rows; one that is not remembered takes that of the pair that was heard the longest ago."""
+    place = _find(counters, a, b)
+    if place >= 0:
+        return place
+    number = a * len(counters.heard) + b
+    place = _slot(number, 0)
+    for probe in range(PROBES):
+        other = _slot(number, probe)
+        if counters.pair[other] < 0:
+            place = other
+            break
+        if counters.t[other] < counters.t[place]:
+            place = other
+    counters.pair[place] = number
+    counters.d[place] = counters.before[place] = counters.t[place] = np.nan
+    return place
 
 
 @compiled

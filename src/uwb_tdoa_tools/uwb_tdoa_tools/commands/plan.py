@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .. import cli, parallel
-from ..planning import messages, options, report, run
+from ..planning import hall, messages, options, report, run
 from ..planning.goal import OBJECTIVES
 from ..planning.maps import FLYABLE, chart
 from ..planning.noise import RadioNoise
@@ -35,6 +35,7 @@ def parser():
         "plan square.yaml --planar --height 0.2 --check --out plan/",
         "plan survey.txt --volume --with height --flights flights/0425 --out plan/",
         "plan survey.txt --volume --improve add --out plan/",
+        "plan hall.yaml --radio-reach 18 --height 1.2 --out plan/",
     )
     add, number, path, default = made.add_argument, {"type": float}, {"type": Path}, "(default: %(default)s)"
     add("anchors", metavar="ANCHORS", help="anchors .yaml or survey (.txt, .csv)")
@@ -61,8 +62,9 @@ def parser():
     add("--link-noise", metavar="M", **number, default=0.0, help="error that every TDOA has of its own besides (default: 0)")
     add("--with", dest="aids", action="append", default=[], choices=["height"], help="what the tag measures besides: a range finder that looks down")
     add("--height-std", metavar="M", **number, default=FilterConfig().height_std, help=f"of that height {default}")
-    unique = "one solution by every pairing alone or by a whole round (default: pairings)"
-    add("--flyable", choices=FLYABLE, default="pairings", help=unique)
+    unique = "one solution by every pairing alone or by a whole round (default: pairings; with --radio-reach: round)"
+    add("--flyable", choices=FLYABLE, help=unique)
+    add("--radio-reach", metavar="M", **number, help="a hall: the tag hears the anchors within that, not all; many more anchors are possible")
 
     more = made.add_argument_group("more")
     add = more.add_argument
@@ -80,6 +82,7 @@ def parser():
 
 def _plan(args):
     cli.check_folders(args.json)
+    args.flyable = args.flyable or ("pairings" if args.radio_reach is None else "round")
     anchors = read_survey(args.anchors)
     installation = options.installation_of(args, anchors)
     room = options.room_for(args, anchors)
@@ -88,6 +91,8 @@ def _plan(args):
         raise InputError("flights: are judged in three dimensions; leave out --planar.")
     reading = inputs.Reading(args.anchors)
     recordings = reading.find(args.flights or [], bool(args.dask))
+    if args.radio_reach is not None:
+        return _plan_hall(args, anchors, installation, room, grid)
     aim = options.aim_of(args, installation, room, grid.axes[2][0]) if args.improve else None
 
     if not np.isfinite(anchors.orientations).all():
@@ -99,7 +104,7 @@ def _plan(args):
         found = chart(installation, grid, args.flyable)
     figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
     report.say_summary(figures["map"])
-    figures["addition"] = run.addition(found, anchors, options.installed(args, installation), options.places_of(args, room), args.flyable)
+    figures["addition"] = run.addition(found, anchors, options.goal_of(args, installation).installed, options.places_of(args, room), args.flyable)
     report.say_flyable(figures["map"], figures["addition"], args.flyable)
     outgoing = run.draw_map(found, installation, args.out)
     if args.check:
@@ -112,6 +117,32 @@ def _plan(args):
     if aim:
         figures["improve"] = run.improve(found, aim, args.improve, args.starts, args.flyable, args.out)
         report.say_improvement(figures["improve"])
+    for path in (args.out / "plan.json", args.json):
+        if path is not None:
+            cli.write_json(path, figures)
+    cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
+    if args.publish:
+        cli.show(f"publishing {', '.join(outgoing)} until Ctrl-C")
+        messages.publish(outgoing)
+
+
+def _plan_hall(args, anchors, installation, room, grid):
+    for name in ("check", "flights", "improve"):
+        if getattr(args, name):
+            raise InputError(f"{name}: is for a room in which every anchor is heard; leave out --{name}, or --radio-reach.")
+    if not args.radio_reach > 0.0:
+        raise InputError(f"radio reach: {args.radio_reach:g} m is none; give one above 0, e.g. 18.")
+    report.say_room(room, args.room is not None)
+    cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
+    whole = hall.Hall(options.goal_of(args, installation), anchors, args.radio_reach)
+    found, heard = whole.chart(grid, args.jobs, args.dask)
+    figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": hall.summary(found, heard)}
+    figures["addition"] = whole.addition(found, room.lower[2])
+    hall.say(figures["map"], figures["addition"])
+    hall.plot(anchors, found, heard, args.out / "hall.png")
+    found.volume(anchors, installation.dimensions).save(args.out / "flyable.npz")
+    outgoing = messages.messages(found, anchors)
+    messages.write(outgoing, args.out / "plan.bag")
     for path in (args.out / "plan.json", args.json):
         if path is not None:
             cli.write_json(path, figures)

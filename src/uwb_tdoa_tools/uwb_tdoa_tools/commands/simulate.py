@@ -35,6 +35,7 @@ def parser():
         "simulate --out flight.bag",
         "simulate --trajectory circle --protocol tdoa3 --height-noise 0.01 --seed 7 --out circle.bag --plot circle.png",
         "simulate --constellation random-12-16 --duration 120 --out unseen.bag --json unseen.json",
+        "simulate --anchors hall.yaml --radio-reach 18 --protocol tdoa3 --duration 300 --out hall.bag",
         "simulate --no-bias --no-multipath --no-outliers --noise 0 --perfect-imu --out exact.bag",
         "simulate --list",
     )
@@ -62,6 +63,7 @@ def parser():
     room.add_argument("--anchors", metavar="FILE.yaml", type=Path, help="your own anchors, with orientations")
     add, off, share = radio.add_argument, {"action": "store_false"}, default.outlier_probability
     add("--protocol", choices=PROTOCOLS, default=default.protocol, help="(default: tdoa2)")
+    add("--radio-reach", metavar="M", type=float, help="anchors farther from the tag than that are not heard (default: all are)")
     add(
         "--noise", dest="noise_std", metavar="M", type=float, default=default.noise_std,
         help="standard deviation, m (default: 0.06)",

@@ -87,17 +87,17 @@ class Chart:
         """Bound along x, y (and z): (n, k) m."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
-    def volume(self, installation):
-        """The FlyableVolume of this chart."""
+    def volume(self, anchors, dimensions):
+        """The FlyableVolume of this chart, among Anchors."""
         return FlyableVolume(
             self.grid.lower,
             np.full(3, self.grid.step),
             self.flyable.reshape(self.grid.shape),
             self.error.reshape(self.grid.shape),
-            installation.anchors.ids,
-            installation.anchors.positions,
-            installation.anchors.frame,
-            installation.dimensions == 2,
+            anchors.ids,
+            anchors.positions,
+            anchors.frame,
+            dimensions == 2,
         )
 
 

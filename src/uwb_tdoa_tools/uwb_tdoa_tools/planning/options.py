@@ -32,7 +32,9 @@ class Aim:
 
 
 def installation_of(args, anchors):
-    """Installation of Anchors and the options. Raises InputError."""
+    """Installation of Anchors and the options. With --radio-reach that of the first few, as each place has its own. Raises InputError."""
+    if args.radio_reach is not None:
+        anchors = _some(anchors, 3 if args.planar or "height" in args.aids else 4)
     if args.noise is not None:
         noise = FixedNoise(args.noise)
     else:
@@ -41,6 +43,16 @@ def installation_of(args, anchors):
     pairing = PAIRINGS[_pairing(args)](len(anchors)) if len(anchors) > 1 else None
     height_std = args.height_std if "height" in args.aids else np.inf
     return Installation(anchors, noise, pairing, args.link_noise, 2 if args.planar else 3, height_std)
+
+
+def _some(anchors, count):
+    """So many Anchors that are not in one plane, if there are."""
+    far = [0]
+    while len(far) < min(count, len(anchors)):
+        away = anchors.positions - anchors.positions[far[0]]
+        basis = np.linalg.qr(away[far[1:]].T)[0] if len(far) > 1 else np.zeros((3, 0))
+        far.append(int(np.argmax(np.linalg.norm(away - away @ basis @ basis.T, axis=1))))
+    return anchors.only(far)
 
 
 def room_for(args, anchors):
@@ -82,9 +94,9 @@ def aim_of(args, installation, room, height):
     return Aim(goal(step), goal(0.4 * step), places_of(args, room), count)
 
 
-def installed(args, installation):
-    """Callable that gives the Installation of other Anchors."""
-    return Goal(np.empty((0, 3)), installation, _pairing(args)).installed
+def goal_of(args, installation):
+    """Goal of no points, whose `installed` gives the Installation of other Anchors."""
+    return Goal(np.empty((0, 3)), installation, _pairing(args), criterion=args.flyable)
 
 
 def places_of(args, room):

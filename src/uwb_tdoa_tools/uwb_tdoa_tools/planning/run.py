@@ -21,7 +21,7 @@ def draw_map(found, installation, out):
     """Pictures, flyable volume and bag of a Chart. Returns {topic: message}, see `messages.messages`."""
     plots.plot_precision(installation, found, out / "precision.png")
     plots.plot_failure(installation, found, out / "failure.png")
-    found.volume(installation).save(out / "flyable.npz")
+    found.volume(installation.anchors, installation.dimensions).save(out / "flyable.npz")
     outgoing = messages.messages(found, installation.anchors)
     messages.write(outgoing, out / "plan.bag")
     return outgoing

@@ -14,6 +14,7 @@ from .room import room_of
 from .schedule import PROTOCOLS
 from .trajectories import TRAJECTORIES
 
+MOST_HEARD = 64  # anchors that a tag hears at once
 YAW_PROFILES = ("fixed", "along_track", "rotating")
 
 
@@ -52,6 +53,7 @@ class SimulationConfig(_Noises):
     The TDOA measurements
     ---------------------
     protocol : "tdoa2" (ring, about 475 per second) or "tdoa3" (any pair, about 240 per second) (default "tdoa2")
+    radio_reach : m; anchors farther from the tag than that are not heard (default None: all are)
     noise_std : standard deviation of the white noise of one TDOA, m; 0 for none (default 0.06)
     anchor_noise_std : standard deviation of the arrival noise of each anchor, m, in the order of the anchors; a TDOA
         then has the root of the summed squares of its two (default None: noise_std / sqrt(2) for every anchor)
@@ -88,6 +90,7 @@ class SimulationConfig(_Noises):
     imu_errors: ImuErrors = field(default_factory=ImuErrors)
     truth_rate: float = 250.0
     protocol: str = "tdoa2"
+    radio_reach: float | None = None
     noise_std: float = 0.06
     anchor_noise_std: tuple | None = None
     shared_noise: bool = False
@@ -116,6 +119,7 @@ class SimulationConfig(_Noises):
             ("floor_time", 0.0, 3600.0),
             ("imu_rate", 50.0, 10000.0),
             ("truth_rate", 1.0, 10000.0),
+            ("radio_reach", 0.1, 10000.0),
             ("noise_std", 0.0, 100.0),
             ("anchor_delay_std", 0.0, 100.0),
             ("outlier_probability", 0.0, 1.0),
@@ -132,8 +136,12 @@ class SimulationConfig(_Noises):
     def complete(self):
         """(config, Room): this config with anchors, place, height, radius and anchor_noise_std filled in."""
         anchors = self.anchors if self.anchors is not None else constellation(self.constellation)
-        if not 2 <= len(anchors) <= 64:
-            raise InputError(f"anchors: {len(anchors)} were given; the simulation takes 2 to 64.")
+        if len(anchors) < 2:
+            raise InputError(f"anchors: {len(anchors)} was given; the simulation takes 2 or more.")
+        if len(anchors) > MOST_HEARD and self.radio_reach is None:
+            raise InputError(
+                f"anchors: {len(anchors)} were given, and each is heard everywhere; give radio_reach, m, or at most {MOST_HEARD} of them."
+            )
         if self.bias and not np.isfinite(anchors.orientations).all():
             lost = anchors.ids[~np.isfinite(anchors.orientations).all(axis=1)][0]
             raise InputError(

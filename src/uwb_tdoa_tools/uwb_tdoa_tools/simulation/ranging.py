@@ -5,11 +5,12 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.antenna import Antenna
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_bias.foundation.radio import FLAT_MOUNT, RadioLink, arrival_bias
 
-from .schedule import make_schedule
+from .schedule import make_schedule, within_reach
 
 UNIT_GAIN_SPREAD = 0.7  # dB, tag to tag
 UNIT_MOUNT_SPREAD = np.deg2rad(2.0)  # rad, tag to tag
@@ -42,6 +43,13 @@ def measure(config, room, trajectory):
     """
     anchors, random = config.anchors, config.random
     schedule = make_schedule(config.protocol, len(anchors), config.duration, random("schedule"))
+    if config.radio_reach is not None:
+        p = trajectory.motion(schedule.t).p
+        schedule = within_reach(schedule, p, anchors.positions, config.radio_reach, config.protocol, random("reach"))
+        if not len(schedule.t):
+            raise InputError(
+                f"radio_reach: two anchors are nowhere within {config.radio_reach:g} m of the path; give a larger one, or another place."
+            )
     t, a, b = schedule.t, schedule.a, schedule.b
     motion = trajectory.motion(t)
     p_tag = motion.p + Rotation.from_quat(motion.q).apply(config.tag_lever_arm)

@@ -1,8 +1,9 @@
 """Who is heard when: the TDOA2 and TDOA3 schedules of the Loco Positioning System."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 SLOT = 2.0e-3  # s, TDOA2: one packet per slot
 SLOT_JITTER = 1.0e-4  # s, standard deviation of a stamp around its slot
@@ -38,6 +39,43 @@ def make_schedule(protocol, n_anchors, duration, rng, rate=None):
     if protocol == "tdoa2":
         return _tdoa2(n_anchors, duration, rng, PACKET_LOSS if rate is None else 1.0 - np.sqrt(min(rate * SLOT, 1.0)))
     return _tdoa3(n_anchors, duration, rng, TDOA3_MEAN_WAIT if rate is None else max(1.0 / rate - TDOA3_DEAD_TIME, 0.0))
+
+
+def within_reach(schedule, p, positions, reach, protocol, rng):
+    """The Schedule among anchors of which the tag hears those that are within reach, m; p (n, 3) m, of the tag at each measurement;
+    positions (N, 3) m, of the anchors. Where it hears fewer than two there is nothing.
+
+    TDOA2: those that are heard send in turn, in the order of their rows, as cells that are out of each other's reach use slots again.
+    TDOA3: any two of those that are heard.
+    """
+    rows, pairs, numbers = [], [], []  # of measurements, (a, b) and their receptions
+    senders, latest = [], {}  # row of the anchor of each reception, and the latest of each anchor
+
+    def receive(anchor):
+        latest[anchor] = len(senders)
+        senders.append(anchor)
+
+    heard = cKDTree(positions).query_ball_point(p, reach, return_sorted=True)
+    chosen = rng.random((len(p), 2))
+    for row, (near, (first, second)) in enumerate(zip(heard, chosen)):
+        if len(near) < 2:
+            continue
+        if protocol == "tdoa2":
+            b = row % len(near)
+            a = b - 1
+        else:
+            b = int(first * len(near))
+            a = (b + 1 + int(second * (len(near) - 1))) % len(near)
+        a, b = near[a], near[b]
+        if a not in latest:
+            receive(a)
+        of_a = latest[a]
+        receive(b)
+        rows.append(row)
+        pairs.append((a, b))
+        numbers.append((of_a, latest[b]))
+    (a, b), (heard_a, heard_b) = (np.array(each, int).reshape(-1, 2).T for each in (pairs, numbers))
+    return replace(schedule, t=schedule.t[rows], a=a, b=b, heard_a=heard_a, heard_b=heard_b, sender=np.array(senders, int))
 
 
 def _tdoa2(n_anchors, duration, rng, loss):
