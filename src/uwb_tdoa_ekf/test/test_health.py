@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402
 from uwb_tdoa_ekf.streams import Finding  # noqa: E402
 
-STARTING, RUNNING = SimpleNamespace(running=False, lost=None), SimpleNamespace(running=True)
+STARTING, RUNNING = SimpleNamespace(running=False, lost=None), SimpleNamespace(running=True, side_unknown=None)
 
 
 class Clock:
@@ -107,7 +107,7 @@ def test_a_tag_outside_of_the_flyable_volume_is_a_warning(clock):
     cells = np.ones((2, 2, 2)), np.full((2, 2, 2), 0.1)
     volume = FlyableVolume([0, 0, 0], [1, 1, 1], *cells, anchors.ids, anchors.positions)
     judge = health.Health(FilterConfig(), 0.25, volume)
-    running = SimpleNamespace(running=True, anchors=anchors)
+    running = SimpleNamespace(running=True, anchors=anchors, side_unknown=None)
     assert second(clock, judge, running)[0] == OK  # no odometry yet
     judge.last_position = np.array([0.5, 1.5, 0.5]), np.diag([0.01, 0.01, 0.02])
     level, text, values = second(clock, judge, running)
@@ -165,3 +165,9 @@ def test_odometry_that_is_ahead_of_the_clock_is_a_warning(clock):
     judge.behind = -9.5
     level, text, _ = second(clock, judge, RUNNING, used=400)
     assert level == WARN and "9.5 s ahead of the clock" in text
+
+
+def test_a_side_that_nobody_knows_is_a_warning(clock):
+    judge = health.Health(FilterConfig(), lag=0.25)
+    level, text, _ = second(clock, judge, SimpleNamespace(running=True, side_unknown="set tag_side to below or above"), used=400)
+    assert (level, text) == (WARN, "set tag_side to below or above")

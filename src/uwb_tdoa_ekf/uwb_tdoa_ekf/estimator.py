@@ -14,7 +14,9 @@ from .aid_rows import aid_rows
 from .core import aids
 from .core.config import FilterConfig
 from .core.engine import LOST_TIME, feed, tell_pose
-from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, Measurements, joined, new_memory, structured
+from .core.height import LONGEST_GAP
+from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, RESIDUAL, TDOA, YAWS, Measurements, joined, new_memory, structured
+from .core.startup import APART
 from .core.validity import usable_all, usable_imu, usable_slopes
 from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, REPEATED, STARTUP, USED
 from .monitoring.implausible import implausible
@@ -124,6 +126,23 @@ class Estimator:
             f"the tag is lost: for more than {LOST_TIME:g} s no TDOA came, and nothing else tells where it is by now; there is no odometry "
             "until TDOAs tell that anew"
         )
+
+    @property
+    def side_unknown(self):
+        """Why nobody knows on which side of its anchors the tag is, a sentence; None where that is known, or does not matter. Anchors that
+        are heard lie in a plane, and the place is uncertain across it."""
+        ekf = self._memory.record
+        if not ekf.running:
+            return None
+        known = self.config.fixed_height_std > 0.0 or ekf.t - ekf.height.used < LONGEST_GAP
+        places = {h // YAWS for h in np.flatnonzero(ekf.hypotheses["log_weight"] > -np.inf).tolist()}
+        variances = np.diagonal(ekf.hypotheses["P"][ekf.best])
+        for axis, (sides, where) in enumerate((("-x or +x", "x"), ("-y or +y", "y"), ("below or above", "height"))):
+            if ekf.flat[axis] and (len(places) > 1 or variances[axis] > APART**2) and not (axis == 2 and known):
+                return (
+                    f"the anchors that are heard have one {where}, so that TDOAs do not tell on which side of them the tag is: set tag_side to {sides}"
+                )
+        return None
 
     @property
     def newest(self):

@@ -73,6 +73,8 @@ class Health:
             judgement = OK, "looking for the start position"
         if judgement == (OK, "running"):
             judgement = self._judge_aids(now, counts)
+        if judgement == (OK, "running") and estimator.side_unknown:
+            judgement = WARN, estimator.side_unknown
         at_position = {}
         if running and self.last_position is not None:
             trouble, at_position = self._volume.judge(estimator.anchors, *self.last_position)

@@ -14,10 +14,10 @@ from .bifurcation import CLEAR, Subsets
 from .maps import Chart
 from .precision import bound, dilution, information, position_error
 
-MOST_HEARD = 12  # nearest anchors that a cell is judged by: more add little, and pairings grow with the fourth power
+MOST_HEARD = 10  # nearest anchors that a cell is judged by: more add little, and pairings grow with the fourth power
 AT_ONCE = 64  # groups of cells that a process takes at once
 ANCHOR_HEIGHT = 4.0  # m above the floor, of an anchor that is proposed
-TRIED = 40  # places that are tried for it, the most promising first
+TRIED, LOOKED_AT = 12, 30  # places that are tried for it, the most promising first, and holes that are looked at for each
 HEARD_COLOURS = [0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25]  # bounds of the colours of the picture
 
 
@@ -79,12 +79,12 @@ class Hall:
             return None
         points = chart.grid.points
         tree, best = cKDTree(points[holes]), (0, None)
-        spread = holes[np.linspace(0, len(holes) - 1, min(len(holes), 20 * TRIED)).astype(int)]
+        spread = holes[np.linspace(0, len(holes) - 1, min(len(holes), 50 * TRIED)).astype(int)]
         around = tree.query_ball_point(points[spread], 0.5 * self.reach, return_length=True)
         for cell in spread[np.argsort(-around, kind="stable")][:TRIED]:
             position = np.array([*points[cell, :2].round(1), floor + ANCHOR_HEIGHT])
             near = holes[tree.query_ball_point(position, self.reach)]
-            near = near[np.linspace(0, len(near) - 1, min(len(near), 60)).astype(int)] if len(near) else near
+            near = near[np.linspace(0, len(near) - 1, min(len(near), LOOKED_AT)).astype(int)] if len(near) else near
             more = Hall(self.goal, _with(self.anchors, position), self.reach)
             gained = 0
             for rows, point in zip(more.heard(points[near]), points[near]):

@@ -89,7 +89,8 @@ def check_anchors(anchors, dimensions):
     if dimensions == 3 and size[2] <= FLAT * size[0]:
         raise InputError(
             f"anchors: all are in one plane to {size[2]:.3f} m, so that its two sides cannot be told apart; move one "
-            "of them out of it, or plan for a tag of known height (--planar) or one that measures it (--with height)."
+            "of them out of it, or plan for a tag of known height (--planar) or one that measures it (--with height). ekf_node can be told the side: "
+            "tag_side."
         )
 
 

@@ -1,0 +1,142 @@
+"""Tags in halls with many anchors, tags that hear few TDOAs, and anchors in a plane. The figures of many seeds: warehouse_table.py."""
+
+from halls import HALLS, fly, hall, room
+import numpy as np
+import pytest
+from warehouse_cost import cost
+from warehouse_table import after_gaps, heard_at_start, judge
+
+from uwb_tdoa_ekf.core import workspace
+from uwb_tdoa_ekf.core.config import SIDES, FilterConfig
+from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
+from uwb_tdoa_ekf.estimator import Estimator
+
+WITHOUT_IMU = FilterConfig(use_imu=False)
+SLOW = {"duration": 12.0, "speed": 1.0}
+
+
+def surroundings(positions, a, b, reach=30.0, tag_side="unknown"):
+    """(2, 3) m: bounds after the anchors in rows a and b were heard, and the memory."""
+    memory, bounds = new_memory(positions), np.empty((2, 3))
+    window = structured(TDOA, 0.01 * np.arange(len(a)), a, b, np.zeros(len(a)))
+    workspace.listen(memory.record, window, memory.anchors, reach, SIDES.index(tag_side))
+    workspace.surround(memory.record, 1.0, bounds)
+    return bounds, memory
+
+
+def test_in_a_room_it_is_searched_in_the_whole_room_whoever_is_heard():
+    positions, whole = room("corners").anchors.positions, np.empty((2, 3))
+    workspace.set_bounds(new_memory(positions).record.extent, 1.0, whole)
+    np.testing.assert_array_equal(surroundings(positions, [0, 1], [1, 2])[0], whole)
+
+
+def test_in_a_hall_it_is_searched_within_reach_of_all_that_are_heard():
+    positions = np.array([[0.0, 0.0, 3.0], [10.0, 0.0, 1.0], [300.0, 0.0, 3.0], [0.0, 200.0, 5.0]])
+    bounds, _ = surroundings(positions, [0], [1])
+    np.testing.assert_allclose(bounds[:, :2], [[-1.0, -1.0], [30.0, 30.0]])
+    bounds, _ = surroundings(positions, [0], [1], reach=5.0)  # they are farther apart than that: the radio reaches farther
+    np.testing.assert_allclose(bounds[:, 0], [10.0 - np.hypot(10.0, 2.0), np.hypot(10.0, 2.0)])
+
+
+@pytest.mark.parametrize(("name", "side", "axis", "sign"), [("ceiling, 4", "below", 2, -1), ("wall, 8", "+x", 0, 1), ("wall, 8", "-x", 0, -1)])
+def test_a_side_that_is_told_bounds_the_search(name, side, axis, sign):
+    positions = room(name).anchors.positions
+    rows = np.arange(len(positions) - 1)
+    bounds, memory = surroundings(positions, rows, rows + 1, tag_side=side)
+    assert bounds[0 if sign > 0 else 1, axis] == pytest.approx(positions[0, axis]) and not memory.record.flat[axis]
+    _, memory = surroundings(positions, rows, rows + 1)
+    assert memory.record.flat[axis]
+
+
+def test_a_side_of_anchors_that_are_in_no_plane_means_nothing():
+    positions = room("corners").anchors.positions
+    rows = np.arange(7)
+    np.testing.assert_array_equal(surroundings(positions, rows, rows + 1, tag_side="below")[0], surroundings(positions, rows, rows + 1)[0])
+
+
+@pytest.mark.parametrize("name", ["300 x 200 m, 294 anchors", "300 x 200 m, 988 anchors"])
+def test_a_tag_is_found_anywhere_in_a_hall(name):
+    where = hall(name)
+    for seed in range(6):
+        flight = fly(where, seed, 4.0)
+        found = judge(flight, FilterConfig())
+        assert found["nees"] < 6.0
+        assert found["at_2"] < 1.0 or heard_at_start(flight) < 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HALLS)
+def test_starts_in_every_hall_are_right_and_honest(name):
+    where, wrong = hall(name), 0
+    for seed in range(100, 140):
+        flight = fly(where, seed, 20.0 if seed < 110 else 3.0)
+        found = judge(flight, FilterConfig())
+        wrong += found["at_2"] > 1.0 and heard_at_start(flight) >= 8
+        assert found["nees"] < 6.0, seed
+    assert wrong <= 1
+
+
+@pytest.mark.parametrize("config", [FilterConfig(), WITHOUT_IMU])
+@pytest.mark.parametrize("blinks", [0.5, 1.0, 2.0])
+def test_a_tag_that_blinks_starts_within_three_blinks(blinks, config):
+    for seed in range(3):
+        found = judge(fly(room("corners"), seed, blinks=blinks, **SLOW), config)
+        assert found["stamps"] <= 3 and found["nees"] < 6.0
+
+
+@pytest.mark.parametrize("config", [FilterConfig(), WITHOUT_IMU])
+@pytest.mark.parametrize("rate", [2.0, 5.0, 10.0])
+def test_a_tag_of_few_tdoas_starts_within_twenty(rate, config):
+    for seed in range(3):
+        found = judge(fly(room("corners"), seed, rate=rate, duration=20.0, speed=1.0), config)
+        assert found["spent"] < 20 and found["nees"] < 6.0
+
+
+@pytest.mark.parametrize(("name", "side"), [("ceiling, 8", "below"), ("wall, 8", "+x")])
+def test_a_tag_stays_on_the_side_that_is_told(name, side):
+    where = room(name)
+    axis, sign = (2, -1.0) if side == "below" else (0, 1.0)
+    for seed in range(3):
+        found = judge(fly(where, seed, 10.0, speed=1.0), FilterConfig(tag_side=side))
+        beyond = sign * (found["odometry"].x[:, axis] - where.anchors.positions[0, axis])
+        assert (beyond > -0.3).all() and found["nees"] < 6.0
+
+
+def test_an_estimator_names_the_parameter_where_the_side_is_not_known():
+    flight = fly(room("ceiling, 4"), 0, 3.0, speed=1.0)
+    for side, said in (("unknown", "set tag_side to below or above"), ("below", None)):
+        estimator = Estimator(flight.anchors, FilterConfig(tag_side=side))
+        estimator.add_imu(flight.imu.t, flight.imu.gyro, flight.imu.accel)
+        estimator.add_tdoa(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
+        estimator.finish()
+        assert (said in estimator.side_unknown) if said else estimator.side_unknown is None
+
+
+def test_after_a_silence_in_which_it_walked_a_tag_is_found_within_two_seconds():
+    where = hall("100 x 60 m, 77 anchors")
+    for seed in range(3):
+        flight = fly(where, seed, 40.0, dead=[(15.0, 28.0)])
+        found = judge(flight, WITHOUT_IMU)
+        assert max(after_gaps(flight, found)) < 2.0 and found["nees"] < 6.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("config", [FilterConfig(), WITHOUT_IMU])
+def test_ten_minutes_with_dead_zones_and_a_change_of_floor(config):
+    flight = fly(hall("100 x 60 m, 77 anchors", floors=2), 0, 600.0, dead=[(120.0, 133.3), (220.0, 233.3), (450.0, 463.3)], lift=300.0)
+    found = judge(flight, config)
+    assert found["nees"] < 6.0 and max(after_gaps(flight, found)) < 2.0
+    assert np.quantile(found["off"] / found["std"], 0.999) < 4.0
+
+
+def test_memory_and_estimate_of_a_tag_do_not_depend_on_how_many_anchors_are_installed():
+    (_, few, _, one), (_, many, _, other) = (cost(n, 3.0, 1) for n in (20, 10_000))
+    assert many < few + 10_000 * 1000  # bytes: what is known of an anchor, and no matrix of all with all
+    np.testing.assert_allclose(one.p, other.p, atol=0.05)
+
+
+@pytest.mark.slow
+def test_a_tag_costs_what_it_hears_and_starts_with_ten_thousand_anchors_within_three_seconds():
+    cost(20, 5.0, 1)  # what is compiled, is
+    (few, *_), (many, _, start, _) = (cost(n, 30.0) for n in (20, 10_000))
+    assert many < 1.1 * few and start < 3.0

@@ -1,0 +1,106 @@
+"""The tables of docs/warehouse.md: starts in halls, slow tags, anchors in a plane, a walk of ten minutes.
+
+python src/uwb_tdoa_ekf/test/warehouse_table.py [--starts N] [--seeds N] [--only WORD]
+"""
+
+import argparse
+
+from driving import drive, memory_for
+from flights import position_at
+from halls import HALLS, fly, hall, room
+import numpy as np
+
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.verdicts import STARTUP
+
+
+def judge(flight, config):
+    """Figures of one run. at_2 : m, error 2 s after the first TDOA, inf where there is no estimate; rmse : m, from 10 s on; nees : mean of
+    the position, 3 where it is honest; start : s after the first TDOA; spent, stamps : TDOAs, and stamps of them, until then."""
+    memory = memory_for(flight)
+    odometry, residuals = drive(flight, config, memory)
+    began = residuals.verdict != STARTUP
+    spent = int(np.argmax(began)) if began.any() else len(began)
+    stamps = len(np.unique(flight.tdoa.t[: spent + 1]))
+    if not len(odometry):
+        return {"at_2": np.inf, "rmse": np.inf, "nees": np.inf, "start": np.inf, "spent": spent, "stamps": stamps, "odometry": None}
+    error = odometry.x[:, :3] - position_at(flight, odometry.t)
+    off, covariance = np.linalg.norm(error, axis=1), odometry.covariance[:, :3, :3]
+    since = odometry.t - flight.tdoa.t[0]
+    nees = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    return {
+        "at_2": off[np.searchsorted(since, 2.0)] if since[-1] > 2.0 and since[0] < 2.0 else np.inf,
+        "rmse": float(np.sqrt(np.mean(off[since >= 10.0] ** 2))) if (since >= 10.0).any() else np.nan,
+        "nees": float(nees.mean()), "start": float(since[0]), "spent": spent, "stamps": stamps,
+        "odometry": odometry, "off": off, "std": np.sqrt(np.trace(covariance, axis1=1, axis2=2)),
+    }  # fmt: skip
+
+
+def heard_at_start(flight, seconds=0.5):
+    """Anchors in the TDOAs of the first seconds."""
+    first = flight.tdoa.t < flight.tdoa.t[0] + seconds
+    return len(np.unique(np.concatenate([flight.tdoa.a[first], flight.tdoa.b[first]])))
+
+
+def after_gaps(flight, found, within=1.0, gap=1.0):
+    """For each silence of more than `gap` s, how long after it the error was above `within` m last, s, of the 10 s that follow."""
+    t, out = flight.tdoa.t, []
+    for k in np.flatnonzero(np.diff(t) > gap):
+        rows = (found["odometry"].t >= t[k + 1]) & (found["odometry"].t < t[k + 1] + 10.0)
+        wrong = found["odometry"].t[rows & (found["off"] > within)]
+        out.append(float(wrong.max() - t[k + 1]) if len(wrong) else 0.0)
+    return out
+
+
+def say(name, runs):
+    """A row: right within 1 m at 2 s; RMSE, median and largest; NEES, mean and largest; start, largest; TDOAs and stamps spent, most."""
+    column = {key: np.array([run[key] for run in runs], float) for key in ("at_2", "rmse", "nees", "start", "spent", "stamps")}
+    started = np.isfinite(column["start"])
+    print(
+        f"| {name} | {started.sum()} of {len(runs)} | {np.sum(column['at_2'] < 1.0)} | {np.median(column['rmse']):.2f} | {column['rmse'].max():.2f} | "
+        f"{column['nees'].mean():.1f} | {column['nees'].max():.1f} | {column['start'].max():.1f} | {column['spent'].max():.0f} | {column['stamps'].max():.0f} |",
+        flush=True,
+    )
+
+
+def main():
+    """Print the rows whose names have a word in them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--starts", type=int, default=100, metavar="N", help="in each hall (default: %(default)s)")
+    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="of each row in the room (default: %(default)s)")
+    parser.add_argument("--only", default="", metavar="WORD", help="rows with this in their name")
+    args = parser.parse_args()
+    print("| where | started | right at 2 s | RMSE, m, median | largest | NEES, mean | largest | start, s, latest | TDOAs spent | stamps |")
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|")
+    with_imu, without = FilterConfig(), FilterConfig(use_imu=False)
+    rows = [(name, args.starts, lambda n=name: hall(n), {}, with_imu) for name in HALLS]
+    first = next(iter(HALLS))
+    rows += [(f"{first}, no IMU", args.starts, lambda: hall(first), {}, without)]
+    rows += [(f"{first}, no IMU, 20 TDOAs/s", args.starts, lambda: hall(first), {"rate": 20.0}, without)]
+    slow = {"duration": 40.0, "speed": 1.0}
+    for imu, config in (("", with_imu), (", no IMU", without)):
+        for rate in (1.0, 2.0, 5.0, 10.0, 20.0):
+            rows.append((f"room, {rate:g} TDOAs/s{imu}", args.seeds, lambda: room("corners"), slow | {"rate": rate}, config))
+        for blinks in (0.5, 1.0, 2.0, 5.0):
+            rows.append((f"room, {blinks:g} blinks/s{imu}", args.seeds, lambda: room("corners"), slow | {"blinks": blinks}, config))
+        for name in ("ceiling, 4", "ceiling, 8", "wall, 8", "line, 5"):
+            rows.append((f"room, {name}{imu}", args.seeds, lambda n=name: room(n), slow, config))
+    for name, side in (("ceiling, 4", "below"), ("ceiling, 8", "below"), ("wall, 8", "+x")):
+        rows.append((f"room, {name}, tag_side {side}", args.seeds, lambda n=name: room(n), slow, FilterConfig(tag_side=side)))
+    for name, count, make, kind, config in rows:
+        if args.only in name:
+            where = make()
+            say(name, [judge(fly(where, seed, **kind), config) for seed in range(count)])
+    for imu, config in (("", with_imu), (", no IMU", without)):
+        if args.only in (name := f"ten minutes{imu}"):
+            where = hall(first, floors=2)
+            for seed in range(3):
+                flight = fly(where, seed, 600.0, dead=[(120.0, 133.3), (220.0, 233.3), (450.0, 463.3)], lift=300.0)
+                found = judge(flight, config)
+                gaps = ", ".join(f"{wrong:.2f}" for wrong in after_gaps(flight, found))
+                worst = float(np.max(found["off"] / found["std"]))
+                print(f"{name}, seed {seed}: NEES {found['nees']:.2f}, largest error {worst:.1f} deviations, wrong after silences for {gaps} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
