@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_tools.simulation.schedule import PROTOCOLS, make_schedule
+from uwb_tdoa_tools.simulation.schedule import PROTOCOLS, make_schedule, within_reach
 
 
 def schedule(protocol, n_anchors=8, duration=60.0, seed=0):
@@ -50,3 +50,18 @@ def test_tdoa3_compares_with_the_newest_packet_of_the_other_anchor():
 def test_seeded(protocol):
     np.testing.assert_array_equal(schedule(protocol, seed=4).t, schedule(protocol, seed=4).t)
     assert schedule(protocol, seed=4).t[0] != schedule(protocol, seed=5).t[0]
+
+
+@given(st.sampled_from(PROTOCOLS), st.floats(4.0, 30.0), st.integers(0, 100))
+def test_within_reach_only_anchors_that_are_near_are_heard(protocol, reach, seed):
+    rng = np.random.default_rng(seed)
+    positions = np.column_stack([rng.uniform(0.0, 60.0, (40, 2)), rng.uniform(0.0, 5.0, 40)])
+    schedule = make_schedule(protocol, len(positions), 2.0, rng)
+    p = np.column_stack([np.linspace(5.0, 55.0, len(schedule.t)), np.full((len(schedule.t), 2), (30.0, 1.0))])
+    near = within_reach(schedule, p, positions, reach, protocol, rng)
+    there = p[np.searchsorted(schedule.t, near.t)]
+    for rows, heard in ((near.a, near.heard_a), (near.b, near.heard_b)):
+        np.testing.assert_array_equal(near.sender[heard], rows)
+    assert (near.a != near.b).all() and np.isin(near.t, schedule.t).all()
+    assert (np.linalg.norm(there - positions[near.b], axis=1) <= reach).all()
+    assert (np.linalg.norm(there - positions[near.a], axis=1) <= reach).all()
