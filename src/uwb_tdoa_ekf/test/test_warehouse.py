@@ -43,9 +43,9 @@ def test_a_side_that_is_told_bounds_the_search(name, side, axis, sign):
     positions = room(name).anchors.positions
     rows = np.arange(len(positions) - 1)
     bounds, memory = surroundings(positions, rows, rows + 1, tag_side=side)
-    assert bounds[0 if sign > 0 else 1, axis] == pytest.approx(positions[0, axis]) and not memory.record.flat[axis]
+    assert bounds[0 if sign > 0 else 1, axis] == pytest.approx(positions[0, axis]) and not memory.ekf["flat"][0][axis]
     _, memory = surroundings(positions, rows, rows + 1)
-    assert memory.record.flat[axis]
+    assert memory.ekf["flat"][0][axis]
 
 
 def test_a_side_of_anchors_that_are_in_no_plane_means_nothing():

@@ -136,9 +136,9 @@ class Estimator:
             return None
         known = self.config.fixed_height_std > 0.0 or ekf.t - ekf.height.used < LONGEST_GAP
         places = {h // YAWS for h in np.flatnonzero(ekf.hypotheses["log_weight"] > -np.inf).tolist()}
-        variances = np.diagonal(ekf.hypotheses["P"][ekf.best])
+        flat, variances = self._memory.ekf["flat"][0], np.diagonal(ekf.hypotheses["P"][ekf.best])
         for axis, (sides, where) in enumerate((("-x or +x", "x"), ("-y or +y", "y"), ("below or above", "height"))):
-            if ekf.flat[axis] and (len(places) > 1 or variances[axis] > APART**2) and not (axis == 2 and known):
+            if flat[axis] and (len(places) > 1 or variances[axis] > APART**2) and not (axis == 2 and known):
                 return (
                     f"the anchors that are heard have one {where}, so that TDOAs do not tell on which side of them the tag is: set tag_side to {sides}"
                 )
