@@ -223,3 +223,15 @@ def test_level_without_any_specific_force_is_upright():
     x = np.zeros(16)
     level(np.zeros(3), 0.0, x)
     assert x[6:10].tolist() == [0, 0, 0, 1]
+
+
+def test_halves_of_a_place_whose_velocity_is_correlated_have_covariances():
+    """Before, the velocity stayed what it was, and the filter became no number."""
+    x, covariance, cost = np.zeros((2, 6)), np.zeros((2, 6, 6)), np.array([0.0, np.inf])
+    row = np.concatenate([np.eye(3), 0.9 * np.eye(3)], axis=1)
+    covariance[0] = 9.0 * row.T @ row + 0.1 * np.eye(6) + np.diag([5.0, 0, 0, 0, 0, 0])
+    whole = covariance[0].copy()
+    split(x, covariance, cost)
+    np.testing.assert_allclose(covariance[0] + np.outer(x[0], x[0]), whole)
+    for each in covariance:
+        assert_covariance(each)

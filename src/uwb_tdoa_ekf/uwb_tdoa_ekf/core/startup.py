@@ -169,13 +169,15 @@ def split(x: np.ndarray, covariance: np.ndarray, cost: np.ndarray) -> None:
         axis /= variance
     if cost[1] < np.inf or variance < APART**2:
         return
-    step, cost[1] = SPLIT * math.sqrt(variance) * axis, cost[0]
-    for i in range(3):
-        for j in range(3):
+    step, cost[1] = np.empty(6), cost[0]
+    for i in range(6):  # the velocity goes along, as far as it is correlated
+        step[i] = SPLIT / math.sqrt(variance) * np.sum(covariance[0, i, :3] * axis)
+    for i in range(6):
+        for j in range(6):
             covariance[0, i, j] -= step[i] * step[j]
     x[1], covariance[1] = x[0], covariance[0]
-    x[0, :3] -= step
-    x[1, :3] += step
+    x[0] -= step
+    x[1] += step
 
 
 @compiled
