@@ -64,7 +64,7 @@ def flight_among(anchors, duration):
     return fly(few, 0, duration)
 
 
-def cost(n, duration=60.0, repeat=3):
+def cost(n, duration=30.0, repeat=3):
     """(share of a core, memory of a tag, bytes, start from a file, s of processor time, the last Odometry) among n installed anchors."""
     anchors, shares = installation(n), []
     with tempfile.TemporaryDirectory() as folder:

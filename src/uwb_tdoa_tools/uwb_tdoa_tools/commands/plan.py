@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .. import cli, parallel
-from ..planning import hall, messages, options, report, run
+from ..planning import options, report, run
 from ..planning.goal import OBJECTIVES
 from ..planning.maps import FLYABLE, chart
 from ..planning.noise import RadioNoise
@@ -92,7 +92,7 @@ def _plan(args):
     reading = inputs.Reading(args.anchors)
     recordings = reading.find(args.flights or [], bool(args.dask))
     if args.radio_reach is not None:
-        return _plan_hall(args, anchors, installation, room, grid)
+        return run.end(args, *run.plan_hall(args, anchors, installation, room, grid))
     aim = options.aim_of(args, installation, room, grid.axes[2][0]) if args.improve else None
 
     if not np.isfinite(anchors.orientations).all():
@@ -117,39 +117,7 @@ def _plan(args):
     if aim:
         figures["improve"] = run.improve(found, aim, args.improve, args.starts, args.flyable, args.out)
         report.say_improvement(figures["improve"])
-    for path in (args.out / "plan.json", args.json):
-        if path is not None:
-            cli.write_json(path, figures)
-    cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
-    if args.publish:
-        cli.show(f"publishing {', '.join(outgoing)} until Ctrl-C")
-        messages.publish(outgoing)
-
-
-def _plan_hall(args, anchors, installation, room, grid):
-    for name in ("check", "flights", "improve"):
-        if getattr(args, name):
-            raise InputError(f"{name}: is for a room in which every anchor is heard; leave out --{name}, or --radio-reach.")
-    if not args.radio_reach > 0.0:
-        raise InputError(f"radio reach: {args.radio_reach:g} m is none; give one above 0, e.g. 18.")
-    report.say_room(room, args.room is not None)
-    cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
-    whole = hall.Hall(options.goal_of(args, installation), anchors, args.radio_reach)
-    found, heard = whole.chart(grid, args.jobs, args.dask)
-    figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": hall.summary(found, heard)}
-    figures["addition"] = whole.addition(found, room.lower[2])
-    hall.say(figures["map"], figures["addition"])
-    hall.plot(anchors, found, heard, args.out / "hall.png")
-    found.volume(anchors, installation.dimensions).save(args.out / "flyable.npz")
-    outgoing = messages.messages(found, anchors)
-    messages.write(outgoing, args.out / "plan.bag")
-    for path in (args.out / "plan.json", args.json):
-        if path is not None:
-            cli.write_json(path, figures)
-    cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
-    if args.publish:
-        cli.show(f"publishing {', '.join(outgoing)} until Ctrl-C")
-        messages.publish(outgoing)
+    run.end(args, figures, outgoing)
 
 
 if __name__ == "__main__":

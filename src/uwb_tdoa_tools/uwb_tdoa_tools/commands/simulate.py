@@ -64,10 +64,7 @@ def parser():
     add, off, share = radio.add_argument, {"action": "store_false"}, default.outlier_probability
     add("--protocol", choices=PROTOCOLS, default=default.protocol, help="(default: tdoa2)")
     add("--radio-reach", metavar="M", type=float, help="anchors farther from the tag than that are not heard (default: all are)")
-    add(
-        "--noise", dest="noise_std", metavar="M", type=float, default=default.noise_std,
-        help="standard deviation, m (default: 0.06)",
-    )  # fmt: skip
+    add("--noise", dest="noise_std", metavar="M", type=float, default=default.noise_std, help="standard deviation, m (default: 0.06)")
     add("--shared-noise", action="store_true", help="TDOAs made from the same reception share its noise")
     add(
         "--no-outliers", dest="outlier_probability", action="store_const", const=0.0, default=share,

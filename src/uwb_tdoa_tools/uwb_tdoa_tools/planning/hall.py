@@ -18,6 +18,7 @@ MOST_HEARD = 10  # nearest anchors that a cell is judged by: more add little, an
 AT_ONCE = 64  # groups of cells that a process takes at once
 ANCHOR_HEIGHT = 4.0  # m above the floor, of an anchor that is proposed
 TRIED, LOOKED_AT = 12, 30  # places that are tried for it, the most promising first, and holes that are looked at for each
+WORTH = 0.001  # of the cells: less is not worth an anchor
 HEARD_COLOURS = [0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25]  # bounds of the colours of the picture
 
 
@@ -126,7 +127,7 @@ def say(about, addition):
     print(f"{100.0 * about['flyable_share']:.0f} % of the cells can be flown; the others hear too few, are not among those they hear, or have two solutions")
     if about["bound_flyable"]:
         print("  bound of one round there, m: " + "  ".join(f"{name} {value:.2f}" for name, value in about["bound_flyable"].items()))
-    if addition and addition["position"]:
+    if addition and addition["position"] and addition["gain"] > WORTH:
         at = ", ".join(f"{x:.1f}" for x in addition["position"])
         print(f"one more anchor would help most near ({at}): {100.0 * (about['flyable_share'] + addition['gain']):.1f} % of the cells")
 

@@ -7,14 +7,48 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+from .. import cli
 from ..progress import Progress
 from ..readers.inputs import Reading
-from . import accuracy, layout, messages, plots
+from . import accuracy, hall, layout, messages, options, plots, report
 from .check import brute_force
 from .maps import Grid, chart, flyable
 
 ENOUGH = 0.95  # of the room that can be flown: no anchor is proposed
 LOOKED_AT, TRIED = 600, 60  # cells of the room, and places, that are tried for one more anchor, about
+
+
+def plan_hall(args, anchors, installation, room, grid):
+    """All of plan with --radio-reach: (figures, messages). args : the options; anchors : Anchors of the hall; installation : Installation of
+    some of them; room : Room; grid : Grid. Raises InputError."""
+    for name in ("check", "flights", "improve"):
+        if getattr(args, name):
+            raise InputError(f"{name}: is for a room in which every anchor is heard; leave out --{name}, or --radio-reach.")
+    if not args.radio_reach > 0.0:
+        raise InputError(f"radio reach: {args.radio_reach:g} m is none; give one above 0, e.g. 18.")
+    report.say_room(room, args.room is not None)
+    cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
+    whole = hall.Hall(options.goal_of(args, installation), anchors, args.radio_reach)
+    found, heard = whole.chart(grid, args.jobs, args.dask)
+    figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": hall.summary(found, heard)}
+    figures["addition"] = whole.addition(found, room.lower[2])
+    hall.say(figures["map"], figures["addition"])
+    hall.plot(anchors, found, heard, args.out / "hall.png")
+    found.volume(anchors, installation.dimensions).save(args.out / "flyable.npz")
+    outgoing = messages.messages(found, anchors)
+    messages.write(outgoing, args.out / "plan.bag")
+    return figures, outgoing
+
+
+def end(args, figures, outgoing):
+    """Write the figures, say what was written, and publish the messages if that was asked for."""
+    for path in (args.out / "plan.json", args.json):
+        if path is not None:
+            cli.write_json(path, figures)
+    cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
+    if args.publish:
+        cli.show(f"publishing {', '.join(outgoing)} until Ctrl-C")
+        messages.publish(outgoing)
 
 
 def draw_map(found, installation, out):
