@@ -30,7 +30,7 @@ def warm_up():
     pose_and_twist(odometry, *estimator.rates_at(odometry.t))
     rotation_std(odometry.q[-1:], odometry.covariance[-1:])
     watch.findings()
-    detector = ChangeDetector(1)
+    detector = ChangeDetector()
     for k in range(YOUNGEST + 2):
         detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1, int), np.zeros(1), np.eye(1)))
     detector.find(0.0)
