@@ -42,7 +42,7 @@ def test_two_frames_are_two_senders():
 
 def test_an_imu_on_another_topic():
     found = said(imu=None, topics={"/uwb/tdoa": "uwb_tdoa_msgs/msg/Tdoa", "/imu/raw": "sensor_msgs/msg/Imu"})
-    assert "/imu/raw:=/imu/data" in found["imu_elsewhere"].remedy
+    assert "--topic imu/data=/imu/raw" in found["imu_elsewhere"].remedy
     assert "imu_missing" in said(imu=None, topics={"/uwb/tdoa": "uwb_tdoa_msgs/msg/Tdoa"})
     assert said(imu=None) == {}  # a CSV file has no topics
 

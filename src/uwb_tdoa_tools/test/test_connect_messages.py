@@ -16,11 +16,10 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
-from test_connect import blocks, section  # noqa: E402
 from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
 from uwb_tdoa_ekf.streams import ERROR, StreamRules  # noqa: E402
-from uwb_tdoa_ekf.streams import ERROR, StreamRules  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
+from walking import blocks, section  # noqa: E402
 
 STAND_IN = """
 #pragma once
@@ -89,7 +88,7 @@ def listener():
 
 def test_the_publisher_in_python(tmp_path, listener):
     """With reliable subscriptions, as most have, that come after the anchors were sent."""
-    (tmp_path / "driver.py").write_text(*blocks(section("Message by message"), "python"))
+    (tmp_path / "driver.py").write_text(*blocks(section("connect.md", "Message by message"), "python"))
     process = subprocess.Popen([sys.executable, tmp_path / "driver.py"], stderr=subprocess.PIPE, text=True)
     try:
         imu, tdoas, surveys = [], [], []
@@ -120,7 +119,7 @@ def test_the_publisher_in_python(tmp_path, listener):
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
 def test_the_publisher_in_cpp(tmp_path):
-    (code,) = blocks(section("Message by message"), "cpp")
+    (code,) = blocks(section("connect.md", "Message by message"), "cpp")
     (tmp_path / "rclcpp").mkdir()
     (tmp_path / "rclcpp" / "rclcpp.hpp").write_text(STAND_IN)
     (tmp_path / "driver.cpp").write_text(code + "\nint main() { Driver driver; }\n")

@@ -1,11 +1,14 @@
 """Command lines that are printed to be copied: each runs as it stands, and does good where it says so."""
 
+import ast
 from dataclasses import replace
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 import re
 import shlex
 
+from documented import ROOT
 import numpy as np
 import pytest
 
@@ -65,7 +68,6 @@ def test_remedies_begin_as_the_user_began(monkeypatch):
     monkeypatch.setenv(command_lines.RUN, "./dev run")
     monkeypatch.setattr(command_lines.shutil, "which", lambda name: None)
     for line, runs in (
-        ("plan anchors.yaml --volume --out maps  # where it is", "./dev run uwb_tdoa_tools plan anchors.yaml --volume --out maps  # where it is"),
         ("ros2 topic hz imu/data", "./dev ros2 topic hz imu/data"),
         ("record a minute in which the tag is carried", "record a minute in which the tag is carried"),
         ("id -= 1", "id -= 1"),
@@ -74,6 +76,55 @@ def test_remedies_begin_as_the_user_began(monkeypatch):
         assert list(report.lines(Finding("rule", "error", "cause", "evidence", line, 0.0)))[2] == f"      remedy: {runs}"
     monkeypatch.delenv(command_lines.RUN)
     assert command_lines.as_it_runs("ros2 topic hz imu/data") == "ros2 topic hz imu/data"
+
+
+# --- all that any tool or node may print: from the sources ---
+
+PACKAGES = [ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")]
+TOOLS = tuple(path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if path.stem != "__init__")
+PRINT = {"commands/calibrate.py", "commands/survey.py", "diagnosis/report/apply.py", "live/demo.py"}  # whose lines tests below, and test_demo.py, run
+
+
+def sources():
+    """[(name, syntax tree)] of all modules but those of studies, which nobody needs to use the suite."""
+    paths = [(path.relative_to(package).as_posix(), path) for package in PACKAGES for path in package.rglob("*.py")]
+    return [(name, ast.parse(path.read_text())) for name, path in paths if not name.startswith("studies/")]
+
+
+def texts(tree):
+    """Texts in a module that may be printed, with "value" where a value is put in: no docstrings, and no examples of --help, which begin as the
+    user began."""
+    passed = {id(part) for node in ast.walk(tree) if isinstance(node, ast.Call) and "parser" in ast.unparse(node.func) for part in ast.walk(node)}
+    inside = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+    for node in ast.walk(tree):
+        if id(node) in passed | inside:
+            continue
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(part.value if isinstance(part, ast.Constant) else "value" for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not node.value.startswith("\n"):
+            yield node.value
+
+
+def test_whoever_prints_lines_to_copy_is_tested_here():
+    made = {name for name, tree in sources() for node in ast.walk(tree) if isinstance(node, ast.Attribute)
+            and getattr(node.value, "id", "") == "command_lines" and node.attr in ("tool", "node", "nodes", "judging")}  # fmt: skip
+    assert made == PRINT
+
+
+def test_no_text_is_a_command_that_does_not_run_as_it_stands():
+    """One that begins with a command of ROS is understood by ./dev ros2 too, and has no gap that the user must fill."""
+    pytest.importorskip("rclpy")
+    spec = spec_from_file_location("dev_ros2", ROOT / ".dev" / "ros2.py")
+    ros2 = module_from_spec(spec)
+    spec.loader.exec_module(ros2)
+    found = [(name, text) for name, tree in sources() for text in texts(tree)]
+    commands = [(name, text) for name, text in found if re.match(r"(ros2|\./dev) \w+ \S|(" + "|".join(TOOLS) + r") (?:\S*[./]\S* )*--\w", text)]
+    assert len(commands) >= 3
+    for name, text in commands:
+        line, *_ = text.split("  #")
+        begin, *words = shlex.split(line)
+        assert begin == "ros2" and not any(re.fullmatch("[A-Z]{3,}", word) for word in words), (name, text)
+        assert ros2.parser().parse_args(words), (name, text)
 
 
 @pytest.mark.slow

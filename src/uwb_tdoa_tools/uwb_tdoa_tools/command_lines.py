@@ -10,7 +10,6 @@ import shutil
 
 RUN = "UWB_TDOA_RUN"  # variable of the environment in which ./dev says how the user started it
 PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf", "debias_node": "uwb_tdoa_ekf", "compile_nodes": "uwb_tdoa_ekf"}
-NAMED = "check", "convert", "diagnose", "evaluate", "plan", "survey"  # executables with which a remedy may begin
 
 
 def tool(name, *words):
@@ -24,11 +23,7 @@ def started(name):
 
 
 def as_it_runs(line):
-    """A line that begins with an executable of ours, or with what ./dev does as ros2 does, as it runs where the user is; any other one as it
-    is."""
-    first, _, rest = line.partition(" ")
-    if first in NAMED:
-        return f"{started(first)} {rest}"
+    """A line that begins with what ./dev does as ros2 does, as it runs where the user is; any other one as it is."""
     if line.startswith(("ros2 topic ", "ros2 node ", "ros2 param ")) and RUN in os.environ and not shutil.which("ros2"):
         return f"{os.environ[RUN].removesuffix(' run')} {line}"
     return line
@@ -40,10 +35,12 @@ def node(name, parameters, files=()):
     return tool(name, "--ros-args", *words, *(word for file in files for word in ("--params-file", file)))
 
 
-def judging(recordings, survey=None, effects=None, config=None):
-    """The line that judges an estimate on recordings with the files of a calibration; None for those that there are not."""
+def judging(recordings, survey=None, effects=None, config=None, truth=True):
+    """The line that judges an estimate on recordings with the files of a calibration, by ground truth, or, where they hold none, by itself;
+    None for files that there are not."""
     options = {"--survey": survey, "--effects": effects, "--config": config}
-    return tool("evaluate", *recordings, *(word for option, file in options.items() if file for word in (option, file)))
+    words = [*recordings, *(word for option, file in options.items() if file for word in (option, file))]
+    return tool("evaluate", *words) if truth else tool("localize", *words, "--out", "localized/")
 
 
 def nodes(anchors=None, effects=None, config=None):

@@ -7,10 +7,12 @@
     options.add_known(parser)                       # --marks, --distances
     options.add_tape(parser)                        # --std, --height-std, --trusted, --trusted-std, --unknown
     options.add_align(parser)                       # --align
+    options.add_rerun(parser)                       # --rerun
     reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
 from dataclasses import fields, replace
+from pathlib import Path
 
 from uwb_tdoa_bias.correction.network import UNPROVEN, load_network
 from uwb_tdoa_bias.effects import EffectSet
@@ -19,6 +21,8 @@ from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
+from . import cli
+from .localizing import rerun_file
 from .localizing.estimate import Estimator
 from .parallel import whole_number
 from .readers import inputs
@@ -159,6 +163,22 @@ def add_align(parser, judges=False):
             "turned and shifted (as evo -a, without scale). What is found is told in any case, with the error of each"
         )
     parser.add_argument("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=words)
+
+
+def add_rerun(parser):
+    """--rerun: a recording for the viewer Rerun."""
+    parser.add_argument("--rerun", metavar="FILE", help=rerun_file.HELP)
+
+
+def rerun_of(args, count, say):
+    """Path of the file that --rerun asks for; None without it, or without the library, of which say(sentence) is told. count : of
+    flights, of which it shows one. Raises InputError."""
+    if not args.rerun:
+        return None
+    cli.check_folders(args.rerun)
+    if count != 1:
+        raise InputError(f"--rerun: needs exactly one flight, got {count}.")
+    return Path(args.rerun) if rerun_file.is_there(say) else None
 
 
 def add_known(parser):

@@ -77,7 +77,7 @@ def two_tags(windows):
     share = share_of(windows, "returns", "successive")
     if share > RETURNS:
         evidence = f"{100.0 * share:.0f} % leap by more than 0.5 m and back within 0.1 s"
-        remedy = "ros2 run DRIVER --ros-args -r __ns:=/tag2  # a namespace for each tag"
+        remedy = "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2"
         return Finding("two_tags", ERROR, "two tags share uwb/tdoa", evidence, remedy, share)
 
 

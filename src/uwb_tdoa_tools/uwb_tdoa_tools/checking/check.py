@@ -27,7 +27,7 @@ HOPELESS = {
     "tdoa_clipped",
 }
 WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "imu_clipped"}
-OTHER_SURVEY = "--survey FOLDER  # with all surveys: check says which one fits; or survey the anchors again"
+OTHER_SURVEY = "give --survey a folder of all surveys: check says which one fits; or survey the anchors again"
 # What a survey of another room is taken for: many things explain some of it, and it does not fit with them undone either.
 BLAMED = {"tdoa_sign", "ids_swapped", "pair_sign", "tdoa_one_sign", "anchor_moved"}
 # What a finding explains that the stream itself only shows.

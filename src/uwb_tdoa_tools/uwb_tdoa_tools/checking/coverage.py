@@ -68,7 +68,7 @@ def flat(view):
     size, thickness = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)[[0, 2]] / np.sqrt(len(p))
     if thickness < FLAT * size:
         evidence = f"they are within {thickness:.2f} m (rms) of a plane and {size:.1f} m across"
-        remedy = "plan anchors.yaml --improve move  # half of the anchors low, half of them high"
+        remedy = "put half of the anchors low, and half of them high; plan --improve move says which where"
         yield Finding(
             "anchors_flat",
             WARNING,
@@ -108,7 +108,7 @@ def outside(view):
             WARNING,
             "the tag is outside of its anchors, where it is hardly located",
             evidence,
-            "plan anchors.yaml --volume --out maps  # where it is",
+            "look where a tag can be located: plan --volume draws it",
             share,
         )
 

@@ -24,8 +24,7 @@ def frames(recording):
 def _frame(topic, frame, place):
     if place is None:
         cause = f"{topic} is in the frame {frame}, and nothing says how that sits on {BODY_FRAME}"
-        line = f"ros2 run tf2_ros static_transform_publisher --frame-id {BODY_FRAME} --child-frame-id {frame}"
-        line += " --roll 0 --pitch 0 --yaw 0"
+        line = f"publish on /tf_static how {frame} sits on {BODY_FRAME}, or have the driver write frame_id {BODY_FRAME}"
         yield Finding("frame_unknown", WARNING, cause, f"no transform to {frame} in /tf_static", line, np.nan)
         return
     turn, arm = place
@@ -35,7 +34,7 @@ def _frame(topic, frame, place):
     evidence = f"roll {roll:.0f}, pitch {pitch:.0f}, yaw {yaw:.0f} degrees and "
     evidence += f"({arm[0]:.2f}, {arm[1]:.2f}, {arm[2]:.2f}) m on {BODY_FRAME}"
     cause = f"{topic} is in the frame {frame}, which /tf_static places on {BODY_FRAME}; its samples are taken there"
-    line = "./dev ros2 topic echo /tf_static  # nothing to do if that is how it is mounted"
+    line = "ros2 topic echo /tf_static  # nothing to do if that is how it is mounted"
     yield Finding("frame_turned", NOTE, cause, evidence, line, turn.magnitude())
 
 
@@ -44,7 +43,7 @@ def senders(recording):
     for topic, counts in recording.frames.items():
         if len(counts) > 1:
             names = ", ".join(f"{frame or '(none)'}: {count}" for frame, count in sorted(counts.items()))
-            line = "ros2 run DRIVER --ros-args -r __ns:=/tag2  # a namespace for each tag"
+            line = "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2"
             yield Finding(
                 "senders",
                 ERROR,
@@ -61,7 +60,7 @@ def no_imu(recording):
         return
     there = sorted(topic for topic, kind in recording.topics.items() if kind == "sensor_msgs/msg/Imu")
     if there:
-        line = f"ros2 bag play BAG --remap {there[0]}:=/{IMU}"
+        line = f"give --topic {IMU}={there[0]} to tools that read the bag, and -r {IMU}:={there[0]} to ekf_node"
         yield Finding(
             "imu_elsewhere", WARNING, f"no inertial samples on {IMU}", f"but on {', '.join(there)}", line, 0.0
         )

@@ -43,7 +43,7 @@ def kinds(recording):
         found = {end.kind for end in (*publishers, *subscriptions)}
         if len(found) > 1:
             evidence = ", ".join(sorted(f"{end.node}: {end.kind}" for end in (*publishers, *subscriptions)))
-            cause, line = f"{topic} has several types", f"ros2 run DRIVER --ros-args -r {topic}:={topic}_other"
+            cause, line = f"{topic} has several types", f"start the driver of the other type with --ros-args -r {topic}:={topic}_other"
             yield Finding("type_other", ERROR, cause, evidence, line, float(len(found)))
 
 
@@ -72,7 +72,7 @@ def several(recording):
     for topic, publishers, _ in _by_topic(recording):
         if len(publishers) > 1 and not topic.startswith("/tf"):
             names = ", ".join(sorted(end.node for end in publishers))
-            line = "ros2 run DRIVER --ros-args -r __ns:=/tag2  # or stop all but one"
+            line = "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2, or stop all but one"
             yield Finding(
                 "publishers_several", ERROR, f"{len(publishers)} publish on {topic}", names, line, float(len(publishers))
             )

@@ -86,7 +86,7 @@ def _calibrate(args):
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()})
     judges = args.holdout or [path for path, _ in found[-1:]]
-    return _stop(made.why_not) if made.why_not is not None else _write(made, out, judges)
+    return _stop(made.why_not) if made.why_not is not None else _write(made, out, judges, all(known))
 
 
 def _checked(reading, recordings, std):
@@ -110,14 +110,14 @@ def _stop(why):
     return 1
 
 
-def _write(made, out, recordings):
+def _write(made, out, recordings, truth):
     files = anchors, effects, config = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
     made.anchors.to_yaml(anchors)
     made.effects.to_yaml(effects)
     write_parameters(config, made.tdoa_std) if made.tdoa_std is not None else config.unlink(missing_ok=True)
     there = [file if file.exists() else None for file in files]
     cli.show(f"wrote {', '.join(file.name for file in there if file)} and calibration.json to {out}")
-    cli.show(f"judge it:   {command_lines.judging(recordings, *there)}", "fly by it:", *command_lines.nodes(*there))
+    cli.show(f"judge it:   {command_lines.judging(recordings, *there, truth)}", "fly by it:", *command_lines.nodes(*there))
 
 
 if __name__ == "__main__":

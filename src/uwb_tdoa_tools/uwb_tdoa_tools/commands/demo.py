@@ -1,5 +1,6 @@
 """demo: a flight through both nodes over ROS topics, and how far the estimate is from ground truth."""
 
+from functools import partial
 from pathlib import Path
 import sys
 import time
@@ -35,6 +36,7 @@ def parser():
         DESCRIPTION,
         "demo",
         "demo --flight 0607/tdoa2-obs-log1 --survey anchor_0607.txt --rate 4",
+        "demo --rerun out/flight.rrd",
         "demo --flight flight.bag --effects effects.yaml --out out/corrected",
     )
     add = made.add_argument
@@ -44,6 +46,7 @@ def parser():
     add("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="for all files (default out/demo)")
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
     add("--model", metavar="FILE", help=f'ONNX bias network to correct with; "default" is the one shipped: {UNPROVEN}'.replace("%", "%%"))
+    options.add_rerun(made)
     return made
 
 
@@ -52,6 +55,7 @@ def _demo(args):
         raise InputError(f"--rate: {args.rate:g} is not a speed; give a number above 0.")
     if args.survey and not args.flight:
         raise InputError("--survey: needs --flight; a simulated flight has its own anchors.")
+    rerun = options.rerun_of(args, 1, partial(cli.say, "demo"))
     started = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
     if args.flight:
@@ -65,14 +69,17 @@ def _demo(args):
     if case.became:
         cli.show(f"flown      by the estimate: {case.became}")
     cli.show(f"correction {case.correction()}")
-    became, scores = demo.fly(case, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
-    in_time = _all_in_time(flight, became)
+    flown = demo.fly(case, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
+    scores, in_time = flown.scores, _all_in_time(flight, flown.became)
     if not in_time:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
     cli.show(*lines_of_errors(scores))
     cli.show(_told(scores))
     plot_comparison(flight, scores[:-1], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
+    if rerun is not None:
+        flown.show(rerun, flight, [case.became, _told(scores)])
+        cli.show(f"rerun      {rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
     cli.show("next       " + "\n           ".join(demo.next_steps(args.flight or args.out / "flight.bag", args.survey)))
     return int(scores[-2].row()["diverged"] or not in_time)  # of the nodes

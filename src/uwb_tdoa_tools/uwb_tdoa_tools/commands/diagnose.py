@@ -15,6 +15,8 @@ from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
 from ..diagnosis.report.apply import applying
 from ..diagnosis.self_survey import tdoa_std_of
+from ..localizing.estimate import Estimator
+from ..localizing.rerun_file import write_rerun
 from ..progress import Progress
 from ..surveying.paths import DRIFT, read_paths
 
@@ -42,6 +44,7 @@ def parser():
         "diagnose flight.bag --out diagnosis/",
         "diagnose 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out diagnosis/",
         "diagnose flight.bag --effects effects.yaml --out second/",
+        "diagnose flight.bag --rerun flight.rrd --out diagnosis/",
         "diagnose flight.bag --reference heights --out by-height/",
         "diagnose flight.bag --reference odometry --odometry /vio/odometry --marks marks.yaml --out by-odometry/",
         "diagnose flight.bag --no-truth --out without/",
@@ -67,6 +70,7 @@ def parser():
     add("--drift", type=float, default=DRIFT, metavar="M", help="of that, m per square root of a second (default %(default)s)")
     options.add_most(made, MOST)
     options.add_align(made)
+    options.add_rerun(made)
     parallel.add_options(made)
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
     return made
@@ -78,7 +82,9 @@ def _diagnose(args):
         options.refuse(args, ("marks", "distances", "odometry"), f"no part of it is used with --reference {args.reference}")
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
-    jobs, dask = parallel.asked(args, len(reading.find(args.flights)), FEW)
+    found = reading.find(args.flights)
+    rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
+    jobs, dask = parallel.asked(args, len(found), FEW)
     flights, holdout = (reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout))
     shared = {f.name for f in flights} & {f.name for f in holdout}
     if shared:
@@ -101,15 +107,27 @@ def _diagnose(args):
         progress("measuring the noise")
         tdoa_std = _noise(result, config, over)
     out.mkdir(parents=True, exist_ok=True)
-    (_, its_survey), *_ = reading.find(args.flights)
-    result = replace(result, applying=applying(out, args.holdout or args.flights, args.survey, its_survey, tdoa_std is not None))
+    (_, its_survey), *_ = found
+    truth = all(flight.truth is not None for flight in holdout or flights)
+    result = replace(result, applying=applying(out, args.holdout or args.flights, args.survey, its_survey, tdoa_std is not None, truth))
     cli.write_json(out / "diagnosis.json", result.as_json())
     result.effects.to_yaml(out / "effects.yaml")
     (out / "report.html").write_text(result.as_html())
     if tdoa_std is not None:
         write_parameters(out / "ekf_node.yaml", tdoa_std)
+    if rerun is not None:
+        _show(result, effects or EffectSet(), config, rerun)
     cli.show(result.as_text())
     cli.show(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
+
+
+def _show(result, base, config, path):
+    """Write the flight of a Diagnosis for Rerun: estimates with the EffectSet `base` and with what was found, what that is, and the ground
+    truth as it was judged by."""
+    (flight,) = result.flights
+    before, after = (Estimator(config, effects)(flight) for effects in (base, result.effects))
+    truth = flight.truth if result.reference.judges else None
+    write_rerun(path, flight, after.odometry, after.residuals, result.as_text().splitlines(), truth, before.odometry)
 
 
 def _noise(result, config, over):

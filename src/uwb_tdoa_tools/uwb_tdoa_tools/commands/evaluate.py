@@ -8,7 +8,6 @@ import sys
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
-from ..localizing import rerun_file
 from ..results_file import asked_of
 from ..scoring import table
 from ..scoring.judge import Judge, results
@@ -54,7 +53,7 @@ def parser():
     )  # fmt: skip
     add("--plot", metavar="FILE", help="picture of the errors over time (one FLIGHT)")
     add("--tum", metavar="DIR", help="write estimates and truths as TUM trajectories, e.g. for evo")
-    add("--rerun", metavar="FILE", help=rerun_file.HELP)
+    options.add_rerun(made)
     add(
         "--resume", metavar="FILE",
         help="keep each flight's figures there as soon as it is judged, a line of JSON each; what is there is not judged again",
@@ -64,17 +63,17 @@ def parser():
 
 
 def _evaluate(args):
-    cli.check_folders(args.json, args.markdown, args.plot, args.rerun)
+    cli.check_folders(args.json, args.markdown, args.plot)
     if args.odometry:
         options.refuse(args, NOT_OF_ODOMETRY, "has no part in an odometry that was recorded, which is judged as it is (--odometry)")
     estimator = options.estimator_of(args, partial(cli.say, "evaluate"))
     reading = options.reading_of(args)
     found = (replace(reading, topics={}, namespace="") if args.odometry else reading).find(args.flights, bool(args.dask))
-    for option in ("odometry", "plot", "rerun"):
+    for option in ("odometry", "plot"):
         if getattr(args, option) and len(found) != 1:
             raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
     trajectories = cli.output_folder(args.tum, "--tum").absolute() if args.tum else None
-    rerun = args.rerun if args.rerun and rerun_file.is_there(partial(cli.say, "evaluate")) else None
+    rerun = options.rerun_of(args, len(found), partial(cli.say, "evaluate"))
     judge = Judge(reading, estimator, args.odometry, args.plot, trajectories, rerun, args.align)
     if not args.odometry:
         cli.show(f"correcting with: {estimator.correction}")

@@ -1,13 +1,9 @@
 """localize: where the tag was, and how far that is to be believed."""
 
 from functools import partial
-from pathlib import Path
 import sys
 
-from uwb_tdoa_bias.foundation.errors import InputError
-
 from .. import cli, options, parallel
-from ..localizing import rerun_file
 from ..localizing.localize import Localizer, all_good, check_names
 
 DESCRIPTION = """Where the tag was: trajectories of recordings, without ground truth, which is not read.
@@ -43,7 +39,7 @@ def parser():
     add = made.add_argument
     add("--bag", action="store_true", help="write the odometry as a bag, too")
     add("--residuals", action="store_true", help="write what is left of each TDOA, too: a table, and a picture")
-    add("--rerun", metavar="FILE", help=rerun_file.HELP)
+    options.add_rerun(made)
     add("--json", metavar="FILE", help="write all figures")
     parallel.add_options(made)
     add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
@@ -52,15 +48,13 @@ def parser():
 
 def _localize(args):
     out = cli.output_folder(args.out)
-    cli.check_folders(args.json, args.rerun)
+    cli.check_folders(args.json)
     say = partial(cli.say, "localize")
     estimator = options.estimator_of(args, say)
     reading = options.reading_of(args, truth=False)
     found = reading.find(args.flights, bool(args.dask))
     check_names(found)
-    if args.rerun and len(found) != 1:
-        raise InputError(f"--rerun: needs exactly one flight, got {len(found)}.")
-    rerun = Path(args.rerun) if args.rerun and rerun_file.is_there(say) else None
+    rerun = options.rerun_of(args, len(found), say)
     out.mkdir(parents=True, exist_ok=True)
     cli.show(f"correcting with: {estimator.correction}")
     localizer, located = Localizer(reading, estimator, out.absolute() if args.dask else out, args.bag, args.residuals, rerun), []

@@ -73,7 +73,7 @@ def _survey(args):
     cli.show(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")
     if result.why_not is None:
         files = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
-        cli.show(f"next: {command_lines.judging(args.flights, *files)}")
+        cli.show(f"next: {command_lines.judging(args.flights, *files, all(flight.truth is not None for flight in flights))}")
     return 0 if result.why_not is None else 1
 
 

@@ -307,8 +307,8 @@ def _inflation(grams, vectors, sizes):
     return float(np.mean(np.sum((scores @ directions[:, told]) ** 2, axis=0) / values[told]))
 
 
-def features(p):
-    """Random Fourier features of a Gaussian kernel at places p (n, 3) m: (n, FEATURES)."""
-    waves = np.random.default_rng(3).standard_normal((3, FEATURES // 2)) / LENGTH
+def features(p, length=LENGTH):
+    """Random Fourier features of a Gaussian kernel of some length, m, at places p (n, 3) m: (n, FEATURES)."""
+    waves = np.random.default_rng(3).standard_normal((3, FEATURES // 2)) / length
     phase = p @ waves
     return np.concatenate([np.cos(phase), np.sin(phase)], axis=1) * np.sqrt(2.0 / FEATURES)

@@ -8,7 +8,8 @@ from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN, load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_ekf.offline import Run, run_offline
 
 from .. import command_lines
 from ..bags.bag import read_odometry, write_bag
@@ -17,6 +18,7 @@ from ..flying.report import sentence
 from ..flying.sensors import Radio
 from ..flying.verdict import judge
 from ..flying.world import HALL
+from ..localizing.rerun_file import write_rerun
 from ..scoring.metrics import Score, airborne
 from .run import accounts, run_live
 
@@ -70,24 +72,41 @@ def measured(path, reading, effects_file=None, model=None):
     return Case(flight, effects_file, model)
 
 
-def fly(case, folder, rate=1.0, say=print):
-    """Write the flight of a Case as a bag, play it to both nodes, and run the filter without ROS beside them.
+@dataclass(frozen=True)
+class Flown:
+    """became : {what became of the messages: count}, see `accounts`; scores : [Score], of the filter without correction, of the nodes, and of
+    the filter with correction; or, if nothing corrects, of the nodes and of the filter; nodes : Odometry; without_ros : Run of the filter
+    with what the nodes correct with; raw : Odometry of the filter without correction, or None if nothing corrects."""
 
-    Returns ({what became of the messages: count}, see `accounts`, [Score]): of the filter without correction, of the nodes, and of the
-    filter with correction; or, if nothing corrects, of the nodes and of the filter. The bags and the output of the nodes go to the folder. Raises InputError,
-    LiveError. say(text) : told what happens.
+    became: dict
+    scores: list
+    nodes: Odometry
+    without_ros: Run
+    raw: Odometry | None
+
+    def show(self, path, flight, sentences):
+        """Write a file for Rerun: what the nodes said, and sentences."""
+        write_rerun(path, flight, self.nodes, self.without_ros.residuals, sentences, flight.truth, self.raw)
+
+
+def fly(case, folder, rate=1.0, say=print):
+    """Write the flight of a Case as a bag, play it to both nodes, and run the filter without ROS beside them: Flown.
+
+    The bags and the output of the nodes go to the folder. Raises InputError, LiveError. say(text) : told what happens.
     """
     flight, bag, correction = case.flight, folder / "flight.bag", case.corrector()
     write_bag(flight, bag, force=True)
     model = SHIPPED if case.model == SHIPPED else _absolute(case.model)
     bias, ekf = {"effects_file": _absolute(case.effects_file), "model_file": model}, {"use_imu": flight.imu is not None}
     live = run_live(bag, folder, rate, bias, ekf, say)
-    nodes, raw = read_odometry(live.recorded), run_offline(flight).odometry
-    estimates = {"nodes": nodes, "without ROS": raw}
+    nodes, raw = read_odometry(live.recorded), run_offline(flight)
+    estimates = {"nodes": nodes, "without ROS": raw.odometry}
     if correction:
-        corrected = run_offline(flight, corrector=correction).odometry
-        estimates = {"raw": raw, "corrected": nodes, "corrected, without ROS": corrected}
-    return accounts(live.bias, live.ekf, flight), [Score(name, one, flight.truth) for name, one in estimates.items()]
+        corrected = run_offline(flight, corrector=correction)
+        estimates = {"raw": raw.odometry, "corrected": nodes, "corrected, without ROS": corrected.odometry}
+    scores = [Score(name, one, flight.truth) for name, one in estimates.items()]
+    without_ros, before = (corrected, raw.odometry) if correction else (raw, None)
+    return Flown(accounts(live.bias, live.ekf, flight), scores, nodes, without_ros, before)
 
 
 def next_steps(recording, survey=None):

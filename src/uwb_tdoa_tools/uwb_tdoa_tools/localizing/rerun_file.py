@@ -1,4 +1,4 @@
-"""A flight and its estimate for the viewer Rerun (rerun.io): anchors, path, covariance, residuals per pair over time, verdict."""
+"""A flight and its estimate for the viewer Rerun (rerun.io): anchors, path, covariance, residuals per pair over time, verdict and findings."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -8,12 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
+from ..scoring.metrics import position_at
 from .pictures import SIGMAS
 from .residuals import by_pair
 
-HELP = "write a recording for the viewer Rerun, too (.rrd; one FLIGHT; needs pip install rerun-sdk)"
+HELP = "write a recording for the viewer Rerun, too (.rrd; of one flight; needs pip install rerun-sdk)"
 RATE = 20.0  # Hz, of poses that are written
-BLUE, RED, GREY, BLACK = (31, 119, 180), (214, 39, 40), (120, 120, 120), (40, 40, 40)
+BLUE, RED, GREY, BLACK, ORANGE = (31, 119, 180), (214, 39, 40), (120, 120, 120), (40, 40, 40), (255, 127, 14)
 
 
 def is_there(say) -> bool:
@@ -24,9 +25,9 @@ def is_there(say) -> bool:
     return False
 
 
-def write_rerun(path: Path, flight: Flight, odometry, residuals, verdict: list, truth: Truth | None = None) -> None:
-    """Write a .rrd file: the Odometry of a Flight among its anchors, Residuals or None, sentences, and the ground truth where it is
-    to be shown. Time is s since the first TDOA."""
+def write_rerun(path: Path, flight: Flight, odometry, residuals, verdict: list, truth: Truth | None = None, before=None) -> None:
+    """Write a .rrd file: the Odometry of a Flight among its anchors, Residuals or None, sentences, the ground truth where it is
+    to be shown, and another Odometry, as it was before something was corrected, or None. Time is s since the first TDOA."""
     import rerun
 
     begin = float(flight.tdoa.t[0])
@@ -46,9 +47,12 @@ def write_rerun(path: Path, flight: Flight, odometry, residuals, verdict: list, 
         _write_scalars(rerun, stream, f"deviation/{axis}", odometry.t - begin, std[:, k])
     for one in by_pair(residuals) if residuals is not None else ():
         _write_scalars(rerun, stream, f"residual/{one.a}-{one.b}", one.t - begin, one.value)
+    if before is not None:
+        stream.log("world/before", rerun.LineStrips3D([before.p], colors=ORANGE, radii=0.005), static=True)
     if truth is not None:
-        true = np.stack([np.interp(odometry.t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
-        _write_scalars(rerun, stream, "error", odometry.t - begin, np.linalg.norm(odometry.p - true, axis=1))
+        for name, one in (("error", odometry), ("error/before", before)):
+            if one is not None:
+                _write_scalars(rerun, stream, name, one.t - begin, np.linalg.norm(one.p - position_at(one.t, truth), axis=1))
     stream.flush()
     stream.disconnect()
 

@@ -36,7 +36,7 @@ class Judge:
     odometry: str | None = None
     picture: str | None = None
     trajectories: Path | None = None
-    rerun: str | None = None
+    rerun: Path | None = None
     align: str = NONE
 
     def __call__(self, recording):
