@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 from uwb_tdoa_ekf.estimator import Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
-from uwb_tdoa_tools.localizing import belief, rerun_file, residuals
+from uwb_tdoa_tools.localizing import belief, residuals
 from uwb_tdoa_tools.localizing.estimate import Estimator
 from uwb_tdoa_tools.localizing.localize import check_names, name_of
 from uwb_tdoa_tools.readers.inputs import Reading
@@ -163,18 +163,3 @@ def test_a_recording_without_an_estimate_has_files_and_a_picture_too(flight, tmp
     assert told["verdict"] == "bad" and told["estimates"] == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(path.rpartition("/")[2] for path in told["files"])
     assert "flight: bad: there is no estimate" in capsys.readouterr().out
-
-
-def test_rerun_is_left_out_with_a_sentence_where_it_is_not_installed(bags, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(rerun_file, "find_spec", lambda name: None)
-    run([bags / "none" / "flight.bag", "--out", tmp_path, "--rerun", tmp_path / "flight.rrd"])
-    assert capsys.readouterr().err.count("pip install rerun-sdk") == 1 and not (tmp_path / "flight.rrd").exists()
-    run([bags / "none" / "flight.bag", bags / "true", "--out", tmp_path, "--rerun", tmp_path / "flight.rrd"], 2)
-
-
-def test_rerun_gets_a_recording(bags, tmp_path):
-    pytest.importorskip("rerun")
-    run([bags / "none" / "flight.bag", "--out", tmp_path, "--rerun", tmp_path / "flight.rrd"])
-    assert (tmp_path / "flight.rrd").read_bytes().startswith(b"RRF")
-    assert evaluate.main([str(bags / "true" / "flight.bag"), "--rerun", str(tmp_path / "judged.rrd")]) == 0
-    assert (tmp_path / "judged.rrd").stat().st_size > 10_000

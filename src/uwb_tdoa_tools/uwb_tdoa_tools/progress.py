@@ -12,7 +12,7 @@ import time
 
 from tqdm import tqdm
 
-FIRST, EVERY = 1.0, 4.0  # s until the first line where there is no terminal, and between two
+FIRST, EVERY = 0.5, 4.0  # s until the first line where there is no terminal, and between two
 OFTEN = 0.5  # s between two changes of the line on a terminal
 
 

@@ -6,7 +6,6 @@ Both sensors are compared over short cells; constant biases and what changes slo
 from itertools import permutations, product
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
 
 from uwb_tdoa_ekf.streams import ERROR, Finding
@@ -205,6 +204,8 @@ def filtered(motion):
 
 def _slowed(values, tau):
     """Through a low pass of first order, of time constant tau, s."""
+    from scipy.signal import lfilter  # takes a second to import
+
     share = 1.0 - np.exp(-CELL / tau)
     return lfilter([share], [1.0, share - 1.0], values - values[0], axis=0) + values[0]
 

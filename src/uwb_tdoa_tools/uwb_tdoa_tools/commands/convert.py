@@ -10,6 +10,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import cli, options
 from ..bags.convert import SENSORS, convert, shifted
 from ..bags.files import STORAGES
+from ..progress import Progress
 from ..readers import columns
 from ..readers.names import read_named
 from ..scoring.settling import on_one_clock
@@ -61,7 +62,9 @@ def parser():
 def _convert(args):
     offsets = _offsets(args.offsets)
     named = _named(args)
-    made = convert(lambda: on_one_clock(shifted(_read(args, named), offsets), args.align), args.out, args.storage, args.force)
+    with Progress("convert") as progress:
+        progress("reading and writing")
+        made = convert(lambda: on_one_clock(shifted(_read(args, named), offsets), args.align), args.out, args.storage, args.force)
     if args.json:
         cli.show(json.dumps(asdict(made), indent=2, default=str))
         return

@@ -10,7 +10,6 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
 from ..live import demo
-from ..scoring.plots import plot_comparison
 from ..scoring.table import lines_of_errors
 
 DESCRIPTION = """Take a flight, write it as a bag, replay the bag through bias_node and ekf_node over ROS topics, and
@@ -75,6 +74,8 @@ def _demo(args):
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
     cli.show(*lines_of_errors(scores))
     cli.show(_told(scores))
+    from ..scoring.plots import plot_comparison  # takes a second to import
+
     plot_comparison(flight, scores[:-1], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
     if rerun is not None:

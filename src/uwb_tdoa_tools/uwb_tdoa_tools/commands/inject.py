@@ -7,6 +7,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
 from ..bags.files import STORAGES
+from ..progress import Progress
 from ..simulation.inject import catalogue, inject, parse_effect
 
 DESCRIPTION = """Add a declared effect to a flight, and write the flight that would have been recorded with it as a
@@ -52,7 +53,9 @@ def _inject(args):
         if not getattr(args, option):
             raise InputError(f"{option}: is missing; see inject --help.")
     effect = parse_effect(args.effect, args.value)
-    name = inject(effect, args.flight, options.reading_of(args), args.out, args.seed, args.storage, args.force)
+    with Progress("inject") as progress:
+        progress("reading and writing")
+        name = inject(effect, args.flight, options.reading_of(args), args.out, args.seed, args.storage, args.force)
     added = ", ".join(f"{key} = {value:g}" for key, value in effect.values.items())
     cli.show(f"{name}: added {effect.name} ({added}, in {effect.unit}) -> {args.out}")
 

@@ -11,6 +11,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from .. import cli
 from ..bags.bag import check_output, write_bag
 from ..bags.files import STORAGES
+from ..progress import Progress
 from ..simulation import NO_IMU_ERRORS, ImuErrors, SimulationConfig, simulate
 from ..simulation.config import YAW_PROFILES
 from ..simulation.plots import plot
@@ -93,8 +94,10 @@ def _simulate(args):
     if args.plot is not None and args.plot.suffix.lower() not in PLOT_SUFFIXES:
         raise InputError(f"plot: {args.plot} is no image file; choose one of {', '.join(PLOT_SUFFIXES)}.")
     cli.check_folders(args.json, args.plot)
-    flight = simulate(_config(args))
-    content = summary(flight)
+    with Progress("simulate") as progress:
+        progress("flying")
+        flight = simulate(_config(args))
+        content = summary(flight)
     cli.show(f"{flight.name}: {content['tdoas']} TDOAs, {content['imu_samples']} IMU samples, {content['poses']} poses")
     cli.show(
         f"errors of the TDOAs, standard deviation: bias {content['bias_std']:.3f} m, "
@@ -102,7 +105,9 @@ def _simulate(args):
         f"{content['outliers']} outliers"
     )
     if args.out is not None:
-        write_bag(flight, args.out, args.storage, args.force)
+        with Progress("simulate") as progress:
+            progress("writing")
+            write_bag(flight, args.out, args.storage, args.force)
         cli.show(f"wrote {args.out}")
     if args.json is not None:
         cli.write_json(args.json, content)

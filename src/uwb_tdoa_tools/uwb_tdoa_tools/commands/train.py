@@ -10,7 +10,6 @@ from ..progress import Progress
 from ..results_file import ResultsFile, asked_of, resumed, state_of
 from ..scoring.settling import told
 from ..training import labels as labelling, models, shrinking
-from ..training.plots import plot_curve
 
 NO_MATTER = ("flights", "survey", "name", "out", "resume", "jobs", "dask")  # to what is kept of a training, beside states of recordings
 MOST = 1_500_000  # TDOAs; what they take: docs/speed.md
@@ -91,6 +90,8 @@ def _write(args, several, over, progress):
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
     label, x, *errors = result.curve
+    from ..training.plots import plot_curve  # takes a second to import
+
     plot_curve(label, x, *errors, args.out / "training.png")
     for name, (before, after) in result.errors.items():
         cli.show(f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m (root mean square)")

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-from matplotlib.figure import Figure
 import numpy as np
 
 from ..scoring.metrics import position_at
@@ -42,6 +41,8 @@ def drawn(flown, verdict):
 
 def plot(flights, anchors, path):
     """Draw [Drawn] among Anchors to an image file: a map and the heights of all, and the errors of the worst."""
+    from matplotlib.figure import Figure  # takes a second to import
+
     figure = Figure(figsize=(14, 8), layout="constrained")
     left, right = figure.subfigures(1, 2)
     landed = sum(one.verdict["landed"] for one in flights)

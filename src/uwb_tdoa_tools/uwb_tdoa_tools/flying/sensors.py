@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from scipy.signal import butter, lfilter
 
 from uwb_tdoa_bias.effects import EFFECTS, Samples
 from uwb_tdoa_bias.foundation.compiled import compiled
@@ -152,6 +151,8 @@ class Inertial:
         rng, band = random(seed, "vibration"), world.vibration_band
         self.shaking = rng.standard_normal((n, 3))
         if band:
+            from scipy.signal import butter, lfilter  # takes a second to import
+
             self.shaking = lfilter(*butter(2, band, fs=IMU_RATE), self.shaking, axis=0)
             self.shaking /= self.shaking.std(axis=0)
         self.shaking = np.array(world.vibration) * (self.shaking + world.rectified * np.sign(rng.standard_normal(3)))
@@ -159,6 +160,8 @@ class Inertial:
 
 def gusts(world, seed, duration):
     """Wind at each sample of the inertial sensor, (n, 3) m/s: exponentially correlated."""
+    from scipy.signal import lfilter  # takes a second to import
+
     n = int(duration * IMU_RATE) + 1
     decay = math.exp(-1.0 / (IMU_RATE * GUST_TIME))
     white = random(seed, "wind").standard_normal((n, 3))

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
-from scipy.stats import qmc
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -113,6 +112,8 @@ def optimise(goal, places, count, fixed=None, start=None, starts=16, seed=0, pro
     layout = Layout(places, count, fixed, goal.points.mean(axis=0), are_turned(goal.installation.anchors))
     rows = _some(goal, ROUGH, seed)
     looked_at = replace(goal, points=goal.points[rows])
+    from scipy.stats import qmc  # takes a second to import
+
     drawn = qmc.Halton(count * places.numbers, seed=seed).random(DRAWN * starts)
     begin = [layout.start(numbers) for numbers in drawn]
     begin = sorted(begin, key=lambda x: looked_at.score(layout.anchors(x)))[:starts]

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from uwb_tdoa_bias.foundation.geometry import ranges
 
@@ -122,5 +121,5 @@ def ellipses(covariance, share=0.99):
     """Ellipses that hold `share` of the estimates in the xy plane: (semi-axes (n, 2) m, the longer first; angle (n,)
     rad of the longer one from x)."""
     values, vectors = np.linalg.eigh(covariance[:, :2, :2])
-    axes = np.sqrt(chi2.ppf(share, 2) * values[:, ::-1])
+    axes = np.sqrt(-2.0 * np.log(1.0 - share) * values[:, ::-1])
     return axes, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])

@@ -1,11 +1,12 @@
 """Pictures of simulated flights."""
 
-from matplotlib.figure import Figure
 import numpy as np
 
 
 def plot(flight, path):
     """Draw path and anchors from above, height, and the bias and full error of the TDOAs, to an image file."""
+    from matplotlib.figure import Figure  # takes a second to import
+
     parts, truth, tdoa = flight.extra["tdoa_truth"], flight.truth, flight.tdoa
     figure = Figure(figsize=(12, 7), layout="constrained")
     figure.suptitle(flight.name)

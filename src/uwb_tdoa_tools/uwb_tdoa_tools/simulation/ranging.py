@@ -1,7 +1,6 @@
 """The TDOA measurements: geometry, and the errors of the two arrival times that each is made of."""
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.antenna import Antenna
@@ -106,6 +105,8 @@ def floor_multipath(t, height, duration, n_anchors, rng):
     t : (n,) s in 0 ... duration; height : (n,) m of the tag above the floor. Own model: the positive part of a Gaussian
     process with exponential correlation, one per anchor, fading out linearly with height.
     """
+    from scipy.signal import lfilter  # takes a second to import
+
     dt = 0.05
     decay = np.exp(-dt / MULTIPATH_TIME)
     white = rng.standard_normal((int(duration / dt) + 2, n_anchors))

@@ -1,0 +1,104 @@
+"""Nobody waits in silence: each command says something within 2 s, and goes on to say something every 5 s.
+
+Time counts as long as the command itself computes. Where others compute on the same cores, that takes up to twice as long, too."""
+
+import os
+from pathlib import Path
+import selectors
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_tools import command_lines
+from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.simulation.constellations import corners
+
+FIRST, EVERY, LONG_ENOUGH = 2.0, 5.0, 15.0  # s; the last: of computing, after which enough is known of what does not end before
+WORDS = {  # command: words after it
+    "bench": "--quick --only core",
+    "calibrate": "flight.bag --out calibrated",
+    "calibrate, no truth": "flight.bag --no-truth --out calibrated",
+    "calibrate, quick": "flight.bag --no-truth --quick",
+    "check": "wrong.bag",
+    "convert": "flight.bag --out other.bag",
+    "debias": "fit flight.bag --out map.npz",
+    "demo": "--out out",
+    "diagnose": "flight.bag --out diagnosis",
+    "evaluate": "flight.bag",
+    "fly": "--flights 2 --jobs 1",
+    "inject": "flight.bag --effect anchor_delay --value 3=0.3 --out late.bag",
+    "localize": "flight.bag --smooth --residuals --out localized",
+    "plan": "anchors.yaml --volume --out maps",
+    "plan, better": "anchors.yaml --improve move --out maps",
+    "simulate": "--duration 300 --out long.bag",
+    "survey": "flight.bag --out surveyed",
+    "train": "flight.bag --model structured --out model",
+}
+ELSEWHERE = {"record", "replay", "study"}  # what these wait for is the time of a recording, or nobody who uses the suite
+
+
+def test_every_command_is_here():
+    commands = {path.stem for path in (Path(command_lines.__file__).parent / "commands").glob("[a-z]*.py")}
+    assert commands == {name.partition(",")[0] for name in WORDS} | ELSEWHERE
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """A folder with a flight, another one whose TDOAs have the wrong sign, and anchors."""
+    folder = tmp_path_factory.mktemp("desk")
+    flight = simulate(SimulationConfig(seed=1, duration=120.0))
+    write_bag(flight, folder / "flight.bag")
+    np.negative(flight.tdoa.d, out=flight.tdoa.d)
+    write_bag(flight, folder / "wrong.bag")
+    corners().to_yaml(folder / "anchors.yaml")
+    return folder
+
+
+def computed(pid):
+    """s of processor time of a process and of the processes that it has started."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK") + sum(map(computed, children))
+
+
+def silences(name, words, folder):
+    """[s] of computing until each thing that a command says, and until its end, or LONG_ENOUGH."""
+    out, process = [], None
+    line = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *words]
+    with subprocess.Popen(line, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+        selector = selectors.DefaultSelector()
+        selector.register(process.stdout, selectors.EVENT_READ)
+        then, clock, before = time.monotonic(), 0.0, 0.0
+        spoken = 0.0
+        while True:
+            heard = selector.select(0.2)
+            now, used = time.monotonic(), max(before, computed(process.pid))
+            clock, then, before = clock + min(now - then, used - before), now, used
+            if heard:
+                out.append(clock - spoken)
+                spoken = clock
+                if not os.read(process.stdout.fileno(), 1 << 16):
+                    break
+            if clock > LONG_ENOUGH or clock - spoken > 2.0 * EVERY:
+                out.append(clock - spoken)
+                break
+        process.terminate()
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WORDS)
+def test_nobody_waits_in_silence(desk, name):
+    if name == "demo":
+        pytest.importorskip("rclpy")
+    first, *others = silences(name.partition(",")[0], WORDS[name].split(), desk)
+    slower = 2.0 if os.getloadavg()[0] > os.cpu_count() else 1.0
+    print(f"{name}: first word after {first:.1f} s, then at most {max(others, default=0.0):.1f} s of silence")
+    assert first < FIRST * slower and max(others, default=0.0) < EVERY * slower, (first, others)
