@@ -101,6 +101,16 @@ def test_another_epoch_is_refused_or_found(name, request):
     assert on_one_clock(one) is one
 
 
+@pytest.mark.parametrize("axes", [np.diag([1, 1, -1]), [[1, 0, 0], [0, 0, -1], [0, 1, 0]]])  # z down; y up, as Motive writes it
+def test_another_epoch_and_other_axes_at_once_are_found(flight, axes):
+    later = shifted(in_frame(flight, np.transpose(axes)), "truth", EPOCH)
+    put_right, said = settled(later, align="time")
+    np.testing.assert_allclose(put_right.truth.t, flight.truth.t, atol=0.03)
+    flown = flight.truth.p[:, 2] > 0.3
+    away = np.linalg.norm(put_right.truth.p - flight.truth.p, axis=1)[flown]
+    assert np.sqrt(np.mean(away**2)) < 0.06 and len(said) == 2
+
+
 def test_a_path_that_repeats_itself_does_not_tell_the_epoch(bare):
     t = np.arange(0.0, 120.0, 0.01)
     circle = np.stack([np.cos(t), np.sin(t), np.full_like(t, 1.5)], axis=1)

@@ -110,6 +110,12 @@ def recorded(hall, truth, name="in time"):
     return script
 
 
+def said_on_the_way(capsys, step, before, after):
+    """Tell what a step has brought, for the documentation."""
+    with capsys.disabled():
+        print(f"{step}: {before:.3f} -> {after:.3f} m on a flight that took no part")
+
+
 # --- with ground truth ---
 
 
@@ -136,7 +142,7 @@ def test_from_csv_and_tape_to_a_diagnosed_flight(desk, capsys, request, source, 
     run(judging)
     printed = capsys.readouterr()
     after = hall.error("diagnosis")
-    print(f"{source}, truth {name}: {before:.3f} -> {after:.3f} m on the other flight")
+    said_on_the_way(capsys, f"{source}, truth {name}", before, after)
     effects = EffectSet.from_yaml("diagnosis/effects.yaml")
     assert not any(effect.name.endswith("time_offset") for effect in effects.effects)
     if len(effects):
@@ -183,7 +189,7 @@ def test_from_tape_to_calibrated_without_ground_truth(desk, capsys, request, sou
     code = ended(*whole)
     printed = capsys.readouterr()
     after = hall.error("calibrated")
-    print(f"{source}, calibrate: {before:.3f} -> {after:.3f} m on the other flight")
+    said_on_the_way(capsys, f"{source}, calibrate", before, after)
     if code:
         assert "nothing to use is written" in printed.err and after == before
     else:
@@ -195,7 +201,7 @@ def test_from_tape_to_calibrated_without_ground_truth(desk, capsys, request, sou
     code = ended(*surveyed)
     printed = capsys.readouterr()
     after = hall.error("surveyed")
-    print(f"{source}, survey: {before:.3f} -> {after:.3f} m on the other flight")
+    said_on_the_way(capsys, f"{source}, survey", before, after)
     assert "nothing is applied" in printed.out if code else after < before
     (located, *_) = commands(blocks(section("localizing.md", "Where the tag was"))[0])
     assert main(*located) in (0, 1) and Path("localized/flight.tum").exists()
@@ -244,6 +250,6 @@ def test_the_four_steps_of_the_readme(desk, capsys):
         if "--out" not in words or name == "localize":
             continue
         after = hall.error(words[words.index("--out") + 1])
-        print(f"{name}: {before:.3f} -> {after:.3f} m on another flight")
+        said_on_the_way(capsys, f"README, {name}", before, after)
         assert after < before if code == 0 else "nothing" in printed.out + printed.err and after == before
     assert Path("localized/FLIGHT.tum").exists()

@@ -16,7 +16,7 @@ def section(page, heading):
     path = ROOT / page if page == "README.md" else ROOT / "docs" / page
     text = path.read_text()
     level = re.search(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE).group(1)
-    return re.split(rf"^#{{2,{len(level)}}} ", text.partition(f"{level} {heading}\n")[2], flags=re.MULTILINE)[0]
+    return re.split(rf"^#{{2,{max(2, len(level))}}} ", text.partition(f"{level} {heading}\n")[2], flags=re.MULTILINE)[0]
 
 
 def blocks(text, language=""):

@@ -7,10 +7,11 @@ import numpy as np
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.estimator import Odometry
 
+from ..scoring.labels import labels
+
 ELLIPSES = 60  # along the path
 SIGMAS = 3.0
 MARGIN = 0.5  # m around anchors and path
-TOGETHER = 0.35  # m; anchors that are nearer to each other in a picture have one label
 
 
 def draw(path: Path, odometry: Odometry, anchors: Anchors, spans: list, title: str) -> None:
@@ -64,7 +65,7 @@ def _plane(ax, odometry, anchors, lost, plane):
         ax.plot(*odometry.p[0, [u, v]], "o", ms=6, mfc="white", color="tab:blue")
         ax.plot(*odometry.p[-1, [u, v]], "s", ms=5, color="tab:blue")
     ax.plot(anchors.positions[:, u], anchors.positions[:, v], "^", ms=8, color="0.2")
-    for names, place in _labels(anchors.ids.tolist(), anchors.positions[:, (u, v)]):
+    for names, place in labels(anchors.ids.tolist(), anchors.positions[:, (u, v)]):
         ax.annotate(names, place, textcoords="offset points", xytext=(6, 5), fontsize=9)
     both = np.concatenate([anchors.positions, known])[:, (u, v)]
     lower, upper = both.min(axis=0) - MARGIN, both.max(axis=0) + MARGIN
@@ -80,12 +81,3 @@ def _plane(ax, odometry, anchors, lost, plane):
             Line2D([], [], color="0.2", marker="^", ls="", label="anchor"),
         ]
         ax.legend(handles=marks, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8)
-
-
-def _labels(ids, places):
-    """Yield (label, (2,) m) of ids at places (n, 2) m; those that would cover each other have one."""
-    left = list(range(len(ids)))
-    while left:
-        here = [k for k in left if np.linalg.norm(places[k] - places[left[0]]) < TOGETHER]
-        yield ", ".join(str(ids[k]) for k in here), places[here].max(axis=0)
-        left = [k for k in left if k not in here]

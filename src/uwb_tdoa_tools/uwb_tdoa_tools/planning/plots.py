@@ -6,12 +6,14 @@ from matplotlib.colors import ListedColormap
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from ..scoring.labels import labels
 from ..scoring.plots import plt
 from .bifurcation import Subsets
 from .precision import NORMAL_99, ellipses
 
 HULL, ENVELOPE, FLYABLE = "magenta", "tab:green", "#ffe680"
 _MOST_LAYERS = 3
+TITLE = {"fontsize": 9, "pad": 12.0}  # above anchors on the upper edge, and their labels
 
 
 def plot_precision(installation, chart, path):
@@ -26,7 +28,7 @@ def plot_precision(installation, chart, path):
         ):
             _field(ax, chart, chart.hull, values, k, label)
             _room(ax, installation, chart.grid, k)
-        row[0].set_title(f"{row[0].get_title()}, 99 % ellipses times {_ellipses(row[0], chart, k)}", fontsize=9)
+        row[0].set_title(f"{row[0].get_title()}, 99 % ellipses times {_ellipses(row[0], chart, k)}", **TITLE)
     _save(figure, "Precision of one round of TDOAs", path)
 
 
@@ -113,14 +115,14 @@ def plot_layouts(charts, path, candidates=None):
             _hatch(ax, chart, k)
             _room(ax, installation, chart.grid, k)
             flown = chart.grid.layer(chart.flyable, k).mean()
-            ax.set_title(f"{title}{ax.get_title()}: {100.0 * flown:.0f} % flyable", fontsize=9)
+            ax.set_title(f"{title}{ax.get_title()}: {100.0 * flown:.0f} % flyable", **TITLE)
     if candidates is not None:
         worst_first = np.argsort(-candidates[1])
         positions, scores = candidates[0][worst_first], candidates[1][worst_first]
         for row, (i, j) in zip(axes, ((0, 1), (0, 2), (1, 2))):
             dots = row[-1].scatter(positions[:, i], positions[:, j], c=100.0 * scores, cmap="viridis_r", s=14)
             row[-1].set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal")
-            row[-1].set_title("score with one more anchor there", fontsize=9)
+            row[-1].set_title("score with one more anchor there", **TITLE)
             figure.colorbar(dots, ax=row[-1], label="cm", shrink=0.8)
     hatched = any(not chart.flyable.all() for _, _, chart in charts)
     _save(figure, "Before and after; hatched: not flyable" if hatched else "Before and after; all is flyable", path)
@@ -171,7 +173,7 @@ def _room(ax, installation, grid, k):
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     ax.set(xlim=(x[0] - half, x[-1] + half), ylim=(y[0] - half, y[-1] + half))
     if k is not None:
-        ax.set_title(f"z = {z[k]:.2f} m", fontsize=9)
+        ax.set_title(f"z = {z[k]:.2f} m", **TITLE)
 
 
 def _anchors(ax, anchors):
@@ -181,8 +183,8 @@ def _anchors(ax, anchors):
     if turned.any():
         front = Rotation.from_quat(anchors.orientations[turned]).apply([1.0, 0.0, 0.0])
         ax.quiver(*p[turned, :2].T, *front[:, :2].T, color="r", width=0.005, scale=18)
-    for number, at in zip(anchors.ids, p):
-        ax.annotate(str(number), at[:2], xytext=(3, 3), textcoords="offset points", fontsize=7, color="r")
+    for names, at in labels(anchors.ids.tolist(), p[:, :2]):
+        ax.annotate(names, at, xytext=(3, 3), textcoords="offset points", fontsize=7, color="r")
 
 
 def _ellipses(ax, chart, k, across=9):

@@ -32,6 +32,7 @@ COMMON, ALIKE, APART = 0.6, 1.3, 2.0  # of the shorter path in common; error of 
 AS_WELL = 0.02  # share by which a turned frame and stamps that are late may differ in what they leave, to be as likely
 FITS = 0.6  # of the size of the path, that may be left where an epoch is found
 EPOCH_STEP = 0.1  # s between epochs that are tried
+ARRANGEMENTS = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,8 +265,7 @@ def _other_axes(truth, odometry):
     def error(axes):
         return apart(true @ axes.T, estimated)
 
-    arrangements = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
-    best = min(arrangements, key=error)
+    best = min(ARRANGEMENTS, key=error)
     return best if error(best) < AXES * error(np.eye(3)) else np.eye(3)
 
 
@@ -284,27 +284,36 @@ def _at(t, path):
 
 
 def _epoch(flight, odometry):
-    """s by which the stamps of a ground truth on another clock are late: where its path is nearest to that of the estimate."""
+    """s by which the stamps of a ground truth on another clock are late: where its path is nearest to that of the estimate, as it is, or
+    else, about its middle, with other axes."""
     truth = flight.truth
     if len(odometry.t) < 2:
         raise InputError(f"{flight.name}: the ground truth is on another clock than the TDOAs, and there is no estimate to find it by.")
     ours, theirs = (_at(np.arange(one.t[0], one.t[-1], EPOCH_STEP), one) for one in (odometry, truth))
-    shorter = min(len(ours), len(theirs))
-    lags = np.arange(-len(theirs) + 1, len(ours))
+    lags, size, told = np.arange(-len(theirs) + 1, len(ours)), np.sqrt(np.sum(ours.var(axis=0))), []
+    for pair, arrangements in (((ours, theirs), (np.eye(3),)), ((ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)), ARRANGEMENTS)):
+        error = _apart_by_lag(*pair, lags, arrangements)
+        best = int(np.argmin(error))
+        others = np.min(error[np.abs(lags - lags[best]) > APART / EPOCH_STEP], initial=np.inf)
+        if error[best] < FITS * size and others >= ALIKE * error[best]:
+            return float(truth.t[0] - odometry.t[0] - lags[best] * EPOCH_STEP)
+        told.append(f"the nearest is {error[best]:.2f} m off, another one {others:.2f} m")
+    raise InputError(
+        f"{flight.name}: the ground truth is on another clock than the TDOAs, and its path does not tell on which ({told[0]}; with other axes "
+        f"{told[1]}): write both on one clock."
+    )
+
+
+def _apart_by_lag(ours, theirs, lags, arrangements):
+    """m, root mean square distance of two paths (n, 3), (m, 3) m at each lag (k,) of the second, with the best of some arrangements (3, 3) of its
+    axes; infinite where they have too little in common."""
     common = np.minimum(lags + len(theirs), len(ours)) - np.maximum(lags, 0)
     square = _over(np.sum(ours**2, axis=1), np.ones(len(theirs))) + _over(np.ones(len(ours)), np.sum(theirs**2, axis=1))
-    square -= 2.0 * sum(_over(mine, its) for mine, its in zip(ours.T, theirs.T))
+    products = np.array([[_over(mine, its) for its in theirs.T] for mine in ours.T])
+    square -= 2.0 * np.max([np.tensordot(axes, products) for axes in arrangements], axis=0)
     error = np.sqrt(np.maximum(square, 0.0) / common)
-    error[common < COMMON * shorter] = np.inf
-    best = int(np.argmin(error))
-    others = error[np.abs(lags - lags[best]) > APART / EPOCH_STEP]
-    size = np.sqrt(np.sum(ours.var(axis=0)))
-    if not error[best] < FITS * size or np.min(others, initial=np.inf) < ALIKE * error[best]:
-        raise InputError(
-            f"{flight.name}: the ground truth is on another clock than the TDOAs, and its path does not tell on which (the nearest is "
-            f"{error[best]:.2f} m off, another one {np.min(others, initial=np.inf):.2f} m): write both on one clock."
-        )
-    return float(truth.t[0] - odometry.t[0] - lags[best] * EPOCH_STEP)
+    error[common < COMMON * min(len(ours), len(theirs))] = np.inf
+    return error
 
 
 def _over(ours, theirs):

@@ -43,7 +43,7 @@ def fitted(diagnosis):
     if not several:
         return ""
     words = (
-        f"± one standard deviation of where the anchor may be, not of the fit; ? marks less than {SURE:g} of them. Other causes of the same "
-        "errors have been counted, as far as the catalogue knows them."
+        f"± one standard deviation of where the anchor may be, not of the fit; ? marks less than {SURE:g} of them. What else makes such "
+        "errors, another one in each direction, or a delay, has been counted."
     )
     return section(TITLE, paragraphs([words], "note"), table(HEAD, several, (1, 2, 3, 4)))
