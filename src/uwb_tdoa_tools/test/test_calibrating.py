@@ -84,6 +84,7 @@ def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, mo
         (0.2, 0.1, "10.0 cm of the innovations are slow with it on flight3, more than 5.5 cm: something else is wrong too"),
         (0.05, 0.04, "it gains too little to be sure that it does no harm"),
         (0.055, 0.02, None),
+        (0.08, 0.05, None),  # a tape that is good to 5 cm
     ],
 )
 def test_innovations_alone_must_speak_clearly(before, after, why):

@@ -19,13 +19,13 @@ from ..diagnosis.calibration import LEFT
 from ..diagnosis.self_survey import slow_innovations, tdoa_std_of
 from ..localizing.estimate import Estimator
 from ..scoring.evaluation import score_of
-from ..surveying.result import CLEARLY
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
 from .parts import split
 
 MISFIT = "survey_misfit"  # the rule of `check` of a survey that does not fit, though no other mistake explains it
 OFF = 3.0  # standard deviations of a coordinate that anchors may be off by, in the median, and be of the same room
+GAINED = 1.5  # slow innovations before over those after, where it took no part, that tell without ground truth that a calibration does good
 FITTED = 2.0 / 3.0  # of the time of a single flight without ground truth; the rest judges
 
 
@@ -112,7 +112,7 @@ def _why_not_blindly(calibration):
             f"{100 * calibration.after:.1f} cm of the innovations are slow with it on {calibration.judged_on}, more than {100 * LEFT:.1f} cm: something "
             "else is wrong too, of which anchors may take the place; record ground truth, or give survey some --marks"
         )
-    if calibration.before < CLEARLY * calibration.after:
+    if calibration.before < GAINED * calibration.after:
         return f"it gains too little to be sure that it does no harm: {calibration.as_text()}; fly more, or keep what there is"
     return None
 
