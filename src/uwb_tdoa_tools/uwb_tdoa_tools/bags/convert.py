@@ -35,7 +35,7 @@ def convert(read, out, storage="mcap", force=False):
     """Write a recording as a bag, see `write_bag`. read : callable, gives the Flight. Returns Converted. Raises
     InputError."""
     check_output(out, force)  # before the work, not after it
-    flight = read()
+    flight = _from_zero_on(read())
     counts = write_bag(flight, out, storage, force)
     together = [stream for name in _held(flight) if _overlaps(stream := getattr(flight, name), flight.tdoa)]
     known = (flight.anchors.index(flight.tdoa.a) >= 0) & (flight.anchors.index(flight.tdoa.b) >= 0)
@@ -62,6 +62,19 @@ def shifted(flight, offsets):
             raise InputError(f"--time-offset: {flight.name} holds no {sensor}; it holds {', '.join(_held(flight))}.")
         changed[sensor] = replace(stream, t=stream.t + offset)
     return replace(flight, **changed)
+
+
+def _from_zero_on(flight):
+    """The Flight without what its other sensors say before 0 s, where the TDOAs are not: a clock that was moved may begin there, and a bag has no
+    place for it."""
+    changed, said = {}, list(flight.meta.get("remarks", ()))
+    for name in _held(flight) if (flight.tdoa.t >= 0.0).all() else ():
+        stream = getattr(flight, name)
+        inside = stream.t >= 0.0
+        if inside.any() and not inside.all():
+            changed[name] = type(stream)(*(None if column is None else column[inside] for column in vars(stream).values()))
+            said.append(f"{name}: {np.count_nonzero(~inside)} samples before 0 s, which a bag has no place for, are left out")
+    return replace(flight, **changed, meta={**flight.meta, "remarks": said}) if changed else flight
 
 
 def _held(flight):
