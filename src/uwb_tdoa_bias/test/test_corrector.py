@@ -3,6 +3,7 @@ from dataclasses import fields
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
+from random_samples import random_samples
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -190,6 +191,13 @@ def test_effects_are_those_of_the_mean_heading_while_the_yaw_is_unknown():
     np.testing.assert_allclose(told[2.0].bias, correct(upright, [0.0]).bias, atol=0.01)  # what is across averages out
     assert abs(told[0.1].bias[0] - told[2.0].bias[0]) > 0.03
     assert told[0.1].std[0] == 0.0 and told[2.0].std[0] > 0.03
+
+
+def test_samples_may_be_of_a_known_yaw():
+    samples, arm = random_samples(6), TagLeverArm({"x": 0.1, "z": 0.2})
+    assert samples.yaw_std is None
+    bias, *_ = Corrector(samples.anchors, EffectSet((arm,))).contribution(samples)
+    np.testing.assert_array_equal(bias, arm.bias(samples))
 
 
 def test_without_an_estimated_attitude_the_yaw_is_what_everybody_assumes():

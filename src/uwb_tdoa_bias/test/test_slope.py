@@ -65,6 +65,11 @@ def test_parts_add_up():
     assert not slope_of(both[2:], samples)[1].any()
 
 
+def test_where_nobody_knows_the_velocity_nothing_follows_it():
+    for part in slope_of([line("climb_rate")], random_samples(5)):
+        assert not part.any()
+
+
 @pytest.mark.parametrize("covariate", [name for name in (*OF_TDOA, *OF_ARRIVAL) if name not in STATES])
 def test_nothing_else_is_followed(covariate):
     assert line(covariate, "arrival" if covariate in OF_ARRIVAL else "common").states == ()

@@ -5,7 +5,10 @@
 One for all tags of a room: remap their uwb/anchors to its own. Every parameter is documented in config/anchors_node.yaml.
 """
 
+from __future__ import annotations
+
 import sys
+from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from tf2_msgs.msg import TFMessage
@@ -17,6 +20,10 @@ from .foundation.ros_anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_messag
 from .foundation.ros_frames import TF_STATIC_QOS
 from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 from .foundation.survey import read_survey
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_msgs.msg import AnchorArray
 
 PARAMETERS = {  # in the order of config/anchors_node.yaml
     "anchors_file": Parameter(ANCHORS_FILE.default, "survey of the anchors, as the tools read it; must be given"),
@@ -31,7 +38,7 @@ class AnchorsNode(ros.StreamNode):
 
     NAME = "anchors_node"
 
-    def __init__(self, arguments=()):
+    def __init__(self, arguments: Sequence[str] = ()) -> None:
         """arguments : of the process."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
@@ -50,7 +57,7 @@ class AnchorsNode(ros.StreamNode):
         self.get_logger().info(f"{len(anchors)} anchors of {own['anchors_file']} in frame '{anchors.frame}'")
 
 
-def transforms(message):
+def transforms(message: AnchorArray) -> TFMessage:
     """TFMessage of an AnchorArray: a frame anchor_<id> for each, level where its orientation is not known."""
     out = TFMessage()
     for anchor in message.anchors:
@@ -62,7 +69,7 @@ def transforms(message):
     return out
 
 
-def markers(message, size):
+def markers(message: AnchorArray, size: float) -> MarkerArray:
     """MarkerArray of an AnchorArray: a cube and a number for each; size : m."""
     out = MarkerArray()
     for anchor in message.anchors:
@@ -78,11 +85,11 @@ def markers(message, size):
     return out
 
 
-def _known(q):
+def _known(q: Quaternion) -> bool:
     return any((q.x, q.y, q.z, q.w))
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
     return ros.run(AnchorsNode, __doc__, argv)
 

@@ -5,10 +5,13 @@ uwb/tdoa (Tdoa), odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray), /tf_st
 Every parameter is documented in config/bias_node.yaml.
 """
 
+from __future__ import annotations
+
 from collections import Counter, deque
 from itertools import groupby
 import math
 import sys
+from typing import Any, TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -30,6 +33,11 @@ from .correction.pose_queue import PoseQueue
 from .correction.network import load_network
 from .correction.poses import parts_of
 from .foundation.stamps import StampGate
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Sequence
+    from .foundation.anchors import Anchors
+    from .foundation.ros_wire import Template
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
     "anchors_file": ANCHORS_FILE,
@@ -57,6 +65,7 @@ CORRECTED = (  # what is written of a TdoaCorrected
 )  # fmt: skip
 MOST_FRAMES = 100  # that are remembered: names on a topic may be anything
 EARLY, EARLY_POSES = 2000, 500  # TDOAs and poses kept while there are no anchors
+Item = tuple[Any, ...]  # of a TDOA: frame, sec, nanosec, and MEASURED
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
@@ -65,7 +74,7 @@ class BiasNode(ros.StreamNode):
 
     NAME = "bias_node"
 
-    def __init__(self, arguments=(), member=None, **options):
+    def __init__(self, arguments: Sequence[str] = (), member: Collection[str] | None = None, **options: Any) -> None:
         """arguments : of the process; member : of a localization_node, which has it take its turns and hands it the odometry:
         names of parameters that are for others, too; options : of Node."""
         super().__init__(self.NAME, **options)
@@ -79,13 +88,19 @@ class BiasNode(ros.StreamNode):
         self._network = load_network(model_file)
         self._model = self._warm_up()
         self._idle = self._model[NETWORK] == "none"
-        self._corrector = None
-        self._epoch, self._counts, self._rate = ros.Epoch(), Counter(), ros.Rate()
-        self._early, self._early_poses, self._hold = deque(), deque(), PoseQueue(self._limit)
+        self._corrector: Corrector = None  # type: ignore[assignment]  # until there are anchors
+        self._epoch, self._rate = ros.Epoch(), ros.Rate()
+        self._counts: Counter[str] = Counter()
+        self._early: deque[Item] = deque()
+        self._early_poses: deque[tuple[str, np.ndarray, np.ndarray]] = deque()  # as of `_take_poses`
+        self._hold = PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
-        self._wire, self._templates = Wire(TdoaCorrected, *CORRECTED), {}  # by frame and model, the latest
-        self._frame, self._frame_trouble, self._frames_said = self._body, None, set()  # of the TDOAs
+        self._wire = Wire(TdoaCorrected, *CORRECTED)
+        self._templates: dict[tuple[str, str], Template] = {}  # by frame and model, the latest
+        self._frame = self._body  # of the TDOAs
+        self._frame_trouble: str | None = None
+        self._frames_said: set[str] = set()
         self._declared = self._effects  # without the arm of the antenna
         self.output = StreamOutput(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
@@ -101,22 +116,23 @@ class BiasNode(ros.StreamNode):
         self.get_logger().info(f"ready; correcting with: {self._model[NETWORK]}")
 
     @property
-    def holds(self):
+    def holds(self) -> int:
         """How many TDOAs wait for their pose."""
         return len(self._hold)
 
-    def _warm_up(self):
+    def _warm_up(self) -> dict[int, str]:
         """Returns what to call each status's bias."""
         name = warm_up(self._effects, self._network, self._lag).model
         return {PASSED: "none", EFFECTS: self._effects.name, NETWORK: name, FADED: name}
 
-    def _start_over(self):
+    def _start_over(self) -> None:
         """Forget poses and whatever waits for one."""
         self._counts["dropped"] += len(self._hold)
         self._hold = PoseQueue(self._limit)
-        self._corrector = Corrector(self._anchors.anchors, self._effects, self._network, self._lag)
+        anchors: Any = self._anchors.anchors  # there are some when this is called
+        self._corrector = Corrector(anchors, self._effects, self._network, self._lag)
 
-    def _on_anchors(self, _):
+    def _on_anchors(self, _: Anchors) -> None:
         self._start_over()
         while self._early_poses:
             self._take_poses(*self._early_poses.popleft())
@@ -124,12 +140,12 @@ class BiasNode(ros.StreamNode):
         self._take([self._seconds(item) for item in early], early)
         self._release()
 
-    def _on_frames(self):
+    def _on_frames(self) -> None:
         """A constant transform is new, or another."""
         if self._frame != self._body:
             self._place_antenna(self._frame)
 
-    def _place_antenna(self, frame):
+    def _place_antenna(self, frame: str) -> None:
         """Find out where the antenna of this frame is on the body, and take out what that does to TDOAs."""
         self._frame, self._frame_trouble, effects = frame, None, self._declared
         if frame not in ("", self._body):
@@ -155,7 +171,7 @@ class BiasNode(ros.StreamNode):
         if self._anchors.anchors is not None:
             self._start_over()
 
-    def _on_odometry(self, frame, t, rows, arrival):
+    def _on_odometry(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         self._counts["poses"] += len(t)
         if self._idle:
             return
@@ -166,7 +182,7 @@ class BiasNode(ros.StreamNode):
         else:
             self._take_poses(frame, t, rows)
 
-    def _take_poses(self, frame, t, rows):
+    def _take_poses(self, frame: str, t: np.ndarray, rows: np.ndarray) -> None:
         if frame != self._corrector.anchors.frame:
             self.get_logger().warning(
                 f"odometry is in frame '{frame}', the anchors in '{self._corrector.anchors.frame}': "
@@ -179,7 +195,7 @@ class BiasNode(ros.StreamNode):
             for k, stamp in enumerate(t.tolist()):
                 self._take_pose(stamp, rows[k : k + 1])
 
-    def _take_pose(self, t, row):
+    def _take_pose(self, t: float, row: np.ndarray) -> None:
         """One pose, after the gate has judged its stamp."""
         accepted, _, jumped_back = self._poses.take(t, row)
         if jumped_back:
@@ -190,10 +206,10 @@ class BiasNode(ros.StreamNode):
         for stamp, row in accepted:
             self._add_poses(np.array([stamp]), row)
 
-    def _add_poses(self, t, rows):
+    def _add_poses(self, t: np.ndarray, rows: np.ndarray) -> None:
         self._corrector.add_pose(t, *parts_of(*(np.array(rows[name]) for name in POSE)))
 
-    def _on_tdoa(self, frame, t, rows, arrival):
+    def _on_tdoa(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         self._counts["received"] += len(t)
         if frame != self._frame:
             self._place_antenna(frame)
@@ -210,18 +226,18 @@ class BiasNode(ros.StreamNode):
         else:
             self._take(t.tolist(), items)
 
-    def _relabelled(self, rows):
+    def _relabelled(self, rows: np.ndarray) -> np.ndarray:
         """Rows of TDOAs with their ids and signs put right."""
         rows, names = rows.copy(), MEASURED[:3]
         for name, column in zip(names, self._labels.correct(*(rows[name] for name in names))):
             rows[name] = column
         return rows
 
-    def _seconds(self, item):
+    def _seconds(self, item: Item) -> float:
         _, sec, nanosec, *_ = item
         return self._epoch.seconds(Time(sec=sec, nanosec=nanosec))
 
-    def _take(self, stamps, items):
+    def _take(self, stamps: Sequence[float], items: Iterable[Item]) -> None:
         """Have TDOAs wait for their poses: stamps, s, as received; items : (frame, sec, nanosec, a, b, d, variance)."""
         stamps = [t - self._late for t in stamps]
         if stamps and self._tdoas.take_all(stamps):
@@ -241,7 +257,7 @@ class BiasNode(ros.StreamNode):
             for stamp, kept in accepted:
                 self._hold.add(stamp, kept)
 
-    def _release(self):
+    def _release(self) -> None:
         """Publish what need not wait any longer."""
         released = self._hold.take(self._is_ready) if self._corrector is not None else []
         if not released:
@@ -259,10 +275,12 @@ class BiasNode(ros.StreamNode):
         self._counts["unready"] += len(t) - sum(ready)
         self._publish(items, correction, self._epoch.parts(t) if self._late else None)
 
-    def _is_ready(self, before):
+    def _is_ready(self, before: float) -> bool:
         return self._poses.newest == -math.inf or self._corrector.ready(before)
 
-    def _publish(self, items, correction, stamps=None):
+    def _publish(
+        self, items: Sequence[Item], correction: Correction, stamps: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> None:
         """Publish corrected TDOAs: items as in `_take`; their Correction; stamps : seconds and nanoseconds, (n,) each, instead of
         their own."""
         columns = [np.array(column) for column in list(zip(*items))[1:]]
@@ -279,7 +297,7 @@ class BiasNode(ros.StreamNode):
         self._counts["published"] += len(items)
         self._counts.update(STATUS[one] for one in status)
 
-    def _template(self, frame, model):
+    def _template(self, frame: str, model: str) -> Template:
         if (frame, model) not in self._templates:
             if len(self._templates) >= MOST_FRAMES:
                 self._templates.clear()
@@ -288,7 +306,7 @@ class BiasNode(ros.StreamNode):
             self._templates[frame, model] = self._wire.template(message)
         return self._templates[frame, model]
 
-    def _report(self):
+    def _report(self) -> ros.Report:
         counts = self._counts
         rate = self._rate.of(counts["received"])
         received, self._reported_received = counts["received"] - self._reported_received, counts["received"]
@@ -315,7 +333,7 @@ class BiasNode(ros.StreamNode):
             level, text = DiagnosticStatus.WARN, next(filter(None, wiring))
         return level, text, values
 
-    def _health(self, rate, unready):
+    def _health(self, rate: float, unready: int) -> tuple[bytes, str]:
         if self._frame_trouble:
             return DiagnosticStatus.WARN, self._frame_trouble
         if self._idle:
@@ -333,7 +351,7 @@ class BiasNode(ros.StreamNode):
         return DiagnosticStatus.OK, f"correcting with {self._model[NETWORK]}"
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
     return ros.run(BiasNode, __doc__, argv)
 

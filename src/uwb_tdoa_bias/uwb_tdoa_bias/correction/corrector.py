@@ -1,7 +1,10 @@
 """From raw TDOAs to corrected ones: the core of bias_node and of the offline engine."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +14,10 @@ from ..effects.slope import N_STATES, slope_of, state_of
 from ..foundation.anchors import Anchors
 from ..foundation.compiled import compiled
 from .poses import POSE_NUMBERS, TWIST_NUMBERS, Poses, parts_of, rotated_in_yaw
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from .network import Network
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
@@ -31,14 +38,15 @@ class Correction:
     state: np.ndarray
 
     @classmethod
-    def flat(cls, d, bias, std, status):
+    def flat(cls, d: np.ndarray, bias: np.ndarray, std: np.ndarray, status: np.ndarray) -> Correction:
         """Of raw d (n,) m with a bias that nobody knows to change with the state."""
         return cls(bias, std, d - bias, status, *np.zeros((2, len(d), N_STATES)))
 
     @classmethod
-    def none(cls, d):
+    def none(cls, d: np.ndarray) -> Correction:
         """Of raw d (n,) m that nothing is known to be wrong with."""
-        return cls.flat(d, *np.zeros((2, len(d))), np.full(len(d), PASSED, dtype=np.uint8))
+        bias, std = np.zeros((2, len(d)))
+        return cls.flat(d, bias, std, np.full(len(d), PASSED, dtype=np.uint8))
 
 
 class Corrector:
@@ -49,7 +57,10 @@ class Corrector:
     report that pose; and the filter can: it needs nothing later than the preceding measurement, after a gap neither.
     """
 
-    def __init__(self, anchors, effects=None, network=None, lag=POSE_LAG, history=4096):
+    def __init__(
+        self, anchors: Anchors, effects: EffectSet | None = None, network: Network | None = None, lag: float = POSE_LAG,
+        history: int = 4096,
+    ) -> None:  # fmt: skip
         """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs stay in, as `weighed`; network : Network or None;
         lag : s; history : poses kept."""
         self.anchors = anchors
@@ -61,35 +72,38 @@ class Corrector:
         self._history = history
         self.reset()
 
-    def reset(self):
+    def reset(self) -> None:
         """Forget all poses."""
         self._poses = Poses(self._history)
-        self._latest = None  # Samples of the latest TDOAs
-        self._newest = None  # latest stamp of a TDOA
-        self._first = self._last = None  # stamp of the first TDOA; stamp and later anchor of the last one
+        self._latest: Samples | None = None  # of the latest TDOAs
+        self._newest: float = None  # type: ignore[assignment]  # latest stamp of a TDOA, once there is one
+        self._first = math.nan  # stamp of the first TDOA, once there is one
+        self._last: tuple[float, int] | None = None  # stamp and later anchor of the last one
 
     @property
-    def idle(self):
+    def idle(self) -> bool:
         """True if there is nothing to correct with."""
         return not len(self.effects) and self.network is None
 
     @property
-    def outside(self):
+    def outside(self) -> list[str]:
         """Phrases on those effects of which less than half was taken out of some of the latest TDOAs, because they were not seen
         where those were."""
         return [] if self._latest is None else self.effects.outside(self._latest)
 
-    def add_pose(self, t, p, q, v=np.nan, yaw_std=0.0):
+    def add_pose(
+        self, t: ArrayLike, p: ArrayLike, q: ArrayLike, v: ArrayLike = np.nan, yaw_std: ArrayLike = 0.0
+    ) -> None:
         """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, v (3,) m/s, world, NaN for an unknown one, yaw_std
         rad: deviation of its rotation about the vertical; or several: (k,), (k, 3), (k, 4), (k, 3), (k,). Stamps must rise;
         others are ignored."""
         self._poses.add(t, p, q, np.broadcast_to(v, np.shape(p)), np.broadcast_to(yaw_std, np.shape(t)))
 
-    def ready(self, before):
+    def ready(self, before: float) -> bool:
         """True if no pose that is still to come can change the correction of a measurement that follows one stamped so."""
         return self.idle or self._poses.newest > before - self.lag
 
-    def correct(self, t, a, b, d):
+    def correct(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> Correction:
         """Correct a batch.
 
         t : (n,) s; a, b : (n,) anchor rows (of `anchors`); d : (n,) raw d_ab, m. Returns a Correction. Where no pose is
@@ -104,7 +118,7 @@ class Corrector:
             _add_learned(*self.network.predict(samples), bias, std, status)
         return Correction(bias, std, d - bias, status, slope, state)
 
-    def contribution(self, samples):
+    def contribution(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """(bias (n,) m, its standard deviation (n,) m, slope (n, 6), state (n, 6)), as of a Correction, of the effects in Samples; while
         the yaw is unknown the mean over four headings, and its scatter, without a slope."""
         slope = state = np.zeros((len(samples), N_STATES))
@@ -115,7 +129,7 @@ class Corrector:
         if len(steep):
             of_steep, slope, curved = slope_of(steep.effects, samples)
             bias, noise, state = bias + of_steep, np.hypot(noise, curved), state_of(samples)
-        unknown = samples.yaw_std > LARGEST_YAW_STD
+        unknown = np.zeros(len(samples), bool) if samples.yaw_std is None else samples.yaw_std > LARGEST_YAW_STD
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
             headings = np.concatenate([samples.q, *(rotated_in_yaw(samples.q, k) for k in range(4))])
@@ -126,7 +140,7 @@ class Corrector:
             slope[unknown] = 0.0
         return bias, noise, slope, state
 
-    def samples(self, t, a, b):
+    def samples(self, t: np.ndarray, a: np.ndarray, b: np.ndarray) -> Samples:
         """Samples of a batch at the poses that are known by now."""
         if self._newest is None:
             self._first = self._newest = t[0]
@@ -145,7 +159,7 @@ class Corrector:
         )
 
 
-def warm_up(effects, network, lag=POSE_LAG):
+def warm_up(effects: EffectSet, network: Network | None, lag: float = POSE_LAG) -> Corrector:
     """A Corrector, after compiling, or loading from numba's cache, whatever its first correction needs."""
     corrector = Corrector(Anchors.from_positions(np.eye(3)), effects, network, lag)
     corrector.add_pose(np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6), np.zeros((1, TWIST_NUMBERS))))
@@ -154,7 +168,9 @@ def warm_up(effects, network, lag=POSE_LAG):
 
 
 @compiled
-def _add_learned(learned, deviation, known, bias, std, status):
+def _add_learned(
+    learned: np.ndarray, deviation: np.ndarray, known: np.ndarray, bias: np.ndarray, std: np.ndarray, status: np.ndarray
+) -> None:
     """Put what a network predicts, three (n,) arrays, on top of bias and std (n,) m of effects, where it is known."""
     for i in range(len(bias)):
         if math.isfinite(learned[i]):

@@ -1,11 +1,18 @@
 """What a network may ask for: the 14 features of Zhao et al. (RA-L 2021, section III), and where everything is."""
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.geometry import rotate
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from ..effects.samples import Samples
 
 # Azimuth (about z, from x) and elevation (above the x-y plane) of the tag seen from the antenna frame of each anchor (A),
 # and of each anchor seen from the tag's body frame (T), rad; positions of the anchors relative to the tag, world axes, m.
@@ -26,12 +33,12 @@ PLACE = (
 NAMES = FEATURES + PLACE
 
 
-def columns(samples, names):
+def columns(samples: Samples, names: Iterable[str]) -> np.ndarray:
     """The named features (of NAMES) of a batch: Samples -> (n, len(names)) float, NaN where unknown."""
     return everything(samples)[:, [NAMES.index(name) for name in names]]
 
 
-def everything(samples):
+def everything(samples: Samples) -> np.ndarray:
     """All features of a batch, in the order of NAMES: Samples -> (n, 29) float, NaN where a pose it needs is
     unknown."""
     out = np.empty((len(samples), len(NAMES)))
@@ -41,14 +48,19 @@ def everything(samples):
 
 
 @compiled
-def fill_all(p, q, a, b, ids, positions, orientations, out):
+def fill_all(
+    p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray, ids: np.ndarray, positions: np.ndarray,
+    orientations: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
     """`everything`, compiled, written to out (n, 29)."""
     _fill(p, q, a, b, positions, orientations, out)
     _fill_place(p, q, a, b, ids, positions, out[:, len(FEATURES) :])
 
 
 @compiled
-def _fill_place(p, q, a, b, ids, positions, out):
+def _fill_place(
+    p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray, ids: np.ndarray, positions: np.ndarray, out: np.ndarray
+) -> None:
     for i in range(len(a)):
         x, y, z, w = q[i]
         out[i, 0], out[i, 1], out[i, 2] = p[i]
@@ -62,7 +74,10 @@ def _fill_place(p, q, a, b, ids, positions, out):
 
 
 @compiled
-def _fill(p, q, a, b, positions, orientations, out):
+def _fill(
+    p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray, positions: np.ndarray, orientations: np.ndarray,
+    out: np.ndarray,
+) -> None:  # fmt: skip
     delta = np.empty(3)
     inverse = np.empty(4)
     seen = np.empty(3)
@@ -85,5 +100,5 @@ def _fill(p, q, a, b, positions, orientations, out):
 
 
 @compiled
-def _conjugate(q, out):
+def _conjugate(q: np.ndarray, out: np.ndarray) -> None:
     out[0], out[1], out[2], out[3] = -q[0], -q[1], -q[2], q[3]

@@ -5,20 +5,24 @@ of the input; and the numbers and the work of a row are bounded (`limits`). No o
 onnxruntime folds constants. What does not fit is Unplayable.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..foundation.limits import MODEL_NODES, MODEL_NUMBERS, MODEL_WORK
-from .onnx_file import Graph, Node
+from .onnx_file import Graph, Node, Shape
+
+Attributes = dict[str, tuple[str, ...]]  # of each operator
 
 # Operators with their attributes. Of one value: as many numbers come out as go in, each follows from its own, or from its own row.
-UNARY = {name: () for name in "Identity Abs Neg Exp Log Sqrt Sin Cos Tanh Relu Sigmoid Erf Softplus".split()}
-UNARY |= {name: () for name in "Softsign Reciprocal Floor Ceil Sign".split()}
+UNARY: Attributes = {name: () for name in "Identity Abs Neg Exp Log Sqrt Sin Cos Tanh Relu Sigmoid Erf".split()}
+UNARY |= {name: () for name in "Softplus Softsign Reciprocal Floor Ceil Sign".split()}
 UNARY |= {"LeakyRelu": ("alpha",), "Elu": ("alpha",), "Celu": ("alpha",), "Selu": ("alpha", "gamma"), "HardSigmoid": ("alpha", "beta")}
-OF_ROWS = {"Softmax": ("axis",), "LogSoftmax": ("axis",)}
-ELEMENTWISE = {name: () for name in "Add Sub Mul Div Max Min Sum".split()}  # of two and more
-OTHERS = {
+OF_ROWS: Attributes = {"Softmax": ("axis",), "LogSoftmax": ("axis",)}
+ELEMENTWISE: Attributes = {name: () for name in "Add Sub Mul Div Max Min Sum".split()}  # of two and more
+OTHERS: Attributes = {
     "MatMul": (), "Gemm": ("alpha", "beta", "transA", "transB"), "Gather": ("axis",), "Reshape": ("allowzero",), "Concat": ("axis",),
     "ReduceSum": ("axes", "keepdims", "noop_with_empty_axes"), "ReduceMax": ("axes", "keepdims", "noop_with_empty_axes"),
     "Clip": ("min", "max"), "Constant": ("value",),
@@ -66,19 +70,20 @@ def size_of(graph: Graph) -> Size:
 class _Walk:
     """What is known after some nodes. A value has columns, and so many rows of them for each row of the input."""
 
-    def __init__(self, constants, name, width):
-        self._constants, self._values = dict(constants), {}
+    def __init__(self, constants: dict[str, np.ndarray], name: str, width: int) -> None:
+        self._constants = dict(constants)
+        self._values: dict[str, tuple[int, int]] = {}
         self._numbers = self._work = self._operations = 0  # of one row of the input, so far
         self.alone = False
         self._put(name, width, 1, 0)
 
-    def value(self, name: str) -> "tuple[int, int]":
+    def value(self, name: str) -> tuple[int, int]:
         """(columns, rows for each row of the input)."""
         if name not in self._values:
             raise Unplayable(f"{name[:40]!r} is no value")
         return self._values[name]
 
-    def compare(self, shapes, rows):
+    def compare(self, shapes: list[tuple[str, Shape]], rows: int | None) -> None:
         """Raises Unplayable unless what a file says of its values is what they are, as onnxruntime believes it. rows : of the input, or
         None."""
         for name, shape in shapes:
@@ -87,7 +92,7 @@ class _Walk:
             if columns and (len(shape) != 2 or any(said not in (None, true) for said, true in zip(shape, known))):
                 raise Unplayable(f"{name[:40]!r} has another shape than the file says")
 
-    def pass_over(self, node: Node):
+    def pass_over(self, node: Node) -> None:
         """Add what a node makes."""
         kind, (name,) = node.kind, node.outputs
         if kind not in ATTRIBUTES:
@@ -104,7 +109,7 @@ class _Walk:
         self._operations += max(1, len(node.inputs) - 1)
         self._put(name, columns, rows, columns * rows * inner)
 
-    def _put(self, name, columns, rows, work):
+    def _put(self, name: str, columns: int, rows: int, work: int) -> None:
         self._numbers, self._work = self._numbers + columns * rows, self._work + work
         if columns < 1 or self._numbers > MODEL_NUMBERS:
             raise Unplayable(f"no column, or more than {MODEL_NUMBERS} numbers for each row")
@@ -112,12 +117,12 @@ class _Walk:
             raise Unplayable(f"more than {MODEL_WORK} additions and multiplications for each row, or {MODEL_NODES} operations")
         self._values[name] = columns, rows
 
-    def _constant(self, name):
+    def _constant(self, name: str) -> np.ndarray:
         if name not in self._constants:
             raise Unplayable(f"{name[:40]!r} is no constant")
         return self._constants[name]
 
-    def _fits(self, name, columns):
+    def _fits(self, name: str, columns: int) -> None:
         """Raises Unplayable unless a constant is the same for all rows, of so many columns or one."""
         array = self._constant(name)
         if array.dtype != np.float32 or array.size not in (1, columns) or array.shape[:-1] not in ((), (1,)):
@@ -125,19 +130,19 @@ class _Walk:
 
     # Each rule: (columns, rows for each row of the input, additions or multiplications for each number that comes out).
 
-    def _of_unary(self, node):
+    def _of_unary(self, node: Node) -> tuple[int, int, int]:
         (name,) = node.inputs
         if node.attributes.get("axis", -1) not in (-1, 1):
             raise Unplayable("rows of the input that mix")
         return *self.value(name), 1
 
-    def _of_clip(self, node):
+    def _of_clip(self, node: Node) -> tuple[int, int, int]:
         name, *limits = node.inputs
         for limit in filter(None, limits):
             self._fits(limit, 1)
         return *self.value(name), 2
 
-    def _of_elementwise(self, node):
+    def _of_elementwise(self, node: Node) -> tuple[int, int, int]:
         if len(node.inputs) < 2:
             raise Unplayable("less than two operands")
         values = [self._values[name] for name in node.inputs if name in self._values]
@@ -151,54 +156,54 @@ class _Walk:
             self._fits(name, columns)
         return columns, values[0][1], len(node.inputs) - 1
 
-    def _of_matmul(self, node):
+    def _of_matmul(self, node: Node) -> tuple[int, int, int]:
         name, weights = node.inputs
         return self._product(name, self._constant(weights))
 
-    def _of_gemm(self, node):
-        name, weights, *added = node.inputs
+    def _of_gemm(self, node: Node) -> tuple[int, int, int]:
+        name, of_weights, *added = node.inputs
         if node.attributes.get("transA", 0) != 0:
             raise Unplayable("rows of the input that mix")
-        weights = self._constant(weights)
+        weights = self._constant(of_weights)
         columns, rows, inner = self._product(name, weights.T if node.attributes.get("transB", 0) else weights)
         for one in filter(None, added):
             self._fits(one, columns)
         return columns, rows, inner + len(added)
 
-    def _product(self, name, weights):
+    def _product(self, name: str, weights: np.ndarray) -> tuple[int, int, int]:
         inner, rows = self.value(name)
         if weights.dtype != np.float32 or weights.ndim != 2 or len(weights) != inner:
             raise Unplayable("a product that does not fit")
         return weights.shape[1], rows, inner
 
-    def _of_gather(self, node):
-        name, taken = node.inputs
-        (own, rows), taken = self.value(name), self._constant(taken)
+    def _of_gather(self, node: Node) -> tuple[int, int, int]:
+        name, of_taken = node.inputs
+        (own, rows), taken = self.value(name), self._constant(of_taken)
         if node.attributes.get("axis", 0) != 1 or taken.ndim != 1 or not ((0 <= taken) & (taken < own)).all():
             raise Unplayable("other than columns taken")
         return len(taken), rows, 1
 
-    def _of_reshape(self, node):
+    def _of_reshape(self, node: Node) -> tuple[int, int, int]:
         name, shape = node.inputs
         (own, rows), shape = self.value(name), self._constant(shape).tolist()
         if len(shape) != 2 or shape[0] != -1 or shape[1] < 1 or own * rows % shape[1]:
             raise Unplayable("a shape in which rows of the input mix")
         return shape[1], own * rows // shape[1], 1
 
-    def _of_concat(self, node):
+    def _of_concat(self, node: Node) -> tuple[int, int, int]:
         parts = [self.value(name) for name in node.inputs]
         rows = {rows for _, rows in parts}
         if node.attributes.get("axis") not in (1, -1) or len(rows) != 1:
             raise Unplayable("rows that do not fit")
         return sum(columns for columns, _ in parts), rows.pop(), 1
 
-    def _of_reducesum(self, node):
+    def _of_reducesum(self, node: Node) -> tuple[int, int, int]:
         columns, rows, inner = self._of_reducemax(node)
         # In which order numbers of a row are added depends on where in memory the row begins, unless they fill whole packets.
         self.alone |= inner >= PACKED and inner % PACKED != 0
         return columns, rows, inner
 
-    def _of_reducemax(self, node):
+    def _of_reducemax(self, node: Node) -> tuple[int, int, int]:
         name, *given = node.inputs
         axes = node.attributes.get("axes") or (self._constant(given[0]).tolist() if given else None)
         if axes not in ([1], [-1]) or node.attributes.get("keepdims", 1) != 1:

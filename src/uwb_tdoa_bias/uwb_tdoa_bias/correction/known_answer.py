@@ -5,10 +5,16 @@
 Re-make it, with the onnx package installed:  python -m uwb_tdoa_bias.correction.known_answer known_answer.onnx
 """
 
+from __future__ import annotations
+
 import json
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
 
 # Neither the order of the features nor offset and scale are what a reader that ignores them would assume.
 FEATURES = ("elevation_T_b", "dx_a")
@@ -19,12 +25,12 @@ SLOPES = (0.01, 0.02)  # m/rad, 1
 CONSTANT = 0.05  # m
 
 
-def known_answer(elevation, dx):
+def known_answer(elevation: float, dx: float) -> float:
     """What the model says, m: elevation of anchor b seen from the tag, rad; dx: anchor a minus tag along x, m."""
     return np.clip(CONSTANT + SLOPES[0] * elevation + SLOPES[1] * dx, -CLIP, CLIP)
 
 
-def make():
+def make() -> ModelProto:
     """The onnx.ModelProto."""
     from onnx import TensorProto, helper, numpy_helper
 

@@ -17,9 +17,12 @@ bias and its standard deviation in metres; or (n, 3), with the share 0 ... 1 of 
 there: it has already faded bias and deviation itself.
 """
 
+from __future__ import annotations
+
 import json
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,6 +33,11 @@ from .features import NAMES, everything
 from .graph_size import Unplayable
 from .onnx_file import Unreadable, read_graph
 
+if TYPE_CHECKING:
+    from ..effects.samples import Samples
+    from .onnx_file import Graph
+    from .session import Session
+
 MODELS = Path(__file__).parent / "models"
 SHIPPED = "default"  # instead of a path: the model that comes with the package
 UNPROVEN = (  # `study default-model`, and evaluate with and without it
@@ -39,7 +47,7 @@ NO_NUMBERS = np.empty(0)
 _COLUMN = {name: column for column, name in enumerate(NAMES)}
 
 
-def load_network(name):
+def load_network(name: str | Path | None) -> Network | None:
     """The Network of a file; for "default" the one shipped; None for an empty name. Raises InputError."""
     if not name:
         return None
@@ -51,7 +59,7 @@ class Network:
     that were taken out before it was trained, and have to be corrected beside it; share : how much of its prediction is
     taken out, 0 ... 1."""
 
-    def __init__(self, path):
+    def __init__(self, path: str | Path) -> None:
         """Load `path`; raises InputError if it is no model or its metadata do not fit."""
         self._path = Path(path).absolute()
         if not Path(path).is_file():
@@ -79,7 +87,7 @@ class Network:
             )
         self._ask(path)
 
-    def _ask(self, path):
+    def _ask(self, path: str | Path) -> None:
         """Ask it for the mean of all features. Raises InputError unless it gives up to three finite numbers for each row."""
         out = self._model.run(np.zeros((1, len(self._inputs))))
         if out.shape[1] > 3 or not np.isfinite(out).all():
@@ -87,11 +95,11 @@ class Network:
                 f"model: {path}: gives (n, {out.shape[1]}), or no finite numbers; the output must be (n, 1), (n, 2) or (n, 3)."
             )
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[type[Network], tuple[Path]]:
         """Pickled as the path of its file: a session cannot be."""
         return Network, (self._path,)
 
-    def _read(self, meta):
+    def _read(self, meta: dict[str, str]) -> None:
         names, self._offset, self._scale = (json.loads(meta[key]) for key in ("features", "offset", "scale"))
         self._offset, self._scale = np.array(self._offset, dtype=float), np.array(self._scale, dtype=float)
         self.clip = float(json.loads(meta["clip"]))
@@ -112,7 +120,7 @@ class Network:
         if not 0.0 <= self.share <= 1.0:
             raise ValueError("share must be between 0 and 1")
 
-    def predict(self, samples):
+    def predict(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
         (n,) arrays. The first two are NaN where a feature that is needed is unknown."""
         yaw_std = NO_NUMBERS if samples.yaw_std is None else np.ascontiguousarray(samples.yaw_std, dtype=float)
@@ -121,24 +129,27 @@ class Network:
         table, x = everything(samples), np.empty((len(samples), len(self._inputs)))
         _select(table, self._inputs, self._offset, self._scale, x)
         _judge(self._model.run(x), table, *judging, found)
-        return tuple(found)
+        return found[0], found[1], found[2]
 
 
-def _session(graph):
+def _session(graph: Graph) -> Session:
     from .session import Session  # imports onnxruntime
 
     return Session(graph)
 
 
 @compiled
-def _select(table, columns, offset, scale, x):
+def _select(table: np.ndarray, columns: np.ndarray, offset: np.ndarray, scale: np.ndarray, x: np.ndarray) -> None:
     for i in range(len(table)):
         for k in range(len(columns)):
             x[i, k] = (table[i, columns[k]] - offset[k]) / scale[k]
 
 
 @compiled
-def _judge(out, table, judged, lower, upper, margin, limits, yaw_std, found):
+def _judge(
+    out: np.ndarray, table: np.ndarray, judged: np.ndarray, lower: np.ndarray, upper: np.ndarray, margin: np.ndarray,
+    limits: tuple[float, float, float, float], yaw_std: np.ndarray, found: np.ndarray,
+) -> None:  # fmt: skip
     """What the network says, (n, 1 to 3), becomes bias, std and known, (3, n)."""
     clip, fade_std, share, largest_yaw_std = limits
     for i in range(len(out)):

@@ -5,9 +5,12 @@ Protocol buffers as of onnx.proto (https://github.com/onnx/onnx, version 1.14); 
 https://protobuf.dev/programming-guides/encoding.
 """
 
+from __future__ import annotations
+
 from collections import defaultdict
 from dataclasses import dataclass
 import struct
+from typing import Any, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -15,7 +18,13 @@ from ..foundation.errors import InputError
 from ..foundation.files import read_bytes
 from ..foundation.limits import MODEL_BYTES, MODEL_NODES
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
 VARINT, BYTES, FOUR_BYTES = 0, 2, 5  # wire types; in those of eight bytes nothing is that is read here
+Shape = list[int | None]  # of a value; None for what is not fixed
+Told = TypeVar("Told")
 KINDS = {1: np.float32, 7: np.int64}  # of tensors, by TensorProto.DataType
 
 
@@ -28,9 +37,9 @@ class Node:
     """kind : name of the operator; inputs, outputs : names of values; attributes : {name: number, (n,) ints, bytes or array}."""
 
     kind: str
-    inputs: list
-    outputs: list
-    attributes: dict
+    inputs: list[str]
+    outputs: list[str]
+    attributes: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -39,16 +48,16 @@ class Graph:
     fixed)]; outputs : names; shapes : [(name, shape)] of what the file says of other values; meta : {key: text}; content : the bytes
     of the file."""
 
-    nodes: list
-    constants: dict
-    inputs: list
-    outputs: list
-    shapes: list
-    meta: dict
+    nodes: list[Node]
+    constants: dict[str, np.ndarray]
+    inputs: list[tuple[str, Shape]]
+    outputs: list[str]
+    shapes: list[tuple[str, Shape]]
+    meta: dict[str, str]
     content: bytes
 
 
-def read_graph(path):
+def read_graph(path: str | Path) -> Graph:
     """The Graph of a file; raises Unreadable, and InputError for a file that is none or too large."""
     try:
         content = read_bytes(path, MODEL_BYTES)
@@ -78,10 +87,12 @@ def read_graph(path):
         raise Unreadable(f"no ONNX model, {error!r}") from error
 
 
-def _message(data, *repeated):
+def _message(data: bytes, *repeated: int) -> dict[int, list[Any]]:
     """{number of a field: its values in their order}: ints, bytes, or float32 as float. Only fields that are `repeated` come twice: of
     others, one reader takes the first, one the last, and one both."""
-    out, place = defaultdict(list), 0
+    out: dict[int, list[Any]] = defaultdict(list)
+    value: int | bytes | float
+    place = 0
     while place < len(data):
         key, place = _varint(data, place)
         if not 0 < key < 1 << 32:
@@ -103,7 +114,7 @@ def _message(data, *repeated):
     return out
 
 
-def _varint(data, place):
+def _varint(data: bytes, place: int) -> tuple[int, int]:
     value = shift = 0
     while True:
         byte = data[place]
@@ -116,7 +127,7 @@ def _varint(data, place):
             return (value - (1 << 64) if value >> 63 else value), place
 
 
-def _ints(values):
+def _ints(values: list[int | bytes]) -> list[int]:
     """Of a repeated int64, packed or not."""
     out = []
     for value in values:
@@ -130,12 +141,12 @@ def _ints(values):
     return out
 
 
-def _floats(values):
+def _floats(values: list[float | bytes]) -> np.ndarray:
     """Of a repeated float, packed or not: (n,) float32."""
-    return np.concatenate([np.float32([value]) if isinstance(value, float) else np.frombuffer(value, "<f4") for value in values])
+    return np.concatenate([np.array([v], "f4") if isinstance(v, float) else np.frombuffer(v, "<f4") for v in values])
 
 
-def _unique(pairs):
+def _unique(pairs: Iterable[tuple[str, Told]]) -> dict[str, Told]:
     """{name: value}: a name that comes twice is refused."""
     pairs = list(pairs)
     if len(out := dict(pairs)) < len(pairs):
@@ -143,7 +154,7 @@ def _unique(pairs):
     return out
 
 
-def _tensor(data):
+def _tensor(data: bytes) -> tuple[str, np.ndarray]:
     """(name, array) of a TensorProto. Its numbers are in one of the fields that its type may have."""
     fields = _message(data, 1, 4, 5, 6, 7, 10, 11, 13, 16)
     kind = KINDS[fields[2][0]]
@@ -159,7 +170,7 @@ def _tensor(data):
     return name, values.astype(kind).reshape(_ints(fields[1]))
 
 
-def _node(data):
+def _node(data: bytes) -> Node:
     fields = _message(data, 1, 2, 5, 9)
     if fields[7] and fields[7][0] not in (b"", b"ai.onnx"):
         raise Unreadable("an operator that is none of ONNX")
@@ -167,10 +178,11 @@ def _node(data):
     return Node(fields[4][0].decode(), inputs, outputs, _unique(map(_attribute, fields[5])))
 
 
-def _attribute(data):
+def _attribute(data: bytes) -> tuple[str, float | list[int] | bytes | np.ndarray]:
     fields = _message(data, 7, 8, 9, 10, 11, 15, 23)
     if any(fields[k] for k in (6, 10, 11, 22, 23)):
         raise Unreadable("a graph within a graph, or a constant of another kind")
+    value: float | list[int] | bytes | np.ndarray
     if fields[5]:
         value = _tensor(fields[5][0])[1]
     elif fields[2]:
@@ -182,7 +194,7 @@ def _attribute(data):
     return fields[1][0].decode(), value
 
 
-def _value(data):
+def _value(data: bytes) -> tuple[str, list[int], Shape | None]:
     """(name, type of its numbers, shape or None) of a ValueInfoProto of a tensor."""
     fields = _message(data, 4)
     if not fields[2]:
@@ -194,7 +206,7 @@ def _value(data):
     return fields[1][0].decode(), tensor[1], [one[1][0] if one[1] else None for one in dimensions]
 
 
-def _is_float(kind, name):
+def _is_float(kind: list[int], name: str) -> bool:
     if kind != [1]:
         raise Unreadable(f"{name[:40]!r} is no float32")
     return True

@@ -1,6 +1,12 @@
 """Measurements that wait for the pose at which they will be corrected."""
 
+from __future__ import annotations
+
 from collections import deque
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 MOST = 10_000  # items: what has one stamp for ever would never have waited too long
@@ -13,22 +19,22 @@ class PoseQueue:
     stamped more than `limit` seconds later, or MOST wait.
     """
 
-    def __init__(self, limit):
+    def __init__(self, limit: float) -> None:
         """limit : s."""
         self.limit = limit
-        self._items = deque()
-        self._newest = None
+        self._items: deque[tuple[float, float, Any]] = deque()
+        self._newest: float = None  # type: ignore[assignment]  # latest stamp so far, s, once there is one
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self._items)
 
-    def add(self, t, item):
+    def add(self, t: float, item: Any) -> None:
         """Append an item stamped t, s."""
         newest = t if self._newest is None else self._newest
         self._items.append((t, min(t, newest), item))
         self._newest = max(newest, t)
 
-    def take(self, ready):
+    def take(self, ready: Callable[[float], bool]) -> list[tuple[float, Any, bool]]:
         """Remove and return what may leave: a list of (t, item, ready(before)), `before` being the latest stamp added before
         the item, at most t; t for the first."""
         out = []

@@ -1,11 +1,17 @@
 """The poses of the last seconds, and how fast they change."""
 
+from __future__ import annotations
+
 import math
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from ..effects.motion import precede
 from ..foundation.compiled import compiled
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36  # of PoseWithCovariance and TwistWithCovariance
 TILT = 0.5  # rad; a filter that does not know the tilt better estimates no attitude
@@ -14,54 +20,56 @@ TILT = 0.5  # rad; a filter that does not know the tilt better estimates no atti
 class Poses:
     """Poses in the order of their stamps, of which at least the last `history` are kept."""
 
-    def __init__(self, history):
+    def __init__(self, history: int) -> None:
         self._history, self._count = history, 0
         self._columns = [np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), (3,), ())]
 
     @property
-    def t(self):
+    def t(self) -> np.ndarray:
         """Stamps, (m,) s."""
         return self._columns[0][: self._count]
 
     @property
-    def p(self):
+    def p(self) -> np.ndarray:
         """Positions, (m, 3) m."""
         return self._columns[1][: self._count]
 
     @property
-    def q(self):
+    def q(self) -> np.ndarray:
         """Attitudes, (m, 4) x y z w, body to world."""
         return self._columns[2][: self._count]
 
     @property
-    def v(self):
+    def v(self) -> np.ndarray:
         """Velocities, (m, 3) m/s, world, NaN where not known."""
         return self._columns[3][: self._count]
 
     @property
-    def newest(self):
+    def newest(self) -> float:
         """Stamp of the last pose, s; -inf if there is none."""
         return self.t[-1] if self._count else -np.inf
 
-    def add(self, t, p, q, v, yaw_std):
+    def add(self, t: ArrayLike, p: ArrayLike, q: ArrayLike, v: ArrayLike, yaw_std: ArrayLike) -> None:
         """Append one pose, or several: t (k,), p (k, 3), q (k, 4), v (k, 3), yaw_std (k,) rad. Those not later than all before
         them are ignored."""
-        if not np.ndim(t):
-            t, p, q, v, yaw_std = [t], [p], [q], [v], [yaw_std]
-        new = [np.ascontiguousarray(part, dtype=float) for part in (t, p, q, v, yaw_std)]
+        parts: Any = (t, p, q, v, yaw_std) if np.ndim(t) else ([t], [p], [q], [v], [yaw_std])
+        new = [np.ascontiguousarray(part, dtype=float) for part in parts]
         self._count = _append(self._count, *self._columns, *new)
 
-    def before(self, t, newest, lag):
+    def before(self, t: np.ndarray, newest: float, lag: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of the newest poses stamped no later than `lag` s before the TDOA that precedes each of t (n,) s, as `preceding`
         says: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN where there is none."""
         n = len(t)
         out = np.empty(n, dtype=np.int64), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)
-        _look_up(t, newest, lag, self._count, *self._columns, *out)
+        _look_up(t, newest, lag, self._count, *(*self._columns, *out))
         return out
 
 
 @compiled
-def _append(count, stamps, p, q, v, yaw_std, new_stamps, new_p, new_q, new_v, new_yaw_std):
+def _append(
+    count: int, stamps: np.ndarray, p: np.ndarray, q: np.ndarray, v: np.ndarray, yaw_std: np.ndarray,
+    new_stamps: np.ndarray, new_p: np.ndarray, new_q: np.ndarray, new_v: np.ndarray, new_yaw_std: np.ndarray,
+) -> int:  # fmt: skip
     """Append what is later than all before it, and returns how many there are. Once there is no room, only the last half is kept."""
     history = len(stamps) // 2
     for i in range(len(new_stamps)):
@@ -77,7 +85,11 @@ def _append(count, stamps, p, q, v, yaw_std, new_stamps, new_p, new_q, new_v, ne
 
 
 @compiled
-def _look_up(t, newest, lag, count, stamps, p, q, v, yaw_std, places, p_out, q_out, yaw_std_out):
+def _look_up(
+    t: np.ndarray, newest: float, lag: float, count: int, stamps: np.ndarray, p: np.ndarray, q: np.ndarray,
+    v: np.ndarray, yaw_std: np.ndarray, places: np.ndarray, p_out: np.ndarray, q_out: np.ndarray,
+    yaw_std_out: np.ndarray,
+) -> None:  # fmt: skip
     precede(t, newest, yaw_std_out)
     for i in range(len(t)):
         place = np.searchsorted(stamps[:count], yaw_std_out[i] - lag, side="right") - 1
@@ -88,7 +100,7 @@ def _look_up(t, newest, lag, count, stamps, p, q, v, yaw_std, places, p_out, q_o
             p_out[i], q_out[i], yaw_std_out[i] = np.nan, np.nan, np.nan
 
 
-def known_yaw_std(std):
+def known_yaw_std(std: np.ndarray) -> np.ndarray:
     """Standard deviation of the yaw, (n,) rad, of attitudes with deviations std (n, 3) rad about the axes of the world.
 
     It is 0 where the tilt is not known either: then no attitude is estimated, and level at yaw 0 is what is meant.
@@ -96,7 +108,7 @@ def known_yaw_std(std):
     return np.where(np.maximum(std[:, 0], std[:, 1]) < TILT, std[:, 2], 0.0)
 
 
-def parts_of(poses, twists):
+def parts_of(poses: np.ndarray, twists: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What a Corrector takes of nav_msgs/Odometry: (p (n, 3) m, q (n, 4) x y z w, v (n, 3) m/s, world, yaw_std (n,) rad).
 
     poses, twists : PoseWithCovariance (n, 43) and TwistWithCovariance (n, 42), body frame, their numbers in their order. An orientation of
@@ -108,7 +120,7 @@ def parts_of(poses, twists):
 
 
 @compiled
-def _part(poses, twists, p, q, v, std):
+def _part(poses: np.ndarray, twists: np.ndarray, p: np.ndarray, q: np.ndarray, v: np.ndarray, std: np.ndarray) -> None:
     for n in range(len(poses)):
         p[n], q[n] = poses[n, :3], poses[n, 3:7]
         if not q[n].any():
@@ -121,7 +133,7 @@ def _part(poses, twists, p, q, v, std):
             std[n, axis] = math.sqrt(max(poses[n, 7 + 7 * (3 + axis)], 0.0))
 
 
-def rotated_in_yaw(q, quarters):
+def rotated_in_yaw(q: np.ndarray, quarters: int) -> np.ndarray:
     """Attitudes q (n, 4) x y z w, turned about the vertical by some quarters of a turn."""
     s, c = np.sin(0.25 * np.pi * quarters), np.cos(0.25 * np.pi * quarters)
     x, y, z, w = q.T

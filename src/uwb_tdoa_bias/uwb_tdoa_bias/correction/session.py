@@ -1,5 +1,7 @@
 """A model in onnxruntime. Importing that takes 60 ms, and is left to those who have a model."""
 
+from __future__ import annotations
+
 import numpy as np
 import onnxruntime
 
@@ -12,7 +14,7 @@ BATCH = 64  # rows at most that are played together: what they hold stays in the
 class Session:
     """A model on one thread, which gives each row of the input the same bits, whatever comes with it."""
 
-    def __init__(self, graph: Graph):
+    def __init__(self, graph: Graph) -> None:
         """Plays the bytes of the file that were read. Raises Unplayable where they are too large, or onnxruntime does not take them."""
         size = size_of(graph)
         options = onnxruntime.SessionOptions()
@@ -40,7 +42,7 @@ class Session:
             out[first : first + len(some)] = made[: len(some)]
         return out
 
-    def _try_out(self):
+    def _try_out(self) -> None:
         """Raises ValueError unless each row comes out as from its own."""
         x = np.random.default_rng(0).normal(size=(2 * PACKED, self._width))
         if not np.array_equal(self.run(x)[:PACKED], self.run(x[:PACKED]), equal_nan=True):

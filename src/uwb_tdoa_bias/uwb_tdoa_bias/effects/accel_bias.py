@@ -1,5 +1,7 @@
 """The accelerometer is off by a constant."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from .affine import Affine
@@ -20,10 +22,10 @@ class AccelBias(ImuEffect):
     reference = "BMI088 data sheet: zero-g offset 20 mg"
     channels = ("accel",)
 
-    def accel(self):
+    def accel(self) -> Affine:
         return Affine(np.eye(3), self.vector())
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         found = readings(self, "along")
         return (
             (f"Calibrate the accelerometer at rest and damp the vibration of its mount: it reads {found}.",)

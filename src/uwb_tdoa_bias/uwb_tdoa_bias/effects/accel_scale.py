@@ -1,5 +1,7 @@
 """The accelerometer reads too much or too little."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from .affine import Affine
@@ -23,9 +25,9 @@ class AccelScale(ImuEffect):
     reference = "BMI088 data sheet: sensitivity tolerance 0.7 %"
     channels = ("accel",)
 
-    def accel(self):
+    def accel(self) -> Affine:
         return Affine(np.eye(3) + np.diag(self.vector()), np.zeros(3))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         found = readings(self, "along", "%", 100.0)
         return (f"Calibrate the accelerometer, each axis up and down: it reads {found}.",) if found else ()

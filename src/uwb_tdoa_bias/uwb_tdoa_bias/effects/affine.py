@@ -1,8 +1,16 @@
 """What a sensor makes of the truth: a matrix and an offset."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .base import Effect
+    from .samples import AidSamples, ImuSamples
 
 
 @dataclass(frozen=True)
@@ -12,14 +20,14 @@ class Affine:
     matrix: np.ndarray
     offset: np.ndarray
 
-    def __call__(self, x):
+    def __call__(self, x: np.ndarray) -> np.ndarray:
         return x @ self.matrix.T + self.offset
 
-    def after(self, first):
+    def after(self, first: Affine) -> Affine:
         """The map that applies `first`, then this one."""
         return Affine(self.matrix @ first.matrix, self.matrix @ first.offset + self.offset)
 
-    def inverse(self):
+    def inverse(self) -> Affine:
         """The map that undoes this one."""
         back = np.linalg.inv(self.matrix)
         return Affine(back, -back @ self.offset)
@@ -28,7 +36,7 @@ class Affine:
 IDENTITY = Affine(np.eye(3), np.zeros(3))
 
 
-def regressors(effect, samples, keys):
+def regressors(effect: Effect, samples: ImuSamples | AidSamples, keys: Sequence[str]) -> np.ndarray:
     """Derivative of what the `sensor_model` of an Effect makes of `samples.reading` (n, k) by the parameters `keys`:
     (n, k, len(keys)); numerical."""
     step, out = 1e-6, np.empty((*samples.reading.shape, len(keys)))

@@ -1,11 +1,20 @@
 """Takes the effects out of what other sensors measure, and out of their stamps, at once or one by one."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from ..foundation.flight import AIDS
 from .affine import IDENTITY
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+    from ..foundation.sensors.sensor import Stream
+    from .affine import Affine
+    from .base import Effect
 
 UNKNOWN = 1e6  # standard deviation at which and above nothing was measured
 
@@ -13,14 +22,14 @@ UNKNOWN = 1e6  # standard deviation at which and above nothing was measured
 class AidCorrector:
     """Undoes the effects of a set in the order in which they are listed."""
 
-    def __init__(self, effects):
-        """effects : iterable of Effect; those that do not act on these streams are passed over."""
+    def __init__(self, effects: Collection[Effect]) -> None:
+        """effects : those that do not act on these streams are passed over."""
         self._late = {stream: sum(effect.stamp_offset(stream) for effect in effects) for stream in AIDS}
         self._undo = {stream: self._inverse(effects, stream) for stream in AIDS}
         self.idle = not any(self._late.values()) and not any(self._undo.values())
 
     @staticmethod
-    def _inverse(effects, stream):
+    def _inverse(effects: Collection[Effect], stream: str) -> Affine | None:
         undo = None
         for effect in effects:
             model = effect.sensor_model(stream)
@@ -28,7 +37,7 @@ class AidCorrector:
                 undo = model.inverse() if undo is None else model.inverse().after(undo)
         return undo
 
-    def correct(self, name, stream):
+    def correct(self, name: str, stream: Stream) -> Stream:
         """The Stream of a sensor, corrected."""
         undo = self._undo[name]
         if self._late[name]:
@@ -41,4 +50,5 @@ class AidCorrector:
         known = np.isfinite(std)  # what was not measured may be anything
         variance = np.where(known, std, UNKNOWN) ** 2 @ undo.matrix.T**2
         std = np.where(variance < UNKNOWN, np.sqrt(variance), np.inf)
-        return replace(stream.with_values(undo(np.where(known, stream.values, 0.0))), std=std)
+        corrected: Any = stream.with_values(undo(np.where(known, stream.values, 0.0)))  # its class has a std, as `stream` has
+        return replace(corrected, std=std)

@@ -1,7 +1,15 @@
 """The clock of one anchor runs away."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from .base import AnchorEffect
 from .wording import counted, listed, significant, size
+
+if TYPE_CHECKING:
+    import numpy as np
+    from .samples import Samples
 
 
 class AnchorClockDrift(AnchorEffect):
@@ -23,10 +31,10 @@ class AnchorClockDrift(AnchorEffect):
     portable = False
     covariates = ("time",)
 
-    def delay_per_unit(self, samples):
+    def delay_per_unit(self, samples: Samples) -> np.ndarray:
         return samples.t - samples.start
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         drifts = [
             f"anchor {key} by {size(self, key, 'm')} a second {'later' if value > 0.0 else 'earlier'}"
             for key, value in significant(self).items()

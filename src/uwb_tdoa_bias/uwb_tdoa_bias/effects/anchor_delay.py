@@ -1,5 +1,7 @@
 """A constant delay of one anchor."""
 
+from __future__ import annotations
+
 from .base import AnchorEffect
 from .wording import counted, listed, significant, size
 
@@ -24,7 +26,7 @@ class AnchorDelay(AnchorEffect):
     }
     reference = "DW1000 user manual, antenna delay calibration: 10 - 50 cm from module to module"
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         late = {
             key: f"{size(self, key)} {'late' if value > 0.0 else 'early'}" for key, value in significant(self).items()
         }

@@ -1,5 +1,7 @@
 """Anchors are called by wrong ids."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from .base import check_anchor
@@ -23,30 +25,32 @@ class AnchorIds(LabelEffect):
     expected = "the id of an anchor, a whole number"
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         check_anchor(cls.name, key, key)
 
     @staticmethod
-    def possible(value):
+    def possible(value: float) -> bool:
         return value >= 0.0 and value == round(value)
 
-    def relabelled(self, a, b, d):
+    def relabelled(self, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self._with_ids(a, {int(key): int(value) for key, value in self.values.items()}, b, d)
 
-    def mislabelled(self, a, b, d):
+    def mislabelled(self, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self._with_ids(a, {int(value): int(key) for key, value in self.values.items()}, b, d)
 
     @staticmethod
-    def _with_ids(a, table, b, d):
+    def _with_ids(
+        a: np.ndarray, table: dict[int, int], b: np.ndarray, d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         out = []
         for ids in (np.asarray(a), np.asarray(b)):
             new = ids.copy()
             for one, other in table.items():
                 new[ids == one] = other
             out.append(new)
-        return *out, d
+        return out[0], out[1], d
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not self.values:
             return ()
         wrong = listed(f"what is called {key} is anchor {value:.0f} of the survey" for key, value in self.values.items())

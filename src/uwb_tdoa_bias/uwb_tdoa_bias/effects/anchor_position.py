@@ -1,5 +1,9 @@
 """An anchor does not stand where the survey says."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.errors import InputError
@@ -7,6 +11,11 @@ from ..foundation.geometry import ranges, tdoa
 from .base import Effect, check_anchor, known_anchors, once_per_anchors
 from .marks import Shift
 from .wording import counted, listed, significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 
 class AnchorPosition(Effect):
@@ -31,19 +40,19 @@ class AnchorPosition(Effect):
     portable = False
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         anchor, _, axis = key.partition(".")
         if axis not in ("x", "y", "z") or not axis:
             raise InputError(f"effects: {cls.name}: parameter {key!r} is not an anchor and an axis; write '3.x: 0.05'.")
         check_anchor(cls.name, anchor, key)
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         each = [tuple(f"{i}.{axis}" for axis in "xyz") for i in known_anchors(anchors)]
         return [sum(each, ()), *each, *((key,) for keys in each for key in keys)]
 
     @once_per_anchors
-    def _moved(self, anchors):
+    def _moved(self, anchors: Anchors) -> np.ndarray:
         positions = anchors.positions.copy()
         rows = {i: row for row, i in enumerate(known_anchors(anchors))}
         for key, value in self.values.items():
@@ -52,12 +61,12 @@ class AnchorPosition(Effect):
                 positions[rows[anchor], "xyz".index(axis)] += value
         return positions
 
-    def bias(self, samples):
+    def bias(self, samples: Samples) -> np.ndarray:
         moved = self._moved(samples.anchors)
         after = tdoa(samples.p, moved[samples.a], moved[samples.b])
         return after - tdoa(samples.p, samples.position_a, samples.position_b)
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         moved, ids = self._moved(samples.anchors), samples.anchors.ids
         unit_a, unit_b = (-ranges(samples.p, moved[rows])[1] for rows in (samples.a, samples.b))
         out = np.empty((len(samples), len(keys)))
@@ -69,8 +78,8 @@ class AnchorPosition(Effect):
             ]
         return out
 
-    def advice(self):
-        shifts = {}
+    def advice(self) -> tuple[str, ...]:
+        shifts: dict[str, dict[str, str]] = {}
         for key, value in significant(self).items():
             anchor, axis = key.split(".")
             shifts.setdefault(anchor, {})[axis] = f"{size(self, key)} towards {'+' if value > 0.0 else '-'}{axis}"
@@ -83,8 +92,8 @@ class AnchorPosition(Effect):
             "If the survey proves right, ranges to there are wrong by direction.",
         )
 
-    def marks(self, anchors):
-        each = {}
+    def marks(self, anchors: Anchors) -> tuple[Shift, ...]:
+        each: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         for key, value in self.values.items():
             anchor, axis = key.split(".")
             by, std = each.setdefault(int(anchor), (np.zeros(3), np.full(3, np.nan)))

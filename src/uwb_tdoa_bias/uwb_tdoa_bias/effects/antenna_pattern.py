@@ -1,5 +1,9 @@
 """Antennas delay a signal by an amount that depends on its direction."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.antenna import Antenna
@@ -7,6 +11,11 @@ from ..foundation.radio import FLAT_MOUNT, into_frame
 from .base import ArrivalEffect
 from .samples import tile
 from .wording import listed, significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 UNIT = Antenna(delay_span=1.0)
 
@@ -29,14 +38,14 @@ class AntennaPattern(ArrivalEffect):
     uses_attitude = True
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("tag", "anchor"), ("tag",), ("anchor",)]
 
-    def delays(self, samples, rows):
+    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
         keys = tuple(self.values)
         return self.delay_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
 
-    def delay_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
         out = np.zeros((len(rows), len(keys)))
         for column, key in enumerate(keys):
@@ -49,7 +58,7 @@ class AntennaPattern(ArrivalEffect):
                 out[:, column] = np.where(known, UNIT.group_delay(seen), 0.0)
         return out
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         spans = [
             f"{size(self, key)} {'later' if value > 0.0 else 'earlier'} in the nulls of the {key}'s antenna"
             for key, value in significant(self).items()

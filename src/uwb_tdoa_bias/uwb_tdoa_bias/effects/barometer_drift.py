@@ -1,12 +1,20 @@
 """The barometer drifts."""
 
-from dataclasses import replace
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .aid_error import need_stream
 from .base import Effect
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight
+    from .samples import AidSamples
 
 
 class BarometerDrift(Effect):
@@ -26,21 +34,21 @@ class BarometerDrift(Effect):
     channels = ("pressure",)
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("rate",)]
 
-    def uncorrected(self, samples):
+    def uncorrected(self, samples: AidSamples) -> np.ndarray:
         return self.values.get("rate", 0.0) * (samples.t - samples.start)[:, None]
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
         return np.repeat((samples.t - samples.start)[:, None, None], len(keys), axis=2)
 
-    def inject(self, flight, rng=None):
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         part = need_stream(self, flight, "pressure")
         extra = self.values.get("rate", 0.0) * (part.t - float(flight.tdoa.t[0]))
-        return replace(flight, pressure=part.sensed(part.values + extra[:, None]))
+        return flight.replaced(pressure=part.sensed(part.values + extra[:, None]))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         way = "upwards" if self.values["rate"] > 0.0 else "downwards"

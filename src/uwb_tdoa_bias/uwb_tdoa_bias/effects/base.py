@@ -1,8 +1,10 @@
 """What a systematic effect is."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 from functools import wraps
-from typing import ClassVar
+from typing import Any, ClassVar, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -12,15 +14,25 @@ from .domain import checked
 from .samples import Samples, true_samples
 from .wording import LARGEST, listed, measured, significant
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable, Iterable, Sequence
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight, Truth
+    from .affine import Affine
+    from .marks import Region, Shift
+    from .sensor_function import SensorFunction
+
 __all__ = ["ArrivalEffect", "Effect", "Samples"]
 
+Made = TypeVar("Made")
 
-def once_per_anchors(method):
+
+def once_per_anchors(method: Callable[[Any, Anchors], Made]) -> Callable[[Any, Anchors], Made]:
     """A method(self, anchors) that is computed once as long as it is asked for the same Anchors object."""
     name = f"_{method.__name__}_of"
 
     @wraps(method)
-    def remembered(self, anchors):
+    def remembered(self: Any, anchors: Anchors) -> Made:
         known = self.__dict__.get(name)
         if known is None or known[0] is not anchors:
             known = self.__dict__[name] = anchors, method(self, anchors)
@@ -41,10 +53,10 @@ class Effect:
     it gives `regressors` on the channels where it shows.
     """
 
-    values: dict = field(default_factory=dict)
-    std: dict = field(default_factory=dict)
+    values: dict[str, float] = field(default_factory=dict)
+    std: dict[str, float] = field(default_factory=dict)
     source: str = ""
-    domain: dict = field(default_factory=dict, kw_only=True)
+    domain: dict[str, tuple[float, float]] = field(default_factory=dict, kw_only=True)
 
     name: ClassVar[str]
     unit: ClassVar[str]
@@ -53,24 +65,26 @@ class Effect:
     typical: ClassVar[float]  # a plausible size, standard deviation of what fits expect before they see data, in `unit`
     example: ClassVar[str]  # the parameter that a value without a name is for; see `from_text`
     physics: ClassVar[str]  # one sentence for the catalogue
-    confounded_with: ClassVar[tuple] = ()
+    confounded_with: ClassVar[tuple[str, ...]] = ()
     reference: ClassVar[str]
-    channels: ClassVar[tuple] = ("tdoa",)  # where it shows: names of channels of diagnose
+    channels: ClassVar[tuple[str, ...]] = ("tdoa",)  # where it shows: names of channels of diagnose
     fitted: ClassVar[bool] = True  # False: found by a detector of its own, not by linear regression
     portable: ClassVar[bool] = True  # goes with the tag, the vehicle and the anchors' modules to another installation
-    covariates: ClassVar[tuple] = ()  # what it is a function of, and must not be taken beyond: its domain is of these
-    settings: ClassVar[tuple] = ()  # further entries in effects.yaml, constructor arguments
+    # what it is a function of, and must not be taken beyond: its domain is of these
+    covariates: ClassVar[tuple[str, ...]] = ()
+    settings: ClassVar[tuple[str, ...]] = ()  # further entries in effects.yaml, constructor arguments
     price: ClassVar[float] = 0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
-    distinguished_by: ClassVar[dict] = {}  # {other effect: which flight tells this one from it}
+    distinguished_by: ClassVar[dict[str, str]] = {}  # {other effect: which flight tells this one from it}
     usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
     unused: ClassVar[str] = "nodes cannot, or need not, take it out"  # why not, where it is not usable
-    witnesses: ClassVar[tuple] = ()  # channels, one of which must be there too: else what it is compared with may be as wrong
+    # channels, one of which must be there too: else what it is compared with may be as wrong
+    witnesses: ClassVar[tuple[str, ...]] = ()
     weighed: ClassVar[bool] = False  # may be there or not: the filter weighs that, and no Corrector takes it out
     needs_reference: ClassVar[bool] = False  # cannot be told from the filter's innovations alone
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
     uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for group in ("values", "std"):
             read = {}
             for key, value in (getattr(self, group) or {}).items():
@@ -90,24 +104,24 @@ class Effect:
         self.domain = checked(self.name, self.domain)
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         """Raise InputError if `key` is no parameter of this effect."""
         if key not in cls.groups(None, None)[0]:
             known = ", ".join(cls.groups(None, None)[0])
             raise InputError(f"effects: {cls.name}: parameter {key!r} is not one of {known}.")
 
     @classmethod
-    def bound_of(cls, key):
+    def bound_of(cls, key: str) -> float:
         """Largest magnitude of the parameter `key`, in its unit."""
         return cls.bound
 
     @classmethod
-    def typical_of(cls, key):
+    def typical_of(cls, key: str) -> float:
         """Plausible size of the parameter `key`, in its unit."""
         return cls.typical
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         """Sets of parameters that make sense together, as tuples of names, the full set first.
 
         anchors : Anchors; pairs : (m, 2) ids of the pairs that were heard. Both may be None where they do not matter.
@@ -115,45 +129,45 @@ class Effect:
         raise NotImplementedError
 
     @property
-    def label(self):
+    def label(self) -> str:
         """What reports call it."""
         return self.label_of(self.values)
 
-    def label_of(self, keys):
+    def label_of(self, keys: Iterable[str]) -> str:
         """What reports call it if it has the parameters `keys` alone."""
         return self.name
 
     @property
-    def identity(self):
+    def identity(self) -> tuple[Hashable, ...]:
         """Hashable: equal for effects whose parameters of one name are the same quantity, which can hence be merged."""
         return (self.name, *(getattr(self, name) for name in self.settings))
 
     @classmethod
-    def plausible(cls, values):
+    def plausible(cls, values: dict[str, float]) -> bool:
         """Whether {parameter: value} could be: within bounds."""
         return all(abs(value) <= cls.bound_of(key) for key, value in values.items())
 
-    def bias(self, samples):
+    def bias(self, samples: Samples) -> np.ndarray:
         """Contribution to what `samples.channel` measures, (n,): of Samples to d_ab, metres; NaN where it cannot be told
         (unknown pose)."""
         return np.zeros(len(samples))
 
     @property
-    def states(self):
+    def states(self) -> tuple[int, ...]:
         """Which of position (0, 1, 2) and velocity (3, 4, 5) its part of a TDOA may change steeply with, so that the filter should
         follow it: tuple."""
         return ()
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
         """Derivative of what `samples.channel` measures by the parameters `keys`: of Samples (n, len(keys)), metres per
         `unit`; of ImuSamples (n, 3, len(keys)), body axes; of AidSamples (n, k, len(keys)). Asked for the channels in `channels` only."""
         return np.zeros((len(samples), len(keys)))
 
-    def noise_std(self, samples):
+    def noise_std(self, samples: Samples) -> np.ndarray:
         """Standard deviation that it adds to d_ab, (n,) metres."""
         return np.zeros(len(samples))
 
-    def inject(self, flight, rng=None):
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         """The Flight that would have been recorded with this effect on top. Raises InputError where that needs a ground
         truth, or an attitude, that the flight does not have. rng : numpy Generator, for random effects."""
         need_truth(self, flight)
@@ -165,7 +179,7 @@ class Effect:
         d[rows] += bias
         return replace(flight, tdoa=replace(flight.tdoa, d=d))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         """What a person can do about it in the hall: imperative sentences, the most important first; () if nothing but
         taking it out of the measurements helps. They name `significant` values alone."""
         largest = list(significant(self).items())[:LARGEST]
@@ -174,28 +188,32 @@ class Effect:
         values = listed(f"{key} = {measured(value, self.std.get(key))}" for key, value in largest)
         return (f"Look for the cause of {self.name}: {self.physics} (found: {values}, in {self.unit}).",)
 
-    def marks(self, anchors):
+    def on_floor(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the filter is told of an effect that is `weighed`, as of `FloorMultipath.on_floor`."""
+        raise NotImplementedError
+
+    def marks(self, anchors: Anchors) -> tuple[Shift | Region, ...]:
         """Shifts and Regions (`marks.py`) that show it on a map of some Anchors: tuple."""
         return ()
 
-    def stamp_offset(self, stream):
+    def stamp_offset(self, stream: str) -> float:
         """Seconds by which the stamps of a stream of a Flight are late, by its name."""
         return 0.0
 
-    def sensor_model(self, channel):
+    def sensor_model(self, channel: str) -> Affine:
         """Affine from the true to the measured values of "gyro" (rad/s), "accel" (m/s^2) or "velocity" (m/s), body axes, or
         of "height" (m)."""
         return IDENTITY
 
-    def sensor_bias(self, channel, features):
+    def sensor_bias(self, channel: str, features: np.ndarray) -> np.ndarray | None:
         """What it adds to "gyro" or "accel" besides, (n, 3), given their features (n, len(OF_IMU)); None for nothing."""
         return None
 
-    def sensor_functions(self):
+    def sensor_functions(self) -> tuple[SensorFunction, ...]:
         """What it adds to inertial samples that changes with the state of the filter: tuple of SensorFunction."""
         return ()
 
-    def uncorrected(self, samples):
+    def uncorrected(self, samples: Any) -> np.ndarray | float:
         """What taking it out of a stream leaves of it in ImuSamples, (n, 3), or AidSamples, (n, k), because nodes know less
         than those."""
         return 0.0
@@ -204,19 +222,19 @@ class Effect:
 class ArrivalEffect(Effect):
     """An effect that makes the signals of single anchors arrive late: bias of d_ab = delay_b - delay_a."""
 
-    def delays(self, samples, rows):
+    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
         """By how much the anchors in `rows` (k * n,), the samples repeated k times, seem too far: (k * n,) m."""
         raise NotImplementedError
 
-    def delay_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         """Its derivative with respect to `keys`, (k * n, len(keys))."""
         raise NotImplementedError
 
-    def bias(self, samples):
+    def bias(self, samples: Samples) -> np.ndarray:
         both = self.delays(samples, np.concatenate([samples.a, samples.b]))
         return both[len(samples) :] - both[: len(samples)]
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         both = self.delay_regressors(samples, np.concatenate([samples.a, samples.b]), keys)
         return both[len(samples) :] - both[: len(samples)]
 
@@ -225,44 +243,45 @@ class AnchorEffect(Effect):
     """An effect with one parameter for each anchor, named by its id, that makes its arrivals late in proportion."""
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         check_anchor(cls.name, key, key)
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         ids = known_anchors(anchors)
         return [ids, *((key,) for key in ids)]
 
-    def delay_per_unit(self, samples):
+    def delay_per_unit(self, samples: Samples) -> np.ndarray | float:
         """By how many metres an anchor is late for each unit of its parameter, (n,) or a scalar."""
         return 1.0
 
-    def bias(self, samples):
+    def bias(self, samples: Samples) -> np.ndarray:
         values = self._of_each(samples.anchors)
         return (values[samples.b] - values[samples.a]) * self.delay_per_unit(samples)
 
     @once_per_anchors
-    def _of_each(self, anchors):
+    def _of_each(self, anchors: Anchors) -> np.ndarray:
         return np.array([self.values.get(str(i), 0.0) for i in anchors.ids.tolist()])
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         ids, wanted = samples.anchors.ids, np.array([int(key) for key in keys])
         sign = (ids[samples.b][:, None] == wanted).astype(float) - (ids[samples.a][:, None] == wanted)
         return sign * np.reshape(self.delay_per_unit(samples), (-1, 1))
 
 
-def need_truth(effect, flight):
-    """Raise InputError if the flight has no ground truth to compute `effect` at."""
+def need_truth(effect: Effect, flight: Flight) -> Truth:
+    """The ground truth of a flight; raises InputError if it has none to compute `effect` at."""
     if flight.truth is None or len(flight.truth) == 0:
         raise InputError(f"{flight.name}: holds no ground truth, which {effect.name} needs.")
+    return flight.truth
 
 
-def check_anchor(name, text, key):
+def check_anchor(name: str, text: str, key: str) -> None:
     """Raise InputError if `text`, of the parameter `key` of effect `name`, is not an anchor id."""
     if not (text.isdigit() and int(text) <= 65535):
         raise InputError(f"effects: {name}: parameter {key!r} is not an anchor id; write for example '3: 0.05'.")
 
 
-def known_anchors(anchors):
+def known_anchors(anchors: Anchors | None) -> tuple[str, ...]:
     """Ids as text; () without anchors."""
     return () if anchors is None else tuple(str(i) for i in anchors.ids.tolist())

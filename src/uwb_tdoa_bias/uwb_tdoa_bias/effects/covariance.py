@@ -1,10 +1,17 @@
 """How well the values of effects are known together: the prior of the next calibration."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from ..foundation.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+    from pathlib import Path
 
 ENTRIES = ("parameters", "matrix")
 
@@ -13,28 +20,28 @@ ENTRIES = ("parameters", "matrix")
 class Covariance:
     """keys : ((name of an effect, parameter), ...); matrix (k, k), of their values, units multiplied."""
 
-    keys: tuple
+    keys: tuple[tuple[str, ...], ...]
     matrix: np.ndarray
 
-    def of(self, keys):
+    def of(self, keys: Sequence[tuple[str, ...]]) -> tuple[np.ndarray, np.ndarray]:
         """(places (m,) of the keys that are in it among `keys`, matrix (m, m) of these)."""
         known = {key: row for row, key in enumerate(self.keys)}
         places = [place for place, key in enumerate(keys) if key in known]
         rows = [known[keys[place]] for place in places]
         return np.array(places, dtype=int), self.matrix[np.ix_(rows, rows)]
 
-    def without(self, anchors):
+    def without(self, anchors: Collection[str]) -> Covariance:
         """The Covariance of what is not of anchors with these ids (text)."""
         kept = [key for key in self.keys if key[1].partition(".")[0] not in anchors]
         return Covariance(tuple(kept), self.of(kept)[1])
 
-    def as_dict(self):
+    def as_dict(self) -> dict[str, list[str] | list[list[float]]]:
         """For YAML: the lower triangle, row by row."""
         rows = [[float(f"{value:.6g}") for value in row[: k + 1]] for k, row in enumerate(self.matrix)]
         return {"parameters": [f"{name} {key}" for name, key in self.keys], "matrix": rows}
 
     @classmethod
-    def from_dict(cls, content, values, where):
+    def from_dict(cls, content: Any, values: dict[str, dict[str, float]], where: str | Path) -> Covariance:
         """What `as_dict` gives, of effects with `values` {name: {parameter: number}}. where : file, for messages. Raises
         InputError."""
         if not isinstance(content, dict) or set(content) != set(ENTRIES):

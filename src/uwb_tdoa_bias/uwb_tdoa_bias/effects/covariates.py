@@ -1,6 +1,9 @@
 """What a systematic error may depend on: quantities that a node can compute, by name."""
 
+from __future__ import annotations
+
 import math
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -9,17 +12,21 @@ from ..foundation.radio import into_frame
 from ..foundation.vibration import VIBRATION_CORNER, low_pass, track_vibration
 from .samples import ImuSamples, tile
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from .samples import AidSamples, Samples
+
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes
 UPWARDS = ("height", "elevation")  # change where a tag leaves the floor
 OF_MOTION = ("speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor")  # need a history
 
 
-def _norm(v):
+def _norm(v: np.ndarray) -> np.ndarray:
     return np.linalg.norm(v, axis=1)
 
 
 # One value per TDOA, of Samples: (n,), or None if the samples do not hold it.
-OF_TDOA = {
+OF_TDOA: dict[str, Callable[[Any], np.ndarray | None]] = {
     "time": lambda s: s.t - s.start,
     "x": lambda s: s.p[:, 0],
     "y": lambda s: s.p[:, 1],
@@ -35,20 +42,20 @@ OF_TDOA = {
 }
 
 
-def _to_anchor(samples, rows):
+def _to_anchor(samples: Samples, rows: np.ndarray) -> np.ndarray:
     return samples.anchors.positions[rows] - tile(samples, samples.p)
 
 
-def _bearing(v):
+def _bearing(v: np.ndarray) -> np.ndarray:
     return np.arctan2(v[:, 1], v[:, 0])
 
 
-def _elevation(v):
+def _elevation(v: np.ndarray) -> np.ndarray:
     return np.arctan2(v[:, 2], np.hypot(v[:, 0], v[:, 1]))
 
 
 # One value per arrival: of the anchors in rows (2n,), the samples repeated twice.
-OF_ARRIVAL = {
+OF_ARRIVAL: dict[str, Callable[[Samples, np.ndarray], np.ndarray]] = {
     "range": lambda s, rows: np.linalg.norm(_to_anchor(s, rows), axis=1),
     "bearing": lambda s, rows: _bearing(_to_anchor(s, rows)),
     "elevation": lambda s, rows: _elevation(_to_anchor(s, rows)),
@@ -81,26 +88,26 @@ EXTRA = "extra."  # before the name of what else a log holds: "extra.STREAM.COLU
 OF_ACCEL = ("accel", "accel_x", "accel_y", "accel_z")  # specific force, m/s^2
 
 
-def sensor_covariate(name, samples):
-    """Covariate `name`, of a pose in OF_TDOA, of ImuSamples also of OF_IMU and "extra.NAME": (n,). samples : ImuSamples or
-    AidSamples."""
+def sensor_covariate(name: str, samples: ImuSamples | AidSamples) -> np.ndarray:
+    """Covariate `name`, of a pose in OF_TDOA, of ImuSamples also of OF_IMU and "extra.NAME": (n,)."""
     if name.startswith(EXTRA):
-        return samples.extra[name.removeprefix(EXTRA)]
+        # who asks has seen that samples hold it, here and below
+        return samples.extra[name.removeprefix(EXTRA)]  # type: ignore[union-attr,index]  # as said
     if samples.channel == "accel" and name in OF_ACCEL:  # the measured one shares its noise with the residual
         return _norm(samples.reading) if name == "accel" else samples.reading[:, "xyz".index(name[-1])]
     if name in OF_IMU and isinstance(samples, ImuSamples):
         return samples.features[:, OF_IMU.index(name)]
-    return OF_TDOA[name](samples)
+    return OF_TDOA[name](samples)  # type: ignore[return-value]  # as said
 
 
 class ImuFeatures:
     """The covariates OF_IMU along a stream of inertial samples; they depend on the past of the stream alone."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._state = np.zeros((4, 3))  # last stamp and first stamp, slow rate, slow force, vibration power
         self._state[0, :2] = np.nan
 
-    def __call__(self, t, gyro, accel):
+    def __call__(self, t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
         """t (n,) s; gyro (n, 3) rad/s; accel (n, 3) m/s^2. Returns (n, len(OF_IMU))."""
         out = np.empty((len(t), len(OF_IMU)))
         _features(self._state, np.ascontiguousarray(t), np.ascontiguousarray(gyro), np.ascontiguousarray(accel), out)
@@ -108,7 +115,7 @@ class ImuFeatures:
 
 
 @compiled
-def _features(state, t, gyro, accel, out):
+def _features(state: np.ndarray, t: np.ndarray, gyro: np.ndarray, accel: np.ndarray, out: np.ndarray) -> None:
     rate, force, power = state[1], state[2], state[3]
     for i in range(len(t)):
         dt = t[i] - state[0, 0]

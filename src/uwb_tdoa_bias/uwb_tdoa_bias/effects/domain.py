@@ -4,21 +4,29 @@ What was fitted over a minute, or between 1 and 2 m of height, says nothing of a
 fades, and what is not taken out any more counts as noise: the filter believes such TDOAs less, instead of a guess.
 """
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.errors import InputError
 from .covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_TDOA, UNITS
 
+if TYPE_CHECKING:
+    from .base import Effect
+    from .samples import Samples
+
 FADE = 0.5  # share of the width of a domain: so far beyond it, exp(-1/2) of an effect is left
 LITTLE = 0.5  # share of an effect; where less is taken out, nodes say so
 
 
-def bounded(name):
+def bounded(name: str) -> bool:
     """Whether a covariate has a domain: whether it is a quantity that nodes know, no name of something."""
     return name not in CATEGORIES and not name.startswith(EXTRA)
 
 
-def checked(effect, domain):
+def checked(effect: str, domain: Any) -> dict[str, tuple[float, float]]:
     """{covariate: (low, high)} as written in effects.yaml; raises InputError. effect : name."""
     out = {}
     for covariate, limits in (domain or {}).items():
@@ -35,7 +43,7 @@ def checked(effect, domain):
     return out
 
 
-def share(values, limits):
+def share(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     """What is left of an effect at values (n,) of a covariate that was seen between two limits: (n,), 1 within; 1 where it is not
     known, too."""
     low, high = limits
@@ -43,9 +51,10 @@ def share(values, limits):
     return np.exp(-0.5 * (np.nan_to_num(beyond) / (FADE * max(high - low, 1e-6))) ** 2)
 
 
-def faded(effect, samples):
+def faded(effect: Effect, samples: Samples) -> tuple[np.ndarray, np.ndarray | float, np.ndarray | float]:
     """(bias of an Effect in Samples, (n,) m, NaN where it cannot tell; standard deviation of what of it is not taken out, (n,) m;
-    share that is taken out, (n,)). The time goes on to its end only: what grows with it is not known to grow further."""
+    share that is taken out, (n,)); the last two are 0.0 and 1.0 without a domain. The time goes on to its end only:
+    what grows with it is not known to grow further."""
     if not effect.domain:
         return effect.bias(samples), 0.0, 1.0
     left, n = np.ones(len(samples)), len(samples)
@@ -59,7 +68,7 @@ def faded(effect, samples):
     return left * bias, (1.0 - left) * np.abs(np.nan_to_num(bias)), left
 
 
-def in_words(effect):
+def in_words(effect: Effect) -> str:
     """One phrase on an Effect with a domain."""
     seen = (f"{name} {low:.3g} to {high:.3g} {UNITS[name]}" for name, (low, high) in effect.domain.items())
     return f"{effect.label} ({', '.join(seen)})"

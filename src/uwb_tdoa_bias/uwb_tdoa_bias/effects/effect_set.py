@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import yaml
@@ -21,6 +22,13 @@ from .label_error import LabelCorrector
 from .smooth_term import SmoothTerm
 from .stamp_error import shifted
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight
+    from .samples import AidSamples, ImuSamples, Samples
+    from .sensor_function import SensorFunction
+
 ENTRY = ("values", "std", "source", "domain")
 STREAMS = ("tdoa", "imu", "truth")  # whose stamps are moved, beside those of AIDS
 
@@ -30,21 +38,21 @@ class EffectSet:
     """The effects that are in the model, in the order in which they are listed. covariance : of some of their values
     together, or None; corrections do not need it."""
 
-    effects: tuple = ()
+    effects: tuple[Effect, ...] = ()
     covariance: Covariance | None = field(default=None, compare=False)
 
     @property
-    def name(self):
+    def name(self) -> str:
         """Names joined by '+', or "none"."""
         return "+".join(effect.name for effect in self.effects) or "none"
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.effects)
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Effect]:
         return iter(self.effects)
 
-    def bias(self, samples):
+    def bias(self, samples: Samples) -> np.ndarray:
         """Sum of all contributions to what `samples.channel` measures, (n,): of Samples to d_ab, metres, faded where they were not
         seen. An effect that cannot tell (unknown attitude) adds nothing."""
         total = np.zeros(len(samples))
@@ -54,16 +62,18 @@ class EffectSet:
         return total
 
     @cached_property
-    def parted(self):
+    def parted(self) -> tuple[EffectSet, EffectSet]:
         """(EffectSet of those whose part of a TDOA changes steeply with the state of the filter, EffectSet of the others)."""
-        return tuple(EffectSet(tuple(effect for effect in self.effects if bool(effect.states) == steep)) for steep in (True, False))
+        steep = tuple(effect for effect in self.effects if effect.states)
+        return EffectSet(steep), EffectSet(tuple(effect for effect in self.effects if not effect.states))
 
-    def uncorrected(self, samples):
+    def uncorrected(self, samples: ImuSamples | AidSamples) -> np.ndarray:
         """What taking the effects out of a stream leaves of them in ImuSamples, (n, 3), or AidSamples, (n, k)."""
         mine = (effect for effect in self.effects if samples.channel in effect.channels)
-        return sum((effect.uncorrected(samples) for effect in mine), np.zeros(samples.reading.shape))
+        parts: Iterator[Any] = (effect.uncorrected(samples) for effect in mine)
+        return sum(parts, np.zeros(samples.reading.shape))
 
-    def noise_std(self, samples):
+    def noise_std(self, samples: Samples) -> np.ndarray:
         """Standard deviation that the effects add to d_ab, (n,) metres, with what of them is not taken out because they were not
         seen there."""
         total = np.zeros(len(samples))
@@ -73,42 +83,42 @@ class EffectSet:
             total += faded(effect, samples)[1] ** 2
         return np.sqrt(total)
 
-    def outside(self, samples):
+    def outside(self, samples: Samples) -> list[str]:
         """Of Samples: phrases on those effects of which less than half is taken out of some, because they were not seen there."""
         return [in_words(effect) for effect in self._limited if np.min(faded(effect, samples)[2], initial=1.0) < LITTLE]
 
     @cached_property
-    def _limited(self):
+    def _limited(self) -> list[Effect]:
         return [effect for effect in self.effects if effect.domain and "tdoa" in effect.channels]
 
     @cached_property
-    def _noisy(self):
+    def _noisy(self) -> list[Effect]:
         return [effect for effect in self.effects if type(effect).noise_std is not Effect.noise_std]
 
     @cached_property
-    def of_attitude(self):
+    def of_attitude(self) -> EffectSet:
         """EffectSet of those whose part of a TDOA changes with the attitude of the tag."""
         return EffectSet(tuple(effect for effect in self.effects if effect.uses_attitude))
 
     @cached_property
-    def needs_motion(self):
+    def needs_motion(self) -> bool:
         """True if an effect looks at more than poses."""
         return any(effect.needs_motion for effect in self.effects)
 
     @cached_property
-    def sensor_functions(self):
+    def sensor_functions(self) -> tuple[SensorFunction, ...]:
         """All SensorFunctions: what the filter itself takes out of inertial samples."""
         return tuple(function for effect in self.effects for function in effect.sensor_functions())
 
-    def on_floor(self, anchors):
+    def on_floor(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """What the filter is told of some Anchors at a tag on the floor, as of `FloorMultipath.on_floor`; None if no effect knows."""
         return next((effect.on_floor(anchors) for effect in self.effects if effect.weighed), None)
 
-    def stamp_offset(self, stream):
+    def stamp_offset(self, stream: str) -> float:
         """Seconds by which the stamps of a stream of a Flight are late, by its name."""
         return sum(effect.stamp_offset(stream) for effect in self.effects)
 
-    def correct_streams(self, flight):
+    def correct_streams(self, flight: Flight) -> Flight:
         """The Flight without the effects' part in ids, signs, stamps, inertial samples, heights and velocities. TDOA biases are
         the Corrector's."""
         labels, of = LabelCorrector(self.effects), flight.tdoa
@@ -125,16 +135,16 @@ class EffectSet:
         gyro, accel = corrector.correct(imu.t, imu.gyro, imu.accel)
         return replace(flight, imu=replace(imu, gyro=gyro, accel=accel))
 
-    def _correct_aids(self, flight):
+    def _correct_aids(self, flight: Flight) -> Flight:
         corrector = AidCorrector(self.effects)
         for stream in AIDS if not corrector.idle else ():
             part = getattr(flight, stream)
             if part is not None:
-                flight = replace(flight, **{stream: corrector.correct(stream, part)})
+                flight = flight.replaced(**{stream: corrector.correct(stream, part)})
         return flight
 
     @classmethod
-    def from_yaml(cls, path):
+    def from_yaml(cls, path: str | Path) -> EffectSet:
         """Read effects.yaml; raises InputError."""
         content = read_yaml(path)
         entries = content.get("effects") if isinstance(content, dict) else None
@@ -160,9 +170,9 @@ class EffectSet:
         values = {name: effect.values for name, effect in zip(map(str, entries), effects)}
         return cls(tuple(effects), Covariance.from_dict(content["covariance"], values, path))
 
-    def to_yaml(self, path):
+    def to_yaml(self, path: str | Path) -> None:
         """Write what `from_yaml` reads."""
-        entries = {}
+        entries: dict[str, dict[str, Any]] = {}
         for effect in self.effects:
             entry = {name: _plain(getattr(effect, name)) for name in (*effect.settings, *ENTRY)}
             number = 1 + sum(other.name == effect.name for other in self.effects[: len(entries)])
@@ -174,14 +184,15 @@ class EffectSet:
         Path(path).write_text(f"# {written_by()}\n{text}")
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
+    """A value of a field of an Effect as YAML has it: lists for tuples."""
     if isinstance(value, dict):
         return {key: _plain(one) for key, one in value.items()}
     return list(value) if isinstance(value, tuple) else value
 
 
-def _kind(name):
+def _kind(name: str) -> type[Effect] | None:
     """Class of an entry: a declared effect or smooth_term, with an optional _NUMBER; None if there is none."""
     head, _, number = name.rpartition("_")
-    kinds = {**EFFECTS, SmoothTerm.name: SmoothTerm}
+    kinds: dict[str, type[Effect]] = {**EFFECTS, SmoothTerm.name: SmoothTerm}
     return kinds.get(name) or (kinds.get(head) if number.isdigit() else None)

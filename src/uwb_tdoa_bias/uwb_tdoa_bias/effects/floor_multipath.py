@@ -1,11 +1,20 @@
 """On the floor the direct path is lost, and an echo is taken for it."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.errors import InputError
 from .base import ArrivalEffect, check_anchor, once_per_anchors
 from .samples import tile
 from .wording import counted, measured, significant
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Sequence
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 PARTS, PLACE = ("delay", "height", "noise"), ("x", "y")
 HEIGHT = 0.12  # m, where no other one is told
@@ -38,7 +47,7 @@ class FloorMultipath(ArrivalEffect):
     weighed = True  # an estimate that is wrong there would be held by what is taken out for it
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         anchor, _, part = key.partition(".")
         if key in PLACE:
             return
@@ -47,28 +56,28 @@ class FloorMultipath(ArrivalEffect):
         check_anchor(cls.name, anchor, key)
 
     @classmethod
-    def bound_of(cls, key):
+    def bound_of(cls, key: str) -> float:
         return 1e6 if key in PLACE else cls.bound
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [()]
 
     @property
-    def identity(self):
+    def identity(self) -> tuple[Hashable, ...]:
         return (self.name, *sorted((key, value) for key, value in self.values.items() if not key.endswith(".delay")))
 
     @classmethod
-    def plausible(cls, values):
+    def plausible(cls, values: dict[str, float]) -> bool:
         return super().plausible(values) and all(value > 0.0 for key, value in values.items() if key.endswith(".height"))
 
     @once_per_anchors
-    def of_each(self, anchors):
+    def of_each(self, anchors: Anchors) -> tuple[np.ndarray, ...]:
         """(delays, heights, noises), each (anchors,) m, of some Anchors."""
         ids = anchors.ids.tolist()
         return tuple(np.array([self.values.get(f"{i}.{part}", default) for i in ids]) for part, default in zip(PARTS, (0.0, HEIGHT, 0.0)))
 
-    def on_floor(self, anchors):
+    def on_floor(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(delays of some Anchors at a tag on the floor, NaN where not known, their standard deviations, each (anchors,) m; x and y, (2,)
         m, of where that was seen, NaN if that is not known)."""
         delays, _, noises = self.of_each(anchors)
@@ -76,7 +85,7 @@ class FloorMultipath(ArrivalEffect):
         stds = np.array([self.std.get(f"{i}.delay", 0.0) for i in anchors.ids.tolist()])
         return np.where(known, delays, np.nan), np.hypot(noises, stds), np.array([self.values.get(name, np.nan) for name in PLACE])
 
-    def _late(self, samples, rows):
+    def _late(self, samples: Samples, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(share of the time that the anchors in `rows` (k * n,) are late there, as far as it is the same echo), each (k * n,)."""
         z, heights = tile(samples, samples.p[:, 2]), self.of_each(samples.anchors)[1][rows]
         share = np.clip(0.5 - 0.5 * np.log(np.maximum(z, 1e-6) / heights) / np.log(SWITCH), 0.0, 1.0)
@@ -84,27 +93,27 @@ class FloorMultipath(ArrivalEffect):
         same = np.exp(-0.5 * sum((part**2 for part in away), np.zeros(len(samples))) / REACH**2)
         return share, tile(samples, same)
 
-    def delays(self, samples, rows):
+    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
         share, same = self._late(samples, rows)
         return self.of_each(samples.anchors)[0][rows] * share * same
 
-    def delay_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         share, same = self._late(samples, rows)
         late, ids = share * same, samples.anchors.ids[rows]
         return np.stack([late * (ids == int(key.partition(".")[0])) for key in keys], axis=1)
 
-    def noise_std(self, samples):
+    def noise_std(self, samples: Samples) -> np.ndarray:
         rows = np.concatenate([samples.a, samples.b])
         share, same = self._late(samples, rows)
         delays, _, noises = (values[rows] for values in self.of_each(samples.anchors))
         power = delays**2 * (share - (share * same) ** 2) + noises**2 * share
         return np.sqrt(np.nan_to_num(np.maximum(power, 0.0)).reshape(2, -1).sum(axis=0))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         late = {key: value for key, value in significant(self).items() if key.endswith(".delay")}
         if not late:
             return ()
-        most = max(late, key=late.get)
+        most = max(late, key=late.__getitem__)
         anchors = sorted((key.partition(".")[0] for key, value in late.items() if value > 0.5 * late[most]), key=int)
         highest = max(self.values.get(f"{i}.height", HEIGHT) for i in anchors)
         who, many = counted(anchors, "anchor"), len(anchors) > 1

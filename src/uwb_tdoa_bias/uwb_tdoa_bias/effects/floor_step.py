@@ -1,6 +1,14 @@
 """The ground below the tag is not where the floor is."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from .interval_error import IntervalEffect
+
+if TYPE_CHECKING:
+    import numpy as np
+    from .samples import AidSamples
 
 
 class FloorStep(IntervalEffect):
@@ -19,10 +27,10 @@ class FloorStep(IntervalEffect):
     reference = "geometry"
     channels = ("height",)
 
-    def per_unit(self, samples):
+    def per_unit(self, samples: AidSamples) -> np.ndarray:
         return -1.0 / samples.up[:, None]
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         return tuple(
             f"Look what lay below the tag{when}: the ground was {size} {'higher' if value > 0.0 else 'lower'}."
             for value, size, when in self.told("m")

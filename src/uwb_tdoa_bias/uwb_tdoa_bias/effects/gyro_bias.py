@@ -1,5 +1,7 @@
 """The gyroscope reads something at rest."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from .affine import Affine
@@ -19,9 +21,9 @@ class GyroBias(ImuEffect):
     reference = "BMI088 data sheet: zero-rate offset 1 degree/s"
     channels = ("gyro",)
 
-    def gyro(self):
+    def gyro(self) -> Affine:
         return Affine(np.eye(3), self.vector())
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         found = readings(self, "about")
         return (f"Let the gyroscope find its zero at rest before take-off: it reads {found}.",) if found else ()

@@ -1,5 +1,7 @@
 """The gyroscope reads too much or too little."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from .affine import Affine
@@ -20,9 +22,9 @@ class GyroScale(ImuEffect):
     reference = "BMI088 data sheet: sensitivity tolerance 1 %"
     channels = ("gyro",)
 
-    def gyro(self):
+    def gyro(self) -> Affine:
         return Affine(np.eye(3) + np.diag(self.vector()), np.zeros(3))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         found = readings(self, "about", "%", 100.0)
         return (f"Calibrate the gyroscope on a turntable: it reads {found}.",) if found else ()

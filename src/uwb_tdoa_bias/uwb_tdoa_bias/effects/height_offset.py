@@ -1,10 +1,17 @@
 """The range finder reads too long, or sits above the origin of the body frame."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from ..foundation.anchors import Anchors
 
 
 class HeightOffset(AidEffect):
@@ -24,13 +31,13 @@ class HeightOffset(AidEffect):
     channels = ("height",)
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("offset",)]
 
-    def aid(self):
+    def aid(self) -> Affine:
         return Affine(np.eye(1), np.array([self.values.get("offset", 0.0)]))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         way = "long" if self.values["offset"] > 0.0 else "short"

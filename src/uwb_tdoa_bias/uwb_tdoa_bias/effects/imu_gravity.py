@@ -1,6 +1,9 @@
 """Gravity is not what the filter takes it for."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +13,12 @@ from .affine import Affine
 from .imu_error import ImuEffect, need_imu
 from .samples import Track
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight
+    from .samples import ImuSamples
 
 
 class ImuGravity(ImuEffect):
@@ -32,28 +41,26 @@ class ImuGravity(ImuEffect):
     channels = ("accel",)
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("excess",)]
 
     @property
-    def excess(self):
+    def excess(self) -> float:
         """m/s^2"""
         return self.values.get("excess", 0.0)
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: ImuSamples, keys: Sequence[str]) -> np.ndarray:
         return np.repeat(samples.up[:, :, None], len(keys), axis=2)  # the true vertical, not the body's z
 
-    def uncorrected(self, samples):
+    def uncorrected(self, samples: ImuSamples) -> np.ndarray:
         return self.excess * (samples.up - [0.0, 0.0, 1.0])
 
-    def accel(self):
+    def accel(self) -> Affine:
         return Affine(np.eye(3), np.array([0.0, 0.0, self.excess]))
 
-    def inject(self, flight, rng=None):
-        need_truth(self, flight)
-        need_imu(self, flight)
-        imu = flight.imu
-        q = Track(flight.truth).attitudes(imu.t)
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
+        truth, imu = need_truth(self, flight), need_imu(self, flight)
+        q = Track(truth).attitudes(imu.t)
         up = (
             rotations.Rotation.from_quat(q).inv().apply([0.0, 0.0, self.excess])
             if np.isfinite(q).all()
@@ -61,7 +68,7 @@ class ImuGravity(ImuEffect):
         )
         return replace(flight, imu=replace(imu, accel=imu.accel + up))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         sign = "much" if self.excess > 0.0 else "little"

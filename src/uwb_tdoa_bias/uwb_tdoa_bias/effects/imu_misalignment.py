@@ -1,5 +1,7 @@
 """The IMU is not mounted along the body's axes."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from ..foundation.later import rotations
@@ -26,16 +28,16 @@ class ImuMisalignment(ImuEffect):
     reference = "strapdown navigation: mounting misalignment"
     channels = ("gyro", "accel")
 
-    def _turn(self):
+    def _turn(self) -> Affine:
         return Affine(rotations.Rotation.from_rotvec(self.vector()).as_matrix().T, np.zeros(3))
 
-    def gyro(self):
+    def gyro(self) -> Affine:
         return self._turn()
 
-    def accel(self):
+    def accel(self) -> Affine:
         return self._turn()
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         turns = {
             key: f"{measured(-np.degrees(value), np.degrees(self.std.get(key, 0.0)), 'degrees')} about {key}"
             for key, value in significant(self).items()

@@ -1,7 +1,8 @@
 """What the effects share that a stream has for a while, several times in a flight."""
 
-from dataclasses import replace
-from typing import ClassVar
+from __future__ import annotations
+
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +11,12 @@ from .aid_error import need_stream
 from .base import Effect, need_truth
 from .samples import Track, aid_samples
 from .wording import measured, significant
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Sequence
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight
+    from .samples import AidSamples
 
 LIMITS = ("start", "end")  # s after the first TDOA
 
@@ -23,12 +30,12 @@ class IntervalEffect(Effect):
     fitted = False
     usable = False  # of another flight it tells nothing; the filter's own judgement is the remedy
 
-    def per_unit(self, samples):
+    def per_unit(self, samples: AidSamples) -> np.ndarray:
         """What a unit of its size adds to the readings of AidSamples: (n, k)."""
         raise NotImplementedError
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         number, _, part = key.partition(".")
         if not number.isdigit() or part not in (cls.part, *LIMITS):
             raise InputError(
@@ -36,23 +43,23 @@ class IntervalEffect(Effect):
             )
 
     @classmethod
-    def bound_of(cls, key):
+    def bound_of(cls, key: str) -> float:
         return 1e6 if key.endswith(LIMITS) else cls.bound
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [()]
 
     @property
-    def identity(self):
+    def identity(self) -> tuple[Hashable, ...]:
         return (self.name, *sorted((key, value) for key, value in self.values.items() if key.endswith(LIMITS)))
 
     @property
-    def sizes(self):
+    def sizes(self) -> dict[str, float]:
         """{parameter: value} without limits."""
         return {key: value for key, value in self.values.items() if not key.endswith(LIMITS)}
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
         get, since, unit = self.values.get, samples.t - samples.start, self.per_unit(samples)
         out = np.zeros((*unit.shape, len(keys)))
         for column, key in enumerate(keys):
@@ -61,20 +68,20 @@ class IntervalEffect(Effect):
             out[inside, :, column] = unit[inside]
         return out
 
-    def uncorrected(self, samples):
+    def uncorrected(self, samples: AidSamples) -> np.ndarray:
         return self.regressors(samples, list(self.sizes)) @ np.array(list(self.sizes.values()))
 
-    def inject(self, flight, rng=None):
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         (stream,) = self.channels
         part = need_stream(self, flight, stream)
-        need_truth(self, flight)
-        samples = aid_samples(stream, part.t, Track(flight.truth), float(flight.tdoa.t[0]))
+        truth = need_truth(self, flight)
+        samples = aid_samples(stream, part.t, Track(truth), float(flight.tdoa.t[0]))
         extra = self.uncorrected(samples)
         if not np.isfinite(extra).all():
             raise InputError(f"{flight.name}: has no attitude in its ground truth, which {self.name} needs.")
-        return replace(flight, **{stream: part.sensed(part.values + extra)})
+        return flight.replaced(**{stream: part.sensed(part.values + extra)})
 
-    def told(self, unit, factor=1.0):
+    def told(self, unit: str, factor: float = 1.0) -> list[tuple[float, str, str]]:
         """[(signed size, its words, when, in words)] of those sizes that the data tell, the most certain first."""
         out = []
         for key, value in significant(self).items():

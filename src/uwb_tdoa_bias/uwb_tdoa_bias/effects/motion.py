@@ -1,5 +1,7 @@
 """Velocity, acceleration and turning rate out of a history of the filter's states: what a node can know when it corrects a TDOA."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 import math
 
@@ -20,7 +22,7 @@ class Motion:
     rate: np.ndarray
 
 
-def motion_at(t, v, q, places):
+def motion_at(t: np.ndarray, v: np.ndarray, q: np.ndarray, places: np.ndarray) -> Motion:
     """Motion at some of the states, from those before them alone: acceleration and rate are backward differences over SPAN.
 
     t (m,) rising stamps, s; v (m, 3) m/s, world; q (m, 4) x y z w; places (n,) numbers of states, -1 for none.
@@ -30,7 +32,7 @@ def motion_at(t, v, q, places):
     return Motion(*out)
 
 
-def preceding(t, newest=None):
+def preceding(t: np.ndarray, newest: float | None = None) -> np.ndarray:
     """Stamp of the TDOA that precedes each of some: (n,) s. t (n,) s, in order of arrival; newest : latest stamp of all
     before them, s. The first of all precedes itself; a stamp that has fallen back counts as its own."""
     out = np.empty(len(t))
@@ -39,7 +41,7 @@ def preceding(t, newest=None):
 
 
 @compiled
-def precede(t, newest, out):
+def precede(t: np.ndarray, newest: float, out: np.ndarray) -> None:
     """`preceding`, compiled, written to out (n,)."""
     for i in range(len(t)):
         out[i] = min(newest, t[i])
@@ -47,7 +49,7 @@ def precede(t, newest, out):
 
 
 @compiled
-def _differences(t, v, q, places, out):
+def _differences(t: np.ndarray, v: np.ndarray, q: np.ndarray, places: np.ndarray, out: np.ndarray) -> None:
     for i in range(len(places)):
         k = places[i]
         if k < 0:

@@ -1,5 +1,9 @@
 """One anchor is blocked, for a while or from a region."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.errors import InputError
@@ -7,6 +11,11 @@ from .base import ArrivalEffect, check_anchor
 from .samples import tile
 from .marks import Region
 from .wording import measured, significant
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Sequence
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 PARTS = ("delay", "start", "end", "x", "y", "z", "radius")
 
@@ -31,29 +40,29 @@ class Nlos(ArrivalEffect):
     fitted = False
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         anchor, _, part = key.partition(".")
         if part not in PARTS:
             raise InputError(f"effects: {cls.name}: parameter {key!r} is not an anchor and one of {', '.join(PARTS)}.")
         check_anchor(cls.name, anchor, key)
 
     @classmethod
-    def bound_of(cls, key):
+    def bound_of(cls, key: str) -> float:
         return 1e6 if key.endswith(("start", "end")) else cls.bound
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [()]
 
     @property
-    def identity(self):
+    def identity(self) -> tuple[Hashable, ...]:
         return (self.name, *sorted((key, value) for key, value in self.values.items() if not key.endswith(".delay")))
 
     @classmethod
-    def plausible(cls, values):
+    def plausible(cls, values: dict[str, float]) -> bool:
         return super().plausible(values) and all(values[key] >= 0.0 for key in values if key.endswith(".delay"))
 
-    def _blocked(self, samples, rows, anchor):
+    def _blocked(self, samples: Samples, rows: np.ndarray, anchor: str) -> np.ndarray:
         """(k * n,) bool"""
         get = self.values.get
         since = tile(samples, samples.t) - samples.start
@@ -66,17 +75,17 @@ class Nlos(ArrivalEffect):
             blocked &= tile(samples, near)
         return blocked
 
-    def delays(self, samples, rows):
+    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
         keys = [key for key in self.values if key.endswith(".delay")]
         return self.delay_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
 
-    def delay_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         out = np.zeros((len(rows), len(keys)))
         for column, key in enumerate(keys):
             out[:, column] = self._blocked(samples, rows, key.partition(".")[0])
         return out
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         out = []
         for anchor, delay in sorted(self._significant_delays().items(), key=lambda item: -item[1]):
             late = measured(delay, self.std.get(f"{anchor}.delay"), "m")
@@ -90,28 +99,28 @@ class Nlos(ArrivalEffect):
                 out.append(f"Look what stood between anchor {anchor} and the tag{when}: it was heard {late} late.")
         return tuple(out)
 
-    def marks(self, anchors):
+    def marks(self, anchors: Anchors) -> tuple[Region, ...]:
         return tuple(
             Region(int(anchor), self._centre(anchor), self.values[f"{anchor}.radius"])
             for anchor in self._significant_delays()
             if f"{anchor}.radius" in self.values
         )
 
-    def _significant_delays(self):
+    def _significant_delays(self) -> dict[str, float]:
         """{anchor: delay}, m."""
         delays = {key: value for key, value in significant(self).items() if key.endswith(".delay")}
         return {key.partition(".")[0]: value for key, value in delays.items()}
 
-    def _centre(self, anchor):
+    def _centre(self, anchor: str) -> np.ndarray:
         """(3,) m"""
         return np.array([self.values.get(f"{anchor}.{axis}", 0.0) for axis in "xyz"])
 
-    def _place(self, anchor):
+    def _place(self, anchor: str) -> str:
         if f"{anchor}.radius" not in self.values:
             return ""
         return "({:.1f}, {:.1f}, {:.1f}) m".format(*self._centre(anchor))
 
-    def _time(self, anchor):
+    def _time(self, anchor: str) -> str:
         """In words, with a space before them; "" without limits."""
         start, end = (self.values.get(f"{anchor}.{part}") for part in ("start", "end"))
         limits = [

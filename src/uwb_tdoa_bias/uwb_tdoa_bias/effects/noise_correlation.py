@@ -1,10 +1,18 @@
 """Errors that outlast one measurement."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .base import Effect
+
+if TYPE_CHECKING:
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight
+    from .samples import Samples
 
 
 class NoiseCorrelation(Effect):
@@ -24,13 +32,13 @@ class NoiseCorrelation(Effect):
     fitted = False
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("std", "time")]
 
-    def noise_std(self, samples):
+    def noise_std(self, samples: Samples) -> np.ndarray:
         return np.full(len(samples), np.sqrt(2.0) * abs(self.values.get("std", 0.0)))
 
-    def inject(self, flight, rng=None):
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         rng, tdoa = rng or np.random.default_rng(), flight.tdoa
         std, time, step = self.values.get("std", 0.0), max(self.values.get("time", 0.5), 1e-3), 0.01
         if len(tdoa) == 0:
@@ -46,5 +54,5 @@ class NoiseCorrelation(Effect):
         error = np.where((a >= 0) & (b >= 0), std * (process[rows, b] - process[rows, a]), 0.0)
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + error))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         return ()  # multipath is everywhere; the filter is told

@@ -1,12 +1,20 @@
 """One pair is noisier than the others."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .base import Effect
 from .pair_offset import PairOffset, link_keys
 from .wording import listed, significant, size
+
+if TYPE_CHECKING:
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight
+    from .samples import Samples
 
 
 class NoiseLevel(Effect):
@@ -27,11 +35,11 @@ class NoiseLevel(Effect):
     check_key = PairOffset.check_key
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         keys = link_keys(pairs)
         return [keys, *((key,) for key in keys)]
 
-    def noise_std(self, samples):
+    def noise_std(self, samples: Samples) -> np.ndarray:
         a, b = samples.anchors.ids[samples.a], samples.anchors.ids[samples.b]
         variance = np.zeros(len(samples))
         for key, value in self.values.items():
@@ -39,7 +47,7 @@ class NoiseLevel(Effect):
             variance += value**2 * (((a == i) & (b == k)) | ((a == k) & (b == i)))
         return np.sqrt(variance)
 
-    def inject(self, flight, rng=None):
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         from .samples import Samples
 
         tdoa, n = flight.tdoa, len(flight.tdoa)
@@ -48,7 +56,7 @@ class NoiseLevel(Effect):
         rng = rng or np.random.default_rng()
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + self.noise_std(samples) * rng.standard_normal(n)))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         noisy = [f"those of {key} by {size(self, key)}" for key in significant(self)]
         if not noisy:
             return ()

@@ -1,11 +1,18 @@
 """Some TDOAs are plainly wrong."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .base import Effect
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight
 
 
 class OutlierRate(Effect):
@@ -26,16 +33,16 @@ class OutlierRate(Effect):
     usable = False  # the filter's weights are the remedy
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("share",)]
 
-    def inject(self, flight, rng=None):
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         rng, tdoa = rng or np.random.default_rng(), flight.tdoa
         hit = rng.random(len(tdoa)) < self.values.get("share", 0.0)
         size = np.copysign(rng.uniform(0.5, 5.0, len(tdoa)), rng.uniform(-1.0, 1.0, len(tdoa)))
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + np.where(hit, size, 0.0)))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         share = size(self, "share", "%", 100.0)

@@ -1,10 +1,20 @@
 """An error of the link between two anchors."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.errors import InputError
 from .base import Effect
 from .wording import listed, significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from numpy.typing import ArrayLike
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 
 class PairOffset(Effect):
@@ -25,17 +35,17 @@ class PairOffset(Effect):
     portable = False
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         if len(key.split("-")) != 2 or not all(part.isdigit() for part in key.split("-")):
             raise InputError(f"effects: {cls.name}: parameter {key!r} is not a pair of anchors; write '0-1: 0.05'.")
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         keys = link_keys(pairs)
         return [keys, *((key,) for key in keys)]
 
-    def bias(self, samples):
-        table = {}
+    def bias(self, samples: Samples) -> np.ndarray:
+        table: dict[tuple[int, int], float] = {}
         for key, value in self.values.items():
             a, b = map(int, key.split("-"))
             table[a, b] = table.get((a, b), 0.0) + value
@@ -47,12 +57,12 @@ class PairOffset(Effect):
                 offsets[rows[a], rows[b]] = value
         return offsets[samples.a, samples.b]
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         a, b = samples.anchors.ids[samples.a], samples.anchors.ids[samples.b]
         links = [tuple(map(int, key.split("-"))) for key in keys]
         return np.stack([1.0 * ((a == i) & (b == k)) - ((a == k) & (b == i)) for i, k in links], axis=1)
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         off = [
             f"the TDOA of {key} is {size(self, key)} too {'large' if value > 0.0 else 'small'}"
             for key, value in significant(self).items()
@@ -63,9 +73,9 @@ class PairOffset(Effect):
         return (f"Let anchors {links} measure the time of flight between them again: {listed(off)}.",)
 
 
-def link_keys(pairs):
+def link_keys(pairs: ArrayLike | None) -> tuple[str, ...]:
     """Names of the links that were heard, each once, in the direction that was heard more or first."""
-    keys = []
+    keys: list[str] = []
     for a, b in [] if pairs is None else np.asarray(pairs).tolist():
         if f"{b}-{a}" not in keys and f"{a}-{b}" not in keys:
             keys.append(f"{a}-{b}")

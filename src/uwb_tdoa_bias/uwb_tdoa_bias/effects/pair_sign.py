@@ -1,5 +1,7 @@
 """The TDOAs of some pairs are subtracted the wrong way round."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from .label_error import LabelEffect
@@ -22,24 +24,24 @@ class PairSign(LabelEffect):
     expected = "-1 for the other sign, or 1"
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         PairOffset.check_key(key)
 
     @staticmethod
-    def possible(value):
+    def possible(value: float) -> bool:
         return value in (-1.0, 1.0)
 
-    def relabelled(self, a, b, d):
+    def relabelled(self, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         sign = np.ones(len(d))
         for key, value in self.values.items():
             one, two = map(int, key.split("-"))
             sign[(np.asarray(a) == one) & (np.asarray(b) == two)] *= value
         return a, b, sign * d
 
-    def mislabelled(self, a, b, d):
+    def mislabelled(self, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.relabelled(a, b, d)
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         wrong = [key for key, value in self.values.items() if value < 0.0]
         if not wrong:
             return ()

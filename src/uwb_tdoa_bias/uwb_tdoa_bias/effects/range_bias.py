@@ -1,10 +1,19 @@
 """The error of an arrival grows with the square of the range."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .base import ArrivalEffect
 from .samples import tile
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 EXAMPLES = 4.0, 8.0  # m, distances that advice names
 
@@ -28,17 +37,17 @@ class RangeBias(ArrivalEffect):
     reference = "Decawave APS011: the range error is a bent function of received power, hence of range"
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("quadratic",)]
 
-    def delays(self, samples, rows):
+    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
         return self.values.get("quadratic", 0.0) * self.delay_regressors(samples, rows, ("quadratic",))[:, 0]
 
-    def delay_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
         return np.repeat(np.sum(to_anchor**2, axis=1)[:, None], len(keys), axis=1)
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         sign = "far" if self.values["quadratic"] > 0.0 else "near"

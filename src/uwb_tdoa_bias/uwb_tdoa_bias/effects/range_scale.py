@@ -1,10 +1,19 @@
 """All ranges are too long by one factor."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.geometry import tdoa
 from .base import Effect
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 
 class RangeScale(Effect):
@@ -24,16 +33,16 @@ class RangeScale(Effect):
     reference = "DW1000 user manual: one tick is 15.65 ps, 4.69 mm"
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("scale",)]
 
-    def bias(self, samples):
+    def bias(self, samples: Samples) -> np.ndarray:
         return self.values.get("scale", 0.0) * tdoa(samples.p, samples.position_a, samples.position_b)
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         return np.repeat(tdoa(samples.p, samples.position_a, samples.position_b)[:, None], len(keys), axis=1)
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         sign = "large" if self.values["scale"] > 0.0 else "small"

@@ -1,11 +1,20 @@
 """The DW1000's range error over received power."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.radio import NOMINAL_GAIN, RadioLink, power_bias, received_power_dbm
 from .base import ArrivalEffect
 from .samples import tile
 from .wording import measured, significant
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 LINK = RadioLink()
 
@@ -28,13 +37,13 @@ class ReceivedPowerBias(ArrivalEffect):
     uses_attitude = True
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("scale",)]
 
-    def delays(self, samples, rows):
+    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
         return self.values.get("scale", 0.0) * self.delay_regressors(samples, rows, ("scale",))[:, 0]
 
-    def delay_regressors(self, samples, rows, keys):
+    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         anchors = samples.anchors
         power = received_power_dbm(
             tile(samples, samples.p),
@@ -51,7 +60,7 @@ class ReceivedPowerBias(ArrivalEffect):
         late = np.where(np.isfinite(power), power_bias(power), np.nan)
         return np.repeat(late[:, None], len(keys), axis=1)
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         scale = measured(self.values["scale"], self.std.get("scale"))

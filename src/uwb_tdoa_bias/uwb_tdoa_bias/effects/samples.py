@@ -1,8 +1,10 @@
 """A batch of measurements with the motion of the tag, as effects see it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar, Protocol, TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +12,9 @@ from ..foundation.anchors import Anchors
 from ..foundation.later import rotations
 from ..foundation.sensors import SENSORS
 from .motion import POSE_LAG, Motion, motion_at, preceding
+
+if TYPE_CHECKING:
+    from ..foundation.flight import Flight
 
 STEP = 0.1  # s over which the velocity at an instant is taken
 
@@ -40,40 +45,41 @@ class Samples:
     interval: np.ndarray | None = None
     previous: np.ndarray | None = None
     vibration: np.ndarray | None = None
-    extra: dict | None = None
+    extra: dict[str, np.ndarray] | None = None
     yaw_std: np.ndarray | None = None
 
     channel: ClassVar[str] = "tdoa"
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.t)
 
-    def repeated(self, times):
+    def repeated(self, times: int) -> Samples:
         """Samples of the same TDOAs, all of them so many times one after the other."""
-        kept = {"anchors": self.anchors, "start": self.start}
+        kept: dict[str, Any] = {"anchors": self.anchors, "start": self.start}
         return Samples(**{name: _repeated(value, times) for name, value in vars(self).items() if name not in kept}, **kept)
 
-    def until(self, t):
+    def until(self, t: float) -> Samples:
         """Samples as if none were later than t, s."""
         return replace(self, t=np.minimum(self.t, t))
 
     @property
-    def position_a(self):
+    def position_a(self) -> np.ndarray:
         """(n, 3) antennas of the first anchors, m."""
         return self.anchors.positions[self.a]
 
     @property
-    def position_b(self):
+    def position_b(self) -> np.ndarray:
         """(n, 3) antennas of the second anchors, m."""
         return self.anchors.positions[self.b]
 
 
-def tile(samples, values):
+def tile(samples: Samples, values: np.ndarray) -> np.ndarray:
     """Per-sample values (n, ...) repeated for both anchors: (2n, ...)."""
     return np.concatenate([values, values])
 
 
-def _repeated(value, times):
+def _repeated(value: Any, times: int) -> Any:
+    """A field of Samples, an array, a Motion, a dict of arrays or None, as of repeated ones."""
     if value is None:
         return None
     if isinstance(value, dict):
@@ -104,9 +110,9 @@ class ImuSamples:
     up: np.ndarray
     features: np.ndarray
     motion: Motion
-    extra: dict | None = None
+    extra: dict[str, np.ndarray] | None = None
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.t)
 
 
@@ -130,15 +136,28 @@ class AidSamples:
     motion: Motion
     vibration: np.ndarray | None = None
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.t)
+
+
+class Poses(Protocol):
+    """t : (m,) s; p : (m, 3) m, world; q : (m, 4) x y z w, body to world, NaN where not known."""
+
+    @property
+    def t(self) -> np.ndarray: ...
+
+    @property
+    def p(self) -> np.ndarray: ...
+
+    @property
+    def q(self) -> np.ndarray: ...
 
 
 class Track:
     """Poses, to be asked at any stamp: positions interpolated linearly, attitudes on the great circle."""
 
-    def __init__(self, poses):
-        """poses : Truth, or anything with t (m,), p (m, 3), q (m, 4). Beyond its ends the nearest pose counts."""
+    def __init__(self, poses: Poses) -> None:
+        """poses : a Truth, say. Beyond its ends the nearest pose counts."""
         self.t, first = np.unique(poses.t, return_index=True)
         self.p, self.q = poses.p[first], poses.q[first]
         known = np.isfinite(self.q).all(axis=1)
@@ -147,28 +166,31 @@ class Track:
             self._turn = rotations.Slerp(self.t[known], rotations.Rotation.from_quat(self.q[known]))
             self._ends = self.t[known][0], self.t[known][-1]
 
-    def positions(self, t):
+    def positions(self, t: np.ndarray) -> np.ndarray:
         """(n, 3) m at stamps t (n,), s."""
         return np.stack([np.interp(t, self.t, self.p[:, k]) for k in range(3)], axis=1)
 
-    def attitudes(self, t):
+    def attitudes(self, t: np.ndarray) -> np.ndarray:
         """(n, 4) x y z w, body to world, at stamps t (n,), s; NaN where none is known."""
         return np.full((len(t), 4), np.nan) if self._turn is None else self._turn(np.clip(t, *self._ends)).as_quat()
 
-    def velocities(self, t):
+    def velocities(self, t: np.ndarray) -> np.ndarray:
         """(n, 3) m/s, world, at stamps t (n,), s."""
         return (self.positions(t + 0.5 * STEP) - self.positions(t - 0.5 * STEP)) / STEP
 
-    def motion(self, t):
+    def motion(self, t: np.ndarray) -> Motion:
         """Motion up to the last pose no later than t (n,), s."""
         return motion_at(self.t, self._own_velocities, self.q, np.searchsorted(self.t, t, side="right") - 1)
 
     @cached_property
-    def _own_velocities(self):
+    def _own_velocities(self) -> np.ndarray:
         return self.velocities(self.t)
 
 
-def samples_at(t, a, b, poses, anchors, start=0.0, motion=True, lag=POSE_LAG):
+def samples_at(
+    t: np.ndarray, a: np.ndarray, b: np.ndarray, poses: Poses, anchors: Anchors, start: float = 0.0,
+    motion: bool = True, lag: float = POSE_LAG,
+) -> Samples:  # fmt: skip
     """Samples of TDOAs (t, a, b as in Samples, t in the order of arrival) at poses, as of a Track.
 
     motion : give velocity and motion too, the latter up to the pose that a node would have, `lag` s old.
@@ -180,16 +202,19 @@ def samples_at(t, a, b, poses, anchors, start=0.0, motion=True, lag=POSE_LAG):
     return replace(samples, velocity=track.velocities(t), motion=track.motion(preceding(t) - lag))
 
 
-def true_samples(flight):
+def true_samples(flight: Flight) -> tuple[Samples, np.ndarray]:
     """(Samples, rows): the usable TDOAs of a Flight at its ground truth, and which rows of flight.tdoa they are."""
     tdoa = flight.tdoa
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
     rows = np.flatnonzero((a >= 0) & (b >= 0) & (a != b) & np.isfinite(tdoa.d) & np.isfinite(tdoa.t))
     start = float(tdoa.t[0]) if len(tdoa) else 0.0
-    return samples_at(tdoa.t[rows], a[rows], b[rows], flight.truth, flight.anchors, start), rows
+    truth: Any = flight.truth  # who asks has seen that there is one
+    return samples_at(tdoa.t[rows], a[rows], b[rows], truth, flight.anchors, start), rows
 
 
-def aid_samples(stream, t, track, start=0.0, vibration=None):
+def aid_samples(
+    stream: str, t: np.ndarray, track: Track, start: float = 0.0, vibration: np.ndarray | None = None
+) -> AidSamples:
     """AidSamples of a stream at stamps t (n,), s, of a Track. start, vibration : see there."""
     before, reading, after = (SENSORS[stream].compared.reading(track, t + late) for late in (-0.5 * STEP, 0.0, 0.5 * STEP))
     change = (after - before) / STEP
@@ -198,6 +223,6 @@ def aid_samples(stream, t, track, start=0.0, vibration=None):
     )
 
 
-def _up(track, t):
+def _up(track: Track, t: np.ndarray) -> np.ndarray:
     q = track.attitudes(t)
     return 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)

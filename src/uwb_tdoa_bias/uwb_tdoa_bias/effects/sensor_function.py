@@ -1,8 +1,14 @@
 """What an inertial sensor reads beside the truth, as a function of where the filter is: a table that compiled code looks up."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 STEPS = 256  # of a table
 
@@ -21,7 +27,10 @@ class SensorFunction:
     periodic: bool = False
 
     @classmethod
-    def of(cls, function, channel, covariate, low, high, periodic=False):
+    def of(
+        cls, function: Callable[[np.ndarray], np.ndarray], channel: str, covariate: str, low: float, high: float,
+        periodic: bool = False,
+    ) -> SensorFunction:  # fmt: skip
         """Of a function of the covariate, (n,) to (n,); channel : "gyro.x" ... "accel.z"."""
         sensor, _, axis = channel.partition(".")
         return cls(sensor, "xyz".index(axis), covariate, low, high, function(np.linspace(low, high, STEPS + 1)), periodic)

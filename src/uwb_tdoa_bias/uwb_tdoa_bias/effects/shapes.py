@@ -1,6 +1,13 @@
 """Functions of a covariate with few coefficients: each has a level of its own, c0, and is held constant beyond its knots."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 # {shape: (knots, coefficients)}: low and high end, between them where something begins or ends; of a wave one period.
 SHAPES = {
@@ -8,7 +15,7 @@ SHAPES = {
 }  # fmt: skip
 
 
-def functions(shape, knots, values):
+def functions(shape: str, knots: Sequence[float], values: np.ndarray) -> np.ndarray:
     """The functions that the coefficients multiply, at covariate values (n,): (n, k); NaN stays NaN.
 
     line : 1 and what rises from -1/2 to 1/2 between the knots; beyond, below : 1 and what rises from 0 at the middle knot

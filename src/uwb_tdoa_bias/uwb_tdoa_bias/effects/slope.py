@@ -5,28 +5,37 @@ as long as the filter may be off (Sarkka, Bayesian Filtering and Smoothing, 2013
 divided-difference filter, Norgaard, Poulsen and Ravn, Automatica 2000).
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .domain import faded
 from .motion import Motion
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from .base import Effect
+    from .samples import Samples
+
 REACH = 0.3  # m and m/s to either side
 N_STATES = 6  # position and velocity of the tag, world axes
 
 
-def slope_of(effects, samples):
+def slope_of(effects: Iterable[Effect], samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(bias (n,) m, slope (n, 6), m per m of position and per m/s of velocity, deviation from it (n,) m) of the sum of those Effects
     that have `states`, at Samples; 0 where it cannot be told."""
-    n, groups = len(samples), {}
+    groups: dict[tuple[int, ...], list[Effect]] = {}
+    n = len(samples)
     bias, slope, power = np.zeros(n), np.zeros((n, N_STATES)), np.zeros(n)
     for effect in effects:
         if effect.states:
             groups.setdefault(effect.states, []).append(effect)
     for states, alike in groups.items():
         moved = _moved(samples, states)
-        here, *sides = sum(_known(faded(effect, moved)[0]) for effect in alike).reshape(-1, n)
+        here, *sides = sum((_known(faded(effect, moved)[0]) for effect in alike), np.zeros(len(moved))).reshape(-1, n)
         bias += here
         for k, (down, up) in zip(states, zip(sides[::2], sides[1::2])):
             slope[:, k] += (up - down) / (2.0 * REACH)
@@ -34,20 +43,21 @@ def slope_of(effects, samples):
     return bias, slope, np.sqrt(power)
 
 
-def _known(bias):
+def _known(bias: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(bias), bias, 0.0)
 
 
-def state_of(samples):
+def state_of(samples: Samples) -> np.ndarray:
     """Position and velocity that Samples are at: (n, 6) m, m/s; 0 for what is not known."""
     velocity = np.zeros_like(samples.p) if samples.motion is None else samples.motion.velocity
     return np.nan_to_num(np.hstack([samples.p, velocity]))
 
 
-def _moved(samples, states):
+def _moved(samples: Samples, states: tuple[int, ...]) -> Samples:
     """The Samples, and all of them with each of some states less and more by REACH, one after the other."""
     n, out = len(samples), samples.repeated(1 + 2 * len(states))
-    position, velocity = out.p.copy(), None if out.motion is None else out.motion.velocity.copy()
+    position = out.p.copy()
+    velocity = np.zeros_like(position) if out.motion is None else out.motion.velocity.copy()
     for number, state in enumerate(states):
         of = position if state < 3 else velocity
         for side, step in enumerate((-REACH, REACH)):

@@ -1,8 +1,10 @@
 """An effect without a name: a smooth function of something, found in residuals."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar, TYPE_CHECKING
 import warnings
 
 import numpy as np
@@ -17,6 +19,12 @@ from .covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_STA
 from .sensor_function import SensorFunction
 from .shapes import SHAPES, functions
 from .smooth_words import sentences
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from numpy.typing import ArrayLike
+    from ..foundation.anchors import Anchors
+    from .samples import AidSamples, ImuSamples, Samples
 
 DEGREE = 2
 GONE = 4 * FADE  # share of the width of a domain beyond which nothing is left of a function
@@ -45,7 +53,7 @@ class SmoothTerm(Effect):
     channel: str = "tdoa"
     covariate: str = "time"
     form: str = "common"
-    knots: tuple = field(default_factory=tuple)
+    knots: tuple[float, ...] = field(default_factory=tuple)
     shape: str = "spline"
 
     name: ClassVar[str] = "smooth_term"
@@ -59,7 +67,7 @@ class SmoothTerm(Effect):
     reference: ClassVar[str] = "found in residuals by diagnose"
     fitted: ClassVar[bool] = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.covariate in OLD_NAMES:
             warnings.warn(f"effects: smooth_term: covariate {self.covariate} is now {OLD_NAMES[self.covariate]}", FutureWarning)
             self.covariate = OLD_NAMES[self.covariate]
@@ -77,9 +85,10 @@ class SmoothTerm(Effect):
                 f"effects: smooth_term: no {self.form!r} function of {self.covariate!r} acts on {self.channel!r}."
             )
         if self.shape != "spline" and SHAPES.get(self.shape, (0,))[0] != len(self.knots):
-            known = ", ".join(f"{shape} ({count})" for shape, (count, _) in SHAPES.items())
+            shapes = ", ".join(f"{shape} ({count})" for shape, (count, _) in SHAPES.items())
             raise InputError(
-                f"effects: smooth_term: shape: {self.shape!r} with {len(self.knots)} knots is not spline or one of {known}."
+                f"effects: smooth_term: shape: {self.shape!r} with {len(self.knots)} knots is not spline or one of "
+                f"{shapes}."
             )
         if self.form in OF_LINKS and self.covariate in OF_ARRIVAL:
             raise InputError(
@@ -88,61 +97,62 @@ class SmoothTerm(Effect):
         super().__post_init__()
 
     @classmethod
-    def plausible(cls, values):
+    def plausible(cls, values: dict[str, float]) -> bool:
         return True
 
     @classmethod
-    def check_key(cls, key):
+    def check_key(cls, key: str) -> None:
         if not key.rpartition(".")[2].removeprefix("c").isdigit():
             raise InputError(f"effects: smooth_term: parameter {key!r} is not a coefficient such as c0 or 3.c0.")
 
-    def typical_of(self, key):
+    # In other effects the following are of the class; here they follow from the settings of each term.
+    def typical_of(self, key: str) -> float:  # type: ignore[override]  # of a term
         if self.shape != "spline" or self.form in OF_LINKS:
             return ALONE if self.channel == "tdoa" else TYPICAL.get(self.channel.partition(".")[0], self.typical)
         return 0.5 * self.typical if "." in key else self.typical  # a function for each anchor: many, hence small
 
     @property
-    def channels(self):
+    def channels(self) -> tuple[str, ...]:  # type: ignore[override]  # of a term
         """Where it acts."""
         return (self.channel.partition(".")[0],)
 
-    def label_of(self, keys):
+    def label_of(self, keys: Iterable[str]) -> str:
         parts = list(dict.fromkeys(key.rpartition(".")[0] for key in keys))
         of = f" of {self.form} {parts[0]}" if len(parts) == 1 and parts[0] else ""
         return f"{self.channel}{of} over {self.covariate}"
 
     @property
-    def covariates(self):
+    def covariates(self) -> tuple[str, ...]:  # type: ignore[override]  # of a term
         return (self.covariate,) if bounded(self.covariate) else ()
 
     @property
-    def uses_attitude(self):
+    def uses_attitude(self) -> bool:  # type: ignore[override]  # of a term
         return self.covariate.endswith("_in_tag") or self.covariate == "tilt"
 
     @property
-    def states(self):
+    def states(self) -> tuple[int, ...]:
         return STATES.get(self.covariate, ()) if self.channel == "tdoa" else ()
 
     @property
-    def needs_motion(self):
+    def needs_motion(self) -> bool:  # type: ignore[override]  # of a term
         return self.channel == "tdoa" and self.covariate in OF_MOTION
 
     @property
-    def usable(self):
+    def usable(self) -> bool:  # type: ignore[override]  # of a term
         """Whether the nodes, and the filter off line, have the covariate at hand."""
         if self.channel == "tdoa":
             return self.covariate in (*OF_TDOA, *OF_ARRIVAL) and self.covariate != "vibration"
         return self.channel in IMU_CHANNELS and self.covariate in (*OF_IMU, *OF_STATE)
 
-    def keys(self, anchors=None):
+    def keys(self, anchors: Anchors | None = None) -> tuple[str, ...]:
         """All coefficients: of every anchor for the form "anchor"."""
         return self.keys_of(known_anchors(anchors)) if self.form == "anchor" else self.keys_of(("",))
 
-    def keys_of(self, parts):
+    def keys_of(self, parts: Iterable[str]) -> tuple[str, ...]:
         """All coefficients of some anchors "3" or pairs "0-1": tuple."""
         return tuple(f"{part}.c{k}".lstrip(".") for part in parts for k in range(self.count))
 
-    def basis(self, values):
+    def basis(self, values: ArrayLike) -> np.ndarray:
         """The functions that the coefficients c0, c1, ... multiply, at covariate values (n,): (n, k), NaN stays NaN."""
         values = np.asarray(values, dtype=float)
         if self.shape != "spline":
@@ -153,29 +163,29 @@ class SmoothTerm(Effect):
         _basis(self._at, values, out)
         return out
 
-    def curve(self, values, prefix=""):
+    def curve(self, values: np.ndarray, prefix: str = "") -> np.ndarray:
         """The function at covariate values (n,): (n,). prefix : "3." for that of anchor 3 of the form "anchor"."""
         weights = np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)]])
         return self._functions(values, weights, np.zeros(len(values), dtype=np.int64))
 
-    def spread(self, values, prefix=""):
+    def spread(self, values: np.ndarray, prefix: str = "") -> np.ndarray:
         """Standard deviation of what `curve` gives beside a level, (n,), as if its coefficients were independent."""
         std = np.array([self.std.get(f"{prefix}c{k}", 0.0) for k in range(self.count)])
         std[0] *= self.shape == "spline"  # else the level
         return np.sqrt(self.basis(values) ** 2 @ std**2)
 
     @cached_property
-    def _at(self):
+    def _at(self) -> np.ndarray:
         return np.array(self.knots, dtype=float)
 
     @property
-    def count(self):
+    def count(self) -> int:
         """Coefficients of each function."""
         if self.shape != "spline":
             return SHAPES[self.shape][1]
         return len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
 
-    def _functions(self, values, weights, rows):
+    def _functions(self, values: np.ndarray, weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Functions with weights (m, k) at values (n,), each that of its row (n,): (n,)."""
         if self.shape != "spline" or self.covariate in CATEGORIES:
             return np.einsum("nk,nk->n", self.basis(values), weights[rows])
@@ -184,12 +194,12 @@ class SmoothTerm(Effect):
         return out
 
     @once_per_anchors
-    def _weights(self, anchors):
+    def _weights(self, anchors: Anchors) -> np.ndarray:
         """Coefficients of every anchor's function, (m, k); zero for an anchor without one."""
         prefixes = [f"{i}." if self.form == "anchor" else "" for i in known_anchors(anchors)]
         return np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)] for prefix in prefixes])
 
-    def _covariate(self, samples):
+    def _covariate(self, samples: Samples) -> tuple[Any, np.ndarray | None]:
         """(values per TDOA or None, values per arrival or None)"""
         if self.covariate in OF_ARRIVAL:
             return None, OF_ARRIVAL[self.covariate](samples, np.concatenate([samples.a, samples.b]))
@@ -199,7 +209,7 @@ class SmoothTerm(Effect):
             values = (samples.extra or {}).get(self.covariate.removeprefix(EXTRA))
         return values, None if values is None else tile(samples, values)
 
-    def bias(self, samples):
+    def bias(self, samples: Samples) -> np.ndarray:
         n = len(samples)
         values, both = self._covariate(samples)
         if self.channel != "tdoa" or both is None:
@@ -212,26 +222,26 @@ class SmoothTerm(Effect):
         late = self._functions(both, self._weights(samples.anchors), np.concatenate([samples.a, samples.b]))
         return late[n:] - late[:n]
 
-    def _of_link(self, samples, link):
+    def _of_link(self, samples: Samples, link: str) -> np.ndarray:
         """By how much the function of the pair "0-1" counts in each d_ab: (n,) 1, -1 or 0."""
         ids, (first, second) = samples.anchors.ids, map(int, link.split("-"))
         a, b = ids[samples.a], ids[samples.b]
         forth = 1.0 * ((a == first) & (b == second))
         return forth - ((a == second) & (b == first)) if self.form == "pair" else forth
 
-    def sensor_bias(self, channel, features):
+    def sensor_bias(self, channel: str, features: np.ndarray) -> np.ndarray | None:
         if channel not in self.channels or self.covariate not in OF_IMU:
             return None
         out, values = np.zeros((len(features), 3)), features[:, OF_IMU.index(self.covariate)]
         out[:, self._axis] = self._faded_curve(values)
         return out
 
-    def _faded_curve(self, values):
+    def _faded_curve(self, values: np.ndarray) -> np.ndarray:
         """`curve`, faded where it was not seen."""
         limits = self.domain.get(self.covariate)
         return self.curve(values) if limits is None else self.curve(values) * share(values, limits)
 
-    def sensor_functions(self):
+    def sensor_functions(self) -> tuple[SensorFunction, ...]:
         if self.channel not in IMU_CHANNELS or self.covariate not in OF_STATE:
             return ()
         low, high = self.domain.get(self.covariate, (self.knots[0], self.knots[-1]))
@@ -240,17 +250,17 @@ class SmoothTerm(Effect):
         return (SensorFunction.of(self._faded_curve, self.channel, self.covariate, low - beyond, high + beyond, periodic),)
 
     @property
-    def _axis(self):
+    def _axis(self) -> int:
         """Place of its axis in what the sensor reads."""
         return "xyz".index(self.channel.partition(".")[2] or "x")
 
-    def uncorrected(self, samples):
+    def uncorrected(self, samples: ImuSamples | AidSamples) -> np.ndarray | float:
         if self.channel in IMU_CHANNELS and self.covariate in OF_IMU:
             return 0.0
         keys = self.keys()
         return self.regressors(samples, keys) @ np.array([self.values.get(key, 0.0) for key in keys])
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
         if samples.channel != "tdoa":
             out = np.zeros((*samples.reading.shape, len(keys)))
             basis = self.basis(sensor_covariate(self.covariate, samples))
@@ -273,18 +283,20 @@ class SmoothTerm(Effect):
             out[:, column] = late[n:] - late[:n]
         return out
 
-    def groups(self, anchors, pairs):
+    def groups(  # type: ignore[override]  # of a term
+        self, anchors: Anchors | None, pairs: np.ndarray | None
+    ) -> list[tuple[str, ...]]:
         keys = self.keys(anchors)
         each = dict.fromkeys(key.rpartition(".")[0] for key in keys)
         alone = [tuple(key for key in keys if key.rpartition(".")[0] == name) for name in each]
         return [keys, *alone] if self.form == "anchor" else [keys]
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         return sentences(self)
 
 
 @compiled
-def _pieces(knots, value):
+def _pieces(knots: np.ndarray, value: float) -> tuple[int, float, float, float]:
     """(number of the first of three quadratic B-splines that are not zero at a value, held at the ends of the knots, and
     their values): de Boor's recursion with clamped ends."""
     last = len(knots) - 1
@@ -306,14 +318,16 @@ def _pieces(knots, value):
 
 
 @compiled
-def _basis(knots, values, out):
+def _basis(knots: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
     for i in range(len(values)):
         piece, first, second, third = _pieces(knots, values[i])
         out[i, piece], out[i, piece + 1], out[i, piece + 2] = first, second, third
 
 
 @compiled
-def _curves(knots, values, weights, rows, out):
+def _curves(
+    knots: np.ndarray, values: np.ndarray, weights: np.ndarray, rows: np.ndarray, out: np.ndarray
+) -> None:
     for i in range(len(values)):
         piece, first, second, third = _pieces(knots, values[i])
         w = weights[rows[i]]

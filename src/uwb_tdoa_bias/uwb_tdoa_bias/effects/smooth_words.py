@@ -1,9 +1,16 @@
 """Functions without a name in words: who is wrong by how much where, what could do such a thing, and which trial tells."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .covariates import EXTRA, UNITS
 from .wording import listed, measured, rounded
+
+if TYPE_CHECKING:
+    from .smooth_term import SmoothTerm
 
 AXES = {"gyro": "the gyroscope reads {} about {}", "accel": "the accelerometer reads {} along {}"}
 SENSOR_UNITS = {"gyro": "rad/s", "accel": "m/s^2"}
@@ -43,7 +50,7 @@ _SENSOR_CAUSES = {
 }  # fmt: skip
 
 
-def described(term, part=""):
+def described(term: SmoothTerm, part: str = "") -> str:
     """The function of an anchor "3", a pair "0-1" or of all, "", as a sentence without its end."""
     prefix = f"{part}." if part else ""
     name, unit = _named(term.covariate), UNITS.get(term.covariate, "")
@@ -72,7 +79,7 @@ def described(term, part=""):
     return _off(term, part, swing, None, f"{where}{seen}")
 
 
-def causes(term):
+def causes(term: SmoothTerm) -> tuple[str, str]:
     """(what could do such a thing, which trial tells)."""
     sensor = term.channel.partition(".")[0]
     if term.covariate.startswith(EXTRA):
@@ -85,7 +92,7 @@ def causes(term):
     raise AssertionError
 
 
-def sentences(term):
+def sentences(term: SmoothTerm) -> tuple[str, ...]:
     """What a person should look for: (sentence, ...)."""
     parts = list(dict.fromkeys(key.rpartition(".")[0] for key in term.values))
     if len(parts) > 3 or not parts:
@@ -95,15 +102,15 @@ def sentences(term):
     return (f"Look for why {said}: {cause}. To tell: {trial}.",)
 
 
-def _named(covariate):
+def _named(covariate: str) -> str:
     return covariate.removeprefix(EXTRA).replace("_", " ").replace(".", " ")
 
 
-def _where(name, over, during):
+def _where(name: str, over: str, during: str) -> str:
     return during if name == "time" else f"where {name} is {over}"
 
 
-def _kind(covariate):
+def _kind(covariate: str) -> str:
     if covariate in ("time", "vibration"):
         return covariate
     if covariate.startswith("rate") or covariate == "turning_rate":
@@ -111,7 +118,7 @@ def _kind(covariate):
     return "force" if covariate.startswith("accel") and covariate != "acceleration" else "motion"
 
 
-def _off(term, part, value, std, how):
+def _off(term: SmoothTerm, part: str, value: float, std: float | None, how: str) -> str:
     sensor, _, axis = term.channel.partition(".")
     if sensor in SENSOR_UNITS:
         amount = f"{measured(abs(value), std, SENSOR_UNITS[sensor])} too {'much' if value > 0.0 else 'little'}"

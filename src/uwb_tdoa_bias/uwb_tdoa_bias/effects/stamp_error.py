@@ -1,8 +1,16 @@
 """What the effects on stamps share: a stream is stamped some seconds after the instant it was taken at."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from .base import Effect
+
+if TYPE_CHECKING:
+    import numpy as np
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight
 
 
 class StampEffect(Effect):
@@ -11,17 +19,17 @@ class StampEffect(Effect):
     stream = "tdoa"
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("offset",)]
 
-    def stamp_offset(self, stream):
+    def stamp_offset(self, stream: str) -> float:
         return self.values.get("offset", 0.0) if stream == self.stream else 0.0
 
-    def inject(self, flight, rng=None):
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         return shifted(flight, self.stream, self.stamp_offset(self.stream))
 
 
-def shifted(flight, stream, seconds):
+def shifted(flight: Flight, stream: str, seconds: float) -> Flight:
     """The Flight with `seconds` added to the stamps of a stream, which may be missing."""
     part = getattr(flight, stream)
     return flight if part is None or not seconds else replace(flight, **{stream: replace(part, t=part.t + seconds)})

@@ -1,11 +1,20 @@
 """The tag's antenna is not at the origin of the body frame."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.geometry import rotate_each, tdoa_each, tdoa_jacobian
 from .base import Effect
 from .wording import listed, significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 
 class TagLeverArm(Effect):
@@ -26,25 +35,25 @@ class TagLeverArm(Effect):
     uses_attitude = True
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("x", "y", "z"), ("x",), ("y",), ("z",)]
 
-    def _arm(self):
+    def _arm(self) -> np.ndarray:
         return np.array([self.values.get(key, 0.0) for key in "xyz"])
 
-    def bias(self, samples):
+    def bias(self, samples: Samples) -> np.ndarray:
         out = np.empty(len(samples))
         q = np.ascontiguousarray(samples.q, dtype=float)
         _moved(samples.p, q, self._arm(), samples.a, samples.b, samples.anchors.positions, out)
         return out
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         antenna = samples.p + _rotate(samples.q, self._arm())
         jacobian = tdoa_jacobian(antenna, samples.position_a, samples.position_b)
         axes = np.eye(3)[["xyz".index(key) for key in keys]]
         return np.stack([np.sum(jacobian * _rotate(samples.q, axis), axis=1) for axis in axes], axis=1)
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         arm = {key: f"{size(self, key)} towards {'+' if v > 0.0 else '-'}{key}" for key, v in significant(self).items()}
         if not arm:
             return ()
@@ -55,7 +64,9 @@ class TagLeverArm(Effect):
 
 
 @compiled
-def _moved(p, q, arm, a, b, positions, out):
+def _moved(
+    p: np.ndarray, q: np.ndarray, arm: np.ndarray, a: np.ndarray, b: np.ndarray, positions: np.ndarray, out: np.ndarray
+) -> None:
     antenna, of_body = np.empty((len(p), 3)), np.empty(len(p))
     rotate_each(q, arm, antenna)
     tdoa_each(p + antenna, positions[a], positions[b], out)
@@ -63,7 +74,7 @@ def _moved(p, q, arm, a, b, positions, out):
     out -= of_body
 
 
-def _rotate(q, v):
+def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """R(q) v for (n, 4) quaternions x y z w, NaN where q is NaN; (n, 3)."""
     out = np.empty((len(q), 3))
     rotate_each(np.ascontiguousarray(q, dtype=float), v, out)

@@ -1,5 +1,9 @@
 """The frame of the survey is not quite that of the ground truth."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.geometry import tdoa
@@ -7,6 +11,11 @@ from ..foundation.later import rotations
 from .base import Effect
 from .marks import Shift
 from .wording import listed, measured, significant
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.anchors import Anchors
+    from .samples import Samples
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 DEGREES = 180.0 / np.pi
@@ -32,27 +41,27 @@ class TruthFrame(Effect):
     unused = "whether the survey or the ground truth is turned or shifted nobody can tell, so that nothing goes to the nodes"
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [KEYS, KEYS[:3], KEYS[3:], *((key,) for key in KEYS)]
 
     @classmethod
-    def bound_of(cls, key):
+    def bound_of(cls, key: str) -> float:
         return cls.bound if key in "xyz" else 0.5
 
     @classmethod
-    def typical_of(cls, key):
+    def typical_of(cls, key: str) -> float:
         return cls.typical if key in "xyz" else 0.03
 
-    def _moved(self, anchors):
+    def _moved(self, anchors: Anchors) -> np.ndarray:
         at = np.array([self.values.get(key, 0.0) for key in KEYS])
         return anchors.positions @ rotations.Rotation.from_rotvec(at[3:]).as_matrix().T + at[:3]
 
-    def bias(self, samples):
+    def bias(self, samples: Samples) -> np.ndarray:
         moved = self._moved(samples.anchors)
         after = tdoa(samples.p, moved[samples.a], moved[samples.b])
         return after - tdoa(samples.p, samples.position_a, samples.position_b)
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         out, step = np.empty((len(samples), len(keys))), 1e-5
         for column, key in enumerate(keys):
             here = self.values.get(key, 0.0)
@@ -60,7 +69,7 @@ class TruthFrame(Effect):
             out[:, column] = (ends[1] - ends[0]) / (2.0 * step)
         return out
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         parts = []
         for key in (key for key in KEYS if key in significant(self)):
             factor, unit = (1.0, "m") if key in "xyz" else (DEGREES, "degrees")
@@ -72,6 +81,6 @@ class TruthFrame(Effect):
             f"shifted and turned together by {listed(parts)}.",
         )
 
-    def marks(self, anchors):
+    def marks(self, anchors: Anchors) -> tuple[Shift, ...]:
         by = self._moved(anchors) - anchors.positions
         return tuple(Shift(int(anchor), shift, np.full(3, np.nan)) for anchor, shift in zip(anchors.ids, by))

@@ -1,5 +1,9 @@
 """The stamps of the ground truth are off."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from ..foundation.geometry import tdoa_jacobian
@@ -7,6 +11,10 @@ from ..foundation.sensors import DIAGNOSED
 from .base import need_truth
 from .stamp_error import StampEffect
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.flight import Flight
 
 
 class TruthTimeOffset(StampEffect):
@@ -27,18 +35,18 @@ class TruthTimeOffset(StampEffect):
     portable = False
     channels = ("tdoa", "gyro", *DIAGNOSED)  # on the accelerometer it is less than its vibration
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
         if samples.channel != "tdoa":  # the truth of that stamp is an earlier one: the sensor reads what comes later
             return np.repeat(samples.change[:, :, None], len(keys), axis=2)
         # the tag is already farther on its way than the truth of that stamp says
         jacobian = tdoa_jacobian(samples.p, samples.position_a, samples.position_b)
         return np.repeat(np.sum(jacobian * samples.velocity, axis=1)[:, None], len(keys), axis=1)
 
-    def inject(self, flight, rng=None):
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         need_truth(self, flight)
         return super().inject(flight, rng)
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         sign = "late" if self.values["offset"] > 0.0 else "early"

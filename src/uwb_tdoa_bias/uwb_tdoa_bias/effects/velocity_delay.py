@@ -1,10 +1,19 @@
 """The stamps of the velocity are late."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .aid_error import need_stream
 from .stamp_error import StampEffect
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..foundation.flight import Flight
+    from .samples import AidSamples
 
 
 class VelocityDelay(StampEffect):
@@ -23,14 +32,14 @@ class VelocityDelay(StampEffect):
     reference = "Li and Mourikis, Int. J. Robotics Research 33, 2014: online temporal calibration of camera and IMU"
     channels = ("velocity",)
 
-    def regressors(self, samples, keys):
+    def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
         return np.repeat(-samples.change[:, :, None], len(keys), axis=2)
 
-    def inject(self, flight, rng=None):
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         need_stream(self, flight, self.stream)
         return super().inject(flight, rng)
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         way = "late" if self.values["offset"] > 0.0 else "early"

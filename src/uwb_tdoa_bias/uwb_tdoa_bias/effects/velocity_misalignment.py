@@ -1,12 +1,18 @@
 """The velocity sensor is turned about the vertical axis of the body."""
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from ..foundation.anchors import Anchors
 
 
 class VelocityMisalignment(AidEffect):
@@ -24,15 +30,15 @@ class VelocityMisalignment(AidEffect):
     channels = ("velocity",)
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("yaw",)]
 
-    def aid(self):
+    def aid(self) -> Affine:
         yaw = self.values.get("yaw", 0.0)
         cos, sin = math.cos(yaw), math.sin(yaw)
         return Affine(np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         way = "counterclockwise" if self.values["yaw"] > 0.0 else "clockwise"

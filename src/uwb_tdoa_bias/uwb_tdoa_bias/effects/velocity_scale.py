@@ -1,10 +1,17 @@
 """The velocity is measured with a wrong length."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
 from .wording import significant, size
+
+if TYPE_CHECKING:
+    from ..foundation.anchors import Anchors
 
 
 class VelocityScale(AidEffect):
@@ -23,13 +30,13 @@ class VelocityScale(AidEffect):
     channels = ("velocity",)
 
     @classmethod
-    def groups(cls, anchors, pairs):
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("scale",)]
 
-    def aid(self):
+    def aid(self) -> Affine:
         return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(3), np.zeros(3))
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         way = "fast" if self.values["scale"] > 0.0 else "slow"

@@ -1,6 +1,14 @@
 """The velocity is lost for a while."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from .interval_error import IntervalEffect
+
+if TYPE_CHECKING:
+    import numpy as np
+    from .samples import AidSamples
 
 
 class VelocitySlip(IntervalEffect):
@@ -19,10 +27,10 @@ class VelocitySlip(IntervalEffect):
     reference = "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: non-systematic errors of odometry"
     channels = ("velocity",)
 
-    def per_unit(self, samples):
+    def per_unit(self, samples: AidSamples) -> np.ndarray:
         return -samples.reading
 
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         return tuple(
             f"Look for slip of the wheels or lost features{when}: the velocity was {size} too "
             f"{'small' if value > 0.0 else 'large'}."

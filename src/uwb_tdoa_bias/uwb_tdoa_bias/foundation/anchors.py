@@ -1,7 +1,10 @@
 """Anchors: where the fixed radios are and which way they point."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import yaml
@@ -9,6 +12,10 @@ import yaml
 from .errors import InputError
 from .safe_yaml import read_yaml
 from .version import written_by
+
+if TYPE_CHECKING:
+    from geometry_msgs.msg import Point, Quaternion
+    from numpy.typing import ArrayLike
 
 MOST = 10_000  # anchors, as many as a message holds
 FARTHEST = 1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
@@ -32,7 +39,7 @@ class Anchors:
     orientations: np.ndarray
     frame: str = "map"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         ids = _whole(self.ids)
         positions = np.array(self.positions, dtype=float, order="C")
         orientations = np.array(self.orientations, dtype=float)
@@ -70,46 +77,47 @@ class Anchors:
         rows[ids + 1] = np.arange(n)
         object.__setattr__(self, "_rows", rows)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.ids)
 
-    def row(self, anchor):
+    def row(self, anchor: int) -> int:
         """Row of one id, -1 if it is unknown."""
         return int(self.index(anchor))
 
-    def index(self, ids):
+    def index(self, ids: ArrayLike) -> np.ndarray:
         """Rows of the given ids: int array of the shape of `ids`, -1 where an id is unknown."""
-        return self._rows.take(np.asarray(ids, dtype=np.int64) + 1, mode="clip")
+        rows = self._rows  # type: ignore[attr-defined]  # __post_init__ puts it there: it is no field
+        return rows.take(np.asarray(ids, dtype=np.int64) + 1, mode="clip")
 
-    def at(self, positions):
+    def at(self, positions: np.ndarray) -> Anchors:
         """The same Anchors at other positions, (N, 3) m."""
         return Anchors(self.ids, positions, self.orientations, self.frame)
 
-    def only(self, rows):
+    def only(self, rows: np.ndarray) -> Anchors:
         """Those of some rows."""
         return Anchors(self.ids[rows], self.positions[rows], self.orientations[rows], self.frame)
 
     @classmethod
-    def from_positions(cls, positions, ids=None, frame="map"):
+    def from_positions(cls, positions: ArrayLike, ids: ArrayLike | None = None, frame: str = "map") -> Anchors:
         """Anchors at (N, 3) positions in metres whose orientations are not known. Default ids: 0 ... N-1."""
         positions = np.asarray(positions, dtype=float)
-        ids = np.arange(len(positions)) if ids is None else ids
+        ids = np.arange(len(positions)) if ids is None else np.asarray(ids)
         return cls(ids, positions, np.full((len(positions), 4), np.nan), frame)
 
     @classmethod
-    def from_message(cls, message):
+    def from_message(cls, message: Any) -> Anchors:
         """Anchors of a uwb_tdoa_msgs/AnchorArray, of rclpy or out of a bag. An orientation of (0, 0, 0, 0) is not
         known; without a frame_id the frame is "map". Raises InputError."""
         poses = [anchor.pose for anchor in message.anchors]
         return cls(
-            [anchor.id for anchor in message.anchors],
+            np.array([anchor.id for anchor in message.anchors]),
             np.array([_numbers(pose.position, "xyz") for pose in poses]).reshape(-1, 3),
             np.array([_numbers(pose.orientation, "xyzw") for pose in poses]).reshape(-1, 4),
             message.header.frame_id or "map",
         )
 
     @classmethod
-    def from_yaml(cls, path):
+    def from_yaml(cls, path: str | Path) -> Anchors:
         """Read `frame` and `anchors: {id: {position: [x, y, z], orientation: [x, y, z, w]}}`; raises InputError."""
         content = read_yaml(path)
         entries = content.get("anchors") if isinstance(content, dict) else None
@@ -131,11 +139,11 @@ class Anchors:
             positions.append(position)
             orientations.append(orientation)
         try:
-            return cls(ids, positions, orientations, frame)
+            return cls(np.array(ids), np.array(positions, dtype=float), np.array(orientations, dtype=float), frame)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
-    def to_yaml(self, path):
+    def to_yaml(self, path: str | Path) -> None:
         """Write what `from_yaml` reads."""
         entries = {}
         for i, p, q in zip(self.ids.tolist(), self.positions.tolist(), self.orientations.tolist()):
@@ -144,7 +152,7 @@ class Anchors:
         Path(path).write_text(f"# {written_by()}\n{text}")
 
 
-def _whole(ids):
+def _whole(ids: ArrayLike) -> np.ndarray:
     """(N,) int64. Raises InputError for what is no whole number 0 ... 65535."""
     values = np.asarray(ids).reshape(-1)
     bad = [value for value in values.tolist() if isinstance(value, bool) or not (0 <= value <= 65535) or value % 1]
@@ -153,11 +161,11 @@ def _whole(ids):
     return values.astype(np.int64)
 
 
-def _numbers(message, names):
+def _numbers(message: Point | Quaternion, names: str) -> list[float]:
     return [getattr(message, name) for name in names]
 
 
-def _entry(key, entry):
+def _entry(key: Any, entry: Any) -> tuple[int, list[float], list[float]]:
     """(id, position, orientation) of one entry of a file. Raises ValueError with what is wrong."""
     if isinstance(key, bool) or not str(key).isascii() or not str(key).isdigit():
         raise ValueError(f"the id is {key!r}, not a whole number 0 ... 65535")
@@ -165,7 +173,8 @@ def _entry(key, entry):
         raise ValueError(f"{entry!r} is not an anchor")
     if unknown := [name for name in entry if name not in ("position", "orientation")]:
         raise ValueError(f"{unknown[0]!r} is not one of position, orientation")
-    position, orientation = entry.get("position"), entry.get("orientation")
+    position: Any = entry.get("position")
+    orientation: Any = entry.get("orientation")
     for name, value, count in (("position", position, 3), ("orientation", orientation, 4)):
         numbers = isinstance(value, list) and all(type(number) in (int, float) for number in value)
         if not (numbers and len(value) == count) and not (name == "orientation" and value is None):

@@ -4,13 +4,20 @@ Antenna frame: z along the null axis of the doughnut (the long side of an uprigh
 Azimuth runs from +x through +y, elevation from the xy plane towards +z.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .errors import InputError
 from .later import interpolate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from numpy.typing import ArrayLike
 
 # Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These are not measured
 # numbers: they are drawn in the shape of the plots in the DWM1000 data sheet (an uneven doughnut: 3 dB of ripple around
@@ -38,13 +45,13 @@ class Antenna:
     Where two cuts cross they must agree (to 0.01 dB), or the pattern would jump.
     """
 
-    azimuth: tuple = DWM1000_AZIMUTH
-    elevation_1: tuple = DWM1000_ELEVATION_1
-    elevation_2: tuple = DWM1000_ELEVATION_2
+    azimuth: tuple[float, ...] = DWM1000_AZIMUTH
+    elevation_1: tuple[float, ...] = DWM1000_ELEVATION_1
+    elevation_2: tuple[float, ...] = DWM1000_ELEVATION_2
     gain_offset: float = 0.0
     delay_span: float = 0.15
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         cuts = []  # their gains on the axes
         for name, most in (("gain_offset", LARGEST_GAIN), ("delay_span", 10.0)):
             value = getattr(self, name)
@@ -68,7 +75,7 @@ class Antenna:
                 raise InputError(f"antenna: two cuts cross at {axis} with {one:.2f} and {other:.2f} dBi; make it one.")
 
     @cached_property
-    def _cuts(self):
+    def _cuts(self) -> tuple[Callable[..., np.ndarray], ...]:
         """Gain around each of the cuts, functions of the angle, rad. Not made before they are asked: scipy takes long to load."""
         out = []
         for gains in map(np.asarray, (self.azimuth, self.elevation_1, self.elevation_2)):
@@ -77,16 +84,16 @@ class Antenna:
         return tuple(out)
 
     @cached_property
-    def _peak(self):
+    def _peak(self) -> float:
         fine = np.linspace(0.0, 2.0 * np.pi, 721)
         return float(max(cut(fine).max() for cut in self._cuts))
 
     @property
-    def peak_gain(self):
+    def peak_gain(self) -> float:
         """Largest gain on the three cuts, dBi."""
         return self._peak + self.gain_offset
 
-    def gain(self, direction):
+    def gain(self, direction: ArrayLike) -> np.ndarray:
         """Gain towards `direction`, (..., 3) in the antenna frame, any length: (...) dBi.
 
         Source: eq. 14 of Grasso et al. (Sensors 2022, 22, 9136). Of each elevation cut the side of the direction's own
@@ -106,7 +113,7 @@ class Antenna:
         elevation = along_x * gain_phi_1 + (1.0 - along_x) * gain_phi_2
         return (1.0 - near_plane) * elevation + near_plane * gain_theta + self.gain_offset
 
-    def group_delay(self, direction):
+    def group_delay(self, direction: ArrayLike) -> np.ndarray:
         """How late the antenna is in `direction`, (..., 3) in its frame: (...) metres, 0 ... delay_span.
 
         Own model: of the field that arrives, the share g = 10^((gain - peak gain) / 20) came straight from the antenna
@@ -115,7 +122,7 @@ class Antenna:
         """
         return self.delay_at(self.gain(direction))
 
-    def delay_at(self, gain):
+    def delay_at(self, gain: np.ndarray) -> np.ndarray:
         """`group_delay` of directions with gains (...), dBi: (...) metres."""
         amplitude = 10.0 ** ((gain - self.peak_gain) / 20.0)
         return self.delay_span * np.maximum(1.0 - amplitude, 0.0)

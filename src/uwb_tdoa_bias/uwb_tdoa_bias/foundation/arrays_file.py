@@ -1,7 +1,10 @@
 """Numpy .npz files from anywhere: what their headers claim is compared with the file before memory is taken for it."""
 
+from __future__ import annotations
+
 import io
 import math
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile, ZipFile
 import zlib
 
@@ -10,8 +13,12 @@ import numpy as np
 from .errors import InputError
 from .limits import ARRAYS_BYTES
 
+if TYPE_CHECKING:
+    from pathlib import Path
+    from zipfile import ZipInfo
 
-def read_arrays(path, kinds, what, remedy):
+
+def read_arrays(path: str | Path, kinds: dict[str, str], what: str, remedy: str) -> dict[str, np.ndarray]:
     """{name: array} of an .npz file that `numpy.savez` wrote. Nothing is unpickled.
 
     kinds : {name: letters of `dtype.kind` that are right}; what, remedy : what the file should be, and how it is made.
@@ -30,14 +37,14 @@ def read_arrays(path, kinds, what, remedy):
     raise InputError(f"{path}: is no {what} ({' '.join(reason.split())}); {remedy}.")
 
 
-def _member(file, name):
+def _member(file: ZipFile, name: str) -> ZipInfo:
     try:
         return file.getinfo(name)
     except KeyError:
         raise KeyError(f"it holds no {name}") from None
 
 
-def _array(name, file, member, kinds):
+def _array(name: str, file: ZipFile, member: ZipInfo, kinds: str) -> np.ndarray:
     with file.open(member) as opened:
         data = opened.read(member.file_size + 1)
     stream = io.BytesIO(data)

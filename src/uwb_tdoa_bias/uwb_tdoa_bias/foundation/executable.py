@@ -6,6 +6,8 @@
 Nothing but the standard library is imported here.
 """
 
+from __future__ import annotations
+
 from functools import partial
 import gc
 from importlib import import_module
@@ -13,26 +15,31 @@ import os
 import signal
 import sys
 from threading import Timer
+from typing import Any, TYPE_CHECKING
 
 from .elsewhere import elsewhere
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType, ModuleType
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
 SOON = 0.05  # s, until an interrupt that was lost comes again
 SAID = 1.5  # s of importing after which it is said that something goes on
 
 
-def executable(module):
+def executable(module: str) -> Callable[..., Any]:
     """The entry point of a module with a main(): imports the module when it is called, returns what main returns."""
     return partial(_run, module)
 
 
-def node_executable(module):
+def node_executable(module: str) -> Callable[..., Any]:
     """The same of a node. Its linear algebra, of small matrices, takes one thread: several would wait for each other by
     spinning. In the environment, because libraries that are loaded later read it too; a user's own setting stays."""
     return partial(_run_node, module)
 
 
-def interrupt(number, frame):
+def interrupt(number: int, frame: FrameType | None) -> None:
     """Signal handler: raises KeyboardInterrupt, for good.
 
     What C code calls back cannot raise, and a destructor cannot either: Python tells such an exception on stderr and
@@ -40,7 +47,7 @@ def interrupt(number, frame):
     included, and where it was the KeyboardInterrupt that was lost, SIGINT comes again in a moment.
     """
 
-    def on_lost(lost):
+    def on_lost(lost: sys.UnraisableHookArgs) -> None:
         if lost.exc_type is KeyboardInterrupt:
             signal.setitimer(signal.ITIMER_REAL, SOON)
 
@@ -49,7 +56,7 @@ def interrupt(number, frame):
     raise KeyboardInterrupt
 
 
-def _run(module, *arguments):
+def _run(module: str, *arguments: Any) -> Any:
     name = module.rpartition(".")[2]
     try:
         main = _imported(module).main
@@ -66,13 +73,13 @@ def _run(module, *arguments):
         return INTERRUPTED
 
 
-def _run_node(module, *arguments):
+def _run_node(module: str, *arguments: Any) -> Any:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     gc.disable()  # until the node runs: nothing that is imported is garbage, and searching it is a tenth of a start
     return _run(module, *arguments)
 
 
-def _imported(module):
+def _imported(module: str) -> ModuleType:
     """Import a module, and say that it takes its time where it does. Meanwhile SIGINT ends the process at once: some of what is imported answers a KeyboardInterrupt
     with a traceback or not at all, and there is nothing yet to clean up."""
     before = signal.getsignal(signal.SIGINT)
@@ -89,7 +96,7 @@ def _imported(module):
         signal.signal(signal.SIGINT, before)
 
 
-def _remedy(package):
+def _remedy(package: str) -> str:
     if package.endswith(("_msgs", "_interfaces")) or package in ("rclpy", "ament_index_python", "domain_coordinator"):
         return "source ROS 2 Jazzy and the built workspace, or use ./dev run"
     return "install it with pip"

@@ -1,6 +1,9 @@
 """Flight: the numpy arrays of one recording. Every reader returns one, every tool takes one."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, make_dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +25,7 @@ class Imu:
     gyro: np.ndarray
     accel: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.t)
 
 
@@ -35,13 +38,13 @@ class Tdoas:
     a: np.ndarray
     b: np.ndarray
     d: np.ndarray
-    variance: np.ndarray = None
+    variance: np.ndarray = None  # type: ignore[assignment]  # __post_init__ puts zeros there
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.variance is None:
             object.__setattr__(self, "variance", np.zeros(len(self.t)))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.t)
 
 
@@ -53,11 +56,11 @@ class Truth:
     p: np.ndarray
     q: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.t)
 
 
-_Felt = make_dataclass(
+_Felt: Any = make_dataclass(  # the names of its attributes are those of SENSORS
     "_Felt", [(name, sensor.stream | None, None) for name, sensor in SENSORS.items()], frozen=True, kw_only=True
 )
 
@@ -84,14 +87,18 @@ class Flight(_Felt):
     extra: dict = field(default_factory=dict)
     meta: dict = field(default_factory=dict)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, "name", harmless(self.name))
 
-    def without(self, *streams):
-        """The Flight without some of the streams that may be missing, by their names, e.g. AIDS."""
-        return replace(self, **dict.fromkeys(streams))
+    def replaced(self, **streams: Any) -> Flight:
+        """The Flight with other streams, by their names, or with None instead of these."""
+        return replace(self, **streams)
 
-    def among(self, rows):
+    def without(self, *streams: str) -> Flight:
+        """The Flight without some of the streams that may be missing, by their names, e.g. AIDS."""
+        return self.replaced(**dict.fromkeys(streams))
+
+    def among(self, rows: np.ndarray) -> Flight:
         """The Flight among its anchors of some rows alone, with the TDOAs that are between them."""
         anchors, tdoa = self.anchors.only(rows), self.tdoa
         kept = np.isin(tdoa.a, anchors.ids) & np.isin(tdoa.b, anchors.ids)

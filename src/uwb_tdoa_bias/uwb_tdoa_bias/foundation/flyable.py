@@ -1,11 +1,19 @@
 """The volume in which a tag can be trusted, as `plan` saves it and the filter's node asks for it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from .arrays_file import read_arrays
 from .errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from numpy.typing import ArrayLike
+    from .anchors import Anchors
 
 _FIELDS = {  # of the file, and the kinds of their numbers
     "frame": "U", "lower": "f", "step": "f", "flyable": "b", "bound": "f", "ids": "i", "positions": "f", "planar": "b",
@@ -37,7 +45,7 @@ class FlyableVolume:
     frame: str = "map"
     planar: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         kinds = {"lower": float, "step": float, "flyable": bool, "bound": np.float32, "ids": int, "positions": float}
         for name, kind in kinds.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
@@ -51,18 +59,18 @@ class FlyableVolume:
                 "flyable volume: it holds a number that is not finite, a step that is not above 0 or a bound below 0."
             )
 
-    def contains(self, p):
+    def contains(self, p: ArrayLike) -> np.ndarray:
         """Whether positions p (..., 3), m, are flyable: (...) bool. Nothing is outside of the box or where not
         finite."""
         inside, cell = self._cells(p)
         return inside & self.flyable[cell]
 
-    def bound_at(self, p):
+    def bound_at(self, p: ArrayLike) -> np.ndarray:
         """The bound at positions p (..., 3), m: (...) m, NaN outside of the box."""
         inside, cell = self._cells(p)
         return np.where(inside, self.bound[cell], np.nan)
 
-    def _cells(self, p):
+    def _cells(self, p: ArrayLike) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
         """Whether positions are inside of the box, and the indexes of their cells."""
         p = np.asarray(p, dtype=float)
         at = np.where(np.isfinite(p), (p - self.lower) / self.step, -1.0)
@@ -72,23 +80,24 @@ class FlyableVolume:
         inside = ((cell >= 0) & (cell < self.flyable.shape)).all(axis=-1)
         return inside, tuple(np.moveaxis(np.where(inside[..., None], cell, 0), -1, 0))
 
-    def belongs_to(self, anchors, tolerance=0.1):
+    def belongs_to(self, anchors: Anchors, tolerance: float = 0.1) -> bool:
         """Whether it was computed for these Anchors: the same ids in the same frame, each within `tolerance`, m."""
         rows = anchors.index(self.ids)
         if anchors.frame != self.frame or len(anchors) != len(self.ids) or (rows < 0).any():
             return False
         return bool((np.linalg.norm(anchors.positions[rows] - self.positions, axis=1) <= tolerance).all())
 
-    def save(self, path):
+    def save(self, path: str | Path) -> None:
         """Write what `load` reads: a numpy .npz file."""
         with open(path, "wb") as file:
             np.savez_compressed(file, **{name: getattr(self, name) for name in _FIELDS})
 
     @classmethod
-    def load(cls, path):
+    def load(cls, path: str | Path) -> FlyableVolume:
         """Read a file that `save` wrote; raises InputError."""
         fields = read_arrays(path, _FIELDS, "flyable volume", _REMEDY)
         try:
-            return cls(**{**fields, "frame": str(fields["frame"]), "planar": bool(fields["planar"])})
+            given: dict[str, Any] = {**fields, "frame": str(fields["frame"]), "planar": bool(fields["planar"])}
+            return cls(**given)
         except (TypeError, ValueError, OverflowError) as error:  # InputError is a ValueError
             raise InputError(f"{path}: is no flyable volume ({error}); {_REMEDY}.") from error

@@ -4,6 +4,8 @@ For arrays of any shape with numpy, and once more for a single TDOA in compiled 
 thousand times a second; a test holds them to the same bits.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
@@ -13,7 +15,7 @@ from .compiled import compiled
 _ON_ANTENNA = 1e-9  # m; closer than that, an antenna is in no direction
 
 
-def ranges(p, anchors):
+def ranges(p: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances between tag and anchors, and their derivatives with respect to the tag's position.
 
     p, anchors : (..., 3) m, one frame. Returns (...) m, and (..., 3) unit vectors from anchor to tag, zero where the
@@ -24,7 +26,7 @@ def ranges(p, anchors):
     return distance, delta / np.where(distance > _ON_ANTENNA, distance, np.inf)[..., None]
 
 
-def tdoa(p, a, b):
+def tdoa(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Difference of the distances to two anchors, d_ab = |p - b| - |p - a|.
 
     Parameters: p, a, b : (..., 3) positions of tag and anchors in one frame, metres. Returns (...) metres.
@@ -33,13 +35,13 @@ def tdoa(p, a, b):
     return np.linalg.norm(p - b, axis=-1) - np.linalg.norm(p - a, axis=-1)
 
 
-def tdoa_jacobian(p, a, b):
+def tdoa_jacobian(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Derivative of `tdoa` with respect to p: (..., 3), no unit. Zero where the tag sits on an antenna."""
     return ranges(p, b)[1] - ranges(p, a)[1]
 
 
 @compiled
-def tdoa_each(p, a, b, out):
+def tdoa_each(p: np.ndarray, a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
     """`tdoa` (n,) m of p, a, b (n, 3), compiled: for arrays so short that what numpy takes for each operation is most of it."""
     for i in range(len(p)):
         ax, ay, az = p[i, 0] - a[i, 0], p[i, 1] - a[i, 1], p[i, 2] - a[i, 2]
@@ -48,7 +50,7 @@ def tdoa_each(p, a, b, out):
 
 
 @compiled
-def linearized_tdoa(p, a, b, jacobian):
+def linearized_tdoa(p: np.ndarray, a: np.ndarray, b: np.ndarray, jacobian: np.ndarray) -> float:
     """`tdoa` (m) of p, a, b (3,), compiled; writes `tdoa_jacobian` to `jacobian` (3,)."""
     ax, ay, az = p[0] - a[0], p[1] - a[1], p[2] - a[2]
     bx, by, bz = p[0] - b[0], p[1] - b[1], p[2] - b[2]
@@ -63,7 +65,7 @@ def linearized_tdoa(p, a, b, jacobian):
 
 
 @compiled
-def rotate(q, v, out):
+def rotate(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
     """out = R(q) v for a unit quaternion q = x y z w (body to world); all (k,) arrays."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     tx = 2.0 * (y * v[2] - z * v[1])
@@ -75,7 +77,7 @@ def rotate(q, v, out):
 
 
 @compiled
-def rotate_each(q, v, out):
+def rotate_each(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
     """out = R(q) v for quaternions q (n, 4) x y z w, of any length, and one v (3,): (n, 3); NaN where q is not finite, or zero."""
     unit = np.empty(4)
     for i in range(len(q)):

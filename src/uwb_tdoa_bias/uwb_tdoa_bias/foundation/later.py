@@ -1,19 +1,27 @@
 """Parts of scipy that take long to import and that a node hardly ever needs: imported when something of them is used."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import ModuleType
+
 
 class Later:
     """Stands for a module."""
 
-    def __init__(self, load):
+    def __init__(self, load: Callable[[], ModuleType]) -> None:
         """load() imports and returns it."""
         self._load = load
 
-    def __getattr__(self, name):
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._load(), name)
 
 
 @Later
-def interpolate():
+def interpolate() -> ModuleType:
     """scipy.interpolate"""
     from scipy import interpolate as module
 
@@ -21,7 +29,7 @@ def interpolate():
 
 
 @Later
-def rotations():
+def rotations() -> ModuleType:
     """scipy.spatial.transform"""
     from scipy.spatial import transform as module
 

@@ -5,6 +5,8 @@ at e = 0 (MacTavish and Barfoot, At all costs: a comparison of robust cost funct
 outliers, 2015, table I).
 """
 
+from __future__ import annotations
+
 import math
 
 from .compiled import compiled
@@ -14,7 +16,7 @@ GEMAN_MCCLURE, HUBER, CAUCHY = range(3)  # places in LOSSES
 
 
 @compiled
-def weight(loss, e, scale):
+def weight(loss: int, e: float, scale: float) -> float:
     """rho'(e) / e, 0 to 1. loss : place in LOSSES; e : normalised residual; scale : where the loss bends, same unit."""
     u = (e / scale) ** 2
     if loss == GEMAN_MCCLURE:
@@ -25,7 +27,7 @@ def weight(loss, e, scale):
 
 
 @compiled
-def geman_mcclure_loss(e, scale):
+def geman_mcclure_loss(e: float, scale: float) -> float:
     """2 rho(e) / scale^2 of Geman and McClure, 0 to 1. e, scale : as for `weight`."""
     u = (e / scale) ** 2
     return u / (1.0 + u)

@@ -1,5 +1,7 @@
 """What everything that talks ROS shares: QoS, stamps, diagnostics, and the life of a node."""
 
+from __future__ import annotations
+
 import argparse
 from copy import copy
 from functools import wraps
@@ -9,6 +11,7 @@ import re
 import signal
 import sys
 import time
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import rclpy
@@ -31,6 +34,19 @@ from .ros_parameters import ParameterNode
 from .ros_spinning import Spinner
 from .ros_wire import Unreadable, decode, name_of
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from types import FrameType
+    from geometry_msgs.msg import Quaternion
+    from rclpy.clock import ROSClock
+    from rclpy.event_handler import QoSMessageLostInfo
+    from rclpy.node import Node
+    from rclpy.publisher import Publisher
+    from rclpy.subscription import Subscription
+    from rclpy.timer import Timer
+    from rclpy.topic_endpoint_info import TopicEndpointInfo
+    from .ros_wire import Wire
+
 # What comes in is sensor data: best effort, which hears every publisher. Deep, because a node that was not scheduled for a
 # moment must find all of it: 10 s of a 1 kHz IMU, or 2.5 s of it replayed four times as fast. Takes memory only where it
 # is used. What goes out is reliable, which every subscriber hears: RViz and most others ask for it.
@@ -46,8 +62,10 @@ PAUSED, SLOWEST_CLOCK = 0.5, 2.0  # s without a new time on /clock; s from one t
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])  # written into the given profile
 
+Report = tuple[bytes, str, dict[str, Any]]  # level of a DiagnosticStatus, text, values
 
-def publish_stream(node, kind, topic):
+
+def publish_stream(node: StreamNode, kind: type, topic: str) -> Publisher:
     """Publisher of a stream; QoS by parameter: qos_overrides.<topic>.publisher.reliability and .depth."""
     return node.create_publisher(kind, topic, copy(OUTPUT_QOS), qos_overriding_options=OVERRIDES)
 
@@ -57,20 +75,26 @@ class StreamNode(ParameterNode):
     spinner : the Spinner that serves it, once there is one; on_failure(error) : is called with what a callback raises, instead of
     raising it."""
 
-    members, spinner, on_failure = (), None, None
+    members: Sequence[StreamNode] = ()
+    spinner: Spinner | None = None
+    on_failure: Callable[[Exception], None] | None = None
 
-    def create_subscription(self, msg_type, topic, callback, qos_profile, **options):
+    def create_subscription(
+        self, msg_type: type, topic: str, callback: Callable[..., None], qos_profile: QoSProfile | int, **options: Any
+    ) -> Subscription:
         """Of rclpy."""
         callback = callback if callback is unserved else self._contained(callback)
         return super().create_subscription(msg_type, topic, callback, qos_profile, **options)
 
-    def create_timer(self, timer_period_sec, callback, **options):
+    def create_timer(  # type: ignore[override]  # its further arguments are handed on by their names
+        self, timer_period_sec: float, callback: Callable[[], None], **options: Any
+    ) -> Timer:
         """Of rclpy."""
         return super().create_timer(timer_period_sec, self._contained(callback), **options)
 
-    def _contained(self, callback):
+    def _contained(self, callback: Callable[..., None]) -> Callable[..., None]:
         @wraps(callback)
-        def call(*arguments):
+        def call(*arguments: Any) -> None:
             try:
                 callback(*arguments)
             except Exception as error:
@@ -81,11 +105,11 @@ class StreamNode(ParameterNode):
         return call
 
     @property
-    def subscriptions(self):
+    def subscriptions(self) -> Iterator[Subscription]:
         """Those that an executor serves."""
         yield from (one for one in super().subscriptions if one.msg_type is not Clock and one.callback is not unserved)
 
-    def take_clock(self):
+    def take_clock(self) -> None:
         """Set the clock of the node to the newest of /clock."""
         for clock in [one for one in super().subscriptions if one.msg_type is Clock]:
             newest = None
@@ -99,11 +123,11 @@ class StreamNode(ParameterNode):
                 self.warn_at_times("/clock", f"/clock: passed over: {error}")
 
 
-def unserved(_):
+def unserved(_: Any) -> None:
     """Callback of a subscription that no executor serves."""
 
 
-def waiting(subscription):
+def waiting(subscription: Subscription) -> Iterator[tuple[bytes, dict[str, Any]]]:
     """Generator of what waits at a subscription that no executor serves: (bytes, information) of each message, which is taken."""
     kind, take = subscription.msg_type, subscription.handle.take_message
     while (taken := take(kind, True)) is not None:
@@ -113,16 +137,16 @@ def waiting(subscription):
 class Refusals:
     """Messages of a topic that could not be read. count : of them; reason : of the last; topic : its name."""
 
-    def __init__(self, node, topic, kind):
+    def __init__(self, node: StreamNode, topic: str, kind: type) -> None:
         self.count, self.reason = 0, ""
         self.topic, self._node, self._kind, self._before = topic, node, kind, 0
 
-    def add(self, error):
-        """Count one. error : Unreadable."""
+    def add(self, error: Unreadable) -> None:
+        """Count one."""
         self.count, self.reason = self.count + 1, str(error)
         self._node.warn_at_times(f"unreadable {self.topic}", f"{self.topic}: a message cannot be read and is not used: {error}")
 
-    def trouble(self):
+    def trouble(self) -> str | None:
         """The sentence for those since this was asked last, or None."""
         new, self._before = self.count - self._before, self.count
         if not new:
@@ -131,7 +155,7 @@ class Refusals:
         remedy = f"{others} publishes another version of {name_of(self._kind)}: build it anew" if others else "check who publishes it"
         return f"{new} messages on {self.topic} cannot be read ({self.reason}): {remedy}"
 
-    def _others(self):
+    def _others(self) -> str:
         """Who publishes another definition of the type than ours, as text."""
         name = self._node.resolve_topic_name(self.topic)
         own = {_hash(end) for end in self._node.get_subscriptions_info_by_topic(name) if end.node_name == self._node.get_name()}
@@ -139,7 +163,7 @@ class Refusals:
         return ", ".join(sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}))
 
 
-def _hash(end):
+def _hash(end: TopicEndpointInfo) -> str:
     return str(end.topic_type_hash)
 
 
@@ -150,18 +174,21 @@ class Input:
     refusals : Refusals; options : of Node.create_subscription.
     """
 
-    def __init__(self, node, kind, topic, callback, qos, read=None, served=True, **options):
+    def __init__(
+        self, node: StreamNode, kind: type, topic: str, callback: Callable[[Any], None], qos: int | QoSProfile,
+        read: Callable[[bytes], Any] | None = None, served: bool = True, **options: Any,
+    ) -> None:  # fmt: skip
         """read(bytes) : what is given to the callback; default the message; raises Unreadable."""
         self.refusals = Refusals(node, topic, kind)
         self._read, self._callback = read or (lambda data: decode(data, kind)), callback
         self.subscription = node.create_subscription(kind, topic, self._take if served else unserved, qos, raw=True, **options)
 
-    def take_all(self):
+    def take_all(self) -> None:
         """Take what waits."""
         for data, _ in waiting(self.subscription):
             self._take(data)
 
-    def _take(self, data):
+    def _take(self, data: bytes) -> None:
         try:
             message = self._read(data)
         except Unreadable as error:
@@ -177,7 +204,7 @@ class StreamInput:
     lost : messages that were sent and that DDS did not deliver, as far as it knows; refusals : Refusals.
     """
 
-    def __init__(self, node, kind, topic):
+    def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
         self.lost, self._before = 0, 0
         self.refusals = Refusals(node, topic, kind)
         self._node, self._topic = node, topic
@@ -186,26 +213,26 @@ class StreamInput:
             kind, topic, unserved, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES, raw=True
         )  # fmt: skip
 
-    def fetch(self, wire):
+    def fetch(self, wire: Wire) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """What has arrived, by a Wire: [(frame, rows (n,), arrivals (n,) s since 1970)], each of successive messages of one
         frame."""
-        messages, arrivals = [], []
+        messages, stamps = [], []
         for data, information in waiting(self._subscription):
             messages.append(data)
-            arrivals.append(information["received_timestamp"] or time.time_ns())
+            stamps.append(information["received_timestamp"] or time.time_ns())
         if not messages:
             return []
-        arrivals = 1e-9 * np.array(arrivals)
+        arrivals = 1e-9 * np.array(stamps)
         return [(frame, rows, arrivals[some]) for frame, rows, some in wire.read(messages, self.refusals.add)]
 
-    def _on_lost(self, status):
+    def _on_lost(self, status: QoSMessageLostInfo) -> None:
         self.lost += status.total_count_change
 
-    def get_publisher_count(self):
+    def get_publisher_count(self) -> int:
         """How many publish it."""
         return self._subscription.get_publisher_count()
 
-    def trouble(self, received):
+    def trouble(self, received: int) -> str | None:
         """What is wrong with the stream as ROS sees it, or None. received : messages since this was asked last."""
         lost, self._before = self.lost - self._before, self.lost
         refused = self.refusals.trouble()
@@ -221,7 +248,7 @@ class StreamInput:
         return None
 
 
-def several_publishers(node, topic):
+def several_publishers(node: StreamNode, topic: str) -> str | None:
     """The sentence for a topic on which more than one publishes, or None."""
     ends = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     if len(ends) < 2:
@@ -236,41 +263,41 @@ class Epoch:
     Seconds since 1970 in a float64 are only good to 2e-7 s. Exact for 48 days before and after the first stamp.
     """
 
-    def __init__(self):
-        self._second = None
+    def __init__(self) -> None:
+        self._second: int = None  # type: ignore[assignment]  # of the first stamp, once there is one
 
-    def seconds(self, stamp):
+    def seconds(self, stamp: Time) -> float:
         """Float s of a builtin_interfaces/Time."""
         if self._second is None:
             self._second = stamp.sec
         return (stamp.sec - self._second) + 1e-9 * stamp.nanosec
 
-    def seconds_of(self, sec, nanosec):
+    def seconds_of(self, sec: np.ndarray, nanosec: np.ndarray) -> np.ndarray:
         """Float s, (n,), of the two parts of stamps, (n,) each."""
         if self._second is None:
             self._second = int(sec[0])
         return (sec.astype(np.int64) - self._second) + 1e-9 * nanosec
 
-    def parts(self, t):
+    def parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What `seconds_of` was given, to the nanosecond, of t (n,) s."""
         second, nanosecond = np.divmod(np.round(t * 1e9).astype(np.int64), 10**9)
         return self._second + second, nanosecond
 
     @property
-    def begin(self):
+    def begin(self) -> int:
         """Stamp, s, of what `seconds` gives as 0."""
         return self._second or 0
 
-    def stamp(self, t):
+    def stamp(self, t: float) -> Time:
         """builtin_interfaces/Time of float s: what `seconds` was given, to the nanosecond."""
         second, nanosecond = divmod(round(t * 1e9), 10**9)
         return Time(sec=self._second + second, nanosec=nanosecond)
 
 
-def orientation_of(q):
+def orientation_of(q: Quaternion) -> tuple[float, float, float, float]:
     """Tuple x y z w of a geometry_msgs/Quaternion; NaN for (0, 0, 0, 0), which says: not known."""
     values = (q.x, q.y, q.z, q.w)
-    return values if any(values) else (np.nan,) * 4
+    return values if any(values) else (np.nan, np.nan, np.nan, np.nan)
 
 
 class Diagnostics:
@@ -281,13 +308,14 @@ class Diagnostics:
     second.
     """
 
-    def __init__(self, node, report, look=lambda: None):
+    def __init__(self, node: StreamNode, report: Callable[[], Report], look: Callable[[], None] = lambda: None) -> None:
         self._node, self._report, self._look, self._saying = node, report, look, Saying()
-        self._clock, self._judgement, self._looks = SimulatedClock(node), None, 0
+        self._clock, self._looks = SimulatedClock(node), 0
+        self._judgement: tuple[bytes, str] | None = None
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS_QOS)
         node.create_timer(REPORT_PERIOD / LOOKS, self._on_timer, clock=SteadyClock(clock_type=ClockType.STEADY_TIME))
 
-    def _on_timer(self):
+    def _on_timer(self) -> None:
         before, self._judgement = self._judgement, self._clock.judge()
         self._looks += 1
         if self._looks % LOOKS == 0 or before != self._judgement:
@@ -295,11 +323,11 @@ class Diagnostics:
         self._look()
 
     @property
-    def paused(self):
+    def paused(self) -> bool:
         """Whether simulated time stands still."""
         return self._judgement is not None
 
-    def publish(self):
+    def publish(self) -> None:
         """Publish now."""
         level, text, values = self._report()
         spinner = self._node.spinner
@@ -321,8 +349,8 @@ class Diagnostics:
             else:  # a statement of its own: rclpy allows one severity per line
                 logger.warning(text)
         name = self._node.get_fully_qualified_name()
-        values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=name, values=values)
+        entries = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=name, values=entries)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
@@ -332,10 +360,11 @@ class Saying:
     """What is worth a line of the log: a sentence of another kind than the last one. Sentences that differ in measured numbers alone,
     not in the anchors that they name, are of one kind, and each kind is said once in AGAIN seconds."""
 
-    def __init__(self):
-        self._last, self._when = None, {}
+    def __init__(self) -> None:
+        self._last: str | None = None
+        self._when: dict[str, float] = {}
 
-    def anew(self, text, now):
+    def anew(self, text: str, now: float) -> bool:
         """Whether to say a text now, s; then it counts as said."""
         kind = NUMBER.sub("#", text)
         if kind == self._last or now - self._when.get(kind, -math.inf) < AGAIN:
@@ -348,13 +377,15 @@ class Saying:
 class SimulatedClock:
     """Whether simulated time goes on; of the clock of a node, asked a few times a second."""
 
-    def __init__(self, node, now=time.monotonic):
+    def __init__(self, node: Node, now: Callable[[], float] = time.monotonic) -> None:
         self._node, self._now = node, now
-        self._time, self._since, self._period = None, now(), 0.0  # the last time, since when, s from one to the next lately
+        self._time: int | None = None  # the last one, ns
+        self._since, self._period = now(), 0.0  # since when, s from one to the next lately
 
-    def judge(self):
+    def judge(self) -> tuple[bytes, str] | None:
         """(level, text) while nothing else can be said, because time stands still; None otherwise."""
-        clock, now = self._node.get_clock(), self._now()
+        clock: ROSClock = self._node.get_clock()  # type: ignore[assignment]  # a node has such a clock
+        now = self._now()
         if not clock.ros_time_is_active:
             self._time = None
             return None
@@ -374,10 +405,10 @@ class SimulatedClock:
 class Rate:
     """How often something happened per second of the wall clock, since it was last asked."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._count, self._since = 0, time.monotonic()
 
-    def of(self, count):
+    def of(self, count: int) -> float:
         """Hz, from a running total."""
         now = time.monotonic()
         rate = (count - self._count) / max(now - self._since, 1e-3)
@@ -385,7 +416,7 @@ class Rate:
         return rate
 
 
-def run(node_class, description, argv=None):
+def run(node_class: type[StreamNode], description: str | None, argv: Sequence[str] | None = None) -> int:
     """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an InputError, or 128 and the
     number of a signal that came before the node was ready.
 
@@ -397,9 +428,11 @@ def run(node_class, description, argv=None):
     parser = argparse.ArgumentParser(
         prog=name, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    interruptible, stop = True, Future()
+    interruptible = True
+    stop: Future = Future()  # of the number of a signal
 
-    def on_signal(number, frame):  # rclpy's own handler would end the context while a callback still publishes
+    # rclpy's own handler would end the context while a callback still publishes
+    def on_signal(number: int, frame: FrameType | None) -> None:
         if not stop.done():
             stop.set_result(number)
         if interruptible:
@@ -407,7 +440,8 @@ def run(node_class, description, argv=None):
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
-    nodes, spinner = [], None
+    nodes: list[StreamNode] = []
+    spinner: Spinner | None = None
     try:
         _init(parser, arguments)
         node = node_class(arguments)
@@ -421,7 +455,7 @@ def run(node_class, description, argv=None):
             raise KeyboardInterrupt
         spinner.spin(stop)
     except SystemExit as ended:  # argparse has said it already
-        return ended.code or 0
+        return ended.code or 0  # type: ignore[return-value]  # argparse ends with a number
     except InputError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return 2
@@ -439,7 +473,7 @@ def run(node_class, description, argv=None):
     return 0
 
 
-def _init(parser, arguments):
+def _init(parser: argparse.ArgumentParser, arguments: list[str]) -> None:
     try:
         parser.parse_args(remove_ros_args(arguments)[1:])
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)

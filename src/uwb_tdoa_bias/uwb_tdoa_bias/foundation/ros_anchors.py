@@ -1,5 +1,9 @@
 """Anchors as messages and frames, and where a node gets them from: a file, or uwb/anchors."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from geometry_msgs.msg import Point, Pose, Quaternion
 import numpy as np
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -12,6 +16,11 @@ from .errors import InputError
 from .ros_parameters import Parameter
 from .survey import read_survey
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo
+    from .ros import StreamNode
+
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -21,7 +30,7 @@ ANCHORS_FILE = Parameter(
 )
 
 
-def anchors_to_message(anchors):
+def anchors_to_message(anchors: Anchors) -> AnchorArray:
     """AnchorArray of Anchors, with a stamp of 0: anchors do not age."""
     message = AnchorArray()
     message.header.frame_id = anchors.frame
@@ -32,7 +41,7 @@ def anchors_to_message(anchors):
     return message
 
 
-def same_anchors(one, other):
+def same_anchors(one: Anchors, other: Anchors) -> bool:
     """True if two Anchors are equal in everything."""
     return (
         one.frame == other.frame
@@ -48,35 +57,36 @@ class AnchorsInput:
     anchors : Anchors or None; refused : what is wrong with what came on the topic, or None.
     """
 
-    def __init__(self, node, on_change, file=""):
+    def __init__(self, node: StreamNode, on_change: Callable[[Anchors], None], file: str = "") -> None:
         """on_change(anchors) is called with the first Anchors, and with others that differ; those of a file are the only
         ones, and are given by `start`. Raises InputError for the file."""
-        self.anchors = self.refused = None
+        self.anchors: Anchors | None = None
+        self.refused: str | None = None
         self._node, self._on_change, self._file = node, on_change, file
         self._of_file = read_survey(file) if file else None
-        self._repeated = None  # the subscription to volatile ones
+        self._repeated: ros.Input | None = None  # the subscription to volatile ones
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
         self._latched = ros.Input(node, AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events)
 
-    def start(self):
+    def start(self) -> None:
         """Give the anchors of the file, if there is one."""
         if self._of_file is not None:
             self.anchors = self._of_file
             self._on_change(self.anchors)
 
     @property
-    def refusals(self):
-        """ros.Refusals of each subscription."""
+    def refusals(self) -> list[ros.Refusals]:
+        """Those of each subscription."""
         return [end.refusals for end in (self._latched, self._repeated) if end is not None]
 
-    def _on_incompatible(self, _):
+    def _on_incompatible(self, _: QoSRequestedIncompatibleQoSInfo) -> None:
         if self._repeated is None:
             self._node.get_logger().warning(
                 "uwb/anchors is not published reliable and transient local: taken when it is repeated"
             )
             self._repeated = ros.Input(self._node, AnchorArray, "uwb/anchors", self._on_message, ANY_QOS)
 
-    def _on_message(self, message):
+    def _on_message(self, message: AnchorArray) -> None:
         try:
             anchors, self.refused = Anchors.from_message(message), None
         except InputError as error:

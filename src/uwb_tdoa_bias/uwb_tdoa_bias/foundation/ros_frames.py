@@ -1,6 +1,9 @@
 """What TF says, as far as a node needs it: constant transforms, and on request those that move."""
 
+from __future__ import annotations
+
 import struct
+from typing import Any, TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -12,6 +15,10 @@ from .ros_parameters import LONGEST_NAME
 from .ros_wire import ENCAPSULATION, LENGTH, MOST_ELEMENTS, Unreadable, aligned, check_length, decode, read_text
 from .transforms import Frames
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from geometry_msgs.msg import TransformStamped
+
 TF_QOS = QoSProfile(depth=100)  # what tf2 uses
 MOVING_QOS = QoSProfile(depth=1000)  # 2 s of a robot that publishes it at 500 Hz
 STAMP, NUMBERS = struct.Struct("<iI"), struct.Struct("<7d")  # of a TransformStamped: p, then q
@@ -19,42 +26,47 @@ TF_STATIC_QOS = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 
+Transform = tuple[int, int, str, str, tuple[float, ...], tuple[float, ...]]  # sec, nanosec, parent, child, q, p
+
 
 class FramesInput:
     """Frames of /tf_static, and of /tf if they may move: its messages wait until `catch_up`. Of a node that is frozen, the first
     constant transform of a frame counts. trouble : a transform that is none, or None; refusals : ros.Refusals."""
 
-    def __init__(self, node, seconds, on_new, moving=False):
+    def __init__(
+        self, node: ros.StreamNode, seconds: Callable[[Time], float], on_new: Callable[[], None], moving: bool = False
+    ) -> None:
         """seconds(stamp) : s of a builtin_interfaces/Time; on_new() is called when a constant transform is new."""
-        self.frames, self.trouble = Frames(), None
+        self.frames = Frames()
+        self.trouble: str | None = None
         self._node, self._seconds, self._on_new = node, seconds, on_new
         static = ros.Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms)
         self._moving = [ros.Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, read_transforms, served=False)] if moving else []
         self.refusals = [end.refusals for end in (static, *self._moving)]
 
-    def catch_up(self):
+    def catch_up(self) -> None:
         """Take what waits on /tf."""
         for end in self._moving:
             end.take_all()
 
-    def _on_static(self, transforms):
+    def _on_static(self, transforms: list[Transform]) -> None:
         new = [self._take("/tf_static", self._set, *transform[2:]) for transform in transforms]
         if any(new):
             self._on_new()
 
-    def _set(self, parent, child, q, p):
+    def _set(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
         if self._node.frozen and self.frames.knows(child):
             if self.frames.differs(parent, child, q, p):
                 self._node.refuse(f"another transform of {child!r:.{LONGEST_NAME}} on /tf_static")
             return False
         return self.frames.set(parent, child, q, p)
 
-    def _on_moving(self, transforms):
+    def _on_moving(self, transforms: list[Transform]) -> None:
         for sec, nanosec, *transform in transforms:
             if sec or nanosec:
                 self._take("/tf", self.frames.move, *transform, self._seconds(Time(sec=sec, nanosec=nanosec)))
 
-    def _take(self, topic, take, *transform):
+    def _take(self, topic: str, take: Callable[..., bool | None], *transform: Any) -> bool | None:
         try:
             return take(*transform)
         except InputError as error:
@@ -63,7 +75,7 @@ class FramesInput:
             return False
 
 
-def read_transforms(data):
+def read_transforms(data: bytes) -> list[Transform]:
     """[(sec, nanosec, parent, child, q, p)] of a serialized tf2_msgs/TFMessage: q x y z w, p m. Raises Unreadable.
 
     A robot publishes hundreds a second, and a message object takes ten times as long as this.
@@ -90,14 +102,14 @@ def read_transforms(data):
     return out
 
 
-def _of(message):
+def _of(message: TransformStamped) -> Transform:
     """The same of a TransformStamped."""
     q, p, stamp = message.transform.rotation, message.transform.translation, message.header.stamp
     names = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
     return stamp.sec, stamp.nanosec, *names, (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
 
 
-def unknown_frame(topic, frame, body):
+def unknown_frame(topic: str, frame: str, body: str) -> str:
     """The sentence for a sensor whose place on the robot nobody says."""
     return (
         f"{topic} is in frame '{frame}', which /tf_static does not connect with '{body}': taken as '{body}'; publish it: "

@@ -1,10 +1,13 @@
 """Parameters of a node: each with text, unit and range; what a node does not know is refused or said."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
 import time
+from typing import Any, ClassVar, TYPE_CHECKING
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import (
@@ -18,6 +21,12 @@ import yaml
 
 from .errors import InputError
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from rclpy.parameter import Parameter as RosParameter
+    from rclpy.service import Service
+    from yaml import MappingNode
+
 KINDS = {float: "a number with a decimal point, e.g. 1.0", int: "a whole number", bool: "true or false", list: "a list"}
 QOS = "qos_overrides."
 SAY_AGAIN = 10.0  # s from one warning to the next of the same kind
@@ -30,15 +39,15 @@ class Parameter:
     """default : its value and type; text : unit and meaning, as in the parameter file; low, high : its range, for a number;
     choices : the texts that it may be; constraint : in words, what cannot be said by these; settable : in flight."""
 
-    default: object
+    default: Any
     text: str
-    low: float = None
-    high: float = None
-    choices: tuple = ()
+    low: float = None  # type: ignore[assignment]  # numbers have both
+    high: float = None  # type: ignore[assignment]  # as low
+    choices: tuple[str, ...] = ()
     constraint: str = ""
     settable: bool = False
 
-    def descriptor(self):
+    def descriptor(self) -> ParameterDescriptor:
         """ParameterDescriptor for ROS."""
         constraint = f"one of {', '.join(self.choices)}" if self.choices else self.constraint
         out = ParameterDescriptor(
@@ -62,12 +71,13 @@ class ParameterNode(Node):
     """
 
     refused, _refused_before, _refusal = 0, 0, ""
+    NAME: ClassVar[str]  # of the executable
 
-    def __init__(self, *arguments, **options):
-        self._warned = {}  # {kind: s of time.monotonic() from which on it may be said again}
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self._warned: dict[str, float] = {}  # {kind: s of time.monotonic() from which on it may be said again}
         super().__init__(*arguments, **options)
 
-    def warn_at_times(self, kind, text):
+    def warn_at_times(self, kind: str, text: str) -> None:
         """Log a warning, unless one of this kind was logged less than SAY_AGAIN ago. (rclpy's own throttle takes half a millisecond to
         find out, which is more than most messages take.)"""
         now = time.monotonic()
@@ -76,23 +86,25 @@ class ParameterNode(Node):
             self.get_logger().warning(text)
 
     @property
-    def frozen(self):
+    def frozen(self) -> bool:
         """Whether nobody may change what was given at the start."""
         return self.has_parameter("frozen") and self.get_parameter("frozen").value
 
-    def refuse(self, what):
+    def refuse(self, what: str) -> str:
         """Count and say that something is refused because the node is frozen; returns the sentence. what : it, and who asked for it."""
         self.refused += 1
         self._refusal = f"{what}: refused, because this node is frozen; start it with frozen:=false to allow it"
         self.warn_at_times("frozen", self._refusal)
         return self._refusal
 
-    def refused_lately(self):
+    def refused_lately(self) -> str | None:
         """The sentence of the last that was refused since this was asked last, or None."""
         new, self._refused_before = self.refused - self._refused_before, self.refused
         return self._refusal if new else None
 
-    def create_service(self, srv_type, srv_name, callback, **options):
+    def create_service(
+        self, srv_type: type, srv_name: str, callback: Callable[[Any, Any], Any], **options: Any
+    ) -> Service:
         """Of rclpy, which makes those of the parameters by it; they raise what they cannot read, and take 1000 requests at a time."""
         if not srv_type.__module__.startswith("rcl_interfaces."):
             return super().create_service(srv_type, srv_name, callback, **options)
@@ -100,7 +112,7 @@ class ParameterNode(Node):
         options["qos_profile"] = QoSProfile(depth=MOST_REQUESTS)
 
         @wraps(callback)
-        def answer(request, response):
+        def answer(request: Any, response: Any) -> Any:
             try:
                 asked = sum(len(getattr(request, several, ())) for several in ("parameters", "names", "prefixes"))
                 if asked > MOST_ASKED:
@@ -113,7 +125,7 @@ class ParameterNode(Node):
 
         return super().create_service(srv_type, srv_name, answer, **options)
 
-    def set_parameters_atomically(self, parameter_list):
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Of rclpy; what the parameter services of the node call."""
         others = [each for each in parameter_list if not self._is_so_for_good(each)]
         if not others and parameter_list:
@@ -122,7 +134,7 @@ class ParameterNode(Node):
             return SetParametersResult(successful=False, reason=self.refuse(f"parameter {others[0].name!r:.{LONGEST_NAME}}"))
         return super().set_parameters_atomically(others)
 
-    def _is_so_for_good(self, parameter):
+    def _is_so_for_good(self, parameter: RosParameter) -> bool:
         name = parameter.name
         return (
             self.has_parameter(name)
@@ -131,7 +143,7 @@ class ParameterNode(Node):
         )
 
 
-def declare(node, name, parameter):
+def declare(node: ParameterNode, name: str, parameter: Parameter) -> Any:
     """Declare a Parameter and return its value; raises InputError."""
     kind = KINDS.get(type(parameter.default), "text")
     try:
@@ -148,12 +160,12 @@ def declare(node, name, parameter):
     return value
 
 
-def declare_all(node, parameters):
+def declare_all(node: ParameterNode, parameters: dict[str, Parameter]) -> dict[str, Any]:
     """Declare {name: Parameter}; returns {name: value}."""
     return {name: declare(node, name, parameter) for name, parameter in parameters.items()}
 
 
-def refuse_unknown(node, others=()):
+def refuse_unknown(node: ParameterNode, others: Collection[str] = ()) -> None:
     """Raise InputError for a parameter that was given and that the node, which has declared its own, does not have.
     others : names that are for somebody else, or old ones that were taken."""
     for name in sorted(node._parameter_overrides):
@@ -164,7 +176,7 @@ def refuse_unknown(node, others=()):
         raise InputError(f"{name}: {node.get_name()} has no such parameter; {remedy} (config/{node.NAME}.yaml has all).")
 
 
-def say_unused(nodes, files):
+def say_unused(nodes: Sequence[Node], files: Iterable[str]) -> None:
     """Say which QoS overrides, and which of the parameter files given, change nothing. To be called when the nodes of a
     process have all of their topics. files : their paths."""
     given, logger = {name for node in nodes for name in node._parameter_overrides}, nodes[0].get_logger()
@@ -180,12 +192,12 @@ def say_unused(nodes, files):
             logger.warning(f"{name}: changes nothing, because this node has no such topic or policy")
 
 
-def files_of(arguments):
+def files_of(arguments: Sequence[str]) -> list[str]:
     """Paths after --params-file in the arguments of a process."""
     return [file for word, file in zip(arguments, arguments[1:]) if word == "--params-file"]
 
 
-def _names(file):
+def _names(file: str) -> set[str]:
     """Names of all parameters in a parameter file, of whatever node. rcl has read it before and judges it: here no value is looked
     at, nor the tag of one (launch_ros gives lists the tag !!python/tuple)."""
     if not Path(file).is_file():  # a pipe, which rcl has emptied
@@ -197,13 +209,13 @@ def _names(file):
         return set()
 
 
-def _below_nodes(part):
+def _below_nodes(part: MappingNode) -> Iterator[str]:
     """Yields the names below each ros__parameters in a part of a file, as yaml.compose gives it."""
     for key, value in part.value if isinstance(part, yaml.MappingNode) else ():
         yield from _flat(value) if key.value == "ros__parameters" else _below_nodes(value)
 
 
-def _flat(part, prefix=""):
+def _flat(part: MappingNode, prefix: str = "") -> Iterator[str]:
     """Yields the names in a mapping of parameters, whose mappings are prefixes."""
     for key, value in part.value if isinstance(part, yaml.MappingNode) else ():
         name = f"{prefix}{key.value}"

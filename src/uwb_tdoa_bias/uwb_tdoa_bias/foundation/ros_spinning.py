@@ -1,15 +1,24 @@
 """How a process serves its streams, and everything else of the graph that concerns it: in turn, so that neither waits for the other."""
 
+from __future__ import annotations
+
 import math
 import time
+from typing import Any, TYPE_CHECKING
 
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from rclpy import Future
+    from .ros import StreamNode
+    from .ros_streams import Turns
+
 try:  # not in rclpy before 7.1.4; a message costs a quarter
     from rclpy.experimental import EventsExecutor
 except ImportError:
-    EventsExecutor = None
+    EventsExecutor = None  # type: ignore[assignment]  # says that there is none
 
 LONGEST_SLEEP = 0.2  # s, until a process without streams sees a signal
 QUIET, LOOK = 1.0, 0.05  # s without a message of a stream, after which it is looked for each LOOK s, and not each millisecond
@@ -28,8 +37,8 @@ class Spinner:
     longest_wait : s, the longest that anything has waited since this was set to 0.0.
     """
 
-    def __init__(self, nodes, turns=None):
-        """nodes : StreamNodes, a list that is kept up to date; turns : ros_streams.Turns."""
+    def __init__(self, nodes: list[StreamNode], turns: Turns | None = None) -> None:
+        """nodes : a list that is kept up to date."""
         self.longest_wait = 0.0
         self._nodes, self._turns = nodes, turns
         self._executor = SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
@@ -37,7 +46,7 @@ class Spinner:
         for node in nodes:
             self._serve_node(node)
 
-    def replace(self, gone, new):
+    def replace(self, gone: Iterable[StreamNode], new: Iterable[StreamNode]) -> None:
         """Leave some nodes, and serve others."""
         for node in gone:
             self._executor.remove_node(node)
@@ -46,11 +55,11 @@ class Spinner:
             self._nodes.append(node)
             self._serve_node(node)
 
-    def _serve_node(self, node):
+    def _serve_node(self, node: StreamNode) -> None:
         node.spinner = self
         self._executor.add_node(node)
 
-    def spin(self, stop):
+    def spin(self, stop: Future) -> None:
         """Live until the future `stop` is done, or the context ends."""
         taken, sleep, quiet = -math.inf, LONGEST_SLEEP if self._turns is None else LOOK, True  # taken : when a turn last took anything
         while not stop.done() and self._nodes[0].context.ok():
@@ -63,15 +72,15 @@ class Spinner:
                 self._guarded(self._executor.spin_once, timeout_sec=sleep)
                 self._served = time.monotonic()
             else:
-                time.sleep(rest or self._turns.PERIOD)
+                time.sleep(rest or self._turns.PERIOD)  # type: ignore[union-attr]  # without turns it is quiet
 
-    def close(self):
+    def close(self) -> None:
         """Leave the nodes."""
         for node in self._nodes:
             self._executor.remove_node(node)
         self._executor.shutdown()
 
-    def _serve(self):
+    def _serve(self) -> None:
         """Everything that has come so far."""
         if EventsExecutor is None:
             self._serve_each()
@@ -84,7 +93,7 @@ class Spinner:
         for node in self._nodes:
             node.take_clock()
 
-    def _serve_each(self):
+    def _serve_each(self) -> None:
         """With the SingleThreadedExecutor, which has no queue: one of everything that waits, until nothing does, or for a while."""
         until, found = time.monotonic() + LONGEST_SERVICE, True
         while found and time.monotonic() < until:
@@ -98,7 +107,7 @@ class Spinner:
             except TimeoutException:
                 pass
 
-    def _guarded(self, serve, **arguments):
+    def _guarded(self, serve: Callable[..., None], **arguments: Any) -> None:
         """Requests to services are decoded by rclpy, which raises what cannot be."""
         try:
             serve(**arguments)
@@ -106,5 +115,5 @@ class Spinner:
             self._nodes[0].warn_at_times("request", f"passed over what could not be taken: {error}")
 
 
-def _nothing():
+def _nothing() -> None:
     """What a mark does."""

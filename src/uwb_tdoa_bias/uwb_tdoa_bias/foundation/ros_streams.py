@@ -1,16 +1,33 @@
 """The streams of a node: all that has arrived is taken together, in turns; a call of the filter costs more than a message."""
 
+from __future__ import annotations
+
 import time
+from typing import Any, Protocol, TYPE_CHECKING
 
 import numpy as np
 
 from . import ros
 from .stamps import LARGEST_STEP_BACK
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+    from .ros import Epoch, Refusals, StreamInput, StreamNode
+    from .ros_wire import Template, Wire
+
+    Take = Callable[[str, np.ndarray, np.ndarray, np.ndarray], None]  # frame, stamps, rows and arrivals
+
 PERIOD = 0.001  # s, at least, of rest after a turn
 LONGEST_WAIT = 0.02  # s without a turn in which anything is taken, whatever it waits for
 ROUNDING = 1e-6  # s by which two ways to compute a stamp since 1970 may differ
 LONGEST_REST = 0.01  # s; after a turn there is a rest as long as it took, at most so long: more is then taken at a time
+Part = tuple[str, np.ndarray, np.ndarray]  # frame, rows and arrivals of successive messages
+
+
+class Taking(Protocol):
+    """Takes what has arrived; returns whether there was anything, or is."""
+
+    def take(self) -> bool: ...
 
 
 class Turns:
@@ -18,11 +35,11 @@ class Turns:
 
     PERIOD = PERIOD
 
-    def __init__(self, streams):
-        """streams : list of Streams, or of what else has take()."""
+    def __init__(self, streams: Collection[Taking]) -> None:
+        """streams : Streams, or what else has take()."""
         self._streams = streams
 
-    def take(self):
+    def take(self) -> float | None:
         """One turn; returns the s of rest after it; None if nothing has arrived."""
         began = time.monotonic()
         if not any([streams.take() for streams in self._streams]):
@@ -33,24 +50,27 @@ class Turns:
 class Streams:
     """Streams of a ros.StreamNode: they hold what arrives until it is taken."""
 
-    def __init__(self, node, epoch, on_taken):
+    def __init__(self, node: StreamNode, epoch: Epoch, on_taken: Callable[[], None]) -> None:
         """epoch : ros.Epoch; on_taken() is called after anything was given to those that take it."""
-        self.inputs = {}  # ros.StreamInput or Handed by topic, in the order in which they are taken
+        self.inputs: dict[str, StreamInput | Handed] = {}  # by topic, in the order in which they are taken
         self._node, self._epoch, self._on_taken = node, epoch, on_taken
-        self._streams, self._by_topic = [], {}
-        self._awaited, self._due, self._until = None, None, -np.inf
+        self._streams: list[_Stream] = []
+        self._by_topic: dict[str, _Stream] = {}
+        self._awaited: _Stream | None = None
+        self._due: Callable[[], float] = lambda: -np.inf  # of what is awaited
+        self._until = -np.inf
 
     @property
-    def refusals(self):
-        """ros.Refusals of each."""
+    def refusals(self) -> list[Refusals]:
+        """Those of each."""
         return [end.refusals for end in self.inputs.values()]
 
-    def wait_for(self, topic, due):
+    def wait_for(self, topic: str, due: Callable[[], float]) -> None:
         """Take nothing before a message of this topic is stamped due(), s since 1970, or later, for LONGEST_WAIT: less could not
         be done with it yet."""
         self._awaited, self._due = self._by_topic[topic], due
 
-    def add(self, wire, topic, take, handed=False):
+    def add(self, wire: Wire, topic: str, take: Take, handed: bool = False) -> None:
         """Subscribe. wire : Wire; take(frame, t, rows, arrival) gets successive messages of one frame: their stamps (n,) s,
         rows (n,) of the Wire, and when they arrived, (n,) s since 1970. handed : a node of this process hands them over."""
         kind = Handed if handed else ros.StreamInput
@@ -58,7 +78,7 @@ class Streams:
         stream = self._by_topic[topic] = _Stream(wire, take, self.inputs[topic])
         self._streams.append(stream)
 
-    def take(self, at_once=False):
+    def take(self, at_once: bool = False) -> bool:
         """Give everything that has arrived to those that take it; at_once : whatever they wait for. Returns whether there was
         anything, or is."""
         if self._awaited is not None and not at_once:
@@ -82,14 +102,15 @@ class Streams:
 class StreamOutput:
     """Publisher of a stream of messages that templates make."""
 
-    def __init__(self, node, kind, topic):
-        self.publisher, self._receiver = ros.publish_stream(node, kind, topic), None
+    def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
+        self.publisher = ros.publish_stream(node, kind, topic)
+        self._receiver: Handed | None = None
 
-    def hand_to(self, receiver):
+    def hand_to(self, receiver: Handed) -> None:
         """Give everything to Handed, too."""
         self._receiver = receiver
 
-    def publish(self, frame, template, rows):
+    def publish(self, frame: str, template: Template, rows: np.ndarray) -> None:
         """Publish rows (n,) of a Template, whose messages are of this frame."""
         if self._receiver is not None:
             self._receiver.hand(frame, rows)
@@ -103,28 +124,29 @@ class Handed:
 
     lost = 0
 
-    def __init__(self, node, kind, topic):
+    def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
         self.refusals = ros.Refusals(node, topic, kind)  # of none
-        self._node, self._topic, self._parts = node, topic, []
+        self._node, self._topic = node, topic
+        self._parts: list[Part] = []
 
-    def hand(self, frame, rows):
+    def hand(self, frame: str, rows: np.ndarray) -> None:
         """Take rows (n,) with the fields of a Wire, all of one frame."""
         self._parts.append((frame, rows, np.full(len(rows), 1e-9 * time.time_ns())))
 
-    def __len__(self):
+    def __len__(self) -> int:
         """Parts that wait."""
         return len(self._parts)
 
-    def fetch(self, wire):
+    def fetch(self, wire: Wire) -> list[Part]:
         """[(frame, rows, arrivals)] since the last time."""
         parts, self._parts = self._parts, []
         return parts
 
-    def get_publisher_count(self):
+    def get_publisher_count(self) -> int:
         """How many publish it."""
         return self._node.count_publishers(self._topic)
 
-    def trouble(self, received):
+    def trouble(self, received: int) -> str | None:
         """What is wrong with the stream as ROS sees it, or None."""
         return ros.several_publishers(self._node, self._topic)
 
@@ -132,11 +154,12 @@ class Handed:
 class _Stream:
     """What has arrived on one of them. waiting : parts; fell : the stamps of what was taken last have fallen back."""
 
-    def __init__(self, wire, take, source):
-        self.waiting, self.fell = [], False
+    def __init__(self, wire: Wire, take: Take, source: StreamInput | Handed) -> None:
+        self.waiting: list[Part] = []
+        self.fell = False
         self._wire, self._take, self._source, self._newest = wire, take, source, -np.inf
 
-    def fetch(self):
+    def fetch(self) -> bool:
         """Returns whether anything has arrived since the last time."""
         parts = self._source.fetch(self._wire)
         if not parts:
@@ -145,14 +168,14 @@ class _Stream:
         return True
 
     @property
-    def newest_waiting(self):
+    def newest_waiting(self) -> float:
         """Stamp, s since 1970, of what was fetched last; -inf if nothing waits."""
         if not self.waiting:
             return -np.inf
         rows = self.waiting[-1][1]
         return rows["sec"][-1] + 1e-9 * rows["nanosec"][-1]
 
-    def parts(self, epoch):
+    def parts(self, epoch: Epoch) -> list[tuple[Any, ...]]:
         """What was fetched, as [(take, frame, stamps, rows, arrivals)]."""
         self.fell, parts = False, []
         for frame, rows, arrivals in self.waiting:
@@ -167,7 +190,7 @@ class _Stream:
         return parts
 
 
-def _pieces(part):
+def _pieces(part: tuple[Any, ...]) -> list[tuple[Any, ...]]:
     """The messages of a part one by one."""
     take, frame, *columns = part
     return [(take, frame, *(column[k : k + 1] for column in columns)) for k in range(len(columns[0]))]

@@ -10,14 +10,20 @@ lengths, texts and numbers of elements are checked before anything is made of th
 with the reason.
 """
 
+from __future__ import annotations
+
 from functools import lru_cache, reduce
 from importlib import import_module
 import struct
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from rclpy.serialization import deserialize_message, serialize_message
 from rosidl_parser.definition import AbstractString, Array, BasicType, NamespacedType
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
 
 STAMP, FRAME = ("sec", "nanosec"), "header.frame_id"
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
@@ -35,7 +41,7 @@ CODES = {
 }  # fmt: skip
 
 
-def message_class(kind):
+def message_class(kind: str) -> Any:
     """Class of a type of ours like "pkg/msg/Name"."""
     package, _, name = kind.partition("/msg/")
     return getattr(import_module(f"{package}.msg"), name)
@@ -52,7 +58,7 @@ class Wire:
     ("pose.pose.position": (3,) of float, as "pose.covariance" is (36,)).
     """
 
-    def __init__(self, kind, *fields):
+    def __init__(self, kind: type, *fields: str) -> None:
         """kind : class of the messages; fields : their names, of numbers or of what holds only numbers of one type."""
         self.kind = kind
         paths = {name: f"header.stamp.{name}" for name in STAMP} | {field: field for field in fields}
@@ -64,18 +70,21 @@ class Wire:
             code, count = spaces[leaves[0]][0], sum(spaces[leaf][1] for leaf in leaves)
             columns.append((name, code, count) if count > 1 else (name, code))
         self.dtype = np.dtype(columns)
-        self._known = None  # _Layout of the messages of late
+        self._known: _Layout | None = None  # of the messages of late
         self.fits = self._agrees()
 
-    def read(self, messages, refuse=None):
+    def read(
+        self, messages: Sequence[bytes], refuse: Callable[[Unreadable], None] | None = None
+    ) -> list[tuple[str, np.ndarray, slice]]:
         """Serialized messages in their order, a list of bytes: a list of (frame_id, rows, slice), each of successive messages of
         one frame, and which they are. What cannot be read is left out: refuse(Unreadable), without which it is raised."""
         out, first = [], 0
         while first < len(messages):
             end = first + 1
             try:
-                frame, rows = self._convert(messages[first]) if self._is_foreign(messages[first]) else (None, None)
-                if rows is None:
+                if self._is_foreign(messages[first]):
+                    frame, rows = self._convert(messages[first])
+                else:
                     layout = self._layout(messages[first])
                     while end < len(messages) and layout.holds(messages[end]):
                         end += 1
@@ -88,11 +97,11 @@ class Wire:
             first = end
         return out
 
-    def template(self, message):
+    def template(self, message: Any) -> Template:
         """Template of messages which are all like this one, but for the fields."""
         return Template(self, message)
 
-    def layout(self, data):
+    def layout(self, data: bytes) -> _Layout:
         """Where the fields are in this serialized message, and in those that have the same texts. Raises Unreadable."""
         if data[:4] != ENCAPSULATION:
             raise Unreadable("it is not plain CDR in little endian")
@@ -117,16 +126,16 @@ class Wire:
         )
         return _Layout(frame, dtype, texts)
 
-    def _layout(self, data):
+    def _layout(self, data: bytes) -> _Layout:
         if self._known is None or not self._known.holds(data):
             self._known = self.layout(data)
         return self._known
 
-    def _is_foreign(self, data):
+    def _is_foreign(self, data: bytes) -> bool:
         """Whether only the type support of the middleware can read it: another byte order, or options."""
         return not self.fits or (data[:4] != ENCAPSULATION and data[:3] in KNOWN_ENCAPSULATIONS)
 
-    def _convert(self, data):
+    def _convert(self, data: bytes) -> tuple[str, np.ndarray]:
         """The same of one message by way of a message object."""
         message, row = decode(data, self.kind), np.empty(1, self.dtype)
         for name, leaves in self._paths.items():
@@ -136,7 +145,7 @@ class Wire:
             raise Unreadable(f"{FRAME} is no UTF-8")
         return frame, row
 
-    def _agrees(self):
+    def _agrees(self) -> bool:
         """Whether messages are laid out as their definition says."""
         message = self.kind()
         message.header.frame_id = "a frame"
@@ -156,7 +165,7 @@ class Wire:
 class Template:
     """Messages that differ in the fields of a Wire and in nothing else."""
 
-    def __init__(self, wire, message):
+    def __init__(self, wire: Wire, message: Any) -> None:
         self._wire, self._message = wire, message
         data = serialize_message(message)
         if wire.fits:
@@ -164,17 +173,17 @@ class Template:
         else:
             self._data, self._dtype = wire._convert(data)[1].tobytes(), wire.dtype
 
-    def rows(self, n):
+    def rows(self, n: int) -> np.ndarray:
         """(n,) of them, whose fields are to be filled in."""
         return np.frombuffer(bytearray(self._data * n), self._dtype)  # a copy of rows is none of what is between the fields
 
-    def messages(self, rows):
+    def messages(self, rows: np.ndarray) -> Iterator[Any]:
         """Generator of what to give to a publisher, for each of the rows that `rows` made."""
         data, size = rows.tobytes(), self._dtype.itemsize
         for k in range(len(rows)):
             yield data[k * size : (k + 1) * size] if self._wire.fits else self._filled(rows[k])
 
-    def _filled(self, row):
+    def _filled(self, row: np.void) -> Any:
         for name, leaves in self._wire._paths.items():
             values, first = np.atleast_1d(row[name]), 0
             for leaf in leaves:
@@ -187,13 +196,13 @@ class Template:
 class _Layout:
     """frame : frame_id; dtype : of a whole message."""
 
-    def __init__(self, frame, dtype, texts):
+    def __init__(self, frame: str, dtype: np.dtype, texts: list[tuple[int, int, bytes]]) -> None:
         self.frame, self.dtype = frame, dtype
         self._size = dtype.itemsize
         # the strings follow each other in most types
         self._texts = texts
 
-    def holds(self, data):
+    def holds(self, data: bytes) -> bool:
         """Whether a message is laid out so, and of the same frame."""
         if len(data) != self._size or data[:4] != ENCAPSULATION:
             return False
@@ -203,7 +212,7 @@ class _Layout:
         return True
 
 
-def decode(data, kind):
+def decode(data: bytes, kind: type) -> Any:
     """Message of a serialized one, of any type, by the type support of the middleware. Raises Unreadable."""
     if data[:3] not in KNOWN_ENCAPSULATIONS:
         raise Unreadable("it is not plain CDR" if len(data) >= 4 else f"it has {len(data)} bytes")
@@ -217,7 +226,7 @@ def decode(data, kind):
     return message
 
 
-def read_text(data, place, what):
+def read_text(data: bytes, place: int, what: str) -> tuple[str, int]:
     """(text, place behind it) of a text in plain little-endian CDR, whose length is at `place`. Raises Unreadable."""
     if place + 4 > len(data):
         raise Unreadable(f"it ends after {len(data)} bytes, before {what}")
@@ -234,7 +243,7 @@ def read_text(data, place, what):
         raise Unreadable(f"{what} is no UTF-8") from error
 
 
-def check_length(data, length, kind, exactly=True):
+def check_length(data: bytes, length: int, kind: type, exactly: bool = True) -> None:
     """Raise Unreadable for a message that is shorter than so many bytes, or, if told, longer."""
     if length > len(data):
         raise Unreadable(f"{len(data)} bytes are {length - len(data)} too few for {name_of(kind)}: cut off, or of {ANOTHER}")
@@ -242,7 +251,7 @@ def check_length(data, length, kind, exactly=True):
         raise Unreadable(f"{len(data)} bytes are {len(data) - length} too many for {name_of(kind)}: of {ANOTHER}")
 
 
-def _check_size(data, kind):
+def _check_size(data: bytes, kind: type) -> None:
     """Raise Unreadable for more than may be allocated: long messages, lists that say that they are longer than they are."""
     leaves, whole = _leaves(kind)
     texts = sum(code == TEXT for _, code, _ in leaves)
@@ -270,16 +279,16 @@ def _check_size(data, kind):
         raise Unreadable(f"its list would have {count} elements, in {len(data)} bytes")
 
 
-def name_of(kind):
+def name_of(kind: type) -> str:
     """Like sensor_msgs/Imu."""
     return f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
 
 
 @lru_cache(maxsize=None)
-def _leaves(kind):
+def _leaves(kind: Any) -> tuple[list[tuple[str, str, int]], bool]:
     """Of a message class up to the first field that has no fixed size: ([(name of a number, an array of numbers or a string,
     its code in CODES, or TEXT, and how many)], whether that is all of it)."""
-    out = []
+    out: list[tuple[str, str, int]] = []
     for name, slot in zip(kind.get_fields_and_field_types(), kind.SLOT_TYPES):
         count, slot = (slot.size, slot.value_type) if isinstance(slot, Array) else (1, slot)
         if isinstance(slot, BasicType) and slot.typename in CODES:
@@ -288,7 +297,7 @@ def _leaves(kind):
             out.append((name, TEXT, 1))
         elif isinstance(slot, NamespacedType) and count == 1:
             inner, whole = _leaves(getattr(import_module(".".join(slot.namespaces)), slot.name))
-            out += [(f"{name}.{leaf}", *rest) for leaf, *rest in inner]
+            out += [(f"{name}.{leaf}", code, several) for leaf, code, several in inner]
             if not whole:
                 return out, False
         else:
@@ -296,20 +305,20 @@ def _leaves(kind):
     return out, True
 
 
-def _is_in(leaf, path):
+def _is_in(leaf: str, path: str) -> bool:
     return leaf == path or leaf.startswith(path + ".")
 
 
-def aligned(place, size):
+def aligned(place: int, size: int) -> int:
     """Numbers are aligned as counted from behind the encapsulation."""
     return place + (4 - place) % size
 
 
-def _get(message, path):
+def _get(message: Any, path: str) -> Any:
     return reduce(getattr, path.split("."), message)
 
 
-def _set(message, path, values):
+def _set(message: Any, path: str, values: np.ndarray) -> None:
     *above, name = path.split(".")
     holder = reduce(getattr, above, message)
     before = getattr(holder, name)

@@ -4,9 +4,12 @@ Mappings, lists, texts, finite numbers, true, false and null (YAML 1.2's core sc
 has them). No tags, no aliases (ROS refuses them too), no key twice, no second document, no number that is not finite.
 """
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
 import re
+from typing import Any, TYPE_CHECKING
 
 import yaml
 from yaml.composer import Composer
@@ -16,8 +19,11 @@ from yaml.resolver import Resolver
 from .errors import InputError
 from .limits import YAML_BYTES, YAML_DEPTH, YAML_NODES
 
+if TYPE_CHECKING:
+    from yaml import CollectionNode, MappingNode, Mark, Node, ScalarNode
 
-def read_yaml(path):
+
+def read_yaml(path: str | Path) -> Any:
     """What a YAML file holds: dict, list, str, int, float, bool or None. Raises InputError that names file and line."""
     try:
         with open(path, "rb") as file:
@@ -30,7 +36,7 @@ def read_yaml(path):
     return parse_yaml(data, path)
 
 
-def parse_yaml(data, name):
+def parse_yaml(data: bytes | str, name: str | Path) -> Any:
     """The same of bytes or text; name : in messages."""
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
@@ -54,7 +60,7 @@ def parse_yaml(data, name):
 
 
 class _Refused(Exception):
-    def __init__(self, mark, sentence):
+    def __init__(self, mark: Mark, sentence: str) -> None:
         super().__init__(sentence)
         self.line = mark.line + 1
 
@@ -62,24 +68,27 @@ class _Refused(Exception):
 class _WithLibyaml(Composer, SafeConstructor, Resolver):
     """The events of libyaml, which reads 10 000 anchors in a second instead of four; nodes and values are made here, where they are checked."""
 
-    def __init__(self, text):
+    def __init__(self, text: str) -> None:
         self._parser = yaml.cyaml.CParser(text)
         self.check_event, self.peek_event, self.get_event = self._parser.check_event, self._parser.peek_event, self._parser.get_event
         for base in (Composer, SafeConstructor, Resolver):
             base.__init__(self)
 
-    def dispose(self):
+    def dispose(self) -> None:
         self._parser.dispose()
 
 
-class _Loader(_WithLibyaml if yaml.__with_libyaml__ else yaml.SafeLoader):
-    yaml_implicit_resolvers = {}  # those of YAML 1.1 take 1:30 for 90, and 1e-3 for a text
+_Base: Any = _WithLibyaml if yaml.__with_libyaml__ else yaml.SafeLoader
 
-    def __init__(self, text):
+
+class _Loader(_Base):
+    yaml_implicit_resolvers: dict = {}  # those of YAML 1.1 take 1:30 for 90, and 1e-3 for a text
+
+    def __init__(self, text: str) -> None:
         super().__init__(text)
         self._nodes = self._depth = 0
 
-    def compose_node(self, parent, index):
+    def compose_node(self, parent: CollectionNode | None, index: int | ScalarNode | None) -> Node:
         event = self.peek_event()
         self._nodes += 1
         self._depth += 1
@@ -94,7 +103,7 @@ class _Loader(_WithLibyaml if yaml.__with_libyaml__ else yaml.SafeLoader):
         self._depth -= 1
         return node
 
-    def construct_mapping(self, node, deep=False):
+    def construct_mapping(self, node: MappingNode, deep: bool = False) -> dict[Any, Any]:
         content = {}
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
@@ -105,13 +114,13 @@ class _Loader(_WithLibyaml if yaml.__with_libyaml__ else yaml.SafeLoader):
             content[key] = self.construct_object(value_node, deep)
         return content
 
-    def construct_yaml_int(self, node):
+    def construct_yaml_int(self, node: ScalarNode) -> int:
         text = node.value.lstrip("+-0")
         if len(text) > 19 or abs(int(node.value)) >= 2**63:
             raise _Refused(node.start_mark, f"{node.value[:40]} does not fit into 64 bits; give a smaller number.")
         return int(node.value)
 
-    def construct_yaml_float(self, node):
+    def construct_yaml_float(self, node: ScalarNode) -> float:
         value = float(re.sub(r"\.(nan|inf)$", r"\1", node.value.lower()))
         if not math.isfinite(value):
             raise _Refused(node.start_mark, f"{node.value} is not finite; give a number.")

@@ -1,6 +1,9 @@
 """Anchor surveys: total-station text files, CSV files of positions, and our own YAML."""
 
+from __future__ import annotations
+
 import re
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +12,9 @@ from .errors import InputError
 from .files import read_bytes
 from .later import rotations
 from .limits import SURVEY_BYTES
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 # The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z), arm 3 forward (x).
 # Arm 2, "left" for somebody who looks at the stand from the front, points to -y: only this makes a right-handed frame
@@ -21,9 +27,10 @@ MAX_TIP_RESIDUAL = 0.010  # metres RMS; measured: 0.5 ... 2.2 mm
 _ANTENNA = re.compile(r"anchorAnt_?([0-9]{1,9})$")
 _TIP = re.compile(r"anchor_?([0-9]{1,9})_([123])$")
 _OURS = re.compile(r"[{\s]*[\"']?anchors[\"']?\s*:")
+Lines = list[tuple[int, list[str]]]  # numbers and cells
 
 
-def read_survey(path):
+def read_survey(path: str | Path) -> Anchors:
     """Anchors of a survey file of any of three kinds, told apart by content.
 
     - total station: lines `name,x,y,z` in metres; `anchorAntN` is the antenna of anchor N, `anchorN_1/_2/_3` the arm
@@ -40,10 +47,10 @@ def read_survey(path):
         raise InputError(
             f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv or .yaml)."
         ) from error
-    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    if any(_OURS.match(line) for _, line in lines):
+    texts = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    if any(_OURS.match(line) for _, line in texts):
         return Anchors.from_yaml(path)
-    lines = [(number, [cell.strip() for cell in line.split(",")]) for number, line in lines]
+    lines = [(number, [cell.strip() for cell in line.split(",")]) for number, line in texts]
     if not lines:
         raise InputError(f"{path}: is empty; give a survey file (.txt, .csv or .yaml).")
     try:
@@ -55,7 +62,7 @@ def read_survey(path):
         raise InputError(message if message.startswith(f"{path}: ") else f"{path}: {message}") from error
 
 
-def orientation_from_tips(tips):
+def orientation_from_tips(tips: np.ndarray) -> tuple[np.ndarray, float]:
     """Rotation that best turns `ARM_TIPS` into the surveyed tips, and the RMS distance that remains.
 
     tips : (3, 3) world positions of tips 1, 2, 3, metres. Returns (quaternion x y z w stand to world, metres).
@@ -66,7 +73,7 @@ def orientation_from_tips(tips):
     return rotation.as_quat(), float(np.sqrt(((rotation.apply(nominal) - surveyed) ** 2).sum(axis=1).mean()))
 
 
-def _positions(path, lines):
+def _positions(path: str | Path, lines: Lines) -> Anchors:
     ids, positions = [], []
     for number, cells in lines:
         if not re.fullmatch("[0-9]{1,9}", cells[0]):
@@ -78,8 +85,9 @@ def _positions(path, lines):
     return Anchors.from_positions(positions, ids)
 
 
-def _total_station(path, lines):
-    antennas, tips = {}, {}
+def _total_station(path: str | Path, lines: Lines) -> Anchors:
+    antennas: dict[Any, list[float]] = {}
+    tips: dict[Any, list[float]] = {}
     for number, cells in lines:
         antenna, tip = _ANTENNA.match(cells[0]), _TIP.match(cells[0])
         points, key = (
@@ -100,10 +108,11 @@ def _total_station(path, lines):
         if anchor not in antennas:
             raise InputError(f"{path}: anchor {anchor} has arm tips but no line 'anchorAnt{anchor},x,y,z'; add it.")
     ids = sorted(antennas)
-    return Anchors(ids, [antennas[i] for i in ids], [_orientation(path, i, tips) for i in ids])
+    orientations = np.array([_orientation(path, i, tips) for i in ids])
+    return Anchors(np.array(ids), np.array([antennas[i] for i in ids]), orientations)
 
 
-def _orientation(path, anchor, tips):
+def _orientation(path: str | Path, anchor: int, tips: dict[tuple[int, int], list[float]]) -> np.ndarray:
     found = [tips[anchor, k] for k in (1, 2, 3) if (anchor, k) in tips]
     if not found:
         return np.full(4, np.nan)
@@ -118,7 +127,7 @@ def _orientation(path, anchor, tips):
     return quaternion
 
 
-def _point(path, number, cells):
+def _point(path: str | Path, number: int, cells: list[str]) -> list[float]:
     try:
         point = [float(cell) for cell in cells[1:]]
     except ValueError:

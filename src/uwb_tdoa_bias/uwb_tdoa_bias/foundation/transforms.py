@@ -1,13 +1,20 @@
 """Frames and how they lie to each other: what TF says, without ROS."""
 
+from __future__ import annotations
+
 from bisect import bisect_right
 from collections import deque
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .errors import InputError
 from .later import rotations
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+    from scipy.spatial.transform import Rotation
 
 KEPT = 1000  # transforms of a frame that moves
 HELD = 0.5  # s for which the last transform of a frame that moves holds
@@ -16,33 +23,36 @@ MOST, MOST_MOVING = 1000, 200  # frames that do not move, and that do
 SHORTEST, LONGEST = 1e-3, 1e3  # of a quaternion, which should be 1
 FARTHEST = 1e8  # m; squares of what is off by more, and is turned by a gyroscope, may overflow
 
+_Moved = tuple[float, tuple[float, ...], tuple[float, ...]]  # t, q and p
+
 
 class Frames:
     """A tree of frames, each with a transform to its parent that is constant, or a course in time."""
 
-    def __init__(self):
-        self._static, self._moving = {}, {}  # {frame: (parent, Rotation, p)} and {frame: (parent, deque of (t, q, p))}
+    def __init__(self) -> None:
+        self._static: dict[str, tuple[str, Rotation, np.ndarray]] = {}  # parent, turn and p of each frame
+        self._moving: dict[str, tuple[str, deque[_Moved]]] = {}  # parent, and the last transforms
 
-    def set(self, parent, child, q, p):
+    def set(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
         """A constant transform: x_parent = R(q) x_child + p; q (4,) x y z w, p (3,) m. Returns whether it is new. Raises
         InputError for what is no transform."""
         new = self.differs(parent, child, q, p)
         self._static[child] = parent, rotations.Rotation.from_quat(q), np.array(p, dtype=float)
         return new
 
-    def knows(self, child):
+    def knows(self, child: str) -> bool:
         """Whether a frame has a constant transform."""
         return child in self._static
 
-    def differs(self, parent, child, q, p):
+    def differs(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
         """Whether this is another transform than the constant one of that frame, or its first. Raises InputError as `set` does."""
         self._check(self._static, MOST, parent, child, q, p)
-        before_parent, turn, before_p = self._static.get(child, (None, None, None))
-        if before_parent != parent or not np.array_equal(before_p, np.array(p, dtype=float)):
+        known = self._static.get(child)
+        if known is None or known[0] != parent or not np.array_equal(known[2], np.array(p, dtype=float)):
             return True
-        return (turn.inv() * rotations.Rotation.from_quat(q)).magnitude() > 1e-9
+        return (known[1].inv() * rotations.Rotation.from_quat(q)).magnitude() > 1e-9
 
-    def move(self, parent, child, q, p, t):
+    def move(self, parent: str, child: str, q: Sequence[float], p: Sequence[float], t: float) -> None:
         """The transform at stamp t, s. One that is not later than the last is passed over; another parent starts anew. Raises
         InputError for what is no transform."""
         self._check(self._moving, MOST_MOVING, parent, child, q, p)
@@ -55,7 +65,9 @@ class Frames:
         if not course or t > course[-1][0]:
             course.append((t, tuple(q), tuple(p)))
 
-    def _check(self, known, most, parent, child, q, p):
+    def _check(
+        self, known: Collection[str], most: int, parent: str, child: str, q: Sequence[float], p: Sequence[float]
+    ) -> None:
         if not all(map(math.isfinite, (*q, *p))):
             raise InputError(f"{parent} -> {child}: q = {tuple(q)}, p = {tuple(p)} must be finite numbers.")
         if max(map(abs, p)) > FARTHEST:
@@ -65,7 +77,7 @@ class Frames:
         if child not in known and len(known) >= most:
             raise InputError(f"{parent} -> {child}: there are {most} frames already; publish fewer.")
 
-    def between(self, target, source, t=None):
+    def between(self, target: str, source: str, t: float | None = None) -> tuple[Rotation, np.ndarray] | None:
         """(Rotation, p (3,) m) with x_target = R x_source + p, at stamp t, s, for frames that move; None if not known."""
         ours, theirs = self._to_root(source, t), self._to_root(target, t)
         common = next((frame for frame in ours if frame in theirs), None)
@@ -74,7 +86,7 @@ class Frames:
         (turn, p), (other_turn, other_p) = ours[common], theirs[common]
         return other_turn.inv() * turn, other_turn.inv().apply(p - other_p)
 
-    def _to_root(self, frame, t):
+    def _to_root(self, frame: str, t: float | None) -> dict[str, tuple[Rotation, np.ndarray]]:
         """{ancestor: (Rotation, p)} of a frame, itself first."""
         turn, p = rotations.Rotation.identity(), np.zeros(3)
         found = {frame: (turn, p)}
@@ -87,7 +99,7 @@ class Frames:
             found[frame] = turn, p
         return found
 
-    def _at(self, frame, t):
+    def _at(self, frame: str, t: float | None) -> tuple[str, Rotation, np.ndarray] | None:
         """(parent, Rotation, p) of a frame that moves, interpolated; None where it is not known."""
         if t is None or frame not in self._moving:
             return None

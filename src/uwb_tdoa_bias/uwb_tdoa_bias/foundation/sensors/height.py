@@ -1,6 +1,9 @@
 """A range finder that looks down along the body's -z."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -42,12 +45,12 @@ def _content(height: Height) -> dict:
     }
 
 
-def _simulated(config, room, motion, turn, noise) -> tuple:
+def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tuple:
     true = (motion.p[:, 2] - room.lower[2]) / turn.apply([0.0, 0.0, 1.0])[:, 2]
     return (np.maximum(true + config.height_noise * noise(), 0.0),)
 
 
-def _reading(track, t: np.ndarray) -> np.ndarray:
+def _reading(track: Any, t: np.ndarray) -> np.ndarray:
     q = track.attitudes(t)
     return (track.positions(t)[:, 2] / (1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)))[:, None]  # over the ground at z = 0
 

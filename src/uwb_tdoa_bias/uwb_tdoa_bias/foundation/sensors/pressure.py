@@ -1,6 +1,9 @@
 """A barometer, and altitudes of the international standard atmosphere (ICAO Doc 7488, troposphere)."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +46,7 @@ def _measured(of: Pressure) -> tuple[dict, np.ndarray]:
     return {"value": altitude_of(np.where(usable, of.pressure, SEA_LEVEL))[:, None]}, usable
 
 
-def _simulated(config, room, motion, turn, noise) -> tuple:
+def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tuple:
     return (pressure_at(SITE + motion.p[:, 2] + config.pressure_noise * noise()),)
 
 

@@ -1,6 +1,9 @@
 """Two-way ranging: distances to anchors."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +43,7 @@ def _measured(ranges: Ranges) -> tuple[dict, np.ndarray]:
     return rows, (ranges.d >= 0.0) & (ranges.d < FARTHEST) & (ranges.variance >= 0.0) & np.isfinite(ranges.variance)
 
 
-def _simulated(config, room, motion, turn, noise) -> tuple:
+def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tuple:
     """Each anchor in its turn."""
     row = np.arange(len(motion.p)) % len(config.anchors)
     antenna = motion.p + turn.apply(config.tag_lever_arm)
@@ -59,6 +62,7 @@ def _unknown(ranges: Ranges, anchors: Anchors) -> Mistake | None:
         return Mistake(
             "range_unknown", "ranges are to anchors that the survey does not list", evidence, remedy, float(share)
         )
+    return None
 
 
 def _unit(ranges: Ranges, anchors: Anchors) -> Mistake | None:
@@ -68,6 +72,7 @@ def _unit(ranges: Ranges, anchors: Anchors) -> Mistake | None:
         evidence = f"their median is {middle:.4g} m, and the anchors are {extent:.1f} m apart at most"
         remedy = "publish metres: divide millimetres by 1000, multiply seconds by 299792458"
         return Mistake("range_unit", "ranges are in another unit than metres", evidence, remedy, middle)
+    return None
 
 
 def _impossible(ranges: Ranges, anchors: Anchors) -> Mistake | None:
@@ -78,6 +83,7 @@ def _impossible(ranges: Ranges, anchors: Anchors) -> Mistake | None:
         return Mistake(
             "range_invalid", "most ranges cannot be distances", evidence, "publish |p - a| in metres, 0 or more", share
         )
+    return None
 
 
 SENSOR = Sensor(

@@ -1,7 +1,10 @@
 """What a sensor is, beside inertia and TDOAs: everything that is not its mathematics in the filter, said once."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
@@ -10,8 +13,11 @@ RATE = 25.0  # Hz, of simulated sensors
 LARGEST_NUMBER = 1e30  # of anything in a recording, in whatever unit: what is computed of it stays finite
 
 
+@dataclass(frozen=True)
 class Stream:
     """Measurements of one sensor: a frozen dataclass of arrays of one length, the first of which is t (n,), s."""
+
+    t: np.ndarray
 
     def __len__(self) -> int:
         return len(self.t)
@@ -132,7 +138,7 @@ class Sensor:
         return self.stream(t, *self.columns(fields))
 
 
-def parameter(default, text: str, high=None, low: float = 0.0, with_low: bool = False, fixed: bool = False) -> Field:
+def parameter(default: float, text: str, high: float | None = None, low: float = 0.0, with_low: bool = False, fixed: bool = False) -> Any:
     """A field of FilterConfig. text : unit and meaning, as in ekf_node.yaml; a number must be above `low`, or may be
     that too, and at most `high`; fixed : cannot change while the filter runs."""
     limits = {"low": low, "high": high, "with_low": with_low}

@@ -1,6 +1,9 @@
 """A velocity in the body frame: wheels, optical flow, visual odometry."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -57,7 +60,7 @@ def _measured(velocity: Velocity) -> tuple[dict, np.ndarray]:
     return rows, sane & known.any(axis=1) & ~np.isnan(std).any(axis=1)
 
 
-def _simulated(config, room, motion, turn, noise) -> tuple:
+def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tuple:
     v = turn.inv().apply(motion.v) + config.velocity_noise * noise(3)
     return v, np.full(v.shape, max(config.velocity_noise, LEAST_STD))
 
