@@ -1,5 +1,7 @@
 """`effects.yaml`: which effects are in the model, with which values."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
