@@ -7,12 +7,12 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from known_effects import clean_flight
 import numpy as np
 
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.readers.inputs import Reading
-from uwb_tdoa_tools.studies.diagnosis.bank import clean_flight
 
 UTIL = "util/const{}-tdoa2.csv.gz"
 SETS = {

@@ -71,3 +71,18 @@ def test_missing_survey(files, capsys):
     assert main(["flight.log", "--survey", "nothing.txt", "--out", "flight.bag"]) == 2
     assert "nothing.txt: cannot be read" in capsys.readouterr().err
     assert not (files / "flight.bag").exists()
+
+
+def test_what_a_moved_clock_puts_before_zero_is_left_out_and_said(tmp_path, monkeypatch, capsys):
+    """As of a tool whose clock begins with the recording."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "survey.csv").write_text(SURVEY)
+    rows = [f"{0.1 * k:.1f},0,1,0.25,,,," for k in range(20)] + [f",,,,{0.1 * k:.1f},1,2,3" for k in range(20)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,a,b,d,tp,x,y,z", *rows, ""]))
+    columns = "tdoa_time=t,anchor_a=a,anchor_b=b,tdoa=d,pose_time=tp,pose_x=x,pose_y=y,pose_z=z"
+    words = ["a.csv", "--columns", columns, "--survey", "survey.csv", "--out", "new.bag"]
+    assert main([*words, "--time-offset", "truth=-0.45"]) == 0
+    assert "truth: 5 samples before 0 s, which a bag has no place for, are left out" in capsys.readouterr().out
+    truth = read_flight("new.bag").truth
+    assert len(truth) == 15 and truth.t[0] == pytest.approx(0.05)
+    assert main([*words[:-1], "other.bag", "--time-offset", "tdoa=-0.45"]) == 2

@@ -86,9 +86,9 @@ PRINT = {"commands/calibrate.py", "commands/survey.py", "diagnosis/report/apply.
 
 
 def sources():
-    """[(name, syntax tree)] of all modules but those of studies, which nobody needs to use the suite."""
+    """[(name, syntax tree)] of all modules that are installed."""
     paths = [(path.relative_to(package).as_posix(), path) for package in PACKAGES for path in package.rglob("*.py")]
-    return [(name, ast.parse(path.read_text())) for name, path in paths if not name.startswith("studies/")]
+    return [(name, ast.parse(path.read_text())) for name, path in paths]
 
 
 def texts(tree):
