@@ -1,3 +1,5 @@
+"""The study of maps of the bias on measured flights."""
+
 import pytest
 
 from uwb_tdoa_tools.readers import inputs

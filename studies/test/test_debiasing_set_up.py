@@ -1,3 +1,5 @@
+"""The figure of what a map of the bias is made of."""
+
 import numpy as np
 
 from uwb_tdoa_tools.simulation import SimulationConfig

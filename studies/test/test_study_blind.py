@@ -1,3 +1,5 @@
+"""The blind study of the diagnosis."""
+
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,3 +1,5 @@
+"""The study of how far trajectories are to be believed."""
+
 import numpy as np
 
 from uwb_tdoa_tools.bags.bag import write_bag

@@ -1,3 +1,5 @@
+"""The study of how good a trained bias can be."""
+
 import numpy as np
 from training_flights import flight
 

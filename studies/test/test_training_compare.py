@@ -1,3 +1,5 @@
+"""The study that compares trained bias models."""
+
 import json
 
 import pytest

@@ -1,3 +1,5 @@
+"""The study of a vehicle that spins."""
+
 import numpy as np
 
 from studies import __main__ as study

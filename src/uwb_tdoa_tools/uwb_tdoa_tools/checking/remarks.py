@@ -5,6 +5,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .case import Case
+from .check import different_surveys
 from .recording import of_flight
 from .tdoa_rules import gained, survey_fit
 
@@ -32,3 +33,10 @@ def survey_remarks(flight):
 
 def _listed(ids):
     return ", ".join(map(str, ids))
+
+
+def remarks_on(flights):
+    """Sentences on the surveys of Flights, each by itself and beside one another."""
+    for flight in flights:
+        yield from (f"{flight.name}: {remark}" for remark in survey_remarks(flight))
+    yield from (f"{finding.cause}: {finding.evidence}; {finding.remedy}." for finding in different_surveys(flights))

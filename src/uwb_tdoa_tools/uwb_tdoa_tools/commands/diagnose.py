@@ -8,15 +8,13 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
-from ..checking.check import different_surveys
-from ..checking.remarks import survey_remarks
+from ..checking.remarks import remarks_on
 from ..diagnosis import diagnose
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
 from ..diagnosis.report.apply import applying
-from ..diagnosis.self_survey import tdoa_std_of
-from ..localizing.estimate import Estimator
-from ..localizing.rerun_file import write_rerun
+from ..diagnosis.self_survey import noise_of
+from ..localizing.rerun_file import write_diagnosis
 from ..progress import Progress
 from ..surveying.paths import DRIFT, read_paths
 
@@ -89,11 +87,8 @@ def _diagnose(args):
     shared = {f.name for f in flights} & {f.name for f in holdout}
     if shared:
         raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
-    for flight in (*flights, *holdout):
-        for remark in survey_remarks(flight):
-            cli.say("diagnose", f"{flight.name}: {remark}")
-    for finding in different_surveys([*flights, *holdout]):
-        cli.say("diagnose", f"{finding.cause}: {finding.evidence}; {finding.remedy}.")
+    for remark in remarks_on([*flights, *holdout]):
+        cli.say("diagnose", remark)
     for option in ("marks", "odometry"):
         if args.reference == option and getattr(args, option) is None:
             raise InputError(f"--reference {option}: --{option} says which, and is missing.")
@@ -105,7 +100,7 @@ def _diagnose(args):
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress, over)
         progress("measuring the noise")
-        tdoa_std = _noise(result, config, over)
+        tdoa_std = noise_of(result, config, over, partial(cli.say, "diagnose"))
     out.mkdir(parents=True, exist_ok=True)
     (_, its_survey), *_ = found
     truth = all(flight.truth is not None for flight in holdout or flights)
@@ -116,27 +111,9 @@ def _diagnose(args):
     if tdoa_std is not None:
         write_parameters(out / "ekf_node.yaml", tdoa_std)
     if rerun is not None:
-        _show(result, effects or EffectSet(), config, rerun)
+        write_diagnosis(rerun, result, effects or EffectSet(), config)
     cli.show(result.as_text())
     cli.show(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
-
-
-def _show(result, base, config, path):
-    """Write the flight of a Diagnosis for Rerun: estimates with the EffectSet `base` and with what was found, what that is, and the ground
-    truth as it was judged by."""
-    (flight,) = result.flights
-    before, after = (Estimator(config, effects)(flight) for effects in (base, result.effects))
-    truth = flight.truth if result.reference.judges else None
-    write_rerun(path, flight, after.odometry, after.residuals, result.as_text().splitlines(), truth, before.odometry)
-
-
-def _noise(result, config, over):
-    """tdoa_std, m, of the flights of a Diagnosis beside its effects; None where they are too short to tell."""
-    try:
-        return tdoa_std_of(result.flights, result.effects, config, over)
-    except InputError as error:
-        cli.say("diagnose", f"no ekf_node.yaml: {error}")
-        return None
 
 
 if __name__ == "__main__":

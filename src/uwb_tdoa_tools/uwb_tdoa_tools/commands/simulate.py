@@ -5,7 +5,6 @@ from pathlib import Path
 import sys
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .. import cli
@@ -14,12 +13,10 @@ from ..bags.files import STORAGES
 from ..progress import Progress
 from ..simulation import NO_IMU_ERRORS, ImuErrors, SimulationConfig, simulate
 from ..simulation.config import YAW_PROFILES
-from ..simulation.plots import plot
+from ..simulation.plots import check_image, plot
 from ..simulation.schedule import PROTOCOLS
 from ..simulation.summary import catalogue, summary
 from ..simulation.trajectories import TRAJECTORIES
-
-PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def main(argv=None):
@@ -91,8 +88,7 @@ def _simulate(args):
         return
     if args.out is not None:
         check_output(args.out, args.force)  # before the work, not after it
-    if args.plot is not None and args.plot.suffix.lower() not in PLOT_SUFFIXES:
-        raise InputError(f"plot: {args.plot} is no image file; choose one of {', '.join(PLOT_SUFFIXES)}.")
+    check_image(args.plot)
     cli.check_folders(args.json, args.plot)
     with Progress("simulate") as progress:
         progress("flying")

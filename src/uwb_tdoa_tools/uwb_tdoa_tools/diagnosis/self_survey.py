@@ -116,6 +116,15 @@ def tdoa_std_of(flights, effects, config=None, over=map):
     return _Runs(flights, effects, config).equations(anchors, np.zeros(len(anchors)), loose, over=over).tdoa_std(config)
 
 
+def noise_of(diagnosis, config, over, say):
+    """The same of the flights of a Diagnosis beside its effects; None where they are too short to tell, and say(why)."""
+    try:
+        return tdoa_std_of(diagnosis.flights, diagnosis.effects, config, over)
+    except InputError as error:
+        say(f"no ekf_node.yaml: {error}")
+        return None
+
+
 @in_one_thread
 def slow_innovations(flights, effects, config=None):
     """m, scale of the innovations of Flights that are slow, averaged over half a second, beside the EffectSet `effects`: what anchors

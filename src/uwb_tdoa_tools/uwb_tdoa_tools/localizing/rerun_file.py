@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
 from ..scoring.metrics import position_at
+from .estimate import Estimator
 from .pictures import SIGMAS
 from .residuals import by_pair
 
@@ -55,6 +56,15 @@ def write_rerun(path: Path, flight: Flight, odometry, residuals, verdict: list, 
                 _write_scalars(rerun, stream, name, one.t - begin, np.linalg.norm(one.p - position_at(one.t, truth), axis=1))
     stream.flush()
     stream.disconnect()
+
+
+def write_diagnosis(path: Path, result, base, config) -> None:
+    """Write the single flight of a Diagnosis: estimates with the EffectSet `base` and with what was found, what that is, and the ground
+    truth as it was judged by."""
+    (flight,) = result.flights
+    before, after = (Estimator(config, effects)(flight) for effects in (base, result.effects))
+    truth = flight.truth if result.reference.judges else None
+    write_rerun(path, flight, after.odometry, after.residuals, result.as_text().splitlines(), truth, before.odometry)
 
 
 def _write_poses(rerun, stream, odometry, begin):

@@ -2,6 +2,16 @@
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.errors import InputError
+
+SUFFIXES = (".png", ".pdf", ".svg")
+
+
+def check_image(path):
+    """Raises InputError for a path that is no image file; None is none."""
+    if path is not None and path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"plot: {path} is no image file; choose one of {', '.join(SUFFIXES)}.")
+
 
 def plot(flight, path):
     """Draw path and anchors from above, height, and the bias and full error of the TDOAs, to an image file."""
