@@ -20,10 +20,10 @@ class Progress:
     """As a context, says what is being done, how much of it is done, and for how long, until it ends; whatever takes shorter than
     FIRST says nothing. Call it with what is being done, as often as you like."""
 
-    def __init__(self, name="", total=None, unit="", stream=None):
-        """name : what the lines begin with; total : of what is to be done, in `unit`, or None; stream : where to, default stderr."""
+    def __init__(self, name="", total=None, unit="", stream=None, what=""):
+        """name : what the lines begin with; total : of what is to be done, in `unit`, or None; stream : where to, default stderr; what : what is done first."""
         self._name, self._total, self._unit, self._stream = name, total, unit, stream
-        self._what, self._done, self._ended = "", 0, Event()
+        self._what, self._done, self._ended = what, 0, Event()
 
     def __call__(self, what):
         self._what = what

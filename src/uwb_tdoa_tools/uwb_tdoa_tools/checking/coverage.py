@@ -28,6 +28,8 @@ class View:
 
 def missing(view):
     """Anchors of the survey that are never, hardly ever or for a while not heard."""
+    if not view.windows:  # a recording of less than a second
+        return
     heard = np.array([window.heard for window in view.windows])
     counts = heard.sum(axis=0)
     lost = view.anchors.ids[counts == 0].tolist()

@@ -62,8 +62,7 @@ def parser():
 def _convert(args):
     offsets = _offsets(args.offsets)
     named = _named(args)
-    with Progress("convert") as progress:
-        progress("reading and writing")
+    with Progress("convert", what="reading and writing"):
         made = convert(lambda: on_one_clock(shifted(_read(args, named), offsets), args.align), args.out, args.storage, args.force)
     if args.json:
         cli.show(json.dumps(asdict(made), indent=2, default=str))

@@ -53,8 +53,7 @@ def _inject(args):
         if not getattr(args, option):
             raise InputError(f"{option}: is missing; see inject --help.")
     effect = parse_effect(args.effect, args.value)
-    with Progress("inject") as progress:
-        progress("reading and writing")
+    with Progress("inject", what="reading and writing"):
         name = inject(effect, args.flight, options.reading_of(args), args.out, args.seed, args.storage, args.force)
     added = ", ".join(f"{key} = {value:g}" for key, value in effect.values.items())
     cli.show(f"{name}: added {effect.name} ({added}, in {effect.unit}) -> {args.out}")
