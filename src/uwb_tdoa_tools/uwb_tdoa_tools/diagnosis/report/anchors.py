@@ -11,14 +11,17 @@ SURE = 2.0  # standard deviations from which a value is marked
 
 
 def rows(diagnosis):
-    """[[cell]] of a table with HEAD, a row for each anchor of which a position or a delay was found; [] without any."""
+    """[[cell]] of a table, those of HEAD first that have any value, then a row for each anchor of which a position or a delay was found; []
+    without any."""
     found = {}
     for finding in diagnosis.findings:
         if finding.effect.name in (POSITION, DELAY) and not finding.on_floor and finding.flight is None:
             for key, value in finding.effect.values.items():
                 anchor, _, axis = key.partition(".")
                 found.setdefault(anchor, {})[axis] = value, finding.effect.std.get(key, np.nan)
-    return [[anchor, *(_cell(found[anchor].get(axis)) for axis in ("x", "y", "z", ""))] for anchor in sorted(found, key=int)]
+    cells = [[anchor, *(_cell(found[anchor].get(axis)) for axis in ("x", "y", "z", ""))] for anchor in sorted(found, key=int)]
+    told = [column for column in zip(HEAD, *cells) if any(column[1:])]
+    return [list(row) for row in zip(*told)]
 
 
 def _cell(known):
@@ -34,7 +37,7 @@ def lines(diagnosis):
     several = rows(diagnosis)
     if not several:
         return []
-    return [f"{TITLE} (? less than {SURE:g} standard deviations):", *("".join(f"{cell:>12s}" for cell in row) for row in (HEAD, *several))]
+    return [f"{TITLE} (? less than {SURE:g} standard deviations):", *("".join(f"{cell:>12s}" for cell in row) for row in several)]
 
 
 def fitted(diagnosis):
@@ -46,4 +49,4 @@ def fitted(diagnosis):
         f"± one standard deviation of where the anchor may be, not of the fit; ? marks less than {SURE:g} of them. What else makes such "
         "errors, another one in each direction, or a delay, has been counted."
     )
-    return section(TITLE, paragraphs([words], "note"), table(HEAD, several, (1, 2, 3, 4)))
+    return section(TITLE, paragraphs([words], "note"), table(several[0], several[1:], range(1, len(several[0]))))

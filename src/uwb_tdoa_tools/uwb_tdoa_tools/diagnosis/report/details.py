@@ -109,7 +109,7 @@ def phases(diagnosis):
     """The error of every run in each phase of its recording, before and after."""
     sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
     found = [[row.get("phases", {}) for row in side] for side in sides]
-    names = [name for name in TITLES if any(name in phases for phases in found[0])]
+    names = [name for name in TITLES if any(phases.get(name, {}).get("rmse_3d") is not None for side in found for phases in side)]
     if not names:
         return ""
     runs = labels(diagnosis)
