@@ -23,7 +23,7 @@ from studies.aids import FAULTS, ONSET, bounds, of_four, only  # noqa: E402
 
 # What the filter copes with is no reason to warn: steps, single wrong ranges, and a barometer that drifts.
 COPED_WITH = ("height: steps of 0.3 to 0.8 m", "height: one in five 1 m too long", "pressure: drifts 1 m per minute")
-RUNNING = type("Estimator", (), {"running": True, "anchors": None})
+RUNNING = type("Estimator", (), {"running": True, "anchors": None, "side_unknown": None})
 
 
 @pytest.fixture(scope="module")
