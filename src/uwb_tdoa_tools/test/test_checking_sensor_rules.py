@@ -41,4 +41,4 @@ def test_a_bag_of_ranges_alone_is_read_and_checked(ranged, tmp_path):
     for one, other in zip(back.range.columns, ranged.range.columns):
         np.testing.assert_array_equal(one, other)
     made = read_recording(Reading(), tmp_path / "ranged.bag")
-    assert len(made.felt["range"]) == len(ranged.range) and not check(made).faulty
+    assert len(made.sensors["range"]) == len(ranged.range) and not check(made).faulty

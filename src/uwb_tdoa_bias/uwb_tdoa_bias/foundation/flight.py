@@ -60,13 +60,13 @@ class Truth:
         return len(self.t)
 
 
-_Felt: Any = make_dataclass(  # the names of its attributes are those of SENSORS
-    "_Felt", [(name, sensor.stream | None, None) for name, sensor in SENSORS.items()], frozen=True, kw_only=True
+_SensorStreams: Any = make_dataclass(  # the names of its attributes are those of SENSORS
+    "_SensorStreams", [(name, sensor.stream | None, None) for name, sensor in SENSORS.items()], frozen=True, kw_only=True
 )
 
 
 @dataclass(frozen=True)
-class Flight(_Felt):
+class Flight(_SensorStreams):
     """One recording. All stamps are of one clock, in s; every stream keeps its own; within a stream stamps never fall.
 
     name : short and unique, e.g. "0425-traj1"; whatever is given, it is `harmless`

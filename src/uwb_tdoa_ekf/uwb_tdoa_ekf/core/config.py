@@ -24,7 +24,7 @@ RENAMED = {  # old name: present name; the old ones work until the release after
 
 
 @dataclass(frozen=True)
-class _OfTdoas:
+class _FilterParameters:
     # The measurement
     tdoa_std: float = parameter(
         0.25, "m; deviation of a TDOA from its prediction, uncorrected systematic part included", high=100.0
@@ -85,11 +85,11 @@ class _OfTdoas:
 
 # What else the tag feels
 _PARAMETERS = [(name, type(each.default), each) for sensor in SENSORS.values() for name, each in sensor.parameters.items()]
-_OfSensors = make_dataclass("_OfSensors", _PARAMETERS, bases=(_OfTdoas,), frozen=True)
+_SensorParameters = make_dataclass("_SensorParameters", _PARAMETERS, bases=(_FilterParameters,), frozen=True)
 
 
 @dataclass(frozen=True)
-class FilterConfig(_OfSensors):
+class FilterConfig(_SensorParameters):
     """Tuning of the filter. The node's parameters have the same names."""
 
     fixed_height: float = parameter(0.0, "m; height of a tag that stays on its floor", high=10000.0, low=-10000.0)

@@ -124,11 +124,11 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
         if not was_running:
             _wait_for_start(ekf, anchors, tuning, t, records)
         return
-    _look_around(ekf, anchors, tuning, t, records)
+    _before_update(ekf, anchors, tuning, t, records)
     late = _update(ekf, anchors, tuning, tdoa, residual, records)
     initialization.relocate(ekf, anchors, tuning, t, records)
     known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
-    _settle(ekf, anchors, tuning, t, not late, abs(residual.innovation - known) < INLIER, records)
+    _after_update(ekf, anchors, tuning, t, not late, abs(residual.innovation - known) < INLIER, records)
 
 
 @compiled
@@ -144,7 +144,7 @@ def _on_range(ekf, anchors, tuning, aid, residual, records):
         if not was_running:
             _wait_for_start(ekf, anchors, tuning, t, records)
         return
-    _look_around(ekf, anchors, tuning, t, records)
+    _before_update(ekf, anchors, tuning, t, records)
     anchor, innovation = anchors[aid.anchor], ekf.innovation
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -155,11 +155,11 @@ def _on_range(ekf, anchors, tuning, aid, residual, records):
         _assimilate(ekf, h, tuning, t, residual, records)
         if h == ekf.best:
             systematic.observe(ekf.information, anchor, anchor, innovation, t, ekf.last_tdoa)
-    _settle(ekf, anchors, tuning, t, True, abs(residual.innovation) < INLIER, records)
+    _after_update(ekf, anchors, tuning, t, True, abs(residual.innovation) < INLIER, records)
 
 
 @compiled
-def _look_around(ekf, anchors, tuning, t, records):
+def _before_update(ekf, anchors, tuning, t, records):
     """Before an update stamped t, s: whether the tag is at rest, which anchors are heard, and whether a silence left the place open."""
     if tuning.zero_velocity:
         if t >= ekf.next_look:
@@ -173,7 +173,7 @@ def _look_around(ekf, anchors, tuning, t, records):
 
 
 @compiled
-def _settle(ekf, anchors, tuning, t, counts, agrees, records):
+def _after_update(ekf, anchors, tuning, t, counts, agrees, records):
     """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the tag is elsewhere. counts :
     what was measured tells that; agrees : with the best hypothesis."""
     _stay_in_workspace(ekf, t, records)

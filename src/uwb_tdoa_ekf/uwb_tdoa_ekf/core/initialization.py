@@ -53,21 +53,34 @@ def is_repeat(ekf, tdoa, anchors):
 
 
 @compiled
+def _height_at_start(ekf, tuning, t):
+    """(z, standard deviation), m, that other sensors tell at stamp t, s, of a tag whose attitude only the accelerometer tells; or NaN."""
+    accel = _mean_accel(ekf.imu, tuning)
+    return _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
+
+
+@compiled
+def _look_for_places(ekf, anchors, tuning, window, z, z_std, x, covariance, cost, near):
+    """`locate` in the surroundings of the anchors of a window; the most probable place first. near (2, 3) m: the box about these anchors is
+    written to it. Returns the share of TDOAs that agree with the first place."""
+    _find_surroundings(ekf, window, anchors, tuning)
+    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
+    workspace.surround(ekf, standing.NEAR, near)
+    near[0, 2] = min(near[0, 2], tuning.ground_height)
+    standing.sort(x, covariance, cost, near)
+    return share
+
+
+@compiled
 def start(ekf, anchors, tuning, t, anyhow, history):
     """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
     window = recent(ekf, tuning.start_window)
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    _find_surroundings(ekf, window, anchors, tuning)
-    x, covariance, cost = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES)
-    accel = _mean_accel(ekf.imu, tuning)
-    z, z_std = _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
-    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
-    near = np.empty((2, 3))
-    workspace.surround(ekf, standing.NEAR, near)
-    near[0, 2] = min(near[0, 2], tuning.ground_height)
-    standing.sort(x, covariance, cost, near)
+    x, covariance, cost, near = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES), np.empty((2, 3))
+    z, z_std = _height_at_start(ekf, tuning, t)
+    share = _look_for_places(ekf, anchors, tuning, window, z, z_std, x, covariance, cost, near)
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     at_rest, its = x[0].copy(), covariance[0].copy()
     wide = np.trace(its[:3, :3]) > APART**2  # before it holds other explanations
@@ -102,15 +115,9 @@ def start_slowly(ekf, anchors, tuning, t, history):
         gap = max(gap, window[i].t - window[i - 1].t)
     if not (enough or len(window) >= MINIMUM) or span < tuning.start_window or gap > LONGEST_GAP * span:
         return
-    _find_surroundings(ekf, window, anchors, tuning)
-    x, covariance, cost = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES)
-    accel = _mean_accel(ekf.imu, tuning)
-    z, z_std = _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
-    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
-    near = np.empty((2, 3))
-    workspace.surround(ekf, standing.NEAR, near)
-    near[0, 2] = min(near[0, 2], tuning.ground_height)
-    standing.sort(x, covariance, cost, near)
+    x, covariance, cost, near = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES), np.empty((2, 3))
+    z, z_std = _height_at_start(ekf, tuning, t)
+    share = _look_for_places(ekf, anchors, tuning, window, z, z_std, x, covariance, cost, near)
     if not (enough or (share >= AGREE and workspace.contains(ekf.workspace, x[0]))):
         return
     if np.trace(covariance[0, :3, :3]) > APART**2:

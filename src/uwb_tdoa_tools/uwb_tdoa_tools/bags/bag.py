@@ -97,8 +97,8 @@ def write_bag(flight, out, storage="mcap", force=False):
     if flight.imu is not None:
         topics["/imu/data"] = "sensor_msgs/msg/Imu", _STREAM_QOS, bag_messages.imu_messages(flight.imu, store)
     for name, sensor in SENSORS.items():
-        if (felt := getattr(flight, name)) is not None:
-            topics[f"/{sensor.topics[0][0]}"] = sensor.message, _STREAM_QOS, bag_messages.sensor_messages(sensor, felt, store)
+        if (stream := getattr(flight, name)) is not None:
+            topics[f"/{sensor.topics[0][0]}"] = sensor.message, _STREAM_QOS, bag_messages.sensor_messages(sensor, stream, store)
     topics["/uwb/tdoa"] = "uwb_tdoa_msgs/msg/Tdoa", _STREAM_QOS, bag_messages.tdoa_messages(flight.tdoa, store, antenna)
     if flight.truth is not None:
         poses = bag_messages.pose_messages(flight.truth, flight.anchors.frame, store)
@@ -186,10 +186,10 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth
             return make(stamps, rows) if len(stamps) else None
 
         tdoa = stream("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of)
-        felt = {
+        sensors = {
             name: stream(sensor.topics[0][0], sensor.message, *bag_messages.of_sensor(sensor)) for name, sensor in SENSORS.items()
         }
-        if tdoa is None and any(felt[name] is not None for name in LOCATING):
+        if tdoa is None and any(sensors[name] is not None for name in LOCATING):
             tdoa = bag_messages.tdoas_of(np.empty(0), np.empty((0, 4)))
         if tdoa is None:
             count = reader.unreadable[name_of("uwb/tdoa")]
@@ -212,7 +212,7 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth
         meta["antenna"] = place[1].tolist()
     if remarks:
         meta["remarks"] = remarks
-    return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, **felt)
+    return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, **sensors)
 
 
 def read_odometry(path, namespace="", salvage=False, topics=None):

@@ -163,7 +163,7 @@ def _facts(recording, streams):
         if windows:
             step = float(np.median([window.stamps.step for window in windows]))
             facts[name] = f"{1.0 / step:.0f} {unit}" if step > 0.0 else "no rate"
-    for name, stream in recording.felt.items():
+    for name, stream in recording.sensors.items():
         step = float(np.median(np.diff(stream.t))) if len(stream) > 1 else 0.0
         facts[name] = f"{SENSORS[name].plural} {1.0 / step:.0f} Hz" if step > 0.0 else f"{SENSORS[name].plural}, no rate"
     if streams.tdoa:

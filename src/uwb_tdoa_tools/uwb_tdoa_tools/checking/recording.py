@@ -37,7 +37,7 @@ class Recording:
     with the body, where the samples are those of an IMU in its origin;
     topics : {topic: type} of a bag, or of all that are live; recorded : Anchors that the bag itself holds, or None; falls :
     how often the stamps fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a
-    damaged one; ends : [End] of live topics; felt : {name: Stream} of those of the SENSORS that there are.
+    damaged one; ends : [End] of live topics; sensors : {name: Stream} of those of the SENSORS that there are.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Recording:
     falls: int = 0
     remarks: tuple = ()
     ends: tuple = ()
-    felt: dict = field(default_factory=dict)
+    sensors: dict = field(default_factory=dict)
 
 
 def read_recording(reading, path, survey=None):
@@ -88,8 +88,8 @@ def of_flight(flight):
     """Recording of a Flight. When its messages arrived is not known."""
     unknown = (np.full(len(stream) if stream is not None else 0, np.nan) for stream in (flight.tdoa, flight.imu))
     falls = sum(flight.meta.get("reordered", {}).values())
-    felt = {name: stream for name in SENSORS if (stream := getattr(flight, name)) is not None}
-    return Recording(flight.name, flight.anchors, flight.tdoa, flight.imu, *unknown, falls=falls, felt=felt)
+    sensors = {name: stream for name in SENSORS if (stream := getattr(flight, name)) is not None}
+    return Recording(flight.name, flight.anchors, flight.tdoa, flight.imu, *unknown, falls=falls, sensors=sensors)
 
 
 def _read_bag(reading, path, survey):
@@ -97,12 +97,12 @@ def _read_bag(reading, path, survey):
     with open_bag(path, reading.salvage) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
         tdoa, imu = (_stream(path, reader, name_of(topic), *_ROWS[topic]) for topic in (TDOA, IMU))
-        felt = {name: _felt(path, reader, name_of(sensor.topics[0][0]), sensor) for name, sensor in SENSORS.items()}
-        felt = {name: stream for name, stream in felt.items() if len(stream)}
+        sensors = {name: _stream_of(path, reader, name_of(sensor.topics[0][0]), sensor) for name, sensor in SENSORS.items()}
+        sensors = {name: stream for name, stream in sensors.items() if len(stream)}
         recorded = _last(path, reader, name_of("uwb/anchors"), Anchors.from_message)
         tree = placing.read_frames(path, reader)
         remarks = tuple(remarks_of(reader))
-    if not len(tdoa.stamps) and not felt.keys() & set(LOCATING):
+    if not len(tdoa.stamps) and not sensors.keys() & set(LOCATING):
         there = sorted(topic for topic, kind in topics.items() if kind == _ROWS[TDOA][0])
         places = " or ".join(f"--topic {TDOA}={topic}" for topic in there)
         hint = f"say where they are ({places})" if there else "record the TDOAs of the tag"
@@ -125,7 +125,7 @@ def _read_bag(reading, path, survey):
         topics=topics,
         recorded=recorded,
         remarks=remarks,
-        felt=felt,
+        sensors=sensors,
     )
 
 
@@ -155,7 +155,7 @@ def _stream(path, reader, topic, kind, row):
     return _Stream(stamps / 1e9, arrivals / 1e9 if known else np.full(len(rows), np.nan), table, frames)
 
 
-def _felt(path, reader, topic, sensor):
+def _stream_of(path, reader, topic, sensor):
     """Stream of a Sensor."""
     row, make, _ = bag_messages.of_sensor(sensor)
     found = _stream(path, reader, topic, sensor.message, row)

@@ -10,7 +10,7 @@ from .recording import Recording
 
 def sensors(recording: Recording) -> Iterator[Finding]:
     """Findings about the Streams of a Recording."""
-    for name, stream in recording.felt.items():
+    for name, stream in recording.sensors.items():
         for rule in SENSORS[name].rules:
             if (found := rule(stream, recording.anchors)) is not None:
                 yield Finding(found.rule, ERROR, found.cause, found.evidence, found.remedy, found.value)
