@@ -52,7 +52,7 @@ def test_the_way_to_a_diagnosed_flight(desk, tmp_path, capsys):
     capsys.readouterr()
     run(judge)
     out = capsys.readouterr().out
-    assert "monday: OK" in out and "antenna delay of anchor 3" in out
+    assert "monday: OK" in out and "anchor_delay: 3 = 0.3" in out
     effects = yaml.safe_load((tmp_path / "diagnosis" / "effects.yaml").read_text())["effects"]
     assert effects["anchor_delay"]["values"]["3"] == pytest.approx(LATE, abs=0.1)
     uncorrected, corrected = errors(out)

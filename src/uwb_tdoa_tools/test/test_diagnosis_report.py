@@ -202,6 +202,13 @@ def test_values_that_are_not_significant_are_counted_not_shown(result):
     assert entry.values == "3 = 0.30 ± 0.01 (m); 1 not significant"
 
 
+def test_a_few_values_are_named_however_uncertain_they_are(result):
+    few = EFFECTS["anchor_delay"]({"3": 0.3}, {"3": 0.2})
+    many = EFFECTS["anchor_delay"]({str(k): 0.3 for k in range(8)}, {str(k): 0.2 for k in range(8)})
+    found = [entry.values for effect in (few, many) for entry in entries(replace(result, findings=[finding(effect)]))]
+    assert found == ["3 = 0.3 ± 0.2 (m); not twice the standard deviation", "8 values, none twice its standard deviation"]
+
+
 # ---------------------------------------------------------------------------------------------------- what is unclear
 
 

@@ -161,12 +161,16 @@ def _values(finding):
     told = significant(effect)
     fitted_first = sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0]))
     unit, factors = effect.unit.replace("rad", "degrees"), {key: for_people(effect.unit, key)[1] for key in effect.values}
-    shown = [f"{key} = {measured(value * factors[key], (effect.std.get(key) or 0.0) * factors[key])}" for key, value in fitted_first if key in told]
-    rest, vague = shown[SHOWN:], len(effect.values) - len(shown)
-    words = shown[:SHOWN] + ([f"{len(rest)} more"] if rest else [])
-    if not words:
-        return f"{vague} values, none by itself twice its standard deviation"
-    return f"{', '.join(words)} ({unit})" + (f"; {vague} not significant" if vague else "")
+    vague = len(effect.values) - len(told)
+    if not told and vague > SHOWN:
+        return f"{vague} values, none twice its standard deviation"
+    named = told or effect.values  # a few values are named, however uncertain they are
+    shown = [f"{key} = {measured(value * factors[key], (effect.std.get(key) or 0.0) * factors[key])}" for key, value in fitted_first if key in named]
+    rest = shown[SHOWN:]
+    words = ", ".join(shown[:SHOWN] + ([f"{len(rest)} more"] if rest else []))
+    if not told:
+        return f"{words} ({unit}); not twice the standard deviation"
+    return f"{words} ({unit})" + (f"; {vague} not significant" if vague else "")
 
 
 def _why_not(finding, refused):
