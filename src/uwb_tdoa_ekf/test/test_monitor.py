@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_ekf.core.verdicts import INVALID, USED
+from uwb_tdoa_ekf.core.verdicts import INVALID, REJECTED, USED
 from uwb_tdoa_ekf.estimator import Odometry, Residuals
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
 
@@ -10,9 +10,9 @@ ANCHORS = Anchors.from_positions(np.random.default_rng(0).uniform(-4, 4, (6, 3))
 IDS, RATE = ANCHORS.ids, 100  # Hz
 
 
-def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True, heard=lambda t, a, b: t == t):
+def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True, heard=lambda t, a, b: t == t, rejected=lambda t: 0.0):
     """[(s, alarms)] of a flight in which the anchors have delays_at(t, p) (6,) m; 100 TDOAs a second in a ring. The tag flies
-    rounds of 10 s; the filter knows where it is."""
+    rounds of 10 s; the filter knows where it is, and rejects that share of the TDOAs."""
     rng, monitor, said = np.random.default_rng(seed), Monitor(ANCHORS), []
     for second in range(seconds):
         t = second + np.arange(RATE) / RATE
@@ -28,7 +28,7 @@ def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=
         one = np.ones(kept.sum())
         zeros, bias = np.zeros((RATE, 3)), np.column_stack([np.zeros((RATE, 2)), [gyro(x) for x in t]])
         odometry = Odometry(t, p, v, np.tile([0, 0, 0, 1.0], (RATE, 1)), zeros, bias, np.zeros((RATE, 9, 9)), np.zeros((RATE, 3, 3)))
-        verdict = np.full(len(one), USED)
+        verdict = np.where(rng.random(len(one)) < [rejected(x) for x in t[kept]], REJECTED, USED)
         monitor.add(odometry, Residuals(t[kept], IDS[a][kept], IDS[b][kept], innovation[kept], noise**2 * one, one, verdict))
         monitor.judge(second + 1.0)
         said.append((second + 1.0, monitor.alarms))
@@ -54,6 +54,11 @@ def test_names_the_anchor_that_changed_and_by_how_much(row, size, word):
     for _, alarms in said[35:]:
         assert len(alarms) == 1 and alarms[0].startswith(f"anchor {IDS[row]}: ") and word in alarms[0]
         assert float(alarms[0].split()[2]) == pytest.approx(size, abs=0.15)
+
+
+def test_names_no_anchor_where_most_tdoas_are_rejected():
+    landed = watch(lambda t, p: only(2, 0.5 * (t > 50.0)), rejected=lambda t: 0.8 * (t > 50.0))
+    assert not any(alarms for _, alarms in landed)
 
 
 def test_names_two_that_changed_one_after_the_other():

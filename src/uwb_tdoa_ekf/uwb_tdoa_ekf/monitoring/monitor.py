@@ -13,6 +13,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
+from ..core.verdicts import REJECTED
 from .change import ChangeDetector
 from .slices import LENGTH, reduced
 from .swap import swapped
@@ -23,6 +24,7 @@ GAP = 30.0  # s without TDOAs after which a new flight begins
 LIMIT = 16.3  # ratio above which an anchor has changed: a tenth above the largest of sound flights of two days, see docs/reliability.md
 CLEARLY = 1.4  # how much larger it must be than that of any other anchor,
 MOST_LEFT = 1.0  # and of the errors since then, over those before, what it may leave: else something else has happened too, as on a floor
+FEWEST_ACCEPTED = 1 / 3  # share of the TDOAs of a slice; where the filter rejects more, as on a floor, it is no single anchor that has changed
 SMALLEST_CHANGE = 0.15  # m; less does not matter, and what has come back to that has gone
 SILENT, FEWEST = 4, 40  # slices without an anchor, and the TDOAs of the others in them
 OFTEN = 0.5  # share of the slices in which it was heard before
@@ -34,7 +36,7 @@ CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
 BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}  # rad/s and m/s^2, by which an estimated bias must have moved
 
 NO_ODOMETRY = [np.empty(0), *[np.empty((0, 3))] * 4]  # t, p, v, gyro_bias, accel_bias
-NO_RESIDUALS = [np.empty(0), *[np.empty(0, int)] * 2, np.empty(0)]  # t, a, b, innovation
+NO_RESIDUALS = [np.empty(0), *[np.empty(0, int)] * 2, np.empty(0), np.empty(0, bool)]  # t, a, b, innovation, whether it was accepted
 
 
 class Heard(NamedTuple):
@@ -88,7 +90,7 @@ class Monitor:
             self._odometry.append([odometry.t, odometry.p, odometry.v, odometry.gyro_bias, odometry.accel_bias])
         began, reached = self._end is not None, np.isfinite(residuals.innovation)  # the filter
         if reached.any():
-            columns = residuals.t, residuals.a, residuals.b, residuals.innovation
+            columns = residuals.t, residuals.a, residuals.b, residuals.innovation, residuals.verdict != REJECTED
             self._residuals.append([column[reached] for column in columns])
             t = self._residuals[-1][0]
             self._last = float(t[-1])
@@ -124,7 +126,7 @@ class Monitor:
 
     def _judge(self, end, residuals, odometry):
         """One slice that ends at `end`, s: its columns."""
-        _, a, b, innovation = residuals
+        _, a, b, innovation, accepted = residuals
         a, b = self._anchors.index(a), self._anchors.index(b)
         t, p, v, gyro_bias, accel_bias = odometry
         self._listen(a, b, p.mean(axis=0) if len(t) else None)
@@ -134,7 +136,8 @@ class Monitor:
             return
         self._follow_biases(end, np.concatenate([gyro_bias[-1], accel_bias[-1]]))
         place = p.mean(axis=0)
-        if not self._look_for_swap(a, b, innovation, place) and not self._swapped:
+        swap = self._look_for_swap(a, b, innovation, place) or self._swapped
+        if not swap and accepted.mean() >= FEWEST_ACCEPTED:
             self._detector.add(reduced(end - 0.5 * LENGTH, place, self._anchors.positions, a, b, innovation))
             self._look_for_change(end)
 

@@ -76,12 +76,11 @@ def _busiest(case, length):
     t, d = case.tdoa.t, case.tdoa.d
     pair = case.tdoa.a * 65536 + case.tdoa.b
     second = np.floor((t - t[0]) / PERIOD).astype(np.int64)
-    keys, inverse = np.unique(np.column_stack([pair, second]), axis=0, return_inverse=True)
-    inverse = inverse.reshape(-1)
-    mean = np.bincount(inverse, d) / np.bincount(inverse)
-    next_one = (keys[1:, 0] == keys[:-1, 0]) & (keys[1:, 1] == keys[:-1, 1] + 1)
-    motion = np.zeros(second[-1] + 2)
-    np.add.at(motion, keys[1:, 1][next_one], np.minimum(np.abs(np.diff(mean))[next_one], 1.0))
+    seconds = second[-1] + 2
+    keys, inverse = np.unique(np.unique(pair, return_inverse=True)[1].reshape(-1) * seconds + second, return_inverse=True)
+    mean = np.bincount(inverse.reshape(-1), d) / np.bincount(inverse.reshape(-1))
+    following = np.diff(keys) == 1  # of one pair: no pair has TDOAs in the last second of `seconds`
+    motion = np.bincount(keys[1:][following] % seconds, np.minimum(np.abs(np.diff(mean))[following], 1.0), minlength=seconds)
     total, n = np.concatenate([[0.0], np.cumsum(motion)]), int(length / PERIOD)
     best = int(np.argmax(total[n:] - total[:-n]))
     return t[0] + min(best * PERIOD, t[-1] - t[0] - length)
