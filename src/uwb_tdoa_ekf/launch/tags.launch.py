@@ -1,22 +1,26 @@
 """Several tags of one YAML file, each in its own namespace and with its own frame.
 
 ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml
-ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml processes:=2     # takes a fraction of the CPU time
+ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml processes:=auto    # takes a fraction of the CPU time
 
     anchors_file: anchors.yaml        # what all share: any parameters of bias_node and ekf_node
+    processes: auto                   # localization_nodes that share the tags of a machine: one for each core
     tags:
       tag1: {}                        # topics /tag1/imu/data ..., frame tag1/base_link
       tag2: {effects_file: tag2.yaml, tdoa_std: 0.3}
+
+With `host: NAME` for each tag, the same file is launched on every machine, and each starts the nodes of its tags.
 """
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
-from uwb_tdoa_ekf.launching import FROZEN, NETWORK, RESPAWN, pooled, tags, typed
+from uwb_tdoa_ekf.launching import FROZEN, NETWORK, RESPAWN, tags, typed
 from uwb_tdoa_ekf.launching_actions import actions
 
 OTHERS = {
-    "processes": ("", "localization_nodes that share the tags, e.g. one for each core; default: two nodes for each tag"),
+    "processes": ("", "localization_nodes that share the tags: a number, or auto, one for each core; default: as the file says, or two nodes for each tag"),
+    "host": ("", "start the tags of this host; default: the name of this machine"),
     "use_sim_time": ("", "true for bags that are played with --clock"),
     "frozen": ("", FROZEN),
     "log_level": ("info", "debug, info, warn, error"),
@@ -40,6 +44,5 @@ def generate_launch_description():
 def _nodes(context):
     given = {name: LaunchConfiguration(name).perform(context) for name in ("tags", *OTHERS, *RESPAWN, *NETWORK)}
     values = typed({name: given[name] for name in ("use_sim_time", "frozen")})
-    starts = tags(given["tags"], values, given["log_level"])
-    starts = pooled(starts, given["processes"]) if given["processes"] else starts
+    starts = tags(given["tags"], values, given["log_level"], given["processes"], given["host"])
     return actions(starts, *(given[name] for name in (*RESPAWN, *NETWORK, "rviz")), values.get("use_sim_time", False))

@@ -1,6 +1,7 @@
 """What the launch files start. Where there is no launch, it is played by stubs that take notes; test_launch_files.py runs the real one."""
 
 import json
+import os
 from pathlib import Path
 import re
 import runpy
@@ -111,6 +112,7 @@ def test_tags_of_a_file(tmp_path):
     [
         ("{}", "expected a mapping 'tags'"), ("tags: {a: 1}", "a: 1 must be a mapping"), ("tags: {a: {gaet: 1}}", "gaet: .* write gate"),
         ("tags: {a: {gate: }}", "gate: None is no value"), ("tags: {a: {gate: {b: 1}}}", "gate: .* is no value"),
+        ("tags: {a: {host: x}, b: {}}", "b: names no host"), ("tags: {a: {host: 3}}", "3 is no name of a machine"),
         ("anchors_file: []\ntags: {a: {}}", ".. is no path"), ("tags: {a: {params_file: 3}}", "3 is no path"),
     ],
 )
@@ -119,6 +121,30 @@ def test_a_bad_file_is_refused(tmp_path, text, named):
     file.write_text(text)
     with pytest.raises(InputError, match=f"{file}: .*{named}"):
         tags(file, {})
+
+
+def test_each_host_starts_its_tags_and_the_first_the_anchors(tmp_path):
+    file = tmp_path / "tags.yaml"
+    file.write_text("anchors_file: a.yaml\nprocesses: 1\ntags: {a: {host: one}, b: {host: two}, c: {host: one, tdoa_std: 0.3}}")
+    one, two = (tags(file, {}, host=host) for host in ("one.lan", "two"))
+    assert [node.executable for node in one] == ["anchors_node", "localization_node"]
+    assert one[1].parameters[1] == {"tags": ["a", "c"]}
+    told = yaml.safe_load(Path(one[1].parameters[0]).read_text())
+    assert told["/**/c/ekf_node"]["ros__parameters"].keys() == {"body_frame", "tdoa_std", "anchors_file"}
+    assert [(node.executable, node.parameters[1]) for node in two] == [("localization_node", {"tags": ["b"]})]
+    assert [node.namespace for node in tags(file, {}, processes="2", host="one")[1:]] == ["", ""]
+    with pytest.raises(InputError, match="no tag has the host three; those named are one, two"):
+        tags(file, {}, host="three")
+    file.write_text("host: one\ntags: {a: {}, b: {}}")
+    assert len(tags(file, {}, host="one")) == 4
+
+
+def test_as_many_processes_as_cores(tmp_path):
+    file = tmp_path / "tags.yaml"
+    file.write_text(f"tags: {{{', '.join(f't{k}: {{}}' for k in range(300))}}}")
+    nodes = tags(file, {}, processes="auto")
+    assert len(nodes) == min(300, len(os.sched_getaffinity(0)))
+    assert sorted(tag for node in nodes for tag in node.parameters[1]["tags"]) == sorted(f"t{k}" for k in range(300))
 
 
 LEVEL = ["--log-level", "info"]

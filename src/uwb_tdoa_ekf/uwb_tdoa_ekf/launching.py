@@ -5,9 +5,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 import json
+import os
 from pathlib import Path
 import shutil
 import signal
+import socket
 import tempfile
 
 import yaml
@@ -49,6 +51,7 @@ WHO = {
     "SUBNET": "nodes on every machine that multicast reaches{}, any of which can command these; with LOCALHOST by those of this machine",
     "SYSTEM_DEFAULT": "whom the settings of the middleware let through",
 }
+AUTO = "auto"  # processes: one for each core
 FIRST, LONGEST = 1.0, 30.0  # s, until a node that has crashed is started again: twice as long each time
 SOUND = 60.0  # s; a node that lived for so long has crashed for the first time again
 ENDING = signal.SIGINT, signal.SIGTERM
@@ -152,40 +155,87 @@ def tag(namespace, values, files=None, log_level="info"):
     return [start(name, namespace, values, (files or {}).get(name, ()), log_level) for name in nodes]
 
 
-def tags(path, values, log_level="info"):
-    """[Start] of all tags of a YAML file, and of anchors_node if it names an anchors_file. values : override the file's.
+@dataclass(frozen=True)
+class Fleet:
+    """What a YAML file of tags says: `tags: {NAMESPACE: {parameter: value, host: HOST}}`, and beside `tags` what all of them share. path : of the
+    file; tags : {namespace: {parameter: value}}; hosts : {namespace: name of the machine that runs its nodes, None where the file names none};
+    processes : text, "" where the file does not say."""
 
-    `tags: {NAMESPACE: {parameter: value}}`, and beside `tags` what all of them share. Each tag has a frame of its own,
-    NAMESPACE/base_link, unless it names another. Raises InputError.
-    """
-    content = read_yaml(path)
-    listed = content.pop("tags", None) if isinstance(content, dict) else None
-    if not isinstance(listed, dict) or not listed:
-        raise InputError(f"{path}: expected a mapping 'tags' of namespace to parameters, e.g. 'tags: {{tag1: {{}}}}'.")
-    starts = []
-    try:
+    path: str
+    tags: dict[str, dict]
+    hosts: dict[str, str | None]
+    processes: str
+
+    @classmethod
+    def read(cls, path: str) -> "Fleet":
+        """Raises InputError."""
+        content = read_yaml(path)
+        listed = content.pop("tags", None) if isinstance(content, dict) else None
+        if not isinstance(listed, dict) or not listed:
+            raise InputError(f"{path}: expected a mapping 'tags' of namespace to parameters, e.g. 'tags: {{tag1: {{}}}}'.")
+        merged, hosts, processes = {}, {}, content.pop("processes", "")
         for namespace, own in listed.items():
             if not isinstance(own or {}, dict):
-                raise InputError(f"tags: {namespace}: {own!r} must be a mapping of parameters, or {{}}.")
-            merged = {"body_frame": f"{namespace}/base_link", **content, **(own or {}), **values}
-            file = merged.pop("params_file", None)
-            files = {name: [_beside(path, file)] for name in ("bias_node", "ekf_node")} if file not in (None, "") else {}
-            merged |= {name: _beside(path, merged[name]) for name in PATHS if merged.get(name) not in (None, "")}
-            starts += tag(str(namespace), merged, files, log_level)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+                raise InputError(f"{path}: tags: {namespace}: {own!r} must be a mapping of parameters, or {{}}.")
+            merged[str(namespace)] = {"body_frame": f"{namespace}/base_link", **content, **(own or {})}
+            hosts[str(namespace)] = merged[str(namespace)].pop("host", None)
+            if hosts[str(namespace)] is not None and not isinstance(hosts[str(namespace)], str):
+                raise InputError(f"{path}: tags: {namespace}: host: {hosts[str(namespace)]!r} is no name of a machine; write a text.")
+        if None in hosts.values() and set(hosts.values()) != {None}:
+            lacks = next(namespace for namespace, name in hosts.items() if name is None)
+            raise InputError(f"{path}: tags: {lacks}: names no host, and other tags do; name it, or a host for all beside 'tags'.")
+        return cls(str(path), merged, hosts, str(processes))
+
+    def at(self, host: str) -> "Fleet":
+        """The tags whose nodes this machine runs: all, where the file names no host. Raises InputError if there is none."""
+        if set(self.hosts.values()) == {None}:
+            return self
+        here = [namespace for namespace, name in self.hosts.items() if name in (host, host.partition(".")[0])]
+        if not here:
+            known = ", ".join(dict.fromkeys(str(name) for name in self.hosts.values()))
+            raise InputError(f"{self.path}: no tag has the host {host}; those named are {known}: correct the file, or give host:=NAME.")
+        return Fleet(self.path, {name: self.tags[name] for name in here}, {name: self.hosts[name] for name in here}, self.processes)
+
+    def starts(self, values: Mapping, log_level: str = "info") -> list[Start]:
+        """bias_node and ekf_node of each tag, each with a frame of its own, NAMESPACE/base_link, unless it names another; values : override
+        the file's. Raises InputError."""
+        starts = []
+        try:
+            for namespace, own in self.tags.items():
+                merged = {**own, **values}
+                file = merged.pop("params_file", None)
+                files = {name: [_beside(self.path, file)] for name in ("bias_node", "ekf_node")} if file not in (None, "") else {}
+                merged |= {name: _beside(self.path, merged[name]) for name in PATHS if merged.get(name) not in (None, "")}
+                starts += tag(namespace, merged, files, log_level)
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from error
+        return starts
+
+
+def tags(path: str, values: Mapping, log_level: str = "info", processes: str = "", host: str = "") -> list[Start]:
+    """What this machine starts of a YAML file of tags (Fleet): their nodes, and anchors_node if all name the same anchors_file. Of a file that names
+    hosts, the host of the first tag alone starts anchors_node.
+
+    values : override the file's; processes : overrides the file's, see `pooled`; host : what this machine is called, default: its name. Raises InputError.
+    """
+    fleet = Fleet.read(path)
+    here = fleet.at(host or socket.gethostname())
+    starts = here.starts(values, log_level)
     anchors = {node.parameters[-1].get("anchors_file") for node in starts if node.parameters} - {None}
-    if len(anchors) == 1:
+    if len(anchors) == 1 and next(iter(here.tags)) == next(iter(fleet.tags)):
         shared = {"anchors_file": anchors.pop(), **{name: values[name] for name in (*EVERYWHERE, "frozen") if name in values}}
         starts.append(start("anchors_node", "", shared, (), log_level))
-    return starts
+    processes = processes or fleet.processes
+    return pooled(starts, processes) if processes else starts
 
 
 def pooled(starts, processes):
     """The same of `tags` with so many localization_nodes instead of bias_nodes and ekf_nodes; what these are told is in a file that
-    is written for them. processes : number, or its text. Raises InputError if it is none, or a tag has a parameter file of its own."""
+    is written for them. processes : number, or its text, or "auto": one for each core. Raises InputError if it is none, or a tag has a parameter file of its own."""
+    if processes == AUTO:
+        processes = len(os.sched_getaffinity(0))
     if not str(processes).isdecimal() or not int(processes):
-        raise InputError(f"processes: {processes!r} must be a whole number above 0, or left out for two nodes for each tag.")
+        raise InputError(f"processes: {processes!r} must be a whole number above 0, auto, or left out for two nodes for each tag.")
     members = [each for each in starts if each.executable in ("bias_node", "ekf_node")]
     if any(isinstance(part, str) for each in members for part in each.parameters):
         raise InputError("params_file: does not go with processes; write its values into the file of the tags.")
