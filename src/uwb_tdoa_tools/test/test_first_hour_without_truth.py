@@ -1,0 +1,106 @@
+"""The first hour of a new user without ground truth, and the steps of README.md, by the commands of the documentation word for word, and what
+came of it."""
+
+from pathlib import Path
+import re
+import shlex
+
+from first_hour import WALK, at_desk, measured, recorded, said_on_the_way, simulated, written
+import numpy as np
+import pytest
+from recordings import log_bytes
+from walking import blocks, commands, main, run, section
+
+from uwb_tdoa_bias.foundation.survey import read_survey
+
+
+def ended(name, words):
+    """Exit code of a step that may say that nothing is to be used: 0 or 1."""
+    code = main(name, words)
+    assert code in (0, 1), (name, words)
+    return code
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["simulated", "measured"])
+def test_from_tape_to_calibrated_without_ground_truth(tmp_path, monkeypatch, capsys, shared_data, source):
+    """docs/calibration.md, in one command and step by step, and docs/localizing.md."""
+    at_desk(tmp_path, monkeypatch)
+    survey = read_survey(written("anchors.yaml", *blocks(WALK, "yaml")))
+    hall = simulated(survey, (0, 6)) if source == "simulated" else measured(shared_data)
+    run(recorded(hall, False))
+    for day, name in (("monday", "first"), ("tuesday", "second")):
+        Path(f"{day}.bag").rename(f"{name}.bag")
+    Path("flight.bag").symlink_to("first.bag")
+    before = hall.error()
+    (quick, whole), *_ = [commands(text) for text in blocks(section("calibration.md", "In one command"))]
+    assert main(*quick) == 0
+    capsys.readouterr()
+    code = ended(*whole)
+    printed = capsys.readouterr()
+    after = hall.error("calibrated")
+    said_on_the_way(capsys, f"{source}, calibrate", before, after)
+    if code:
+        assert "nothing to use is written" in printed.err and after == before
+    else:
+        assert after < before
+        _lines_run(printed.out)
+    (checked,), (surveyed,) = (commands(blocks(section("calibration.md", heading))[0]) for heading in ("2. Fly, and check", "3. Survey"))
+    assert main(*checked) in (0, 1)
+    capsys.readouterr()
+    code = ended(*surveyed)
+    printed = capsys.readouterr()
+    after = hall.error("surveyed")
+    said_on_the_way(capsys, f"{source}, survey", before, after)
+    assert "nothing is applied" in printed.out if code else after < before
+    (located, *_) = commands(blocks(section("localizing.md", "Where the tag was"))[0])
+    assert main(*located) in (0, 1) and Path("localized/flight.tum").exists()
+
+
+def _lines_run(text):
+    """Lines that a tool has printed to be copied run as they stand; those of nodes have files that can be read."""
+    lines = re.findall(r"\./dev run uwb_tdoa_\w+ .*$", text, re.MULTILINE)
+    assert len(lines) == 3
+    for line in lines:
+        _, _, _, name, *words = shlex.split(line)
+        if name.endswith("_node"):
+            files = [word.partition(":=")[2] or word for word in words if ".yaml" in word]
+            assert files and all(Path(file).is_file() for file in files)
+        else:
+            assert main(name, words) in (0, 1), line
+
+
+# --- README, from a log ---
+
+
+def write_log(flight, path):
+    """Write a Flight as a micro-SD log: deg/s and g."""
+    rows = [("estTDOA", t, (int(a), int(b), d)) for t, a, b, d in zip(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)]
+    for name, values in (("estGyroscope", np.rad2deg(flight.imu.gyro)), ("estAcceleration", flight.imu.accel / 9.81)):
+        rows += [(name, t, tuple(value)) for t, value in zip(flight.imu.t, values)]
+    rows += [("estPose", t, (*p, *q)) for t, p, q in zip(flight.truth.t, flight.truth.p, flight.truth.q)]
+    rows.sort(key=lambda row: row[1])
+    Path(path).write_bytes(log_bytes([(name, round(1e6 * t), values) for name, t, values in rows]))
+
+
+@pytest.mark.slow
+def test_the_four_steps_of_the_readme(tmp_path, monkeypatch, capsys):
+    """check, calibrate, diagnose, survey, localize: README.md, from a log and a survey."""
+    at_desk(tmp_path, monkeypatch)
+    hall = simulated(read_survey(written("anchors.yaml", *blocks(WALK, "yaml"))))
+    write_log(hall.flights[0], "FLIGHT.log")
+    rows = [f"{i},{x:.3f},{y:.3f},{z:.3f}" for i, (x, y, z) in zip(hall.tape.ids, hall.tape.positions)]
+    written("SURVEY.txt", "\n".join(["id,x,y,z", *rows, ""]))
+    steps = [command for text in blocks(section("README.md", "Four steps")) for command in commands(text)]
+    steps = [(name, words) for name, words in steps if words and "--live" not in words and not name.endswith("_node")]
+    assert [name for name, _ in steps] == ["check", "calibrate", "calibrate", "diagnose", "survey", "localize"]
+    before = hall.error()
+    for name, words in steps:
+        code = ended(name, words)
+        printed = capsys.readouterr()
+        if "--out" not in words or name == "localize":
+            continue
+        after = hall.error(words[words.index("--out") + 1])
+        said_on_the_way(capsys, f"README, {name}", before, after)
+        assert after < before if code == 0 else "nothing" in printed.out + printed.err and after == before
+    assert Path("localized/FLIGHT.tum").exists()
