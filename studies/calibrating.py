@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.calibrating.calibrate import without_truth
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.surveying.tape import Tape
 
 from .surveying import at, measured_flights, rmse
@@ -24,15 +25,17 @@ SETS = {  # name: number of the room and flights to calibrate with, flights to j
     "const3, two flights": (["3", "1-tdoa2"], ["2-tdoa2"], ["3-tdoa2", "4-tdoa2"]),
     "const4, two flights": (["4", "1-tdoa2-traj1"], ["1-tdoa2-traj2"], ["1-tdoa2-traj3"]),
 }
+SIMULATED, FLOWN = "simulated hall, two flights", dict(trajectory="sines", duration=60.0, imu_rate=200.0, truth_rate=50.0, bias=False)
+DELAY = 0.05  # m, standard deviation of the delays of its anchors
 
 
 def add_options(add):
     """add : add_argument of a parser."""
-    add("--data", type=Path, required=True, metavar="DATA", help="folder of measured flights")
+    add("--data", type=Path, required=True, metavar="DATA", help="folder of measured flights (not used for the simulated hall)")
     add("--draws", type=int, default=5, metavar="N", help="of each set (default 5)")
     add("--first", type=int, default=200, metavar="SEED", help="of the first draw (default 200)")
     add("--std", type=float, default=0.1, metavar="M", help="of each coordinate of an anchor (default 0.1)")
-    add("--only", choices=tuple(SETS), help="one set")
+    add("--only", choices=(*SETS, SIMULATED), help="one set")
     add("--json", type=argparse.FileType("w"), metavar="FILE", help="write every draw")
 
 
@@ -40,14 +43,25 @@ def run(args):
     """Print a table, a row for each set."""
     print("| set | draws | offered | before, m: mean | after | ratio: median | largest | largest, had all been offered |\n|---|" + 7 * "---:|")
     every = {}
-    for name in [args.only] if args.only else SETS:
-        (room, *fitted), judges, judged = SETS[name]
-        flights, holdout, others = (measured_flights(args.data, [_UTIL.format(room, k) for k in some]) for some in (fitted, judges, judged))
+    for name in [args.only] if args.only else (*SETS, SIMULATED):
+        flights, holdout, others = flights_of(name, args.data)
         seeds = range(args.first, args.first + args.draws)
         every[name] = [draw(flights, holdout, others, args.std, seed) for seed in tqdm(seeds, desc=name, disable=None)]
         print(f"| {name} | {len(every[name])} | {summary(every[name])} |", flush=True)
     if args.json:
         json.dump(every, args.json, indent=1)
+
+
+def flights_of(name, data):
+    """(flights to calibrate with, to judge that on, to judge the tag on) of a set."""
+    if name != SIMULATED:
+        (room, *fitted), judges, judged = SETS[name]
+        return tuple(measured_flights(data, [_UTIL.format(room, k) for k in some]) for some in (fitted, judges, judged))
+    flown = [simulate(SimulationConfig(seed=seed, **FLOWN)) for seed in (11, 12, 13)]
+    delays = DELAY * np.random.default_rng(2).standard_normal(len(flown[0].anchors))
+    late = AnchorDelay({str(i): float(delay) for i, delay in zip(flown[0].anchors.ids, delays)})
+    first, second, third = map(late.inject, flown)
+    return [first], [second], [third]
 
 
 def draw(flights, holdout, others, std, seed):
