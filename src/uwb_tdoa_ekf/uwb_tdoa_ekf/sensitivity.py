@@ -15,7 +15,7 @@ from .core.config import FilterConfig
 from .core.history import RESET
 from .core.state import ERROR_STATES, MOVING_STATES
 from .estimator import VERDICTS
-from .offline import run_offline
+from .offline import Run, run_offline
 
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
@@ -32,7 +32,7 @@ class Innovations:
     rows: np.ndarray
     value: np.ndarray
     variance: np.ndarray
-    run: object
+    run: Run
     records: list
     of: list
 

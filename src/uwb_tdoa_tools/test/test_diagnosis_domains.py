@@ -1,11 +1,10 @@
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, SmoothTerm
 from uwb_tdoa_bias.effects.samples import samples_at
 from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.channels import TdoaResidual
 from uwb_tdoa_tools.diagnosis.domains import Seen
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from known_effects import clean_flight
@@ -24,11 +23,12 @@ def test_a_drift_that_is_found_knows_for_how_long_it_was_seen(flight):
 
 
 def residual(flight, low, high):
-    """Something like a residual, looked at between two times after the first TDOA."""
+    """A residual, looked at between two times after the first TDOA."""
     t = flight.tdoa.t
     a, b = (flight.anchors.index(side) for side in (flight.tdoa.a, flight.tdoa.b))
     samples = samples_at(t, a, b, flight.truth, flight.anchors, t[0], motion=False)
-    return {"tdoa": SimpleNamespace(samples=samples, fitted=(t >= t[0] + low) & (t <= t[0] + high))}
+    fitted = (t >= t[0] + low) & (t <= t[0] + high)
+    return {"tdoa": TdoaResidual(samples, np.zeros(len(t)), fitted, fitted)}
 
 
 def test_a_domain_is_of_the_flights_that_were_fitted_and_of_the_air(flight):

@@ -1,4 +1,6 @@
-"""mypy, where it is installed, as .ci/mypy.ini says: the annotations of uwb_tdoa_bias."""
+"""mypy, where it is installed, as .ci/mypy.ini says: the annotations of the packages and folders that it names."""
+
+import configparser
 
 import pytest
 
@@ -7,11 +9,21 @@ from documented import ROOT
 WRONG = "from uwb_tdoa_bias.foundation.version import version; version() + 1"
 
 
+def annotated():
+    """Names of the packages and folders whose functions must have annotations."""
+    found = configparser.ConfigParser()
+    found.read(ROOT / ".ci/mypy.ini")
+    sections = (name for name in found.sections() if found[name].getboolean("disallow_untyped_defs", False))
+    return [name.removeprefix("mypy-").removesuffix(".*") for name in sections]
+
+
 @pytest.mark.slow
 def test_annotations(monkeypatch):
     run = pytest.importorskip("mypy.api").run
     monkeypatch.chdir(ROOT)
-    report, failure, code = run(["--config-file", ".ci/mypy.ini", "-p", "uwb_tdoa_bias"])
+    assert {"uwb_tdoa_bias", "uwb_tdoa_tools.diagnosis"} <= set(annotated())
+    packages = [word for name in annotated() for word in ("-p", name)]
+    report, failure, code = run(["--config-file", ".ci/mypy.ini", *packages])
     assert code == 0, report + failure
     report, failure, code = run(["--config-file", ".ci/mypy.ini", "-c", WRONG])
     assert code == 1 and "[operator]" in report, report + failure

@@ -6,6 +6,8 @@
 Processes are kept from one call to the next, if each ends of itself: whoever stops before the last result ends them too.
 """
 
+from __future__ import annotations
+
 import argparse
 import os
 import signal
@@ -13,6 +15,7 @@ import sys
 import warnings
 from contextlib import contextmanager, nullcontext
 from functools import lru_cache
+from typing import Any, Protocol, TYPE_CHECKING, TypeVar
 
 from joblib import Parallel, cpu_count, delayed, parallel_config
 from threadpoolctl import threadpool_limits
@@ -22,11 +25,26 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .progress import Progress
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
 CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
+
+Function = TypeVar("Function", bound="Callable[..., Any]")
+Item = TypeVar("Item")
+Made = TypeVar("Made")
+
+
+class MapFunction(Protocol):
+    """What gives function(item) of every item, in their order: as `map` does, but for the time and the process in
+    which each is done."""
+
+    def __call__(self, function: Callable[[Item], Made], items: Iterable[Item], /) -> Iterable[Made]: ...
+
 
 # Decorator: linear algebra in one thread. Of small matrices, several only wait for each other, and by spinning: with another
 # process beside it, diagnose took six times the processor time.
-in_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+in_one_thread: Callable[[Function], Function] = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 def add_options(parser):

@@ -1,7 +1,10 @@
 """A calibration of a tag and its anchors, and what it is worth where it took no part."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +25,12 @@ from ..scoring.evaluation import score_of
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
 from .parts import split
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from ..checking.recording import Recording
+    from uwb_tdoa_ekf.streams.finding import Finding
 
 MISFIT = "survey_misfit"  # the rule of `check` of a survey that does not fit, though no other mistake explains it
 OFF = 3.0  # standard deviations of a coordinate that anchors may be off by, in the median, and be of the same room
@@ -44,7 +53,7 @@ class Calibration:
     why_not: str | None
     text: str
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "offered": self.why_not is None, "why_not": self.why_not, "measure": self.measure, "before": self.before, "after": self.after,
@@ -57,7 +66,7 @@ class Calibration:
         return f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm ({ratio - 1.0:+.0%}) on {self.judged_on}"
 
 
-def stopping(recording, findings, std):
+def stopping(recording: Recording, findings: Iterable[Finding], std: float) -> list[Finding]:
     """Those Findings of `check` in a Recording that a calibration cannot put right: all errors, but for a survey that does not fit by
     as much as a tape may be off. std : m, of a coordinate."""
     errors = [finding for finding in findings if finding.severity == ERROR]
@@ -68,7 +77,10 @@ def stopping(recording, findings, std):
     return errors
 
 
-def with_truth(flights, holdout, base=EffectSet(), config=None, progress=lambda what: None) -> Calibration:
+def with_truth(
+    flights: Sequence[Flight], holdout: Sequence[Flight], base: EffectSet = EffectSet(),
+    config: FilterConfig | None = None, progress: Callable[[str], object] = lambda what: None,
+) -> Calibration:  # fmt: skip
     """Calibration of Flights with ground truth, by `diagnose`, judged on Flights of `holdout`, or on halves of a single flight."""
     found = diagnose(flights, holdout, base, config, None, progress)
     progress("measuring the noise")
@@ -84,7 +96,10 @@ def with_truth(flights, holdout, base=EffectSet(), config=None, progress=lambda 
     return _judged(calibration, len(found.effects) > len(base))
 
 
-def without_truth(flights, holdout, tape=Tape(), base=EffectSet(), config=None, progress=lambda what: None) -> Calibration:
+def without_truth(
+    flights: Sequence[Flight], holdout: Sequence[Flight], tape: Tape = Tape(), base: EffectSet = EffectSet(),
+    config: FilterConfig | None = None, progress: Callable[[str], object] = lambda what: None,
+) -> Calibration:  # fmt: skip
     """Calibration of Flights, whose ground truth is not used, by `survey`, judged on Flights of `holdout`, or on the end of a single
     flight: by how much of the innovations is slow, as anchors that are wrong make them."""
     judges, fitted, on = holdout, flights, _names(holdout)
@@ -105,7 +120,7 @@ def without_truth(flights, holdout, tape=Tape(), base=EffectSet(), config=None, 
     return calibration if calibration.why_not else replace(calibration, why_not=_why_not_blindly(calibration))
 
 
-def _why_not_blindly(calibration):
+def _why_not_blindly(calibration: Calibration) -> str | None:
     """Why a Calibration that was judged by innovations alone may do harm, though they are smaller; or None."""
     if calibration.after > LEFT:
         return (
@@ -117,7 +132,7 @@ def _why_not_blindly(calibration):
     return None
 
 
-def _judged(calibration, something):
+def _judged(calibration: Calibration, something: bool) -> Calibration:
     """The Calibration with why it is not to be used; something : whether there is anything to use."""
     if calibration.why_not is not None:
         return calibration
@@ -128,19 +143,20 @@ def _judged(calibration, something):
     return calibration
 
 
-def _rmse(flights, effects, config):
+def _rmse(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None) -> float:
     """m, 3D RMSE of all Flights together, by an estimate with an EffectSet."""
     errors = [score_of(flight, Estimator(config, effects))[0].error for flight in flights]
     return float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1))))
 
 
-def _with_noise(config, std):
+def _with_noise(config: FilterConfig | None, std: float | None) -> FilterConfig:
     """FilterConfig with tdoa_std, m, unless that is None."""
     config = config or FilterConfig()
-    return config if std is None else replace(config, tdoa_std=round(std, 3))
+    changed: dict[str, Any] = {} if std is None else {"tdoa_std": round(std, 3)}
+    return replace(config, **changed) if changed else config
 
 
-def _noise(flights, effects, config):
+def _noise(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None) -> float | None:
     """tdoa_std, m; None where the flights are too short to tell."""
     try:
         return tdoa_std_of(flights, effects, config)
@@ -148,5 +164,5 @@ def _noise(flights, effects, config):
         return None
 
 
-def _names(flights):
+def _names(flights: Sequence[Flight]) -> str:
     return ", ".join(flight.name for flight in flights)

@@ -1,6 +1,9 @@
 """What a calibration is likely to bring, from a part of the flights."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +16,13 @@ from ..surveying.result import IMPROVED
 from ..surveying.survey import survey
 from ..surveying.tape import Tape
 from .parts import between
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from ..surveying.result import Result
 
 SECONDS = 60.0  # of a flight that are looked at
 MOVES = 0.25  # of the extent of the anchors that a path must have along an axis to tell much of them
@@ -33,7 +43,7 @@ class Prospect:
     left: float
     path: np.ndarray
     hall: np.ndarray
-    ids: tuple
+    ids: tuple[int, ...]
     why_not: str | None
 
     @property
@@ -66,7 +76,10 @@ class Prospect:
         return told
 
 
-def prospect(flights, tape=Tape(), base=EffectSet(), config=None, progress=lambda: None) -> Prospect:
+def prospect(
+    flights: Sequence[Flight], tape: Tape = Tape(), base: EffectSet = EffectSet(), config: FilterConfig | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> Prospect:  # fmt: skip
     """Prospect of a calibration of Flights without their ground truth. Raises InputError where they are too short to say."""
     longest = max(flights, key=lambda one: np.ptp(one.tdoa.t))
     middle = 0.5 * float(longest.tdoa.t[0] + longest.tdoa.t[-1])
@@ -82,7 +95,7 @@ def prospect(flights, tape=Tape(), base=EffectSet(), config=None, progress=lambd
     )  # fmt: skip
 
 
-def _expected(anchors, found, base, more):
+def _expected(anchors: Anchors, found: Result, base: EffectSet, more: float) -> np.ndarray:
     """(N, 3) m: standard deviations after `more` times what was looked at for a survey, as its information adds up."""
     prior = np.linalg.inv(Prior.of(anchors, found.given_std, base.covariance).covariance)
     values, vectors = np.linalg.eigh(np.linalg.inv(found.surveyed.covariance) - prior)

@@ -1,10 +1,15 @@
 """Flights before and after a bias map."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.estimator import Odometry
 
 from ..readers.inputs import Reading
 from ..scoring.alignment import NONE
@@ -12,15 +17,24 @@ from ..scoring.evaluation import evaluate, judging_truth
 from ..scoring.metrics import Score
 from ..scoring.settling import told
 
+if TYPE_CHECKING:
+    from pathlib import Path
+    from uwb_tdoa_ekf.debias import BiasMap
 
-def debiased(odometry, bias_map):
+
+Scored = tuple[Flight, Score, Odometry]  # a flight with its errors and the estimate that has them
+
+
+def debiased(odometry: Odometry, bias_map: BiasMap) -> Odometry:
     """The Odometry, of run_offline, that debias_node would make of it: another position and its covariance."""
     covariance = odometry.covariance.copy()
     p, covariance[:, :3, :3], _ = bias_map.correct(odometry.p, covariance[:, :3, :3])
     return replace(odometry, p=p, covariance=covariance)
 
 
-def fly(flight, config=None, effects=None, align=NONE):
+def fly(
+    flight: Flight, config: FilterConfig | None = None, effects: EffectSet | None = None, align: str = NONE
+) -> Scored:
     """(Flight, Score, odometry) of a Flight with ground truth, run through the filter. Raises InputError: what diagnose finds with
     less, heights, odometry or marks, is corrected before the filter, and a map of that path would only repeat the filter's own error."""
     if flight.truth is None:
@@ -46,11 +60,11 @@ class Estimator:
     effects: EffectSet | None = None
     align: str = NONE
 
-    def __call__(self, recording):
+    def __call__(self, recording: tuple[Path, Path | None]) -> Scored:
         return fly(self.reading.read(recording), self.config, self.effects, self.align)
 
 
-def judge(flown, bias_map, effects=None):
+def judge(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = None) -> Score:
     """Score of a flight from `fly` with its positions corrected by a BiasMap. effects : those it was flown with."""
     flight, _, odometry = flown
     return Score(flight.name, debiased(odometry, bias_map), judging_truth(flight, effects))

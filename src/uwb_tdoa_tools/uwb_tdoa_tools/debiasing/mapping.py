@@ -1,14 +1,25 @@
 """A bias map from flights and from places where a tag stood still."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import fit
 
 from .parts import LEAST, part_of, static_parts
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from uwb_tdoa_ekf.debias import BiasMap
+    from .judge import Estimator, Scored
 
-def fit_map(flown, static, estimator, step=0.35, planar=False, interpolator="thin_plate"):
+
+def fit_map(
+    flown: Iterable[Scored], static: Sequence[str | Path], estimator: Estimator, step: float = 0.35,
+    planar: bool = False, interpolator: str = "thin_plate",
+) -> BiasMap:  # fmt: skip
     """BiasMap of flights, as an Estimator gave them, and of files of a tag that stood still. Raises InputError.
 
     static : paths, see `static_parts`; step : m; planar, interpolator : see `uwb_tdoa_ekf.debias.fit`.

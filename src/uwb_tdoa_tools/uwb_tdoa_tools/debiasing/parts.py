@@ -1,6 +1,9 @@
 """Pairs of measured and true positions, to fit a bias map to: from flights, and from places where a tag stood still."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +18,10 @@ from ..scoring.evaluation import judging_truth
 from ..scoring.metrics import position_at
 from .judge import Estimator
 
+if TYPE_CHECKING:
+    from uwb_tdoa_ekf.estimator import Odometry
+    from ..scoring.metrics import Score
+
 LEAST = 10  # positions of flights, 5 ms apart, that make a marker
 COLUMNS = ("true_x", "true_y", "true_z", "x", "y", "z")
 SETTLE = 1.0  # s at a place before positions count
@@ -22,13 +29,13 @@ REST = 0.02  # m that a tag at rest may move in SETTLE
 SHORTEST = 100  # positions that make a stay
 
 
-def part_of(score, odometry):
+def part_of(score: Score, odometry: Odometry) -> Part:
     """Part of an evaluated flight: its airborne odometry, at the stamps that the Score has."""
     measured = odometry.p[(odometry.t >= score.first) & (odometry.t <= score.last)]
     return Part(measured, measured - score.error, score.covariance)
 
 
-def static_parts(path, estimator=Estimator(), planar=False):
+def static_parts(path: str | Path, estimator: Estimator = Estimator(), planar: bool = False) -> list[Part]:
     """List of Part of a tag that stood still, one for each place.
 
     path : a CSV file with the columns true_x, true_y, true_z, x, y, z (m; without the z if planar), one row for each
@@ -52,7 +59,7 @@ def static_parts(path, estimator=Estimator(), planar=False):
     return [Part(odometry.p[rows], true[rows], odometry.covariance[rows, :3, :3]) for rows in stays]
 
 
-def _from_table(path, planar):
+def _from_table(path: str | Path, planar: bool) -> list[Part]:
     names = [name for name in COLUMNS if not (planar and name.endswith("z"))]
     table = read_numbers(path, names)
     if not len(table):

@@ -1,13 +1,23 @@
 """What debias says: a line on a map, and rows of flights."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from .judge import judge
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from uwb_tdoa_bias.effects import EffectSet
+    from uwb_tdoa_ekf.debias import BiasMap
+    from .judge import Scored
+
 _RUN = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean")
 
 
-def about(bias_map):
+def about(bias_map: BiasMap) -> str:
     """One line on a BiasMap."""
     figures = about_figures(bias_map)
     added = ", ".join(f"{std:.3f}" for std in figures["added_std"])
@@ -18,7 +28,7 @@ def about(bias_map):
     )
 
 
-def about_figures(bias_map):
+def about_figures(bias_map: BiasMap) -> dict[str, Any]:
     """The same for JSON."""
     return {
         "markers": len(bias_map.at),
@@ -32,7 +42,7 @@ def about_figures(bias_map):
     }
 
 
-def rows(flown, bias_map, effects=None):
+def rows(flown: Iterable[Scored], bias_map: BiasMap, effects: EffectSet | None = None) -> list[dict[str, Any]]:
     """[{"flight", "before": figures, "after": figures, "known"}] of what `fly` gave. known : share of the positions
     that the map knows."""
     out = []
@@ -45,7 +55,7 @@ def rows(flown, bias_map, effects=None):
     return out
 
 
-def say_rows(title, found):
+def say_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
     """Print rows, and their mean."""
     if not found:
         return
@@ -58,5 +68,5 @@ def say_rows(title, found):
     print(f"mean 3D RMSE {before:.3f} m before, {after:.3f} m after ({after / before - 1:+.0%})")
 
 
-def _side(figures):
+def _side(figures: Mapping[str, float]) -> str:
     return "  " + "".join(f"{figures[name]:8.3f}" for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "nees_mean"))

@@ -1,11 +1,14 @@
 """From flights to a model: which effects are there, how large, how sure, and what else it could be."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import UPWARDS
 from uwb_tdoa_bias.foundation.anchors import Anchors
 
@@ -24,6 +27,20 @@ from .regression.select import Selection, select, with_rivals, worth
 from .regression.table import table_of
 from .regression.terms import Candidate, Term, candidates_of, columns_of
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Hashable, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from ..parallel import MapFunction
+    from .channels.views import CovariateView
+    from .detectors import Detection, Detector
+    from .judging import Kept
+    from .references import Reference
+    from .regression.fit import Fit
+    from .regression.select import Search
+    from .regression.table import Table
+    from .channels import ChannelResidual, ChannelResiduals
+
 ROUNDS = 2  # of linearising about what was found
 STRAIGHT = 0.1  # of the channel's scale: root mean square by which a linear model may be off
 MAPS_GAIN, MAPS_SURE = 20.0, 3.0  # held-out log-likelihood, twice, and its t value over blocks, that maps must bring
@@ -41,38 +58,38 @@ class Attribution:
     ((name of a flight, Selection), ...) of what one flight shows and the others do not; floor : Selection of what there is near the
     floor, beside what is found in the air; None if nobody knows; floor_names : of the flights of its Table."""
 
-    residuals: list
-    remaining: list
+    residuals: list[ChannelResiduals]
+    remaining: list[ChannelResiduals]
     selection: Selection
-    detections: tuple
-    candidates: list
-    refused: tuple
-    names: tuple
-    alone: tuple = ()
+    detections: tuple[Detection, ...]
+    candidates: list[Candidate]
+    refused: tuple[Refused, ...]
+    names: tuple[str, ...]
+    alone: tuple[tuple[str, Selection], ...] = ()
     floor: Selection | None = None
-    floor_names: tuple = ()
+    floor_names: tuple[str, ...] = ()
 
     @cached_property
-    def seen(self):
+    def seen(self) -> Seen:
         """Seen, of what the residuals hold."""
         return Seen(self.residuals)
 
     @property
-    def effects(self):
+    def effects(self) -> tuple[Effect, ...]:
         """All Effects found that may be taken out: tuple."""
         in_the_air = self.seen.limited((*effects_of(self.selection), *(detection.effect for detection in self.detections)))
         return (*in_the_air, *self.of_floor)
 
     @property
-    def of_floor(self):
+    def of_floor(self) -> tuple[Effect, ...]:
         """Effects found near the floor that the filter may be told: tuple. Functions without a name would go on in the air."""
         return tuple(effect for effect in effects_of(self.floor) if effect.weighed) if self.floor else ()
 
-    def of(self, kept):
+    def of(self, kept: Kept) -> Attribution:
         """The Attribution of what was Kept."""
         return replace(self, selection=with_deviations(kept.selection), detections=kept.detections, alone=())
 
-    def findings(self):
+    def findings(self) -> list[Finding]:
         """[Finding], those by regression first, those of one flight alone last."""
         out = _findings(self.selection, self.candidates, self.names)
         out += map(_of_detection, self.detections)
@@ -84,7 +101,11 @@ class Attribution:
 
 
 @in_one_thread
-def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True, progress=lambda: None, over=map):
+def attribute(
+    flights: Sequence[Flight], reference: Reference, base: EffectSet = EffectSet(),
+    kinds: Collection[str] | None = None, undeclared: bool = True, progress: Callable[[], object] = lambda: None,
+    over: MapFunction = map,
+) -> Attribution:  # fmt: skip
     """Attribution of the residuals of Flights, which the Reference has prepared, to effects beyond `base`.
 
     kinds : names of the declared effects to look for, None for all; undeclared : look for functions without a name too;
@@ -93,64 +114,71 @@ def attribute(flights, reference, base=EffectSet(), kinds=None, undeclared=True,
     wanted = [detector for name, detector in DETECTORS.items() if kinds is None or name in kinds]
     detectors = [detector for detector in wanted if not detector.on_floor]
 
-    def at(model):
+    def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
         return residuals_of(flights, reference, EffectSet((*base.effects, *model)), progress, over)
 
     search = partial(_search, detectors)
     under_base = at(())
     installation = _installation(flights)
     declared = _declared(under_base, reference, kinds, installation)
-    current, model, inflation, tables = under_base, (), None, []
-    for last in (number == ROUNDS - 1 for number in range(ROUNDS)):
-        table = _linearised(current, declared, model)
-        tables.append(table)
-        if inflation is None:
-            inflation = _inflation(table, declared, partial(_search, [detector for detector in detectors if detector.disguises]))
-        progress()
-        selection = select(table, declared, inflation, search, progress=progress)
-        model = effects_of(selection)
-        if not model:
+    unmoved = _linearised(under_base, declared, ())
+    disguises = partial(_search, [detector for detector in detectors if detector.disguises])
+    inflation = _inflation(unmoved, declared, disguises)
+    progress()
+    selection = select(unmoved, declared, inflation, search, progress=progress)
+    current, found = under_base, effects_of(selection)
+    for _ in range(ROUNDS - 1):
+        if not found:
             break
-        current = current if last else at(model)
-    refused = []
-    selection, smooth, scans = _that_hold_on_other_data(selection, refused), [], {}
+        current = at(found)
+        progress()
+        selection = select(_linearised(current, declared, found), declared, inflation, search, progress=progress)
+        found = effects_of(selection)
+    refused: list[Refused] = []
+    selection = _that_hold_on_other_data(selection, refused)
+    smooth: list[Candidate] = []
+    scans: dict[int, Scan] = {}
 
-    def scan_of(table):  # one for each number of rows, which other stamps can change
+    def scan_of(table: Table) -> Scan:  # one for each number of rows, which other stamps can change
         if len(table.y) not in scans:
             scans[len(table.y)] = Scan(table, _views(table))
         return scans[len(table.y)]
 
     if undeclared:
         smooth = _smooth(current, installation)
-        selection = _with_smooth(selection, tables[0], declared, smooth, search, scan_of, progress)
+        selection = _with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress)
         selection = _straightened(selection, at, declared + smooth)
         selection = _that_hold_on_other_data(selection, refused)
     selection = with_rivals(selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress)
     if undeclared and len(flights) >= FOR_MAPS:
         selection = _with_maps(selection, smooth, refused)
     remaining, selection = at(effects_of(selection)), with_deviations(selection)
-    detections = (detector.detect(remaining) for detector in detectors)
-    found = tuple(detection for detection in detections if detection is not None)
-    alone, names = [], tuple(flight.name for flight in flights)
+    detected = (detector.detect(remaining) for detector in detectors)
+    detections = tuple(detection for detection in detected if detection is not None)
+    names = tuple(flight.name for flight in flights)
+    alone: tuple[tuple[str, Selection], ...] = ()
     if undeclared and len(flights) > 1 and all(reference.positions_known):
-        alone = [(names[k], own) for k, own in of_one(remaining, inflation, _views, search, over)]
+        alone = tuple((names[k], own) for k, own in of_one(remaining, inflation, _views, search, over))
     near = [(name, part) for name, part in zip(names, map(near_floor, remaining)) if part]
     floor = None
     if near:
         floor = on_floor([part for _, part in near], [one for one in wanted if one.on_floor], undeclared, refused, progress)
     floor_names = tuple(name for name, _ in near)
     return Attribution(
-        under_base, remaining, selection, found, declared, tuple(refused), names, tuple(alone), floor, floor_names
+        under_base, remaining, selection, detections, declared, tuple(refused), names, alone, floor, floor_names
     )  # fmt: skip
 
 
-def near_floor(residuals):
+def near_floor(residuals: ChannelResiduals) -> ChannelResiduals:
     """{channel: ChannelResidual} of what is near the floor in the residuals of a flight; {} of nothing."""
     parts = {name: part.of_floor() for name, part in residuals.items()}
     return {name: part for name, part in parts.items() if part is not None}
 
 
-def on_floor(residuals, detectors, undeclared, refused, progress=lambda: None):
+def on_floor(
+    residuals: Sequence[ChannelResiduals], detectors: Sequence[Detector], undeclared: bool, refused: list[Refused],
+    progress: Callable[[], object] = lambda: None,
+) -> Selection:  # fmt: skip
     """Selection of what [{channel: ChannelResidual}] near the floor show: effects with a name, or, where there is none, functions of what
     changes with the height: at one place all else is the same.
 
@@ -167,13 +195,14 @@ def on_floor(residuals, detectors, undeclared, refused, progress=lambda: None):
     return _that_hold_on_other_data(found, refused)
 
 
-def effects_of(selection):
+def effects_of(selection: Selection) -> tuple[Effect, ...]:
     """The chosen Candidates with the values of the fit, parameters of one effect together, within the bounds of the effect:
     tuple of Effects."""
-    values, std = {}, {}
-    error = np.sqrt(np.diag(selection.fit.cov)) if len(selection.fit.beta) else ()
-    fitted = dict(zip(selection.fit.columns, zip(selection.fit.beta.tolist(), map(float, error))))
-    effects = {}
+    values: dict[Hashable, dict[str, float]] = {}
+    std: dict[Hashable, dict[str, float]] = {}
+    effects: dict[Hashable, Effect] = {}
+    error = np.sqrt(np.diag(selection.fit.cov))
+    fitted = dict(zip(selection.fit.columns, zip(selection.fit.beta.tolist(), error.tolist())))
     for term in (term for candidate in selection.chosen for term in candidate.terms):
         effect = term.effect
         identity = _merged_as(effect)
@@ -190,12 +219,15 @@ def effects_of(selection):
     )
 
 
-def _merged_as(effect):
+def _merged_as(effect: Effect) -> Hashable:
     """Equal for Effects that are one entry of effects.yaml."""
-    return effect.identity if effect.settings else effect.name
+    return effect.identity if isinstance(effect, SmoothTerm) else effect.name
 
 
-def residuals_of(flights, reference, effects, progress=lambda: None, over=map):
+def residuals_of(
+    flights: Sequence[Flight], reference: Reference, effects: EffectSet,
+    progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+) -> list[ChannelResiduals]:  # fmt: skip
     """[`channels.residuals`] of Flights. progress, over : as of `attribute`."""
     if not all(reference.positions_known):
         over = map  # with all that the filter knows of the path, they take as long to send as to find
@@ -206,11 +238,11 @@ def residuals_of(flights, reference, effects, progress=lambda: None, over=map):
     return out
 
 
-def _search(detectors, table, model, chosen):
+def _search(detectors: Sequence[Detector], table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
     return [candidate for detector in detectors for candidate in detector.search(table, model, chosen)]
 
 
-def _installation(flights):
+def _installation(flights: Sequence[Flight]) -> tuple[Anchors, np.ndarray]:
     """(Anchors with every id of the flights, each at the first of its places; (m, 2) ids of the pairs that were heard, the
     most frequent first)."""
     several = [flight.anchors for flight in flights]
@@ -225,7 +257,10 @@ def _installation(flights):
     return anchors, pairs[np.argsort(-count, kind="stable")]
 
 
-def _declared(found, reference, kinds, installation):
+def _declared(
+    found: Sequence[ChannelResiduals], reference: Reference, kinds: Collection[str] | None,
+    installation: tuple[Anchors, np.ndarray],
+) -> list[Candidate]:  # fmt: skip
     """[Candidate] of the catalogue, of effects that a channel shows, and that the reference can tell."""
     shown = {name for flight in found for name in flight}
     effects = [effect for effect in EFFECTS.values() if effect.fitted and shown & set(effect.channels)]
@@ -238,7 +273,7 @@ def _declared(found, reference, kinds, installation):
     return [candidate for effect in chosen for candidate in candidates_of(effect(), *installation)]
 
 
-def _smooth(found, installation):
+def _smooth(found: Sequence[ChannelResiduals], installation: tuple[Anchors, np.ndarray]) -> list[Candidate]:
     """[Candidate] of functions of whatever each channel may depend on, of all anchors alike or each with its own."""
     out = []
     for name, channel in CHANNELS.items():
@@ -248,15 +283,15 @@ def _smooth(found, installation):
     return out
 
 
-def _views(table):
-    """{channel: [View]} of what a part of each channel of a Table may depend on."""
-    parts = {}
+def _views(table: Table) -> dict[str, list[CovariateView]]:
+    """{channel: [CovariateView]} of what a part of each channel of a Table may depend on."""
+    parts: dict[str, list[ChannelResidual]] = {}
     for _, name, _, part in table.parts:
         parts.setdefault(name, []).append(part)
     return {name: CHANNELS[name].views(several) for name, several in parts.items()}
 
 
-def _linearised(found, candidates, model):
+def _linearised(found: Sequence[ChannelResiduals], candidates: Sequence[Candidate], model: Sequence[Effect]) -> Table:
     """Table with the columns of all candidates about `model`, whose contribution is put back: a fit gives whole values, not
     increments."""
     here = {effect.identity: effect for effect in model}
@@ -267,13 +302,13 @@ def _linearised(found, candidates, model):
     return table.with_contribution([(term.effect, term.columns) for term in own])
 
 
-def _is_large(candidate, selection):
+def _is_large(candidate: Candidate, selection: Selection) -> bool:
     """Whether a chosen Candidate moves what it moves by ON_FLOOR: less is of the place, of which a few seconds tell nothing."""
     part = selection.table.matrix(candidate.columns) @ selection.fit.values(candidate.columns)
     return np.ptp(part) > ON_FLOOR
 
 
-def _inflation(table, declared, search):
+def _inflation(table: Table, declared: Sequence[Candidate], search: Search) -> np.ndarray:
     """(groups,) loss of independence, on the residual of a fit with all that is declared, and with what `search`, as of `select`, finds."""
     known, model = list(declared), fit(table, columns_of(declared))
     for _ in range(DISGUISED):
@@ -287,7 +322,9 @@ def _inflation(table, declared, search):
     return model.inflation
 
 
-def _straightened(selection, at, candidates):
+def _straightened(
+    selection: Selection, at: Callable[[Sequence[Effect]], list[ChannelResiduals]], candidates: Sequence[Candidate]
+) -> Selection:
     """The selection fitted anew in a Table about its own values, with the columns of `candidates`, where it is not as linear
     as the Table that it was found in says: positions of anchors that are far off are not."""
     for _ in range(ROUNDS):
@@ -302,10 +339,13 @@ def _straightened(selection, at, candidates):
     return selection
 
 
-def _with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress):
+def _with_smooth(
+    selection: Selection, unmoved: Table, declared: Sequence[Candidate], smooth: Sequence[Candidate], search: Search,
+    scan_of: Callable[[Table], Scan], progress: Callable[[], object],
+) -> Selection:  # fmt: skip
     """The selection carried on with functions without a name; or begun anew with them in the Table `unmoved`, about nothing, if
     that explains more: the declared effect, or the large group of parameters, was a stopgap."""
-    everything = smooth + declared
+    everything = [*smooth, *declared]
     terms = [term for candidate in smooth for term in candidate.terms]
     table = selection.table.with_terms(terms)
     progress()
@@ -317,7 +357,7 @@ def _with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress
     return after
 
 
-def _simpler(after, anew, choices):
+def _simpler(after: Selection, anew: Selection, choices: int) -> Selection:
     """Of two Selections the one that is worth more; or, if they tell of other things, the one with fewer parameters where it is hardly
     worth less: how far a function is off grows with its size, and many parameters can be anything."""
     fewer, more = sorted((after, anew), key=lambda each: len(each.fit.beta))
@@ -327,15 +367,16 @@ def _simpler(after, anew, choices):
     return fewer if least >= most * (1.0 if same else 1.0 - SAME_STORY) else more
 
 
-def _with_maps(selection, smooth, refused):
+def _with_maps(selection: Selection, smooth: Sequence[Candidate], refused: list[Refused]) -> Selection:
     """Add functions of the place for every anchor, each too weak alone, if together they are plainly worth it on data that
     they were not fitted to."""
     taken = {term.effect.identity for candidate in selection.chosen for term in candidate.terms}
     for channel in CHANNELS.values():
-        terms = {}
+        terms: dict[Hashable, Term] = {}
         for candidate in smooth:  # the first of a function is that of all anchors
             term = candidate.terms[0]
-            if term.effect.form == "anchor" and channel.name in candidate.channels and term.effect.covariate in channel.maps:
+            function = term.function if channel.name in candidate.channels else None
+            if function and function.form == "anchor" and function.covariate in channel.maps:
                 terms.setdefault(term.effect.identity, term)
         maps = Candidate(tuple(term for identity, term in terms.items() if identity not in taken))
         if not maps.terms:
@@ -352,7 +393,7 @@ def _with_maps(selection, smooth, refused):
     return selection
 
 
-def _that_hold_on_other_data(selection, refused):
+def _that_hold_on_other_data(selection: Selection, refused: list[Refused]) -> Selection:
     """Drop, one by one, what does not help rows that it was not fitted to."""
     while selection.chosen:
         scores = held_out(selection)
@@ -372,14 +413,14 @@ def _that_hold_on_other_data(selection, refused):
     return selection
 
 
-def recurs(candidate):
+def recurs(candidate: Candidate) -> bool:
     """Whether it should hold on other flights too: not what happened at a time."""
     return not any(key.endswith((".start", ".end")) for term in candidate.terms for key in term.effect.values)
 
 
-def _findings(selection, candidates, names):
+def _findings(selection: Selection, candidates: Sequence[Candidate], names: Sequence[str]) -> list[Finding]:
     effects = {_merged_as(effect): effect for effect in effects_of(selection)}
-    out = {}
+    out: dict[Hashable, Finding] = {}
     for candidate, score, loss in zip(selection.chosen, held_out(selection), selection.loss):
         evidence = {
             "criterion": round(float(loss), 1),
@@ -389,7 +430,8 @@ def _findings(selection, candidates, names):
         others = tuple(alternatives(selection, candidate, candidates))
         for term in candidate.terms:
             identity = _merged_as(term.effect)
-            covariates = tuple(t.effect.covariate for t in candidate.terms if t is not term) if term.effect.settings else ()
+            beside = [other.function for other in candidate.terms if other is not term] if term.function else []
+            covariates = tuple(function.covariate for function in beside if function)
             finding = Finding(
                 effects[identity], candidate.channels[0], evidence, score.explained, others, (candidate,),
                 together_with=covariates, shares=shares(selection, candidate, names),
@@ -398,7 +440,7 @@ def _findings(selection, candidates, names):
     return list(out.values())
 
 
-def _merged(finding, other):
+def _merged(finding: Finding, other: Finding) -> Finding:
     """One Finding of two of one effect."""
     evidence = {key: round(finding.evidence[key] + other.evidence[key], 1) for key in other.evidence}
     named = {alternative.effect for alternative in finding.alternatives}
@@ -412,5 +454,5 @@ def _merged(finding, other):
     )
 
 
-def _of_detection(detection):
+def _of_detection(detection: Detection) -> Finding:
     return Finding(detection.effect, detection.channel, detection.evidence, 0.0)

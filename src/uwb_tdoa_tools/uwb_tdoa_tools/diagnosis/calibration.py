@@ -6,7 +6,10 @@ place of the shifts and delays that it looks like, and the position gets worse. 
 applied then.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +21,17 @@ from .regression.select import Selection
 from .regression.table import BLOCK, table_of
 from .regression.terms import columns_of
 from .self_survey import FEWEST, survey
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from ..parallel import MapFunction
+    from .attribution import Attribution
+    from .constraints import Constraint
+    from .regression.table import Table
+    from .self_survey import Change
 
 CALIBRATED = POSITION, DELAY
 POSITION_STD = 0.1  # m, of the coordinates of anchors as they are given
@@ -36,11 +50,11 @@ class Calibration:
     left: float
     explained: float
     long_enough: bool
-    marks: tuple | None = None
-    changes: tuple = ()
+    marks: tuple[float, float, float] | None = None
+    changes: tuple[Change, ...] = ()
 
     @property
-    def why_not(self):
+    def why_not(self) -> str | None:
         """Why it must not be applied; None if it may."""
         if not self.long_enough:
             return f"the flights are too short: {MIN_BLOCKS * BLOCK:g} s in the air are needed without ground truth"
@@ -56,7 +70,10 @@ class Calibration:
         return None
 
 
-def calibrate(flights, attribution, base, config=None, constraints=(), progress=lambda: None, over=map):
+def calibrate(
+    flights: Sequence[Flight], attribution: Attribution, base: EffectSet, config: FilterConfig | None = None,
+    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+) -> Calibration:  # fmt: skip
     """Calibration from the innovations of prepared Flights. attribution : Attribution of them; base : EffectSet that is in the
     model, its covariance the prior; config : FilterConfig; constraints : what else is known; over : as of
     `attribution.attribute`."""
@@ -78,7 +95,7 @@ def calibrate(flights, attribution, base, config=None, constraints=(), progress=
     return Calibration(selection, found.left, explained, long_enough, found.marks, found.changes)
 
 
-def why_marks_speak_against(marks):
+def why_marks_speak_against(marks: tuple[float, float, float]) -> str | None:
     """Why a survey must not be applied, after what its marks say, each left out once; None if it may: the estimate must come nearer
     to them on average, and to NEARER of them. marks : of Surveyed."""
     before, after, nearer = marks
@@ -90,7 +107,7 @@ def why_marks_speak_against(marks):
     )
 
 
-def merged(base, found, selection):
+def merged(base: EffectSet, found: Sequence[Effect], selection: Selection) -> EffectSet:
     """The EffectSet `base` with other Effects: positions and delays of anchors are added to those it has. Their covariance is
     that of the fit of a Selection, and is the prior of the next calibration."""
     effects = list(base.effects)
@@ -106,11 +123,11 @@ def merged(base, found, selection):
     if not columns:
         return EffectSet(tuple(effects), base.covariance)
     places = [selection.fit.columns.index(column) for column in columns]
-    keys = tuple((column.effect[0], column.key) for column in columns)
+    keys = tuple((str(column.effect[0]), column.key) for column in columns)
     return EffectSet(tuple(effects), Covariance(keys, selection.fit.cov[np.ix_(places, places)]))
 
 
-def _rows(table, chosen):
+def _rows(table: Table, chosen: np.ndarray) -> Table:
     """Table of some rows, (n,) bool, with the columns that it has."""
     each = ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
     arrays = {name: getattr(table, name)[chosen] for name in each}

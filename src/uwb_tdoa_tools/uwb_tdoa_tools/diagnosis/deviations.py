@@ -7,7 +7,10 @@ smooth function of the place for every anchor, as large as the evidence says, as
 coordinates and delays of anchors that the fit takes for zero. All these are integrated out. What a value is away from that counts as its error.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,18 +18,24 @@ from .prior import DELAY, FUNCTION_STDS, POSITION, eliminated, posterior
 from .regression.fit import prior_sizes
 from .self_survey import features
 
+if TYPE_CHECKING:
+    from .prior import Solution
+    from .regression.fit import Fit
+    from .regression.select import Selection
+    from .regression.table import Table
+
 LENGTH = 4.0  # m over which functions of the place change; the shift of an anchor makes errors that change as slowly
 UNSAID = 0.03  # m, that coordinates and delays may be off by, of which no anchor has any in the fit
 LASTING = 14.0  # by which errors that are alike for a while are alike for longer than blocks tell
 OF_ANCHORS = POSITION, DELAY
 
 
-def with_deviations(selection):
+def with_deviations(selection: Selection) -> Selection:
     """The Selection with standard deviations of positions and delays of anchors that hold; as it is where there are none, or where
     the path is not known."""
     table, model = selection.table, selection.fit
     places = [k for k, column in enumerate(model.columns) if column.effect[0] in OF_ANCHORS]
-    if not places or any(getattr(part, "innovations", None) is not None for *_, part in table.parts):
+    if not places or any(part.innovations is not None for part in table.tdoa_parts):
         return selection
     values, std = _beside_others(table, model)
     fitted = np.sqrt(np.diag(model.cov))
@@ -35,7 +44,7 @@ def with_deviations(selection):
     return replace(selection, fit=replace(model, cov=model.cov * np.outer(grow, grow)))
 
 
-def _beside_others(table, model):
+def _beside_others(table: Table, model: Fit) -> tuple[np.ndarray, np.ndarray]:
     """(values (k,), standard deviations (k,)) of the columns of a Fit, with what can take the place of anchors integrated out."""
     rows, known = table.rows_of("tdoa"), {column.effect for column in model.columns}
     others = [column for column in table.columns if column.effect in ((POSITION,), (DELAY,)) and column not in model.columns]
@@ -49,7 +58,7 @@ def _beside_others(table, model):
     gram, vector, n = (x * weight[:, None]).T @ x, x.T @ (weight * table.y[rows]), mine.shape[1]
     prior = np.diag(prior_sizes(model.columns) ** 2.0)
 
-    def beside(size):
+    def beside(size: float) -> Solution:
         return posterior(*eliminated(gram, vector, n, np.append(sizes, np.full(functions.shape[1], size))), prior, np.zeros(n))
 
     best = max(map(beside, FUNCTION_STDS), key=lambda one: one.evidence)

@@ -1,7 +1,10 @@
 """The whole loop in one call."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +22,18 @@ from .health import health
 from .references import GroundTruth, Reference
 from .regression.confounding import unobservable
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
+    from ..parallel import MapFunction
+    from .channels import ChannelResiduals
+    from .channels.base import Figures
+    from .findings import Finding
+    from .judging import Kept
+    from .regression.confounding import Unobservable
+
 SAME_PLACE = 0.05  # m by which an anchor may differ between flights of one installation
 
 
@@ -34,32 +49,32 @@ class Diagnosis:
     of_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its ground truth.
     """
 
-    flights: tuple
+    flights: tuple[Flight, ...]
     reference: Reference
-    findings: list
+    findings: list[Finding]
     effects: EffectSet
-    refused: list
-    unobservable: list
-    before: dict
-    after: dict
+    refused: list[Refused]
+    unobservable: list[Unobservable]
+    before: dict[str, Any]
+    after: dict[str, Any]
     judged_on: str
-    health: dict
+    health: Figures
     attribution: Attribution
-    remaining: list
-    numbers: dict
-    changes: tuple = ()
-    applying: tuple = ()
-    of_truth: dict = field(default_factory=dict)
+    remaining: list[ChannelResiduals]
+    numbers: dict[str, list[NumbersFinding]]
+    changes: tuple[str, ...] = ()
+    applying: tuple[tuple[str, str], ...] = ()
+    of_truth: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def as_json(self):
+    def as_json(self) -> dict[str, Any]:
         """What diagnosis.json holds."""
         return output.as_json(self)
 
-    def as_text(self):
+    def as_text(self) -> str:
         """A few lines for the screen."""
         return output.as_text(self)
 
-    def as_html(self):
+    def as_html(self) -> str:
         """One self-contained page."""
         from .report.page import html  # here, because drawing takes a second to import
 
@@ -67,7 +82,11 @@ class Diagnosis:
 
 
 @in_one_thread
-def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None, progress=lambda what: None, over=map):
+def diagnose(
+    flights: Sequence[Flight], holdout: Sequence[Flight] = (), base: EffectSet = EffectSet(),
+    config: FilterConfig | None = None, reference: Reference | None = None,
+    progress: Callable[[str], object] = lambda what: None, over: MapFunction = map,
+) -> Diagnosis:  # fmt: skip
     """Diagnosis of Flights.
 
     holdout : Flights to judge on; base : EffectSet that is in the model already; config : FilterConfig; reference :
@@ -79,7 +98,7 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     same_anchors([*flights, *holdout])
     flights, holdout = (tuple(map(reference.prepare, some)) for some in (flights, holdout))
 
-    def saying(what):
+    def saying(what: str) -> Callable[[], object]:
         return lambda: progress(what)
 
     looking, count = saying(f"looking at {reference.words}"), len(flights)
@@ -139,20 +158,22 @@ def diagnose(flights, holdout=(), base=EffectSet(), config=None, reference=None,
     )
 
 
-def _settled(reference, base, config, flight):
+def _settled(
+    reference: Reference, base: EffectSet, config: FilterConfig | None, flight: Flight
+) -> tuple[Flight, tuple[str, ...]]:
     return reference.settled(flight, base, config)
 
 
-def _findings(attribution, model, kept):
+def _findings(attribution: Attribution, model: Attribution, kept: Kept) -> list[Finding]:
     """[Finding]: those that are added, with the values that are written, then the others."""
     detected = {detection.effect.name: detection for detection in attribution.detections}
 
-    def judged(finding, added):
+    def judged(finding: Finding, added: bool) -> Finding:
         tried = finding.candidates or (detected[finding.effect.name],)
         worth = [kept.worth[each] for each in tried if each in kept.worth]
         return replace(finding, added=added, worth=float(np.sum(worth)) if worth else None)
 
-    def usable_there(finding):
+    def usable_there(finding: Finding) -> bool:
         return finding.effect.weighed if finding.on_floor else finding.effect.usable
 
     out = [judged(finding, usable_there(finding)) for finding in model.findings()]
@@ -160,7 +181,7 @@ def _findings(attribution, model, kept):
     return out + [judged(finding, False) for finding in attribution.findings() if finding.key not in added]
 
 
-def same_anchors(flights):
+def same_anchors(flights: Sequence[Flight]) -> None:
     """Raises InputError unless all of some Flights, at least one, were flown among the same anchors."""
     if not flights:
         raise InputError("give at least one flight.")

@@ -1,8 +1,16 @@
 """What a diagnosis says."""
 
-from dataclasses import dataclass
+from __future__ import annotations
 
-from uwb_tdoa_bias.effects import Effect, EffectSet
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from uwb_tdoa_bias.effects import Effect, EffectSet, SmoothTerm
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Iterable
+    from .over_flights import Share
+    from .regression.confounding import Alternative
+    from .regression.terms import Candidate
 
 
 LEAST_WORTH = 0.005  # m that a finding may be worth, to come before one that is surer
@@ -22,29 +30,34 @@ class Finding:
 
     effect: Effect
     channel: str
-    evidence: dict
+    evidence: dict[str, float]
     explained: float
-    alternatives: tuple = ()
-    candidates: tuple = ()
+    alternatives: tuple[Alternative, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
     added: bool = True
     worth: float | None = None
-    together_with: tuple = ()
-    shares: tuple = ()
+    together_with: tuple[str, ...] = ()
+    shares: tuple[Share, ...] = ()
     flight: str | None = None
     on_floor: bool = False
 
     @property
-    def declared(self):
+    def declared(self) -> bool:
         """Whether it is in the catalogue, not a function without a name."""
-        return not self.effect.settings
+        return self.function is None
 
     @property
-    def prominence(self):
+    def function(self) -> SmoothTerm | None:
+        """Its Effect, if that is a function without a name."""
+        return self.effect if isinstance(self.effect, SmoothTerm) else None
+
+    @property
+    def prominence(self) -> float:
         """How sure and how large it is, to put findings in order: what it gains in likelihood, times what it is worth."""
         return self.evidence.get("criterion", 1.0) * (max(self.worth or 0.0, 0.0) + LEAST_WORTH)
 
     @property
-    def key(self):
+    def key(self) -> tuple[Hashable, str | None]:
         """Hashable: equal for findings of one effect."""
         return (self.effect.name if self.declared else self.effect.identity), self.flight
 
@@ -57,6 +70,6 @@ class Refused:
     why: str
 
 
-def usable(effects):
+def usable(effects: Iterable[Effect]) -> EffectSet:
     """EffectSet of those of some Effects that nodes can take out."""
     return EffectSet(tuple(effect for effect in effects if effect.usable))

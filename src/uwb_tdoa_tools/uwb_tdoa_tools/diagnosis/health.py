@@ -1,20 +1,31 @@
 """Health of every channel, and of the filter."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_ekf.estimator import VERDICTS
 
 from .channels import CHANNELS
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_ekf.offline import Run
+    from ..scoring.metrics import Score
+    from .channels import ChannelResiduals
+    from .channels.base import Figures
+
 KEYS = ("pairs", "anchors", "axes", "cross_correlation")  # of what channels tell
 REACHED = [value for value, name in VERDICTS.items() if name in ("used", "rejected")]
 
 
-def health(residuals, runs=(), scores=()):
+def health(residuals: Sequence[ChannelResiduals], runs: Sequence[Run] = (), scores: Sequence[Score] = ()) -> Figures:
     """What [{channel: ChannelResidual}] look like: {"pairs", "anchors", "axes", "cross_correlation", "filter"}, each a list
     of dicts. runs, scores : Run and Score of each flight, for NIS (1 is honest) and NEES (3 is honest).
     """
-    out = {key: [] for key in KEYS}
+    out: Figures = {key: [] for key in KEYS}
     for name, channel in CHANNELS.items():
         parts = [flight[name] for flight in residuals if name in flight]
         for key, items in channel.health(parts).items() if parts else ():
@@ -22,7 +33,7 @@ def health(residuals, runs=(), scores=()):
     return {**out, "filter": [_filter(run, score) for run, score in zip(runs, scores)]}
 
 
-def _filter(run, score):
+def _filter(run: Run, score: Score) -> dict[str, Any]:
     reached = np.isin(run.residuals.verdict, REACHED)
     nis = run.residuals.innovation[reached] ** 2 / run.residuals.variance[reached]
     return {

@@ -1,8 +1,11 @@
 """The loop closed: the filter with and without the effects, on data that they were not fitted to."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle
+from typing import Any, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -24,6 +27,24 @@ from .regression.select import Selection
 from .regression.table import BLOCK
 from .regression.terms import columns_of
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from uwb_tdoa_ekf.offline import Run
+    from ..parallel import MapFunction
+    from .attribution import Attribution
+    from .constraints import Constraint
+    from .detectors import Detection
+    from .references import Reference
+    from .regression.terms import Candidate
+
+    Model = tuple[Sequence[Candidate], Sequence[Detection]]
+    Poses = tuple[np.ndarray, ...]  # as `poses_of` gives them
+    Spans = tuple[tuple[float, float], ...]  # (first, last) s
+
+Made = TypeVar("Made")
+
 BOOTSTRAPS = 400
 Z95 = 1.96  # standard deviations from the middle of a 95 % interval to its ends
 JUDGES = 3  # flights, or halves of one, on which trials are judged
@@ -43,10 +64,10 @@ class Case:
     """A flight to judge on, and an EffectSet that it took no part in fitting. spans : ((first, last), ...) s, None for all; reach : the
     same for phases, which those at either end of the flight go on to its begin and its end for."""
 
-    flight: object
+    flight: Flight
     effects: EffectSet
-    spans: tuple | None = None
-    reach: tuple = EVERYTHING
+    spans: Spans | None = None
+    reach: Spans = EVERYTHING
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,28 +77,31 @@ class Kept:
     last calibration."""
 
     selection: Selection
-    detections: tuple
-    refused: tuple
-    worth: dict
-    changes: tuple = ()
+    detections: tuple[Detection, ...]
+    refused: tuple[Refused, ...]
+    worth: dict[Candidate | Detection, float]
+    changes: tuple[str, ...] = ()
 
     @property
-    def candidates(self):
+    def candidates(self) -> tuple[Candidate, ...]:
         """Those that are kept."""
         return self.selection.chosen
 
 
-def nothing(attribution, refused=()):
+def nothing(attribution: Attribution, refused: Iterable[Refused] = ()) -> Kept:
     """Kept of an Attribution of which nothing is."""
     return Kept(attribution.selection.only(()), (), tuple(refused), {})
 
 
-def cross_fitted(attribution, flights, base, candidates, detections, most=None):
+def cross_fitted(
+    attribution: Attribution, flights: Sequence[Flight], base: EffectSet, candidates: Sequence[Candidate],
+    detections: Sequence[Detection], most: int | None = None,
+) -> list[Case]:  # fmt: skip
     """[Case]: each flight, or each half of a single one, every other block, with the effects of `candidates` fitted to the others alone; `most` of
     them, evenly taken, if there are more."""
     table, selection = attribution.selection.table, attribution.selection
     if len(flights) > 1:
-        parts = [(k, table.flight != k, {}) for k in range(len(flights))]
+        parts = [(Case(flights[k], base), k, table.flight != k) for k in range(len(flights))]
     else:
         # in turns, so that both parts are of all of the flight
         start, since = float(flights[0].tdoa.t[0]), table.t - table.t.min()
@@ -87,17 +111,20 @@ def cross_fitted(attribution, flights, base, candidates, detections, most=None):
         edges[-1] = start + table.t.max()
         spans = list(zip(edges[:-1].tolist(), edges[1:].tolist()))
         reach = [(-np.inf, spans[0][1]), *spans[1:-1], (spans[-1][0], np.inf)] if len(spans) > 1 else EVERYTHING
-        parts = [(0, number % 2 != k, {"spans": tuple(spans[k::2]), "reach": tuple(reach[k::2])}) for k in range(2)]
+        parts = [(Case(flights[0], base, tuple(spans[k::2]), tuple(reach[k::2])), 0, number % 2 != k) for k in range(2)]
     out, columns = [], columns_of(candidates)
-    for k, rows, which in parts[:: -(-len(parts) // (most or len(parts)))]:
+    for case, k, rows in parts[:: -(-len(parts) // (most or len(parts)))]:
         others = replace(selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows))
         found = usable([*effects_of(others), *(detection.effect for detection in detections)])
-        fitted = [number for number in range(len(flights)) if number != k] or [k]
-        out.append(Case(flights[k], EffectSet((*base.effects, *attribution.seen.limited(found.effects, fitted))), **which))
+        fitted = [other for other in range(len(flights)) if other != k] or [k]
+        out.append(replace(case, effects=EffectSet((*base.effects, *attribution.seen.limited(found.effects, fitted)))))
     return out
 
 
-def useful(attribution, flights, baseline, progress=lambda: None, over=map):
+def useful(
+    attribution: Attribution, flights: Sequence[Flight], baseline: Baseline,
+    progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+) -> Kept:  # fmt: skip
     """Kept: what makes the filter no worse where it was not fitted.
 
     Candidates go, one by one, if the error is smaller without, or of a single flight hardly larger; detections stay only if it is
@@ -106,24 +133,28 @@ def useful(attribution, flights, baseline, progress=lambda: None, over=map):
     What happened at a time of a single flight is tried, so that its worth is known, and not kept.
     over : as of `attribute`.
     """
-    candidates, detections, refused = list(attribution.selection.chosen), [], []
+    candidates, refused = list(attribution.selection.chosen), []
+    detections: list[Detection] = []
     least = WORTH_OF_ONE if len(flights) == 1 else -WORSE
     trials = _Trials(attribution, flights, baseline, progress, over)
     error = trials.start(candidates, detections)
-    without, suspects, left_out = {}, _applicable(candidates), {}
+    without: dict[Candidate, float] = {}
+    worth: dict[Candidate | Detection, float] = {}
+    suspects = _applicable(candidates)
     while suspects:
         less = [([c for c in candidates if c is not one], detections) for one in suspects]
         without = dict(zip(suspects, trials.errors(less)))
-        harmful = sorted((one for one in suspects if without[one] <= error * (1.0 + least)), key=without.get)
+        harmful = sorted((one for one in suspects if without[one] <= error * (1.0 + least)), key=without.__getitem__)
         if harmful:
             why = _why_without(error, without[harmful[0]])
             refused.append(Refused(harmful[0].label, why))
-            candidates, left_out[harmful[0]] = [one for one in candidates if one is not harmful[0]], without[harmful[0]] - error
+            candidates = [one for one in candidates if one is not harmful[0]]
+            worth[harmful[0]] = without[harmful[0]] - error
             error, without = trials.start(candidates, detections), {}
         elif len(suspects) == len(_applicable(candidates)):
             break
         suspects = harmful[1:] or _applicable(candidates)
-    worth = left_out | {candidate: trial - error for candidate, trial in without.items()}
+    worth.update((candidate, trial - error) for candidate, trial in without.items())
     for detection in attribution.detections:
         if not detection.effect.usable:
             continue
@@ -142,12 +173,12 @@ def useful(attribution, flights, baseline, progress=lambda: None, over=map):
     return Kept(attribution.selection.kept(candidates), tuple(detections), tuple(refused), worth)  # fitted as in the trials
 
 
-def _applicable(candidates):
+def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Those of some Candidates that a node can take out, at least in part."""
     return [one for one in candidates if any(term.effect.usable for term in one.terms)]
 
 
-def _why_without(error, without):
+def _why_without(error: float, without: float) -> str:
     """Why an effect is not applied, by the errors with and without it, m."""
     figures = f"{error:.3f} m with, {without:.3f} m without"
     if without <= error * (1.0 - WORSE):
@@ -155,16 +186,19 @@ def _why_without(error, without):
     return f"of one flight, worth less than {WORTH_OF_ONE:.0%} of the error ({figures}), it may as well do harm to another: {SECOND}"
 
 
-def _momentary(candidate):
+def _momentary(candidate: Candidate) -> bool:
     """Whether it is what happened at a time of one flight: a delay for a while, or a function of the time that is no drift."""
-    functions = [term.effect for term in candidate.terms if term.effect.settings]
+    functions = [term.function for term in candidate.terms if term.function]
     return not recurs(candidate) or any(one.covariate == "time" and one.shape not in DRIFTS for one in functions)
 
 
 _NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
 
 
-def borne_out(attribution, flights, base, config=None, constraints=(), progress=lambda: None, over=map):
+def borne_out(
+    attribution: Attribution, flights: Sequence[Flight], base: EffectSet, config: FilterConfig | None = None,
+    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+) -> Kept:  # fmt: skip
     """Kept, where the reference tells no errors: positions and delays of anchors together, or nothing.
 
     A model that is wrong makes innovations smaller too, by pushing the path to where they are. On measured flights
@@ -188,16 +222,19 @@ def borne_out(attribution, flights, base, config=None, constraints=(), progress=
 class Baseline:
     """The model before: runs of the filter with it, one for each flight."""
 
-    def __init__(self, base, config=None):
+    def __init__(self, base: EffectSet, config: FilterConfig | None = None) -> None:
         """base : EffectSet; config : FilterConfig."""
-        self.base, self.config, self._runs = base, config, {}
+        self.base, self.config = base, config
+        self._runs: dict[int, tuple[Flight, Run]] = {}
 
-    def run(self, flight):
+    def run(self, flight: Flight) -> Run:
         """Run of a Flight, the same one whenever it is asked for."""
         self.prepare([flight])
         return self._runs[id(flight)][1]
 
-    def prepare(self, flights, progress=lambda: None, over=map):
+    def prepare(
+        self, flights: Sequence[Flight], progress: Callable[[], object] = lambda: None, over: MapFunction = map
+    ) -> None:
         """Make the runs of Flights that there are none of yet. over : as of `attribute`."""
         missing = [flight for flight in flights if id(flight) not in self._runs]
         missing = list({id(flight): flight for flight in missing}.values())
@@ -210,23 +247,33 @@ class _Trials:
     """Mean 3D RMSE, m, of cross-fitted models. The first is run as the nodes would; then each at the poses of a run with nearly
     the same model, which takes a tenth of the time."""
 
-    def __init__(self, attribution, flights, baseline, progress, over):
+    def __init__(
+        self, attribution: Attribution, flights: Sequence[Flight], baseline: Baseline, progress: Callable[[], object],
+        over: MapFunction,
+    ) -> None:  # fmt: skip
         self._attribution, self._flights, self._baseline, self._progress = attribution, flights, baseline, progress
-        self._poses, self._over = [None], over
+        self._over = over
+        self._poses: Sequence[Poses | None] = [None]
 
-    def start(self, candidates, detections):
+    def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
         """The error of a model; later trials take the poses of its runs."""
         (told,) = self._tried(_error_and_poses, [(candidates, detections)])
-        errors, self._poses = zip(*told)
-        return float(np.mean(errors))
+        self._poses = [poses for _, poses in told]
+        return float(np.mean([error for error, _ in told]))
 
-    def errors(self, models):
+    def errors(self, models: Sequence[Model]) -> list[float]:
         """The errors of other models, [(candidates, detections)]: [m]."""
         return [float(np.mean(errors)) for errors in self._tried(_error, models)]
 
-    def _tried(self, function, models):
+    def _tried(
+        self, function: Callable[[FilterConfig | None, tuple[Case, Poses | None]], Made], models: Sequence[Model]
+    ) -> list[list[Made]]:
         """[[function of each trial] of each model], all at once."""
-        fitted = [cross_fitted(self._attribution, self._flights, self._baseline.base, *model, JUDGES) for model in models]
+        attribution, flights, base = self._attribution, self._flights, self._baseline.base
+        fitted = [
+            cross_fitted(attribution, flights, base, candidates, detections, JUDGES)
+            for candidates, detections in models
+        ]
         told = []
         for of_case in self._over(partial(function, self._baseline.config), zip(sum(fitted, []), cycle(self._poses))):
             told.append(of_case)
@@ -234,11 +281,11 @@ class _Trials:
         return [told[k : k + len(fitted[0])] for k in range(0, len(told), len(fitted[0]))]
 
 
-def _error(config, trial):
+def _error(config: FilterConfig | None, trial: tuple[Case, Poses | None]) -> float:
     return _error_and_poses(config, trial)[0]
 
 
-def _error_and_poses(config, trial):
+def _error_and_poses(config: FilterConfig | None, trial: tuple[Case, Poses | None]) -> tuple[float, Poses]:
     """(3D RMSE, m, poses of the run) of a trial: a Case, and the poses that it is corrected at, None for those of the run itself."""
     case, poses = trial
     anchors, effects = case.flight.anchors, case.effects
@@ -247,7 +294,10 @@ def _error_and_poses(config, trial):
     return score(case, run).row()["rmse_3d"], poses_of(run.odometry)
 
 
-def judge(attribution, flights, holdout, baseline, effects, reference, progress=lambda: None, over=map):
+def judge(
+    attribution: Attribution, flights: Sequence[Flight], holdout: Sequence[Flight], baseline: Baseline,
+    effects: EffectSet, reference: Reference, progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+) -> tuple[dict[str, Any], dict[str, Any], str]:  # fmt: skip
     """(before, after, on what): the errors on the hold-out flights if there are any, or cross-fitted, or, where the
     reference tells no errors, what the filter's own innovations say. As `compare` gives them. over : as of `attribute`."""
     progress()
@@ -263,11 +313,13 @@ def judge(attribution, flights, holdout, baseline, effects, reference, progress=
         cases = [Case(flight, effects) for flight in flights]
         on = "the flights that were fitted, by their innovations alone"
     if reference.judges:
-        return *compare(cases, baseline, progress, reference.shift_std, over), on
-    return *_innovations(cases, baseline, progress, over), on
+        before, after = compare(cases, baseline, progress, reference.shift_std, over)
+    else:
+        before, after = _innovations(cases, baseline, progress, over)
+    return before, after, on
 
 
-def why_not(before, after, shift_std):
+def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> str | None:
     """Why what was found must not be applied, after `compare`; None if it may. shift_std : m, what a reference may be off by in all
     of a flight; the gain must be SURE standard deviations of what that can feign."""
     gain, interval = after["pooled"]["rmse_3d"] < before["pooled"]["rmse_3d"], after["pooled"]["rmse_3d_gain_ci"]
@@ -287,11 +339,15 @@ def why_not(before, after, shift_std):
     return None
 
 
-def compare(cases, baseline, progress=lambda: None, shift_std=lambda name: np.zeros(3), over=map):
+def compare(
+    cases: Sequence[Case], baseline: Baseline, progress: Callable[[], object] = lambda: None,
+    shift_std: Callable[[str], np.ndarray] = lambda name: np.zeros(3), over: MapFunction = map,
+) -> list[dict[str, Any]]:  # fmt: skip
     """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, phases too, besides
     residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts
     what the references of whole flights may be off by too. shift_std : of a Reference; over : as of `attribute`."""
-    sides, draws = [], []
+    sides: list[dict[str, Any]] = []
+    draws = []
     for after in (False, True):
         scores, rows, blocks = [], [], []
         for run, case in zip(_runs(cases, baseline, after, progress, over), cases):
@@ -305,11 +361,12 @@ def compare(cases, baseline, progress=lambda: None, shift_std=lambda name: np.ze
         together = {**as_json(pooled(scores)), "residual_spread": float(np.mean(spreads)) if spreads else None}
         sides.append({"runs": rows, "pooled": {**together, "rmse_3d_ci": _interval(blocks)}, "scores": scores})
         draws.append(blocks)
-    sides[1]["pooled"]["rmse_3d_gain_ci"] = _gain_interval(*draws, [case.flight.name for case in cases], shift_std)
+    names = [case.flight.name for case in cases]
+    sides[1]["pooled"]["rmse_3d_gain_ci"] = _gain_interval(draws[0], draws[1], names, shift_std)
     return sides
 
 
-def score(case, run):
+def score(case: Case, run: Run) -> Score:
     """Score of a Run on a Case. Raises InputError where there is no estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
     out = Score(case.flight.name, run.odometry, truth, run.residuals, case.flight.tdoa.t, case.spans, case.reach)
@@ -318,7 +375,9 @@ def score(case, run):
     return out
 
 
-def _runs(cases, baseline, after, progress, over):
+def _runs(
+    cases: Sequence[Case], baseline: Baseline, after: bool, progress: Callable[[], object], over: MapFunction
+) -> Iterator[Run]:
     """Runs of Cases in turn, before or after."""
     if not after:
         baseline.prepare([case.flight for case in cases], progress, over)
@@ -329,30 +388,33 @@ def _runs(cases, baseline, after, progress, over):
         yield run
 
 
-def _run(config, case):
+def _run(config: FilterConfig | None, case: Case) -> Run:
     return run_offline(case.flight, config, Corrector(case.flight.anchors, case.effects))
 
 
-def _innovations(cases, baseline, progress, over):
+def _innovations(
+    cases: Sequence[Case], baseline: Baseline, progress: Callable[[], object], over: MapFunction
+) -> list[dict[str, Any]]:
     sides = []
     for after in (False, True):
         rows = []
         for run, case in zip(_runs(cases, baseline, after, progress, over), cases):
             used = run.residuals.verdict == USED
             nis = run.residuals.innovation[used] ** 2 / run.residuals.variance[used]
-            figures = {"nis_mean": float(np.mean(nis)), "residual_spread": _spread(run)}
+            figures: dict[str, Any] = {"nis_mean": float(np.mean(nis)), "residual_spread": _spread(run)}
             rows.append({"flight": case.flight.name, "rmse_3d": None, **figures})
-        means = {key: float(np.mean([row[key] for row in rows])) for key in ("nis_mean", "residual_spread")}
-        sides.append({"runs": rows, "pooled": {"rmse_3d": None, **means}, "scores": []})
+        pooled_figures: dict[str, Any] = {"rmse_3d": None}
+        pooled_figures |= {key: float(np.mean([row[key] for row in rows])) for key in ("nis_mean", "residual_spread")}
+        sides.append({"runs": rows, "pooled": pooled_figures, "scores": []})
     return sides
 
 
-def _spread(run):
+def _spread(run: Run) -> float | None:
     used = run.residuals.verdict == USED
     return float(1.4826 * np.median(np.abs(run.residuals.innovation[used]))) if used.any() else None
 
 
-def _blocks(judged):
+def _blocks(judged: Score) -> np.ndarray:
     """(b, 5) per block of 5 s: sums of squared 3D errors, counts, sums of errors."""
     if not len(judged.t):
         return np.zeros((1, 5))
@@ -361,14 +423,14 @@ def _blocks(judged):
     return np.stack([np.bincount(block, power), np.bincount(block), *(np.bincount(block, e) for e in judged.error.T)], axis=1)
 
 
-def _interval(blocks):
+def _interval(blocks: Sequence[np.ndarray]) -> list[float] | None:
     """95 % interval of the 3D RMSE: [low, high], m."""
-    blocks = np.concatenate(blocks)
-    draws = _draws(blocks, np.zeros((BOOTSTRAPS, len(blocks), 3)))
+    together = np.concatenate(blocks)
+    draws = _draws(together, np.zeros((BOOTSTRAPS, len(together), 3)))
     return [float(x) for x in np.quantile(draws, [0.025, 0.975])] if np.isfinite(draws).all() else None
 
 
-def _draws(blocks, shifts):
+def _draws(blocks: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     """(BOOTSTRAPS,) m: the 3D RMSE of blocks (b, 5) drawn at random, whose errors are all off by shifts (BOOTSTRAPS, b, 3), m."""
     chosen = np.random.default_rng(0).integers(0, len(blocks), (BOOTSTRAPS, len(blocks)))
     power, count, error = blocks[chosen, 0], blocks[chosen, 1], blocks[chosen, 2:]
@@ -377,7 +439,10 @@ def _draws(blocks, shifts):
     return np.sqrt(np.maximum(power.sum(axis=1), 0.0) / np.maximum(count.sum(axis=1), 1))
 
 
-def _gain_interval(before, after, names, shift_std):
+def _gain_interval(
+    before: Sequence[np.ndarray], after: Sequence[np.ndarray], names: Sequence[str],
+    shift_std: Callable[[str], np.ndarray],
+) -> list[float] | None:  # fmt: skip
     """95 % interval of the share of the 3D RMSE that is gone, the same blocks drawn for both, with references that are off by what
     they may be, alike in all of a flight. before, after : [(b, 5)], blocks of each case; names : of their flights."""
     blocks, others = np.concatenate(before), np.concatenate(after)

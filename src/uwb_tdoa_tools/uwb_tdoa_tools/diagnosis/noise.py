@@ -1,11 +1,18 @@
 """What noise the filter should assume beside a calibration: a parameter file for ekf_node."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
 PARAMETERS = """/**:
   ros__parameters:
     tdoa_std: {:.3f}  # m; measured: as many TDOAs count as independent as there are
 """
 
 
-def write_parameters(path, tdoa_std):
+def write_parameters(path: Path, tdoa_std: float) -> None:
     """Write the parameters of ekf_node. tdoa_std : m."""
     path.write_text(PARAMETERS.format(tdoa_std))

@@ -1,6 +1,9 @@
 """A diagnosis for machines, and in a few lines. Both say what the report says, in its order."""
 
+from __future__ import annotations
+
 import textwrap
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -12,10 +15,15 @@ from .report.entries import doubt_in_words, entries, worth_in_words
 from .report.unclear import by_remedy, untold
 from .report.verdict import faults_in_words, truth_in_words, verdict
 
+if TYPE_CHECKING:
+    from .diagnose import Diagnosis
+    from .findings import Finding
+    from uwb_tdoa_bias.effects import SmoothTerm
+
 WIDTH, LABEL = 120, 10  # columns of the screen, and of them for what a line is
 
 
-def as_json(diagnosis):
+def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """What diagnosis.json holds: plain values. Its keys are described in docs/diagnosis.md."""
     return _plain(
         {
@@ -25,7 +33,7 @@ def as_json(diagnosis):
             "findings": [_finding(finding) for finding in diagnosis.findings if finding.declared],
             "numbers": {name: [vars(item) for item in found] for name, found in diagnosis.numbers.items()},
             "ground_truth": {name: list(said) for name, said in diagnosis.of_truth.items()},
-            "unattributed": [_function(finding) for finding in diagnosis.findings if not finding.declared],
+            "unattributed": [_function(item, item.function) for item in diagnosis.findings if item.function],
             "ambiguous": _ambiguous(diagnosis),
             "unobservable": [
                 {
@@ -45,7 +53,7 @@ def as_json(diagnosis):
     )
 
 
-def as_text(diagnosis):
+def as_text(diagnosis: Diagnosis) -> str:
     """Lines for the screen: verdict, what to do, what was found and its worth, what could not be told, what to run."""
     found = entries(diagnosis)
     lines = [("" if k else "verdict", sentence) for k, sentence in enumerate(verdict(diagnosis).sentences)]
@@ -60,21 +68,21 @@ def as_text(diagnosis):
         )
         lines.append(("found" if entry.findings[0].declared else "no name", what))
         lines += [("", sentence) for sentence in [entry.over_flights, *doubt_in_words(entry)] if sentence]
-    for told_by, what in by_remedy(untold(diagnosis)).items():
-        lines.append(("not told", f"{listed(what)}; what would tell: {told_by}."))
+    for told_by, several in by_remedy(untold(diagnosis)).items():
+        lines.append(("not told", f"{listed(several)}; what would tell: {told_by}."))
     if any(entry.added for entry in found):
         lines += [("apply", command) for command, _ in diagnosis.applying]
     return "\n".join([*(_wrapped(*line) for line in lines), *anchors.lines(diagnosis)])
 
 
-def _wrapped(label, text):
+def _wrapped(label: str, text: str) -> str:
     return textwrap.fill(
         text, WIDTH, initial_indent=label.ljust(LABEL), subsequent_indent=" " * LABEL, break_on_hyphens=False,
         break_long_words=False,
     )  # fmt: skip
 
 
-def _finding(finding):
+def _finding(finding: Finding) -> dict[str, Any]:
     effect = finding.effect
     return {
         "effect": effect.name,
@@ -99,8 +107,7 @@ def _finding(finding):
     }
 
 
-def _function(finding):
-    effect = finding.effect
+def _function(finding: Finding, effect: SmoothTerm) -> dict[str, Any]:
     at = np.linspace(effect.knots[0], effect.knots[-1], 25)
     prefixes = sorted({key.rpartition("c")[0] for key in effect.values})
     return {
@@ -122,18 +129,18 @@ def _function(finding):
     }
 
 
-def _over_flights(finding):
+def _over_flights(finding: Finding) -> dict[str, Any]:
     return {"shares": [vars(share) for share in finding.shares], "over_flights": course(finding.shares), "flight": finding.flight}
 
 
-def _alternatives(finding):
+def _alternatives(finding: Finding) -> list[dict[str, Any]]:
     return [
         {"effect": other.effect, "share": other.share, "criterion_gap": other.gap, "tell_apart": other.tell_apart}
         for other in finding.alternatives
     ]
 
 
-def _ambiguous(diagnosis):
+def _ambiguous(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Findings that another effect would explain nearly as well."""
     return [
         {
@@ -148,7 +155,7 @@ def _ambiguous(diagnosis):
     ]
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     """numpy and non-finite numbers as JSON has them."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}

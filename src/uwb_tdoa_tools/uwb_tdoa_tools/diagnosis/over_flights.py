@@ -1,13 +1,25 @@
 """Several flights: whether a finding is the same in all, differs, grows from one to the next, or belongs to one alone."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .regression.select import select
 from .regression.scan import Scan
 from .regression.table import table_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from ..parallel import MapFunction
+    from .channels import ChannelResiduals
+    from .channels.views import CovariateView
+    from .regression.select import Search, Selection
+    from .regression.table import Table
+    from .regression.terms import Candidate
 
 TOLD = 0.25  # standard deviation of a share, that a flight must at least tell
 SURE = 4.0  # standard deviations
@@ -27,12 +39,12 @@ class Share:
     std: float
 
     @property
-    def told(self):
+    def told(self) -> bool:
         """Whether the flight tells it."""
         return self.std < TOLD
 
 
-def shares(selection, candidate, names):
+def shares(selection: Selection, candidate: Candidate, names: Sequence[str]) -> tuple[Share, ...]:
     """(Share, ...) of a chosen Candidate, one for each flight of its Table, which has `names`: a fit of one factor to the rows of
     each."""
     table, model = selection.table, selection.fit
@@ -40,7 +52,9 @@ def shares(selection, candidate, names):
     return _shares(part, model.residual + part, model.information(table), table.flight, names)
 
 
-def _shares(part, y, information, flight, names):
+def _shares(
+    part: np.ndarray, y: np.ndarray, information: np.ndarray, flight: np.ndarray, names: Sequence[str]
+) -> tuple[Share, ...]:
     out = []
     for number, name in enumerate(names):
         rows = flight == number
@@ -50,7 +64,7 @@ def _shares(part, y, information, flight, names):
     return tuple(out)
 
 
-def course(several):
+def course(several: Sequence[Share]) -> str | None:
     """ALL, ALONE, GROWS or DIFFERS of (Share, ...) in the order of the flights; None where fewer than two tell it."""
     told = [each for each in several if each.told]
     if len(told) < 2:
@@ -73,7 +87,7 @@ def course(several):
     return DIFFERS
 
 
-def in_words(several):
+def in_words(several: Sequence[Share]) -> str:
     """A sentence on (Share, ...); "" where flights do not tell."""
     kind, told = course(several), [each for each in several if each.told]
     if kind is None:
@@ -86,11 +100,14 @@ def in_words(several):
     return f"{'Grows' if kind == GROWS else 'Differs'} from flight to flight: {listed} of it."
 
 
-def of_one(remaining, inflation, views, search, over=map):
+def of_one(
+    remaining: list[ChannelResiduals], inflation: np.ndarray, views: Callable[[Table], dict[str, list[CovariateView]]],
+    search: Search, over: MapFunction = map,
+) -> list[tuple[int, Selection]]:  # fmt: skip
     """[(flight, Selection)] of what each flight alone shows of its own, of [{channel: ChannelResidual}] that a model of all leaves.
 
-    inflation : of the fit of all; views(table) -> {channel: [View]}; search : as `select` takes it; over : as of `attribute`. What
-    another flight shows too is not of one alone."""
+    inflation : of the fit of all; views(table) -> {channel: [CovariateView]}; search : as `select` takes it; over : as
+    of `attribute`. What another flight shows too is not of one alone."""
     out = []
     for number, selection in enumerate(over(partial(_selection, inflation, views, search), remaining)):
         if selection is None:
@@ -101,14 +118,17 @@ def of_one(remaining, inflation, views, search, over=map):
     return out
 
 
-def _selection(inflation, views, search, residuals):
+def _selection(
+    inflation: np.ndarray, views: Callable[[Table], dict[str, list[CovariateView]]], search: Search,
+    residuals: ChannelResiduals,
+) -> Selection | None:  # fmt: skip
     """Selection of what the residuals of a flight show; None if that is nothing."""
     table = table_of([residuals])
     selection = select(table, [], inflation, search, Scan(table, views(table)))
     return selection if selection.chosen else None
 
 
-def _elsewhere(selection, candidate, remaining, number):
+def _elsewhere(selection: Selection, candidate: Candidate, remaining: list[ChannelResiduals], number: int) -> bool:
     """Whether another flight shows a good part of a Candidate that was found in flight `number`."""
     fit = selection.fit
     for other in remaining[:number] + remaining[number + 1 :]:

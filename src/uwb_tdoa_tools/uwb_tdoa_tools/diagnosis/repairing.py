@@ -1,6 +1,9 @@
 """Wrong ids and signs, which come before physics: undone, and judged like any other effect."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,8 +16,20 @@ from ..checking.repairs import repairs
 from .detectors import Detection
 from .judging import JUDGES, WORSE, Case, score
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from .attribution import Attribution
+    from .judging import Kept
+    from .regression.terms import Candidate
 
-def repaired(flights, base, config=None, progress=lambda: None):
+
+def repaired(
+    flights: Sequence[Flight], base: EffectSet, config: FilterConfig | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> dict[Detection, float]:  # fmt: skip
     """{Detection: m by which the mean 3D RMSE of the filter is larger without it, and those before it} of the LabelEffects that all
     Flights need beyond the EffectSet `base`, and that make the filter better."""
     out, effects, error = {}, base.effects, None
@@ -27,7 +42,9 @@ def repaired(flights, base, config=None, progress=lambda: None):
     return out
 
 
-def sound(flights, base, found):
+def sound(
+    flights: Sequence[Flight], base: EffectSet, found: Iterable[Detection]
+) -> tuple[tuple[Flight, ...], EffectSet]:
     """(Flights without wrong ids and signs, EffectSet of the rest): what `base` and Detections have of these is taken out of the
     flights, so that pairs and anchors are called by their names."""
     labels = [effect for effect in base.effects if isinstance(effect, LabelEffect)]
@@ -36,26 +53,31 @@ def sound(flights, base, found):
     return tuple(map(undo.correct_streams, flights)), replace(base, effects=rest)
 
 
-def before_others(attribution, kept, found):
+def before_others(attribution: Attribution, kept: Kept, found: dict[Detection, float]) -> tuple[Attribution, Kept]:
     """(Attribution, Kept) with Detections and what they are worth, as of `repaired`."""
     attribution = replace(attribution, detections=(*found, *attribution.detections))
-    return attribution, replace(kept, detections=(*found, *kept.detections), worth={**found, **kept.worth})
+    worth: dict[Candidate | Detection, float] = dict(found.items())
+    return attribution, replace(kept, detections=(*found, *kept.detections), worth=worth | kept.worth)
 
 
-def _common(several):
+def _common(several: Sequence[Sequence[LabelEffect]]) -> list[LabelEffect]:
     """Effects with the values that those of every flight have; ids that are not the same in all are left."""
     out = []
     for effect in several[0]:
         same = [next((other for other in others if other.name == effect.name), None) for others in several]
-        if None in same:
+        known = [other for other in same if other is not None]
+        if len(known) < len(same):
             continue
-        shared = {key: value for key, value in effect.values.items() if all(other.values.get(key) == value for other in same)}
-        if shared and (effect.separable or all(other.values == effect.values for other in same)):
+        keys = [key for key, value in effect.values.items() if all(one.values.get(key) == value for one in known)]
+        shared = {key: effect.values[key] for key in keys}
+        if shared and (effect.separable or all(other.values == effect.values for other in known)):
             out.append(replace(effect, values=shared, source="diagnose"))
     return out
 
 
-def _error(flights, effects, config, progress):
+def _error(
+    flights: Sequence[Flight], effects: Iterable[Effect], config: FilterConfig | None, progress: Callable[[], object]
+) -> float:
     """Mean 3D RMSE, m, of some of the flights."""
     errors = []
     for flight in flights[:: -(-len(flights) // JUDGES)]:
@@ -65,7 +87,7 @@ def _error(flights, effects, config, progress):
     return float(np.mean(errors))
 
 
-def _evidence(flight, effects, effect):
+def _evidence(flight: Flight, effects: Iterable[Effect], effect: Effect) -> dict[str, float]:
     """Median error, m, at the true place of the TDOAs that the effect changes, with it and without."""
     one = KnownPath(EffectSet(tuple(effects)).correct_streams(flight))
     other = one.without(effect)

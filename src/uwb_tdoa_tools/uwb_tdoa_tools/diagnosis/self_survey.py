@@ -7,12 +7,16 @@ features for large-scale kernel machines, NIPS 2007). How large delays and funct
 functions explain what shifts would, shifts stay where the prior is.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EFFECTS, Covariance, EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet
+from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -20,9 +24,21 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from ..parallel import in_one_thread
 from ..scoring.metrics import AIRBORNE
 from .channels import CHANNELS, Comparison
+from .constraints import Distance, Mark
 from .prior import DELAY, MOVED, POSITION, Prior, keys_of, solve
 from .references.nothing import Nothing
 from .regression.fit import NU, student_scale
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.estimator import Odometry
+    from ..parallel import MapFunction
+    from .channels.tdoa import TdoaResidual
+    from .constraints import Constraint
+    from .diagnose import Diagnosis
+    from .prior import Solution
 
 ROUNDS = 2  # linear solutions, each about the last
 BLOCK = 3.0  # s over which sums of scores show how alike errors are
@@ -52,12 +68,12 @@ class Surveyed:
     tdoa_std: float
     delay_std: float
     function_std: float
-    changes: tuple = ()
-    marks: tuple | None = None
+    changes: tuple[Change, ...] = ()
+    marks: tuple[float, float, float] | None = None
     grounded: int = 0
 
     @property
-    def position_std(self):
+    def position_std(self) -> np.ndarray:
         """(N, 3) m."""
         return np.sqrt(np.diag(self.covariance))[: 3 * len(self.anchors)].reshape(-1, 3)
 
@@ -71,9 +87,9 @@ class Change:
     anchor: str
     values: np.ndarray
     std: np.ndarray
-    rivals: tuple = ()
+    rivals: tuple[str, ...] = ()
 
-    def as_text(self):
+    def as_text(self) -> str:
         """One sentence."""
         by = ", ".join(f"{100 * value:+.1f} +- {100 * std:.1f}" for value, std in zip(self.values, self.std))
         if self.effect == POSITION:
@@ -81,7 +97,11 @@ class Change:
         return f"anchor {self.anchor} is later than it was by {by} cm" + ", or has moved" * bool(self.rivals)
 
 
-def survey(flights, position_std, base=EffectSet(), config=None, constraints=(), progress=lambda: None, over=map):
+def survey(
+    flights: Sequence[Flight], position_std: np.ndarray, base: EffectSet = EffectSet(),
+    config: FilterConfig | None = None, constraints: Sequence[Constraint] = (),
+    progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+) -> Surveyed:  # fmt: skip
     """Surveyed of Flights of the same anchors, which are where they say within position_std, (N, 3) m, or as the covariance of
     `base` says.
 
@@ -92,12 +112,17 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
     given, runs = flights[0].anchors, _Runs(flights, base, config, constraints)
     n, prior = len(given), Prior.of(given, position_std, base.covariance)
     start = np.concatenate([given.positions.ravel(), np.zeros(n)])
-    best, rounds, found = start, [], None
-    for _ in range(ROUNDS):
-        rounds.append(runs.equations(given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :], prior.loose, progress, over))
-        found = solve(rounds[-1].gram, rounds[-1].vector, prior, best - start)
+
+    def linearised(about: np.ndarray) -> _Equations:
+        return runs.equations(given.at(about[: 3 * n].reshape(n, 3)), about[3 * n :], prior.loose, progress, over)
+
+    first = last = linearised(start)
+    found = solve(first.gram, first.vector, prior, np.zeros(4 * n))
+    best = start + found.step
+    for _ in range(ROUNDS - 1):
+        last = linearised(best)
+        found = solve(last.gram, last.vector, prior, best - start)
         best = best + found.step
-    first, last = rounds[0], rounds[-1]
     moved, delays = given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :]
     parts = [runs.residual(flight, moved, delays) for flight in runs.flights]
     left = student_scale(np.concatenate([_slow(part) for part in parts]))
@@ -108,7 +133,9 @@ def survey(flights, position_std, base=EffectSet(), config=None, constraints=(),
 
 
 @in_one_thread
-def tdoa_std_of(flights, effects, config=None, over=map):
+def tdoa_std_of(
+    flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None, over: MapFunction = map
+) -> float:
     """m, the tdoa_std that the innovations of Flights call for beside the EffectSet `effects`; their ground truth is not used. over : as
     of `attribution.attribute`."""
     config, anchors = config or FilterConfig(), flights[0].anchors
@@ -116,7 +143,9 @@ def tdoa_std_of(flights, effects, config=None, over=map):
     return _Runs(flights, effects, config).equations(anchors, np.zeros(len(anchors)), loose, over=over).tdoa_std(config)
 
 
-def noise_of(diagnosis, config, over, say):
+def noise_of(
+    diagnosis: Diagnosis, config: FilterConfig | None, over: MapFunction, say: Callable[[str], object]
+) -> float | None:
     """The same of the flights of a Diagnosis beside its effects; None where they are too short to tell, and say(why)."""
     try:
         return tdoa_std_of(diagnosis.flights, diagnosis.effects, config, over)
@@ -126,7 +155,7 @@ def noise_of(diagnosis, config, over, say):
 
 
 @in_one_thread
-def slow_innovations(flights, effects, config=None):
+def slow_innovations(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None) -> float:
     """m, scale of the innovations of Flights that are slow, averaged over half a second, beside the EffectSet `effects`: what anchors
     that are elsewhere or late make. Their ground truth is not used. Raises InputError for a flight that is too short."""
     runs, none = _Runs(flights, effects, config or FilterConfig()), np.zeros(len(flights[0].anchors))
@@ -135,59 +164,87 @@ def slow_innovations(flights, effects, config=None):
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Normal equations of all flights: gram (k, k), vector (k,); marks : [_Mark] that are in them; slow : m, scale of the slow
-    innovations; alike : by how much larger sums of scores are than those of independent errors; seconds : s that tell."""
+    """Normal equations of all flights: gram (k, k), vector (k,); marks : [_Mark] that are in them; slow : m, scale of
+    the slow innovations; inflation : by how much larger sums of scores are than those of independent errors;
+    seconds : s that tell."""
 
     gram: np.ndarray
     vector: np.ndarray
-    marks: list
+    marks: list[_Mark]
     slow: float
-    alike: float
+    inflation: float
     seconds: float
 
-    def tdoa_std(self, config):
+    def tdoa_std(self, config: FilterConfig) -> float:
         """m: as many independent TDOAs as there are tell as much as the filter then believes."""
-        return config.tdoa_std * float(np.sqrt(self.alike / config.tdoa_correlation_length))
+        return config.tdoa_std * float(np.sqrt(self.inflation / config.tdoa_correlation_length))
+
+
+@dataclass(frozen=True, eq=False)
+class _FlightEquations:
+    """Those of one flight, as of _Equations, before they are divided by the inflation of their errors; slow (n,) m, the
+    slow innovations."""
+
+    gram: np.ndarray
+    vector: np.ndarray
+    marks: list[_Mark]
+    slow: np.ndarray
+    inflation: float
+    seconds: float
 
 
 class _Runs:
     """Runs of Flights with anchors that are moved and late. spans : {flight: (first, last) s in the air}, as the first run of each
     says: other anchors may move the path to the floor, but not the tag; grounded : how many marks are on the floor, and left out."""
 
-    def __init__(self, flights, base, config, constraints=()):
+    def __init__(
+        self, flights: Sequence[Flight], base: EffectSet, config: FilterConfig | None,
+        constraints: Sequence[Constraint] = (),
+    ) -> None:  # fmt: skip
         """base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known."""
-        self._base, self._reference, self.spans = base, Nothing(config), {}
+        self._base, self._reference = base, Nothing(config)
+        self.spans: dict[str, tuple[float, float]] = {}
         self.flights = [self._reference.prepare(flight) for flight in flights]
-        self._of_anchors, marks = ([one for one in constraints if (one.flight is None) is what] for what in (True, False))
+        self._of_anchors = [one for one in constraints if isinstance(one, Distance)]
+        marks = [one for one in constraints if isinstance(one, Mark)]
         self._marks = [one for one in marks if one.position[2] > AIRBORNE]
         self.grounded = len(marks) - len(self._marks)
 
-    def residual(self, flight, anchors, delays):
+    def residual(self, flight: Flight, anchors: Anchors, delays: np.ndarray) -> TdoaResidual:
         """TdoaResidual of one of `flights` with Anchors that are late by delays (N,) m: the innovations of a run."""
         return _residual(self._base, self._reference, anchors, delays, flight, self.spans.get(flight.name))[0]
 
-    def equations(self, anchors, delays, loose, progress=lambda: None, over=map):
+    def equations(
+        self, anchors: Anchors, delays: np.ndarray, loose: np.ndarray, progress: Callable[[], object] = lambda: None,
+        over: MapFunction = map,
+    ) -> _Equations:  # fmt: skip
         """_Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may be."""
-        gram, vector, marks, slow, alike, seconds = 0.0, 0.0, [], [], [], 0.0
+        gram: np.ndarray = np.zeros(())
+        vector: np.ndarray = np.zeros(())
+        marks: list[_Mark] = []
+        several = []
         here = [[one for one in self._marks if one.flight == flight.name] for flight in self.flights]
         items = [(flight, self.spans.get(flight.name), some) for flight, some in zip(self.flights, here)]
         told = over(partial(_of_flight, self._base, self._reference, anchors, delays, loose), items)
         for (one, span), flight in zip(told, self.flights):
             self.spans[flight.name] = span
             marks += one.marks
-            slow.append(one.slow)
-            alike.append(one.alike)
-            seconds += one.seconds
-            gram = gram + one.gram / (SYSTEMATIC * one.alike)
-            vector = vector + one.vector / (SYSTEMATIC * one.alike)
+            several.append(one)
+            gram = gram + one.gram / (SYSTEMATIC * one.inflation)
+            vector = vector + one.vector / (SYSTEMATIC * one.inflation)
             progress()
         of_anchors = [one.equations(anchors, len(vector)) for one in self._of_anchors]
         for more, right in [*((mark.gram, mark.vector) for mark in marks), *of_anchors]:
             gram, vector = gram + more, vector + right
-        return _Equations(gram, vector, marks, student_scale(np.concatenate(slow)), float(np.mean(alike)), seconds)
+        slow = student_scale(np.concatenate([one.slow for one in several]))
+        inflation, seconds = float(np.mean([one.inflation for one in several])), sum(one.seconds for one in several)
+        return _Equations(gram, vector, marks, slow, inflation, seconds)
 
 
-def _residual(base, reference, anchors, delays, flight, span):
+def _residual(
+    base: EffectSet, reference: Nothing, anchors: Anchors, delays: np.ndarray, flight: Flight,
+    span: tuple[float, float] | None,
+) -> tuple[TdoaResidual, tuple[float, float]]:  # fmt: skip
     """(TdoaResidual, span) of a Flight: the innovations of a run with Anchors that are late by delays (N,) m."""
     effects = EffectSet((*base.effects, delay_effect(anchors, delays))) if delays.any() else base
     comparison = Comparison.of(replace(flight, anchors=anchors), reference, effects, span)
@@ -197,17 +254,21 @@ def _residual(base, reference, anchors, delays, flight, span):
     return part, comparison.span
 
 
-def _of_flight(base, reference, anchors, delays, loose, item):
-    """(_Equations, span) of (Flight, span or None, marks of it), before they are divided by what their errors are alike; slow : (n,) m."""
-    flight, span, marks = item
-    part, span = _residual(base, reference, anchors, delays, flight, span)
+def _of_flight(
+    base: EffectSet, reference: Nothing, anchors: Anchors, delays: np.ndarray, loose: np.ndarray,
+    item: tuple[Flight, tuple[float, float] | None, list[Mark]],
+) -> tuple[_FlightEquations, tuple[float, float]]:  # fmt: skip
+    """(_FlightEquations, span) of (Flight, span or None, marks of it)."""
+    flight, known_span, marks = item
+    part, span = _residual(base, reference, anchors, delays, flight, known_span)
     grams, vectors, known = _equations(part, flight, marks)
     n = len(loose)
-    alike = _inflation(grams[:, :n, :n], vectors[:, :n], loose)
-    return _Equations(grams.sum(axis=0), vectors.sum(axis=0), known, _slow(part), alike, BLOCK * len(grams)), span
+    inflation = _inflation(grams[:, :n, :n], vectors[:, :n], loose)
+    gram, vector = grams.sum(axis=0), vectors.sum(axis=0)
+    return _FlightEquations(gram, vector, known, _slow(part), inflation, BLOCK * len(grams)), span
 
 
-def _left_out(equations, prior):
+def _left_out(equations: _Equations, prior: Prior) -> tuple[float, float, float] | None:
     """Surveyed.marks: each is left out of _Equations about the anchors as given."""
     if not equations.marks:
         return None
@@ -219,7 +280,7 @@ def _left_out(equations, prior):
     return float(np.sqrt(before.mean())), float(np.sqrt(after.mean())), float(np.mean(after < before))
 
 
-def _changes(prior, found, offset):
+def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[Change, ...]:
     """(Change, ...) of a Solution."""
     std, out = np.sqrt(np.diag(found.covariance)), []
     for (effect, anchor), others in found.changed.items():
@@ -229,7 +290,9 @@ def _changes(prior, found, offset):
     return tuple(out)
 
 
-def calibrated(base, anchors, shifts, delays, covariance):
+def calibrated(
+    base: EffectSet, anchors: Anchors, shifts: np.ndarray, delays: np.ndarray, covariance: np.ndarray
+) -> EffectSet:
     """The EffectSet `base` with shifts (N, 3) m and delays (N,) m of Anchors on top, and their covariance (4N, 4N) m^2."""
     std = np.sqrt(np.diag(covariance))
     keys = keys_of(anchors.ids)
@@ -245,30 +308,33 @@ def calibrated(base, anchors, shifts, delays, covariance):
     return EffectSet(tuple(effects), Covariance(keys, covariance))
 
 
-def delay_effect(anchors, delays):
+def delay_effect(anchors: Anchors, delays: np.ndarray) -> Effect:
     """The effect anchor_delay with delays (N,) m of Anchors."""
-    return EFFECTS[DELAY]({str(i): float(delay) for i, delay in zip(anchors.ids, delays)})
+    return AnchorDelay({str(i): float(delay) for i, delay in zip(anchors.ids, delays)})
 
 
-def _slow(part):
+def _slow(part: TdoaResidual) -> np.ndarray:
     """Innovations averaged over cells of half a second, (n,) m, those of which hold enough to hide the noise."""
     rows = part.rows()
     return rows.y[rows.count >= FEWEST]
 
 
-def _equations(part, flight, constraints):
+def _equations(
+    part: TdoaResidual, flight: Flight, constraints: Sequence[Mark]
+) -> tuple[np.ndarray, np.ndarray, list[_Mark]]:
     """(grams (b, k, k), vectors (b, k)) of the normal equations that a TdoaResidual gives, block by block, and [_Mark] of
     constraints of its Flight."""
-    samples, air, anchors = part.samples, part.airborne, part.samples.anchors
+    samples, air, anchors, innovations = part.samples, part.airborne, part.samples.anchors, part.innovations
+    assert innovations is not None  # as of a Reference that does not know the path
     ids = [str(i) for i in anchors.ids]
-    positions = EFFECTS[POSITION]().regressors(samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
-    late = EFFECTS[DELAY]().regressors(samples, ids)
+    positions = AnchorPosition().regressors(samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
+    late = AnchorDelay().regressors(samples, ids)
     functions = (late[:, :, None] * features(samples.p)[:, None, :]).reshape(len(late), -1)
     stamps = [one.stamps(flight.tdoa.t[0]) for one in constraints]
     regressors = np.nan_to_num(np.concatenate([positions, late, functions], axis=1))
-    columns, moved = part.innovations.and_positions(regressors, np.sort(np.concatenate([[], *stamps])))
+    columns, moved = innovations.and_positions(regressors, np.sort(np.concatenate([[], *stamps])))
     columns = columns[air]
-    innovation, variance = part.innovations.value[air], part.innovations.variance[air]
+    innovation, variance = innovations.value[air], innovations.variance[air]
     error = innovation / np.sqrt(variance)
     scale = max(1.4826 * np.median(np.abs(error)), 1e-3)
     weight = (NU + 1.0) / (NU + (error / scale) ** 2) / variance
@@ -276,7 +342,7 @@ def _equations(part, flight, constraints):
     parts = [(columns[block == k], weight[block == k], innovation[block == k]) for k in np.unique(block)]
     grams = np.stack([(some * w[:, None]).T @ some for some, w, _ in parts])
     vectors = np.stack([some.T @ (w * value) for some, w, value in parts])
-    return grams, vectors, _known(constraints, stamps, moved, part.innovations.run.odometry)
+    return grams, vectors, _known(constraints, stamps, moved, innovations.run.odometry)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +355,9 @@ class _Mark:
     columns: np.ndarray
 
 
-def _known(constraints, stamps, moved, odometry):
+def _known(
+    constraints: Sequence[Mark], stamps: Sequence[np.ndarray], moved: np.ndarray, odometry: Odometry
+) -> list[_Mark]:
     """[_Mark] of constraints of a flight that ask for the estimate at stamps. moved (m, 3, k): its derivative at all of them in
     turn."""
     order = np.argsort(np.concatenate([[], *stamps]), kind="stable")
@@ -305,7 +373,7 @@ def _known(constraints, stamps, moved, odometry):
     return out
 
 
-def _inflation(grams, vectors, sizes):
+def _inflation(grams: np.ndarray, vectors: np.ndarray, sizes: np.ndarray) -> float:
     """By how much sums of scores over blocks (b, k, k), (b, k) are larger than those of independent errors, averaged over the
     directions that the data tell. sizes (k,): prior standard deviations."""
     gram, vector = grams.sum(axis=0) / PRELIMINARY, vectors.sum(axis=0) / PRELIMINARY
@@ -316,7 +384,7 @@ def _inflation(grams, vectors, sizes):
     return float(np.mean(np.sum((scores @ directions[:, told]) ** 2, axis=0) / values[told]))
 
 
-def features(p, length=LENGTH):
+def features(p: np.ndarray, length: float = LENGTH) -> np.ndarray:
     """Random Fourier features of a Gaussian kernel of some length, m, at places p (n, 3) m: (n, FEATURES)."""
     waves = np.random.default_rng(3).standard_normal((3, FEATURES // 2)) / length
     phase = p @ waves

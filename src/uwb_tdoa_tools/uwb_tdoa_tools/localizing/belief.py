@@ -1,7 +1,10 @@
 """How far an estimate can be believed, from the recording and the run themselves: no ground truth."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 import math
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +19,9 @@ from ..checking.check import check
 from ..checking.recording import of_flight
 from ..scoring.metrics import LOST
 from . import residuals
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 SIGMAS = 2.0  # standard deviations of the 3D position within which it is for 95 % of the time, or longer: whatever the shape, 1.6 to 2.0
@@ -32,10 +38,10 @@ class Belief:
     sentences on why it is not good; remedies : sentences on what would make it better."""
 
     level: str
-    figures: dict
-    lost: list = field(default_factory=list)
-    reasons: tuple = ()
-    remedies: tuple = ()
+    figures: dict[str, Any]
+    lost: list[tuple[float, float]] = field(default_factory=list)
+    reasons: tuple[str, ...] = ()
+    remedies: tuple[str, ...] = ()
 
     def sentences(self) -> list[str]:
         """The verdict for people."""
@@ -77,7 +83,7 @@ def lost_spans(flight: Flight, odometry: Odometry) -> list[tuple[float, float]]:
     t, std = odometry.t, np.sqrt(np.einsum("nii->n", odometry.covariance[:, :3, :3]))
     ends = np.append(t[1:], max(t[-1], flight.tdoa.t.max(initial=-math.inf)))
     wide = (std > LOST) | (ends - t > GAP)
-    spans = []
+    spans: list[tuple[float, float]] = []
     for begin, end in zip(t[wide].tolist(), ends[wide].tolist()):
         if spans and begin - spans[-1][1] < GAP:
             spans[-1] = spans[-1][0], end
@@ -86,11 +92,11 @@ def lost_spans(flight: Flight, odometry: Odometry) -> list[tuple[float, float]]:
     return [(begin, end) for begin, end in spans if end > begin]
 
 
-def _length(flight):
+def _length(flight: Flight) -> float:
     return float(np.ptp(flight.tdoa.t)) if len(flight.tdoa) else 0.0
 
 
-def _deviation(odometry):
+def _deviation(odometry: Odometry) -> dict[str, float]:
     """{name: m, or rad} of what an Odometry says that it may be off by, and what of it lasts."""
     known = np.einsum("nii->n", odometry.covariance[:, :3, :3]) <= LOST**2
     rows = known if known.any() else np.ones(len(known), bool)
@@ -102,7 +108,7 @@ def _deviation(odometry):
     return out | {"std": std, "within": SIGMAS * std, "lasting": lasting, "yaw_std": float(yaw)}
 
 
-def _doubts(flight, figures, lost):
+def _doubts(flight: Flight, figures: Mapping[str, Any], lost: Sequence[tuple[float, float]]) -> Iterator[str]:
     """Yield sentences."""
     if figures["lost"] > LONG * figures["seconds"]:
         spans = ", ".join(f"{begin - flight.tdoa.t[0]:.0f} - {end - flight.tdoa.t[0]:.0f} s" for begin, end in lost[:5])
@@ -117,7 +123,7 @@ def _doubts(flight, figures, lost):
         yield f"the yaw is not known in the end: +-{math.degrees(figures['yaw_std']):.0f} degrees"
 
 
-def _remedies(flight, run, figures, corrected):
+def _remedies(flight: Flight, run: Run, figures: Mapping[str, Any], corrected: bool) -> Iterator[str]:
     """Yield sentences."""
     ids = np.unique(np.concatenate([flight.tdoa.a, flight.tdoa.b]))
     lacking = ids[flight.anchors.index(ids) < 0]

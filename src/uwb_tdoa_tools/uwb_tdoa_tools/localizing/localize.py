@@ -1,7 +1,10 @@
 """Recordings to trajectories, one by one."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
@@ -12,6 +15,9 @@ from . import files, pictures, rerun_file, residuals
 from .belief import GOOD, Belief, believe
 from .estimate import Estimator
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
 SUFFIXES = ".gz", ".csv", ".bag", ".mcap", ".db3", ".log"
 
 
@@ -21,9 +27,9 @@ class Located:
 
     flight: str
     belief: Belief
-    written: tuple
+    written: tuple[Path, ...]
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         told = self.belief
         return {
@@ -47,13 +53,13 @@ class Localizer:
     left: bool = False
     rerun: Path | None = None
 
-    def __call__(self, recording) -> Located:
+    def __call__(self, recording: tuple[Path, Path | None]) -> Located:
         flight, name = self.reading.read(recording), name_of(recording[0])
         run = self.estimator(flight)
         belief = believe(flight, run, self.estimator.effects is not None)
         written = []
 
-        def path(end):
+        def path(end: str) -> Path:
             written.append(self.folder / f"{name}{end}")
             return written[-1]
 
@@ -73,7 +79,7 @@ class Localizer:
         return Located(name, belief, tuple(file for file in written if file.exists()))
 
 
-def name_of(path) -> str:
+def name_of(path: str | Path) -> str:
     """What the files of a recording are called: its own name without what says of which kind it is."""
     name = Path(path).name
     while Path(name).suffix in SUFFIXES:
@@ -81,15 +87,15 @@ def name_of(path) -> str:
     return name
 
 
-def check_names(recordings: list) -> None:
+def check_names(recordings: Sequence[tuple[Path, Path | None]]) -> None:
     """Raise InputError if two of some recordings, (path, survey), would be written to the same files."""
-    seen = {}
+    seen: dict[str, Path] = {}
     for path, _ in recordings:
         other = seen.setdefault(name_of(path), path)
         if other is not path:
             raise InputError(f"{path}: {other} has the same name, so that one would replace the other; localize them to two directories.")
 
 
-def all_good(located: list) -> bool:
+def all_good(located: Iterable[Located]) -> bool:
     """Whether all of some Located are good."""
     return all(one.belief.level == GOOD for one in located)

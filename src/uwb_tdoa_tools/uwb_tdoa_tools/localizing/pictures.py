@@ -1,6 +1,9 @@
 """The path from above and from the side with its uncertainty, and over time."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,12 +12,16 @@ from uwb_tdoa_ekf.estimator import Odometry
 
 from ..scoring.labels import labels
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from matplotlib.axes import Axes
+
 ELLIPSES = 60  # along the path
 SIGMAS = 3.0
 MARGIN = 0.5  # m around anchors and path
 
 
-def draw(path: Path, odometry: Odometry, anchors: Anchors, spans: list, title: str) -> None:
+def draw(path: Path, odometry: Odometry, anchors: Anchors, spans: Sequence[tuple[float, float]], title: str) -> None:
     """Draw an Odometry among Anchors. spans : [(begin, end)] s, in which the tag was lost; title : a line."""
     from matplotlib.figure import Figure  # takes a second to import
 
@@ -43,7 +50,7 @@ def draw(path: Path, odometry: Odometry, anchors: Anchors, spans: list, title: s
     figure.savefig(path, dpi=110)
 
 
-def _plane(ax, odometry, anchors, lost, plane):
+def _plane(ax: Axes, odometry: Odometry, anchors: Anchors, lost: np.ndarray, plane: tuple[int, int, str]) -> None:
     """Path, ellipses and anchors in a plane: (two axes, name)."""
     from matplotlib.collections import EllipseCollection
     from matplotlib.lines import Line2D

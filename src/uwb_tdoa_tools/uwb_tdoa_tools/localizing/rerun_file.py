@@ -1,7 +1,10 @@
 """A flight and its estimate for the viewer Rerun (rerun.io): anchors, path, covariance, residuals per pair over time, verdict and findings."""
 
+from __future__ import annotations
+
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,12 +16,20 @@ from .estimate import Estimator
 from .pictures import SIGMAS
 from .residuals import by_pair
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from types import ModuleType
+    from uwb_tdoa_bias.effects import EffectSet
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from uwb_tdoa_ekf.estimator import Odometry, Residuals
+    from ..diagnosis.diagnose import Diagnosis
+
 HELP = "write a recording for the viewer Rerun, too (.rrd; of one flight; needs pip install rerun-sdk)"
 RATE = 20.0  # Hz, of poses that are written
 BLUE, RED, GREY, BLACK, ORANGE = (31, 119, 180), (214, 39, 40), (120, 120, 120), (40, 40, 40), (255, 127, 14)
 
 
-def is_there(say) -> bool:
+def is_there(say: Callable[[str], object]) -> bool:
     """Whether the library is installed; say(sentence) is told if not."""
     if find_spec("rerun") is not None:
         return True
@@ -26,7 +37,10 @@ def is_there(say) -> bool:
     return False
 
 
-def write_rerun(path: Path, flight: Flight, odometry, residuals, verdict: list, truth: Truth | None = None, before=None) -> None:
+def write_rerun(
+    path: Path, flight: Flight, odometry: Odometry, residuals: Residuals | None, verdict: Sequence[str],
+    truth: Truth | None = None, before: Odometry | None = None,
+) -> None:  # fmt: skip
     """Write a .rrd file: the Odometry of a Flight among its anchors, Residuals or None, sentences, the ground truth where it is
     to be shown, and another Odometry, as it was before something was corrected, or None. Time is s since the first TDOA."""
     import rerun
@@ -51,14 +65,15 @@ def write_rerun(path: Path, flight: Flight, odometry, residuals, verdict: list, 
     if before is not None:
         stream.log("world/before", rerun.LineStrips3D([before.p], colors=ORANGE, radii=0.005), static=True)
     if truth is not None:
-        for name, one in (("error", odometry), ("error/before", before)):
-            if one is not None:
-                _write_scalars(rerun, stream, name, one.t - begin, np.linalg.norm(one.p - position_at(one.t, truth), axis=1))
+        for name, estimate in (("error", odometry), ("error/before", before)):
+            if estimate is not None:
+                error = np.linalg.norm(estimate.p - position_at(estimate.t, truth), axis=1)
+                _write_scalars(rerun, stream, name, estimate.t - begin, error)
     stream.flush()
     stream.disconnect()
 
 
-def write_diagnosis(path: Path, result, base, config) -> None:
+def write_diagnosis(path: Path, result: Diagnosis, base: EffectSet, config: FilterConfig | None) -> None:
     """Write the single flight of a Diagnosis: estimates with the EffectSet `base` and with what was found, what that is, and the ground
     truth as it was judged by."""
     (flight,) = result.flights
@@ -67,7 +82,7 @@ def write_diagnosis(path: Path, result, base, config) -> None:
     write_rerun(path, flight, after.odometry, after.residuals, result.as_text().splitlines(), truth, before.odometry)
 
 
-def _write_poses(rerun, stream, odometry, begin):
+def _write_poses(rerun: ModuleType, stream: Any, odometry: Odometry, begin: float) -> None:
     """The tag and its ellipsoid of three standard deviations, at most RATE times a second."""
     cells = np.floor((odometry.t - begin) * RATE) if len(odometry.t) else np.zeros(0)
     rows = np.flatnonzero(np.diff(cells, prepend=-np.inf) > 0.0)
@@ -85,7 +100,7 @@ def _write_poses(rerun, stream, odometry, begin):
     stream.reset_time()
 
 
-def _write_scalars(rerun, stream, name, t, values):
+def _write_scalars(rerun: ModuleType, stream: Any, name: str, t: np.ndarray, values: np.ndarray) -> None:
     """A curve over time, s."""
     known = np.isfinite(values)
     stream.send_columns(name, indexes=[rerun.TimeColumn("time", duration=t[known])], columns=rerun.Scalars.columns(scalars=values[known]))

@@ -1,7 +1,10 @@
 """What is left of each TDOA after the estimate: a table, sums per pair of anchors, a picture."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +28,7 @@ class OfPair:
     std: np.ndarray
     explained: np.ndarray
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "a": self.a, "b": self.b, "tdoas": len(self.t), "median": float(np.median(self.value)), "std": float(self.value.std()),

@@ -1,6 +1,9 @@
 """What positions and delays of anchors do not explain: regions, or times, in which something makes one of them late."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EffectSet
 
@@ -8,10 +11,20 @@ from ..diagnosis.attribution import attribute
 from ..diagnosis.references import Nothing
 from ..diagnosis.self_survey import delay_effect
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from .result import Result
+
 LEAST = 0.2  # m by which an anchor must be late there; antennas alone make up to that
 
 
-def with_blocked(result, flights, config=None, progress=lambda: None):
+def with_blocked(
+    result: Result, flights: Sequence[Flight], config: FilterConfig | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> Result:  # fmt: skip
     """The Result of a survey of Flights with what blocks its anchors, looked for beside all that was found."""
     found, reference = result.surveyed, Nothing(config)
     moved = [reference.prepare(replace(flight, anchors=found.anchors)) for flight in flights]
@@ -20,7 +33,7 @@ def with_blocked(result, flights, config=None, progress=lambda: None):
     return replace(result, blocked=tuple(sentence for effect in effects for sentence in large(effect).advice()))
 
 
-def large(effect):
+def large(effect: Effect) -> Effect:
     """The effect nlos with those of its anchors alone that are late by LEAST."""
     late = {key.partition(".")[0] for key, value in effect.values.items() if key.endswith(".delay") and value >= LEAST}
     values, std = ({key: some[key] for key in some if key.partition(".")[0] in late} for some in (effect.values, effect.std))

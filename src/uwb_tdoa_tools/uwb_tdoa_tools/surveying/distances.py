@@ -1,5 +1,9 @@
 """Distances between anchors, measured by laser, by tape, or by the anchors themselves."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -7,10 +11,14 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..diagnosis.constraints import Distance
 from ..readers.tables import number, read_table
 
+if TYPE_CHECKING:
+    from pathlib import Path
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+
 COLUMNS = "a", "b", "distance", "std"
 
 
-def read_distances(path, anchors):
+def read_distances(path: str | Path, anchors: Anchors) -> list[Distance]:
     """[Distance] of a CSV file with the columns COLUMNS: ids, m, m. Raises InputError for one that cannot be of Anchors."""
     out, known = [], ", ".join(str(i) for i in anchors.ids)
     for line, row in read_table(path, COLUMNS):

@@ -1,15 +1,24 @@
 """Marks: places measured beforehand where the tag stood or passed."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 from ..diagnosis.constraints import Mark
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 KEYS = ("flight", "from", "to", "position", "std")
 EXAMPLE = "{flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], std: 0.05}"
 
 
-def read_marks(path, flights):
+def read_marks(path: str | Path, flights: Sequence[Flight]) -> list[Mark]:
     """[Mark] of a YAML file, for Flights. Raises InputError for one that is not as EXAMPLE, or of no or too short a flight.
 
     `from` and `to`: s since the first TDOA of the flight; position: m, of the tag, on average between them.
@@ -22,7 +31,7 @@ def read_marks(path, flights):
     return [_mark(f"{path}: mark {number}", entry, lengths) for number, entry in enumerate(entries, start=1)]
 
 
-def _mark(where, entry, lengths):
+def _mark(where: str, entry: Any, lengths: Mapping[str, float]) -> Mark:
     if not isinstance(entry, dict) or set(entry) != set(KEYS):
         raise InputError(f"{where}: must be as {EXAMPLE}.")
     flight, first, last, position, std = (entry[key] for key in KEYS)

@@ -1,7 +1,10 @@
 """Paths of another odometry or SLAM: a CSV file, or a topic of the bags that the flights are in."""
 
+from __future__ import annotations
+
 from array import array
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,11 +15,15 @@ from ..bags.bag import read_odometry
 from ..diagnosis.references.path import OdometryPath
 from ..readers.tables import number, read_table
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 COLUMNS = "t", "x", "y", "z"
 DRIFT = 0.02  # m per square root of a second: visual-inertial odometry that is off by 1 % of 200 m, flown at 1 m/s, after that
 
 
-def read_paths(source, flights, drift=DRIFT, namespace=""):
+def read_paths(source: str, flights: Sequence[Flight], drift: float = DRIFT, namespace: str = "") -> list[OdometryPath]:
     """[OdometryPath], one for each of some Flights that it has. source : a CSV file with the columns flight, t (s, clock of the recording), x, y, z (m), or
     the name of a nav_msgs/Odometry topic of the bags; drift : m per square root of a second. Raises InputError."""
     if not 0.0 <= drift <= 10.0:
@@ -33,7 +40,7 @@ def read_paths(source, flights, drift=DRIFT, namespace=""):
     return out
 
 
-def _of_table(path, flights, drift):
+def _of_table(path: str, flights: Sequence[Flight], drift: float) -> list[OdometryPath]:
     rows = {flight.name: array("d") for flight in flights}
     for line, row in read_table(path, ("flight", *COLUMNS), TABLE_CELLS):
         if row["flight"] in rows:

@@ -1,12 +1,22 @@
 """Anchors of which nothing is known: placed from where the others say that the tag flew."""
 
+from __future__ import annotations
+
 import itertools
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.smoother import smooth
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from uwb_tdoa_ekf.estimator import Odometry
 
 MOST = 3000  # TDOAs of a flight that are used
 FEWEST = 200
@@ -15,7 +25,7 @@ BEYOND = 1.0  # m, of the starts beyond the box of the other anchors
 PLACED_STD = 0.5  # m, of what is found, for what follows
 
 
-def place(flights, rows, config=None):
+def place(flights: Sequence[Flight], rows: Sequence[int], config: FilterConfig | None = None) -> Anchors:
     """Anchors of Flights with those of some rows placed, one after the other.
 
     Each TDOA between the anchor and one of the others is a hyperboloid about where the tag was; robust least squares over
@@ -32,7 +42,7 @@ def place(flights, rows, config=None):
         if len(p) < FEWEST:
             raise InputError(f"--unknown {anchors.ids[row]}: {len(p)} TDOAs tell of it, {FEWEST} are needed; fly for longer.")
 
-        def residual(x, p=p, to=to):
+        def residual(x: np.ndarray, p: np.ndarray = p, to: np.ndarray = to) -> np.ndarray:
             return np.linalg.norm(p - x, axis=1) - to
 
         starts = itertools.product(*zip(low, high))
@@ -41,7 +51,9 @@ def place(flights, rows, config=None):
     return anchors.at(positions)
 
 
-def _distances(flight, path, row, known, positions):
+def _distances(
+    flight: Flight, path: Odometry, row: int, known: np.ndarray, positions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Where the tag was, (n, 3) m, and how far from the anchor of a row, (n,) m, as its TDOAs with known ones tell."""
     tdoa = flight.tdoa
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)

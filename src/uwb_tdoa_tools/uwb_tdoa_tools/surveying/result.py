@@ -1,6 +1,9 @@
 """What a survey from flights says: figures, sentences, a picture."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +12,10 @@ from uwb_tdoa_bias.foundation.elsewhere import elsewhere
 
 from ..diagnosis.calibration import LEFT, why_marks_speak_against
 from ..diagnosis.self_survey import Surveyed, calibrated
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
 IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
 CLEARLY = 2.6  # slow innovations as given over those that are left, beyond which the tape was worse than what else is wrong
@@ -20,15 +27,15 @@ class Result:
     """given : Anchors; given_std (N, 3) m; surveyed : Surveyed; flights : names; base : EffectSet that was in the model;
     blocked : sentences on what makes anchors late somewhere, once somebody has looked (`blocked.py`)."""
 
-    given: object
+    given: Anchors
     given_std: np.ndarray
     surveyed: Surveyed
-    flights: tuple
+    flights: tuple[str, ...]
     base: EffectSet = EffectSet()
-    blocked: tuple = ()
+    blocked: tuple[str, ...] = ()
 
     @property
-    def why_not(self):
+    def why_not(self) -> str | None:
         """Why it must not be used instead of what was given; None if it may."""
         before, left, marks = self.surveyed.before, self.surveyed.left, self.surveyed.marks
         if marks:
@@ -41,12 +48,12 @@ class Result:
         )
 
     @property
-    def anchors(self):
+    def anchors(self) -> Anchors:
         """The Anchors to use."""
         return self.surveyed.anchors if self.why_not is None else self.given
 
     @property
-    def effects(self):
+    def effects(self) -> EffectSet:
         """The EffectSet to use with them, with what was in the model; its covariance is the prior of the next survey."""
         if self.why_not is not None:
             return self.base
@@ -54,16 +61,16 @@ class Result:
         return calibrated(self.base, found.anchors, np.zeros_like(self.shifts), found.delays, found.covariance)
 
     @property
-    def shifts(self):
+    def shifts(self) -> np.ndarray:
         """(N, 3) m, from what was given."""
         return self.surveyed.anchors.positions - self.given.positions
 
     @property
-    def improved(self):
+    def improved(self) -> np.ndarray:
         """(N, 3) bool."""
         return self.surveyed.position_std < IMPROVED * self.given_std
 
-    def as_dict(self):
+    def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         found = self.surveyed
         return {
@@ -96,7 +103,7 @@ class Result:
             "function_std": found.function_std,
         }
 
-    def as_text(self):
+    def as_text(self) -> str:
         """A table of all coordinates, and what it means."""
         lines = ["values that make these data fit; measure again before you move an anchor:"] if self.why_not else []
         lines += [f"{'anchor':>6}  {'given [m]':>24}  {'shift [cm]':>20}  {'std [cm]':>17}  improved"]
@@ -128,7 +135,7 @@ class Result:
             lines.append(f"nothing is applied, anchors stay as given: {self.why_not}")
         return "\n".join(lines)
 
-    def picture(self, path):
+    def picture(self, path: str | Path) -> None:
         """Plan and elevation, before and after, with 95 % intervals."""
         with elsewhere():  # where no settings of others are
             from matplotlib.figure import Figure  # takes a second to import

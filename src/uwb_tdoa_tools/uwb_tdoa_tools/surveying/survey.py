@@ -1,6 +1,9 @@
 """From a tape measure and flights to anchors."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,12 +17,22 @@ from ..parallel import in_one_thread
 from .placing import PLACED_STD, place
 from .result import Result
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from ..diagnosis.constraints import Constraint
+    from .tape import Tape
+
 LEAST = 30.0  # s in the air; fewer do not tell how alike errors are
 NOTHING_KNOWN = 1e3  # m, standard deviation of a coordinate of which nothing is known
 
 
 @in_one_thread
-def survey(flights, tape, base=EffectSet(), config=None, constraints=(), progress=lambda: None):
+def survey(
+    flights: Sequence[Flight], tape: Tape, base: EffectSet = EffectSet(), config: FilterConfig | None = None,
+    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None,
+) -> Result:  # fmt: skip
     """Result of Flights with the anchors that a Tape speaks of.
 
     base : EffectSet that is in the model already; its covariance, of the last calibration, counts where there is one, not the

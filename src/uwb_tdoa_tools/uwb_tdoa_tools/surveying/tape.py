@@ -1,10 +1,16 @@
 """What somebody with a tape measure says of the anchors: how far off each coordinate may be."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
 AXES = "xyz"
 
@@ -16,17 +22,17 @@ class Tape:
 
     std: float = 0.1
     height_std: float | None = None
-    trusted: tuple = ()
+    trusted: tuple[str, ...] = ()
     trusted_std: float = 0.01
-    unknown: tuple = ()
+    unknown: tuple[str, ...] = ()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("std", "height_std", "trusted_std"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value <= 5.0:
                 raise InputError(f"--{name.replace('_', '-')}: {value:g} must be above 0 and at most 5 m.")
 
-    def position_std(self, anchors):
+    def position_std(self, anchors: Anchors) -> np.ndarray:
         """(N, 3) m for Anchors. Raises InputError for a name that is no anchor, and where nothing tells the frame."""
         out = np.full((len(anchors), 3), self.std)
         if self.height_std is not None:
@@ -39,7 +45,7 @@ class Tape:
             out[row, AXES.index(axis) if axis else slice(None)] = self.trusted_std
         return out
 
-    def unknown_rows(self, anchors):
+    def unknown_rows(self, anchors: Anchors) -> list[int]:
         """Rows of the unknown anchors. Raises InputError where fewer than four others are left."""
         rows = [self._row(anchors, anchor, f"--unknown {anchor}") for anchor in self.unknown]
         if len(anchors) - len(rows) < 4:
@@ -47,7 +53,7 @@ class Tape:
         return rows
 
     @staticmethod
-    def _row(anchors, text, option):
+    def _row(anchors: Anchors, text: str, option: str) -> int:
         if text not in [str(i) for i in anchors.ids]:
             known = ", ".join(str(i) for i in anchors.ids)
             raise InputError(f"{option}: there is no anchor {text!r}; the survey has {known}: add it there, roughly.")

@@ -1,7 +1,10 @@
 """Labels: what each TDOA of a flight was wrong by, and the pose it was taken at."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 import hashlib
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,13 +14,18 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 
 from ..scoring.metrics import AIRBORNE, airborne
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Flight, Truth
+
 MARGIN = 0.5  # s after take-off and before landing that are left out: near the floor TDOAs are metres off
 LARGEST = 1.0  # m; a larger error is an outlier, not bias (Zhao et al., section V-B)
 ZERO = 1e-3  # m; if no label is larger, the TDOAs were computed, not measured
 FEWEST = 100  # labels that a flight must give
 MEMORY = 1.0  # s over which the errors of one anchor are alike: so much time counts as one look at it
 SAME_PLACE = 0.1  # m by which an anchor may have moved and still be in its place, one standard deviation
-LEVEL = (0.0, 0.0, 0.0, 1.0)
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -36,28 +44,26 @@ class Labels:
     has_attitude: bool
     digest: str
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.error)
 
     @property
-    def anchors(self):
+    def anchors(self) -> Anchors:
         """Anchors of the flight."""
         return self.samples.anchors
 
-    def take(self, rows):
+    def take(self, rows: np.ndarray) -> Labels:
         """Labels of some rows, each counting for more, so that they count for as much together."""
         part, looks = _rows(self.samples, rows), self.looks * len(self) / max(len(rows), 1)
         return replace(self, samples=part, error=self.error[rows], looks=looks)
 
 
-def labels(flight, effects=EffectSet()):
+def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
     """Labels of a Flight, its airborne part without outliers; what `effects` explain is taken out. Raises InputError
     where it cannot teach anything."""
-    if flight.truth is None:
-        raise InputError(f"{flight.name}: it holds no ground truth to learn from.")
-    has_attitude = bool(np.isfinite(flight.truth.q).all())
+    has_attitude = bool(np.isfinite(known_truth(flight).q).all())
     flight = effects.correct_streams(replace(level(flight), imu=None))
-    truth, data, anchors = flight.truth, flight.tdoa, flight.anchors
+    truth, data, anchors = known_truth(flight), flight.tdoa, flight.anchors
     first, last = airborne(truth)
     first, last = first + MARGIN, last - MARGIN
     chosen = (data.t > first) & (data.t < last)
@@ -85,15 +91,22 @@ def labels(flight, effects=EffectSet()):
     return Labels(flight.name, samples, error[kept], looks, has_attitude, _digest(samples, error[kept]))
 
 
-def level(flight):
+def known_truth(flight: Flight) -> Truth:
+    """The ground truth of a Flight. Raises InputError where there is none."""
+    if flight.truth is None:
+        raise InputError(f"{flight.name}: it holds no ground truth to learn from.")
+    return flight.truth
+
+
+def level(flight: Flight) -> Flight:
     """The Flight; if the attitudes of its ground truth are not all measured, they are level, at yaw 0."""
-    truth = flight.truth
+    truth = known_truth(flight)
     if np.isfinite(truth.q).all():
         return flight
     return replace(flight, truth=replace(truth, q=np.tile(LEVEL, (len(truth), 1))))
 
 
-def split(names, seed, validation=None):
+def split(names: Sequence[str], seed: int, validation: Sequence[str] | None = None) -> tuple[list[str], list[str]]:
     """(training, validation) names: whole flights, one in five validates, drawn with `seed`, or those that are
     named."""
     if len(set(names)) != len(names):
@@ -115,7 +128,7 @@ def split(names, seed, validation=None):
     return training, sorted(validation)
 
 
-def thinned(all_labels, seconds, rng):
+def thinned(all_labels: Sequence[Labels], seconds: float, rng: np.random.Generator) -> list[Labels]:
     """Each of a list of Labels with at most one sample per `seconds` on average, drawn at random."""
     out = []
     for one in all_labels:
@@ -125,7 +138,7 @@ def thinned(all_labels, seconds, rng):
     return out
 
 
-def white_noise(all_labels):
+def white_noise(all_labels: Sequence[Labels]) -> float:
     """Standard deviation of what changes from one TDOA of a pair to its next, m: no model of the pose can know it."""
     steps = []
     for one in all_labels:
@@ -135,15 +148,15 @@ def white_noise(all_labels):
     return float(1.4826 * np.median(np.abs(np.concatenate(steps))) / np.sqrt(2.0))
 
 
-def digest(all_labels):
+def digest(all_labels: Sequence[Labels]) -> str:
     """Hex digest of the data of several Labels, in any order."""
     return hashlib.sha256("".join(sorted(one.digest for one in all_labels)).encode()).hexdigest()[:16]
 
 
-def constellations(some):
+def constellations(some: Iterable[Flight | Labels]) -> list[dict[str, list[float]]]:
     """The different anchor constellations of flights or labels: list of dicts of id (text) to position, m, to the
     centimetre."""
-    found = []
+    found: list[dict[str, list[float]]] = []
     for one in some:
         layout = dict(zip(map(str, one.anchors.ids.tolist()), one.anchors.positions.round(2).tolist()))
         if not any(_alike(layout, known) for known in found):
@@ -151,15 +164,15 @@ def constellations(some):
     return found
 
 
-def _alike(one, other):
+def _alike(one: Mapping[str, list[float]], other: Mapping[str, list[float]]) -> bool:
     return set(one) == set(other) and all(np.linalg.norm(np.subtract(one[i], other[i])) < SAME_PLACE for i in one)
 
 
-def _rows(s, rows):
+def _rows(s: Samples, rows: np.ndarray) -> Samples:
     return Samples(s.t[rows], s.a[rows], s.b[rows], s.p[rows], s.q[rows], s.anchors, s.start)
 
 
-def _digest(samples, error):
+def _digest(samples: Samples, error: np.ndarray) -> str:
     content = hashlib.sha256()
     for array in (samples.t, samples.a, samples.b, samples.p, samples.q, error, samples.anchors.positions):
         content.update(np.ascontiguousarray(array, dtype="<f8").tobytes())

@@ -5,11 +5,17 @@ one anchor at one place and has weights of its own on features phi that depend o
 blocks of two sites meet in a row and the normal equations are summed up block by block.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri, dtrtri
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 ITERATIONS = 8
 PRECISION = (1e-1, 1e4)  # limits of 1 / s^2
@@ -43,7 +49,7 @@ class Posterior:
     dense_std: float
 
 
-def fit(design, sites, noise, known_std=()):
+def fit(design: Design, sites: int, noise: float, known_std: Sequence[float] | np.ndarray = ()) -> Posterior:
     """Posterior of the weights of `sites` sites and of the dense ones.
 
     The priors are N(0, s^2): the last dense weights have the standard deviations known_std; the others share one s, the
@@ -77,14 +83,16 @@ def fit(design, sites, noise, known_std=()):
     return Posterior(weights, dense, site_covariance, covariance[size:, size:], *std)
 
 
-def _inverse_diagonal(factor):
+def _inverse_diagonal(factor: np.ndarray) -> np.ndarray:
     """Diagonal (k,) of the inverse of a matrix, of its upper Cholesky factor (k, k), whose place is taken: half the work of the
     whole inverse."""
     inverse, _ = dtrtri(factor, overwrite_c=True)
     return np.array([row[k:] @ row[k:] for k, row in enumerate(inverse)])
 
 
-def _normal_equations(design, groups, size, row):
+def _normal_equations(
+    design: Design, groups: Sequence[tuple[int, int, np.ndarray]], size: int, row: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Left (k, k) and right (k,) side of the weighted least squares of all rows, weights of the rows (n,)."""
     m, q = design.phi.shape[1], design.dense.shape[1]
     left, right = np.zeros((size + q, size + q)), np.zeros(size + q)
@@ -105,12 +113,12 @@ def _normal_equations(design, groups, size, row):
     return left, right
 
 
-def predict(design, weights, dense):
+def predict(design: Design, weights: np.ndarray, dense: np.ndarray) -> np.ndarray:
     """What weights (sites, m) and dense (q,) say for every row: (n,)."""
     return np.einsum("nm,nm->n", design.phi, weights[design.b] - weights[design.a]) + design.dense @ dense
 
 
-def _groups(a, b, sites):
+def _groups(a: np.ndarray, b: np.ndarray, sites: int) -> list[tuple[int, int, np.ndarray]]:
     pair = a * sites + b
     order = np.argsort(pair, kind="stable")
     starts = np.flatnonzero(np.diff(pair[order], prepend=-1))

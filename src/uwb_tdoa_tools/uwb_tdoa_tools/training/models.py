@@ -1,6 +1,9 @@
 """The kinds of models that can be trained, all by one call: `train`."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +14,17 @@ from uwb_tdoa_bias.correction.features import columns
 
 from ..parallel import in_one_thread
 from . import labels as labelling, linear, paper, physics, structured
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
+    from onnx import ModelProto
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from .labels import Labels
+    from .paper import Paper
+    from .structured import Structured
+
+    LearningCurve = tuple[str, list[int], list[float], list[float]]  # label, x, training and validation RMS, m
 
 KINDS = ("paper", "paper_no_orientation", "structured", "physics", "physics+structured")
 SPACING = 0.01  # s between the samples that are learned from: nearer ones tell the same
@@ -28,21 +42,23 @@ class Trained:
     """model : Paper, Structured or None; effects : EffectSet or None; curve : (label, x, training RMS, validation RMS);
     meta : metadata of the ONNX file; errors : {validation flight: (before, after)}, RMS of its TDOAs, m."""
 
-    model: object
+    model: Paper | Structured | None
     effects: EffectSet | None
-    curve: tuple
-    meta: dict
-    errors: dict
+    curve: LearningCurve
+    meta: dict[str, Any]
+    errors: dict[str, tuple[float, float]]
 
-    def onnx(self):
+    def onnx(self) -> ModelProto | None:
         """The onnx.ModelProto, or None for a kind without a network."""
         return self.model.onnx(self.meta) if self.model else None
 
 
 @in_one_thread
 def train(
-    kind, training, validation, seed, name, options=structured.Options(), progress=lambda text: None, found=None, curve=True
-):  # fmt: skip
+    kind: str, training: Sequence[Flight], validation: Sequence[Flight], seed: int, name: str,
+    options: structured.Options = structured.Options(), progress: Callable[[str], object] = lambda text: None,
+    found: physics.Physics | None = None, curve: bool = True,
+) -> Trained:  # fmt: skip
     """Train a model of `kind` (of KINDS) on lists of Flights. Returns Trained. Raises InputError.
 
     name : of the model, goes into every corrected message; progress : called with a text now and then; found : Physics
@@ -54,7 +70,9 @@ def train(
     if kind not in KINDS:
         raise InputError(f"model: {kind!r} is not known; choose {', '.join(KINDS)}.")
     raw = groups = _labels(training, validation)
-    effects, free, model = None, EffectSet(), None
+    effects: EffectSet | None = None
+    model: Paper | Structured | None = None
+    free = EffectSet()
     if kind.startswith("physics"):
         if found is None:
             progress("looking for effects")
@@ -65,15 +83,17 @@ def train(
         progress(f"effects: {found.effects.name}")
         groups = _labels(training, validation, effects)
     if kind.startswith("paper"):
-        model, errors, left = _paper(kind, *groups, seed, progress)
-    elif kind == "physics" and not len(free):
-        errors, left = _judge_effects(found, *raw, _growing(len(training), seed, curve))
+        model, errors, left = _paper(kind, groups[0], groups[1], seed, progress)
+    elif found is not None and kind == "physics" and not len(free):
+        errors, left = _evaluate_effects(found, raw[0], raw[1], _growing(len(training), seed, curve))
     else:
         growing = _growing(len(training), seed, curve)
-        model, free, errors, left = _structured(*groups, seed, options, progress, growing, free, kind == "physics")
+        model, free, errors, left = _structured(
+            groups[0], groups[1], seed, options, progress, growing, free, kind == "physics"
+        )
         effects = None if effects is None else EffectSet((*free.effects, *effects.effects))
     everything = [*groups[0], *groups[1]]
-    meta = {
+    meta: dict[str, Any] = {
         "name": name, "kind": kind, "clip": CLIP, "seed": seed, "data": labelling.digest([*raw[0], *raw[1]]),
         "trained_on": sorted(one.name for one in training), "validated_on": sorted(one.name for one in validation),
         "constellations": labelling.constellations(everything),
@@ -86,26 +106,34 @@ def train(
         heads = [meta["validity"][name] for name in ("forward_x", "forward_y")]
         if model.sees_attitude and any(high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads):
             meta["largest_yaw_std"] = LARGEST_YAW_STD  # before the yaw is known, it cannot tell
-    after = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
-    return Trained(model, effects, errors, meta, after)
+    of_flights = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
+    return Trained(model, effects, errors, meta, of_flights)
 
 
-def _labels(training, validation, effects=EffectSet()):
-    return [[labelling.labels(flight, effects) for flight in group] for group in (training, validation)]
+def _labels(
+    training: Sequence[Flight], validation: Sequence[Flight], effects: EffectSet = EffectSet()
+) -> tuple[list[Labels], list[Labels]]:
+    first, second = ([labelling.labels(flight, effects) for flight in group] for group in (training, validation))
+    return first, second
 
 
-def _paper(kind, training, validation, seed, progress):
+def _paper(
+    kind: str, training: list[Labels], validation: list[Labels], seed: int, progress: Callable[[str], object]
+) -> tuple[paper.Paper, LearningCurve, list[np.ndarray]]:
     """(Paper, learning curve over epochs, what is left of the errors of each validation flight)."""
-    thin = [labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation)]
+    thin, held = (labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation))
     model, errors = paper.fit(
-        *thin, kind == "paper", seed, lambda epoch, error: progress(f"epoch {epoch}: validation {error:.4f} m")
+        thin, held, kind == "paper", seed, lambda epoch, error: progress(f"epoch {epoch}: validation {error:.4f} m")
     )
     left = [one.error - model.mean(one.samples) for one in validation]
     model.std = _deviation(left, 0.0, validation)
     return model, ("epochs", list(range(1, len(errors[0]) + 1)), *errors), left
 
 
-def _structured(training, validation, seed, options, progress, growing, free, alone):
+def _structured(
+    training: list[Labels], validation: list[Labels], seed: int, options: structured.Options,
+    progress: Callable[[str], object], growing: Sequence[Sequence[int]], free: EffectSet, alone: bool,
+) -> tuple[structured.Structured | None, EffectSet, LearningCurve, list[np.ndarray]]:  # fmt: skip
     """(Structured, EffectSet, learning curve over numbers of training flights, what is left of the errors of each
     validation flight by a fit to the training flights). The model itself is then fitted to all flights.
 
@@ -114,23 +142,31 @@ def _structured(training, validation, seed, options, progress, growing, free, al
     """
     thin = [labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation)]
 
-    def remaining(one):
+    def remaining(one: Labels) -> np.ndarray:
         return one.error - fitted.bias(one.samples) - (0.0 if alone else model.mean(one.samples))
 
-    curve = []
+    curve: list[tuple[int, float, float]] = []
     for some in growing:
         model, fitted = fit_structured([thin[0][k] for k in some], seed, options, free)
-        errors = [_rms(map(remaining, group)) for group in ([thin[0][k] for k in some], thin[1])]
-        curve.append((len(some), *errors))
-        progress("{} of {} flights: training {:.4f} m, validation {:.4f} m".format(len(some), len(training), *errors))
+        fit_error, error = (_rms(map(remaining, group)) for group in ([thin[0][k] for k in some], thin[1]))
+        curve.append((len(some), fit_error, error))
+        progress(f"{len(some)} of {len(training)} flights: training {fit_error:.4f} m, validation {error:.4f} m")
     left = [remaining(one) for one in validation]
     explained = np.concatenate([model.variance(one.samples) for one in validation])
     whole, fitted = fit_structured([*thin[0], *thin[1]], seed, options, free)
     whole.floor = _deviation(left, explained, validation)
-    return None if alone else whole, fitted, ("training flights", *map(list, zip(*curve))), left
+    return None if alone else whole, fitted, _over_flights(curve), left
 
 
-def fit_structured(some, seed, options, free=EffectSet()):
+def _over_flights(curve: Sequence[tuple[int, float, float]]) -> LearningCurve:
+    """Of (number of training flights, RMS of training and validation, m)."""
+    counts, training, validation = zip(*curve)
+    return "training flights", list(counts), list(training), list(validation)
+
+
+def fit_structured(
+    some: Sequence[Labels], seed: int, options: structured.Options, free: EffectSet = EffectSet()
+) -> tuple[structured.Structured, EffectSet]:
     """(Structured, EffectSet with the values of the linear effects `free`), fitted together to Labels."""
     model = structured.prepare(some, options, seed)
     parts = [model.design(one.samples, one.error, one.looks) for one in some]
@@ -144,19 +180,21 @@ def fit_structured(some, seed, options, free=EffectSet()):
     return model, physics.with_values(free, posterior.dense[own:], posterior.dense_covariance[own:, own:])
 
 
-def _judge_effects(found, training, validation, growing):
+def _evaluate_effects(
+    found: physics.Physics, training: list[Labels], validation: list[Labels], growing: Sequence[Sequence[int]]
+) -> tuple[LearningCurve, list[np.ndarray]]:
     """(Learning curve over numbers of training flights, what is left of the errors of each validation flight) of the
     effects of a Physics, which counts training flights first. growing : as `_growing` gives."""
-    curve = []
+    curve: list[tuple[int, float, float]] = []
     for some in growing:
         effects = found.fitted_to(some)
-        judged = ([training[k] for k in some], validation)
-        left = [[one.error - effects.bias(one.samples) for one in group] for group in judged]
-        curve.append((len(some), *map(_rms, left)))
-    return ("training flights", *map(list, zip(*curve))), left[1]
+        groups = [training[k] for k in some], validation
+        left_of_fit, left = ([one.error - effects.bias(one.samples) for one in group] for group in groups)
+        curve.append((len(some), _rms(left_of_fit), _rms(left)))
+    return _over_flights(curve), left
 
 
-def _growing(count, seed, curve):
+def _growing(count: int, seed: int, curve: bool) -> list[list[int]]:
     """Growing subsets of `count` flights, in random order, the last one all of them, which is the only one without `curve`:
     lists of numbers."""
     order = np.random.default_rng(seed).permutation(count).tolist()
@@ -165,19 +203,19 @@ def _growing(count, seed, curve):
     return [order[:n] for n in sorted({int(round(n)) for n in np.geomspace(1, count, min(count, POINTS))})]
 
 
-def _deviation(left, explained, validation):
+def _deviation(left: Sequence[np.ndarray], explained: np.ndarray | float, validation: Sequence[Labels]) -> float:
     """Standard deviation of what is left of errors, without what maps explain, m^2, and what no model of poses can
     know."""
     variance = np.mean(np.concatenate(left) ** 2 - explained) - labelling.white_noise(validation) ** 2
     return float(np.sqrt(max(variance, SMALLEST_STD**2)))
 
 
-def _rms(parts):
+def _rms(parts: Iterable[np.ndarray]) -> float:
     parts = list(parts)
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) if parts else float("nan")
 
 
-def _validity(learned_from, judged):
+def _validity(learned_from: Sequence[Labels], judged: Sequence[str]) -> dict[str, list[float]]:
     """{feature: [lowest, highest, margin]} of Labels."""
     limits = {}
     for names, more in ((_ATTITUDE, SLACK), (judged, 0.0)):
@@ -189,7 +227,7 @@ def _validity(learned_from, judged):
     return limits
 
 
-def save(result, folder):
+def save(result: Trained, folder: Path) -> tuple[Path | None, Path | None]:
     """Write model.onnx and effects.yaml of a Trained, as far as it has them. Returns their paths, None for none."""
     model, effects = folder / "model.onnx", folder / "effects.yaml"
     made = result.onnx()

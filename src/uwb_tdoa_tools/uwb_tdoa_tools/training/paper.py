@@ -4,7 +4,10 @@ As published (section V-B): scaled inputs, rectified linear units, mini-batch gr
 stopped when the validation error has not fallen for five epochs in a row. Its deviation is that of the validation
 flights."""
 
+from __future__ import annotations
+
 import copy
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from sklearn.neural_network import MLPRegressor
@@ -13,6 +16,12 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.correction.features import FEATURES, columns
 
 from . import export
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from onnx import ModelProto
+    from uwb_tdoa_bias.effects import Samples
+    from .labels import Labels
 
 LAYERS = (30, 30, 30)
 PATIENCE, MOST_EPOCHS = 5, 200
@@ -25,12 +34,15 @@ class Paper:
 
     sees_attitude = True
 
-    def __init__(self, names, offset, scale, layers, std):
+    def __init__(
+        self, names: Sequence[str], offset: np.ndarray, scale: np.ndarray,
+        layers: list[tuple[np.ndarray, np.ndarray]], std: float,
+    ) -> None:  # fmt: skip
         """names : features; offset, scale : (k,); layers : list of (weights (i, o), biases (o,)); std : m."""
         self.names, self.offset, self.scale, self.layers, self.std = names, offset, scale, layers, std
         self.judged = tuple(name for name in names if name[0] == "d")
 
-    def mean(self, samples):
+    def mean(self, samples: Samples) -> np.ndarray:
         """Predicted error, (n,) m."""
         x = (columns(samples, self.names) - self.offset) / self.scale
         for k, (weights, biases) in enumerate(self.layers):
@@ -38,7 +50,7 @@ class Paper:
             x = np.maximum(x, 0.0) if k < len(self.layers) - 1 else x
         return x[:, 0]
 
-    def onnx(self, meta):
+    def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
         """The onnx.ModelProto: bias, standard deviation. meta : further metadata."""
         graph = export.Graph()
         x = graph.input
@@ -50,7 +62,10 @@ class Paper:
         return graph.model(len(self.names), [x, std], meta)
 
 
-def fit(training, validation, orientations, seed, progress=lambda epoch, error: None):
+def fit(
+    training: Sequence[Labels], validation: Sequence[Labels], orientations: bool, seed: int,
+    progress: Callable[[int, float], object] = lambda epoch, error: None,
+) -> tuple[Paper, tuple[list[float], list[float]]]:  # fmt: skip
     """Paper, and its learning curve: lists of training and validation error per epoch (RMS, m). Raises InputError.
 
     training, validation : lists of Labels; orientations : use those of the anchors; progress : called after each epoch.
@@ -71,7 +86,9 @@ def fit(training, validation, orientations, seed, progress=lambda epoch, error: 
     network = MLPRegressor(
         hidden_layer_sizes=LAYERS, solver="sgd", batch_size=BATCH, learning_rate_init=RATE, random_state=seed
     )
-    best, since, curve = None, 0, ([], [])
+    curve: tuple[list[float], list[float]] = ([], [])
+    best: tuple[float, tuple[list[np.ndarray], list[np.ndarray]]] | None = None
+    since = 0
     for epoch in range(MOST_EPOCHS):
         network.partial_fit(x, y)
         for errors, inputs, outputs in zip(curve, (x, x_held), (y, y_held)):
@@ -83,10 +100,11 @@ def fit(training, validation, orientations, seed, progress=lambda epoch, error: 
             since += 1
             if since == PATIENCE:
                 break
+    assert best is not None  # after one epoch at least
     return Paper(names, offset, scale, list(zip(*best[1])), best[0]), curve
 
 
-def _table(group, names):
+def _table(group: Sequence[Labels], names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     return (
         np.concatenate([columns(one.samples, names) for one in group]),
         np.concatenate([one.error for one in group]),

@@ -1,6 +1,9 @@
 """Physical effects: what `diagnose` finds among the declared ones in the flights to train on."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +17,11 @@ from ..diagnosis.regression.fit import refit
 from ..diagnosis.regression.terms import columns_of
 from .labels import constellations, level
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from uwb_tdoa_bias.effects import Samples
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 # What goes with the tag, the vehicle and the modules of the anchors to another installation.
 PORTABLE = tuple(name for name, effect in EFFECTS.items() if effect.portable)
 
@@ -25,7 +33,7 @@ class Physics:
     effects: EffectSet
     attribution: Attribution | None = None
 
-    def fitted_to(self, flights):
+    def fitted_to(self, flights: Iterable[int]) -> EffectSet:
         """EffectSet of the same effects, fitted to the flights with these numbers alone; what detectors found stays as it is."""
         if self.attribution is None:
             return self.effects
@@ -36,36 +44,36 @@ class Physics:
         return usable([*effects_of(replace(selection, fit=model)), *detected])
 
 
-def separate(effects):
+def separate(effects: EffectSet) -> tuple[EffectSet, EffectSet]:
     """(EffectSet of those with parameters in which the error of a TDOA is linear, EffectSet of the others)."""
     linear = [bool(effect.fitted and effect.channels == ("tdoa",) and effect.values) for effect in effects.effects]
-    parts = [tuple(e for e, mine in zip(effects.effects, linear) if mine is kind) for kind in (True, False)]
-    return tuple(map(EffectSet, parts))
+    linear_ones, others = (tuple(e for e, one in zip(effects.effects, linear) if one is kind) for kind in (True, False))
+    return EffectSet(linear_ones), EffectSet(others)
 
 
-def regressors(effects, samples):
+def regressors(effects: EffectSet, samples: Samples) -> np.ndarray:
     """Derivatives of the error of Samples by all parameters of linear effects, at zero: (n, k)."""
     parts = [type(effect)().regressors(samples, list(effect.values)) for effect in effects.effects]
     return np.concatenate([np.zeros((len(samples), 0)), *parts], axis=1)
 
 
-def sizes(effects):
+def sizes(effects: EffectSet) -> np.ndarray:
     """Plausible sizes of all parameters, (k,), each in its unit: standard deviations of their priors."""
     return np.array([effect.typical_of(key) for effect in effects.effects for key in effect.values])
 
 
-def with_values(effects, values, covariance):
+def with_values(effects: EffectSet, values: np.ndarray, covariance: np.ndarray) -> EffectSet:
     """The same effects with values (k,) of all parameters in turn, and their covariance (k, k)."""
     std, out, first = np.sqrt(np.diag(covariance)), [], 0
     for effect in effects.effects:
         rows = slice(first, first + len(effect.values))
-        named = [dict(zip(effect.values, numbers[rows].tolist())) for numbers in (values, std)]
-        out.append(type(effect)(*named, "train"))
+        fitted, errors = (dict(zip(effect.values, numbers[rows].tolist())) for numbers in (values, std))
+        out.append(type(effect)(fitted, errors, "train"))
         first = rows.stop
     return EffectSet(tuple(out))
 
 
-def find(flights, progress=lambda: None):
+def find(flights: Sequence[Flight], progress: Callable[[], object] = lambda: None) -> Physics:
     """Physics of Flights with ground truth. progress() is called now and then.
 
     Of flights in one constellation, all that `diagnose` can name; of several, what goes from one to the other

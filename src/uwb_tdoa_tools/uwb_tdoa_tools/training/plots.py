@@ -1,9 +1,17 @@
 """Pictures of trainings and comparisons."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.stats import norm
 
 from ..scoring.plots import plt
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
 COLOURS = {
     "none": "0.6", "paper_no_orientation": "tab:red", "paper": "tab:cyan", "physics": "tab:orange",
@@ -11,7 +19,9 @@ COLOURS = {
 }  # fmt: skip
 
 
-def plot_curve(label, x, training, validation, path):
+def plot_curve(
+    label: str, x: Sequence[float], training: Sequence[float], validation: Sequence[float], path: Path
+) -> None:
     """Learning curve: RMS errors of training and validation flights, m, over epochs or number of flights."""
     figure, ax = plt.subplots(figsize=(7, 4), layout="constrained")
     for name, errors in (("training", training), ("validation", validation)):
@@ -23,7 +33,7 @@ def plot_curve(label, x, training, validation, path):
     plt.close(figure)
 
 
-def plot_histograms(errors, path):
+def plot_histograms(errors: Mapping[str, np.ndarray], path: Path) -> None:
     """Errors of TDOAs before and after correction, one panel per model with its Gaussian fit: counterpart of figure 6
     of Zhao et al. errors : {model: (n,) m}."""
     size = (6, 1.8 * len(errors))
@@ -41,7 +51,7 @@ def plot_histograms(errors, path):
     plt.close(figure)
 
 
-def plot_bars(groups, path):
+def plot_bars(groups: Mapping[str, Mapping[str, float]], path: Path) -> None:
     """RMSE bars: counterpart of figure 7 of Zhao et al. groups : {group: {model: mean 3D RMSE, m}}."""
     figure, ax = plt.subplots(figsize=(1.5 + 2.2 * len(groups), 4), layout="constrained")
     names = list(next(iter(groups.values())))

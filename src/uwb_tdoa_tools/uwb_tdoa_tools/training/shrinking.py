@@ -5,10 +5,13 @@ of its prediction. Whole flights: samples of one are too alike. The effects are 
 values fitted to the others alone: `physics.find` has judged them on flights left out already.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,17 +23,28 @@ from ..scoring.borne_out import SHARES, BorneOut, choose
 from ..scoring.evaluation import evaluate
 from . import models, physics, structured
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from uwb_tdoa_bias.effects import EffectSet
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from ..parallel import MapFunction
+
 FOLDS = 5
 
 
 @in_one_thread
-def bear_out(kind, flights, plain, seed, options=structured.Options(), found=None, progress=lambda text: None, over=map):
+def bear_out(
+    kind: str, flights: Sequence[Flight], plain: Mapping[str, float], seed: int,
+    options: structured.Options = structured.Options(), found: physics.Physics | None = None,
+    progress: Callable[[str], object] = lambda text: None, over: MapFunction = map,
+) -> BorneOut:  # fmt: skip
     """BorneOut of a kind of model trained on Flights.
 
     plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with effects; over(function, folds) :
     as map, but for the time and the process in which each is done.
     """
-    order, errors = np.random.default_rng(seed).permutation(len(flights)), {}
+    order = np.random.default_rng(seed).permutation(len(flights))
+    errors: dict[str, dict[float | None, float]] = {}
     folds = [order[k :: min(FOLDS, len(flights))].tolist() for k in range(min(FOLDS, len(flights)))]
     rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
     known = [found and physics.Physics(found.fitted_to(others)) for others in rest]
@@ -42,22 +56,31 @@ def bear_out(kind, flights, plain, seed, options=structured.Options(), found=Non
     return BorneOut(choose(errors), errors)
 
 
-def uncorrected(flights, over=map):
+def uncorrected(flights: Sequence[Flight], over: MapFunction = map) -> dict[str, float]:
     """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction. over : as of `bear_out`."""
     return {flight.name: error for error, flight in zip(over(_error, flights), flights)}
 
 
-def judged(flight, plain, effects, network, shares=SHARES):
+def judged(
+    flight: Flight, plain: Mapping[str, float], effects: EffectSet | None, network: Network | None,
+    shares: Sequence[float] = SHARES,
+) -> dict[float | None, float]:  # fmt: skip
     """{share: 3D RMSE of the filter on a Flight, m, from TDOAs and IMU alone}, under None without any correction, as `plain`
     says. Without a network there is one share, 1."""
-    out = {None: plain[flight.name]}
-    for share in shares if network else ():
+    out: dict[float | None, float] = {None: plain[flight.name]}
+    if network is None:
+        return out | {1.0: _error(flight, effects)}
+    for share in shares:
         network.share = share
         out[share] = _error(flight, effects, network)
-    return out if network else {**out, 1.0: _error(flight, effects)}
+    return out
 
 
-def train(kind, training, validation, seed, name, options=structured.Options(), progress=lambda text: None, over=map):
+def train(
+    kind: str, training: Sequence[Flight], validation: Sequence[Flight], seed: int, name: str,
+    options: structured.Options = structured.Options(), progress: Callable[[str], object] = lambda text: None,
+    over: MapFunction = map,
+) -> tuple[models.Trained, BorneOut]:  # fmt: skip
     """(Trained, BorneOut): `models.train`, and as much of it as is borne out. over : as of `bear_out`."""
     flights = [*training, *validation]
     found = None
@@ -72,7 +95,10 @@ def train(kind, training, validation, seed, name, options=structured.Options(), 
 
 
 @in_one_thread
-def _left_out(kind, flights, plain, seed, options, fold):
+def _left_out(
+    kind: str, flights: Sequence[Flight], plain: Mapping[str, float], seed: int, options: structured.Options,
+    fold: tuple[list[int], list[int], physics.Physics | None],
+) -> dict[str, list[tuple[float | None, float]]]:  # fmt: skip
     """{flight: [(share, 3D RMSE), ...]}, JSON, of a fold: (numbers of the flights left out, of the others, Physics fitted to those or
     None)."""
     left_out, others, known = fold
@@ -85,5 +111,5 @@ def _left_out(kind, flights, plain, seed, options, fold):
 
 
 @in_one_thread
-def _error(flight, effects=None, network=None):
+def _error(flight: Flight, effects: EffectSet | None = None, network: Network | None = None) -> float:
     return evaluate(flight.without(*AIDS), None, effects, network)[0].row()["rmse_3d"]

@@ -1,8 +1,15 @@
 """Simulated flights to compare models on: some constellations to train on, others never seen."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ..simulation import SimulationConfig, simulate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
 
 TRAINING = ("corners", "wall_middles", "staircase")
 UNSEEN = ("pillars", "low_ceiling", "random-7")
@@ -10,14 +17,17 @@ TRAJECTORIES = ("sines", "sines", "rising_circle", "circle", "square")
 DURATION = 40.0  # s
 
 
-def flights(constellations, count, first_seed, progress=lambda names: names):
+def flights(
+    constellations: Sequence[str], count: int, first_seed: int,
+    progress: Callable[[list[tuple[str, int]]], Iterable[tuple[str, int]]] = lambda names: names,
+) -> dict[str, list[Flight]]:  # fmt: skip
     """{constellation: [Flight, ...]}, `count` each, of varied paths, yaws, protocols and tag specimens.
 
     The anchors' own delays are calibrated (zero): they are constants of single modules, which no model of poses can
     know.
     progress : wraps the list of what is to be flown, e.g. tqdm.
     """
-    out = {name: [] for name in constellations}
+    out: dict[str, list[Flight]] = {name: [] for name in constellations}
     for name, k in progress([(name, k) for name in constellations for k in range(count)]):
         config = SimulationConfig(
             seed=first_seed + k,

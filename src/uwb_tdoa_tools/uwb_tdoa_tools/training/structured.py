@@ -13,7 +13,10 @@ fit is one linear regression, the standard deviation is its posterior's, and awa
 to zero and the deviation to the prior's by itself.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -24,6 +27,13 @@ from uwb_tdoa_bias.correction.features import columns
 
 from . import export, linear
 from .labels import SAME_PLACE, constellations
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from onnx import ModelProto
+    from uwb_tdoa_bias.effects import Samples
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .labels import Labels
 
 COARSE = 4.0  # ratio of the long to the short length of the site map
 NEAREST = 0.1  # m; all that is nearer counts as at this distance, which has a logarithm
@@ -48,7 +58,7 @@ class Options:
 
     fine: float = 0.1
     coarse: float = 0.1
-    length: tuple = (1.0, 1.0, 0.6)
+    length: tuple[float, float, float] = (1.0, 1.0, 0.6)
     link: float = 0.1
     noise: float = 0.1
     centres: int = 200
@@ -62,31 +72,33 @@ class Map:
 
     centres: np.ndarray
     whiten: np.ndarray
-    amplitudes: tuple
-    lengths: tuple
+    amplitudes: tuple[float, ...]
+    lengths: tuple[float, ...]
     squared: bool
 
     @property
-    def variance(self):
+    def variance(self) -> float:
         """Of the process at one point, m^2."""
         return float(sum(a**2 for a in self.amplitudes))
 
-    def scaled(self, factor):
+    def scaled(self, factor: float) -> Map:
         """The Map of a process `factor` times as large."""
         return replace(self, whiten=self.whiten / factor, amplitudes=tuple(factor * a for a in self.amplitudes))
 
-    def kernel(self, x):
+    def kernel(self, x: np.ndarray) -> np.ndarray:
         """Kernel values between scaled inputs (n, k) and the centres: (n, m)."""
         far = cdist(x, self.centres)
         parts = (-0.5 * (far / s) ** 2 if self.squared else -far / s for s in self.lengths)
         return sum(a**2 * np.exp(part) for a, part in zip(self.amplitudes, parts))
 
-    def features(self, x):
+    def features(self, x: np.ndarray) -> np.ndarray:
         """(n, m), uncorrelated and of unit variance under the prior."""
         return self.kernel(x) @ self.whiten
 
 
-def make_map(x, count, amplitudes, lengths, squared, seed):
+def make_map(
+    x: np.ndarray, count: int, amplitudes: Sequence[float], lengths: Sequence[float], squared: bool, seed: int
+) -> Map:
     """Map with up to `count` centres spread over the scaled inputs x (n, k)."""
     rng = np.random.default_rng(seed)
     some = x[rng.choice(len(x), min(len(x), 5000), replace=False)]
@@ -103,14 +115,15 @@ class Structured:
 
     judged = ()  # it fades over positions by itself
 
-    def __init__(self, options, site, site_ids, site_positions):
+    def __init__(self, options: Options, site: Map, site_ids: np.ndarray, site_positions: np.ndarray) -> None:
         """site : Map over scaled positions; site_ids (s,), site_positions (s, 3) m : the anchors and where they
         stand."""
         self.options, self.site, self.site_ids, self.site_positions = options, site, site_ids, site_positions
-        self.links = {}  # "T": Map as the tag sees the anchor, "A": as the anchor sees the tag; empty if not told apart
+        # "T": Map as the tag sees the anchor, "A": as the anchor sees the tag; empty if not told apart
+        self.links: dict[str, Map] = {}
         self.floor = 0.0  # m, standard deviation of what remains where everything is known
 
-    def design(self, samples, error=None, looks=1.0):
+    def design(self, samples: Samples, error: np.ndarray | None = None, looks: float = 1.0) -> linear.Design:
         """linear.Design of Samples: the sites of their anchors, one behind the last for those at none, and the link
         maps as dense part."""
         phi = self.site.features(samples.p / self.options.length)
@@ -122,12 +135,12 @@ class Structured:
         y = np.zeros(len(samples)) if error is None else error
         return linear.Design(phi, a, b, np.concatenate(dense, axis=1), y, np.broadcast_to(looks, len(samples)))
 
-    def _site_of(self, anchors):
+    def _site_of(self, anchors: Anchors) -> np.ndarray:
         far = np.linalg.norm(anchors.positions[:, None] - self.site_positions, axis=2)
         far[anchors.ids[:, None] != self.site_ids] = np.inf
         return np.argmin(np.column_stack([far, np.full(len(far), SAME_PLACE)]), axis=1)  # the last: none is so near
 
-    def set_posterior(self, posterior):
+    def set_posterior(self, posterior: linear.Posterior) -> None:
         """Take over weights and the sizes of the priors."""
         s = posterior.site_std
         self.site = self.site.scaled(s)
@@ -141,53 +154,54 @@ class Structured:
             self.link_covariances[viewer] = posterior.dense_covariance[mine, mine] / s**2
             first = mine.stop
 
-    def forget_sites(self):
+    def forget_sites(self) -> None:
         """Keep what holds for all anchors; each is then at a site of which nothing is known."""
         self.site_ids, self.site_positions, self.weights = self.site_ids[:0], self.site_positions[:0], self.weights[:0]
 
     @property
-    def sees_attitude(self):
+    def sees_attitude(self) -> bool:
         """Whether the mean depends on how the tag is turned."""
         return bool(self.links)
 
     @property
-    def link_columns(self):
+    def link_columns(self) -> int:
         """How many dense columns of `design` there are."""
         return sum(link.whiten.shape[1] for link in self.links.values())
 
     @property
-    def prior(self):
+    def prior(self) -> float:
         """Variance of the error of one arrival where nothing is known, m^2."""
         return self.site.variance + sum(link.variance for link in self.links.values())
 
-    def mean(self, samples):
+    def mean(self, samples: Samples) -> np.ndarray:
         """Predicted error of Samples, (n,) m."""
         sites = np.vstack([self.weights, np.zeros(self.weights.shape[1])])
         links = np.concatenate([np.zeros(0), *(self.link_weights[viewer] for viewer in self.links)])
         return linear.predict(self.design(samples), sites, links)
 
-    def variance(self, samples):
+    def variance(self, samples: Samples) -> np.ndarray:
         """Of the maps, for Samples: (n,) m^2, without the floor."""
         phi = self.site.features(samples.p / self.options.length)
         known, sites = _quadratic(phi, self.site_covariance), self._site_of(samples.anchors)
         at_site = sites < len(self.site_ids)
-        total = sum(np.where(at_site[rows], known, self.site.variance) for rows in (samples.a, samples.b))
+        at_a, at_b = (np.where(at_site[rows], known, self.site.variance) for rows in (samples.a, samples.b))
+        total = at_a + at_b
         for viewer, link in self.links.items():
             for side in "ab":
                 phi = link.features(link_inputs(samples, side, viewer))
                 total += _quadratic(phi, self.link_covariances[viewer])
         return total
 
-    def _end_inputs(self, side="a"):
+    def _end_inputs(self, side: str = "a") -> list[str]:
         sites = (*_PLACE, *(f"{name}_{side}" for name in _END)) if len(self.site_ids) else ()
         angles = [f"{angle}_{viewer}_{side}" for angle in ("azimuth", "elevation") for viewer in self.links]
         return [*sites, *(f"{name}_{side}" for name in _DELTA if self.links), *angles]
 
-    def inputs(self):
+    def inputs(self) -> list[str]:
         """Names of the features that the network is fed, in order: those of one end, then those of the other."""
         return [name for side in "ab" for name in self._end_inputs(side)]
 
-    def onnx(self, meta):
+    def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
         """The onnx.ModelProto: bias, standard deviation, share of what can be known. meta : further metadata."""
         graph, names = export.Graph(), self.inputs()
         end = graph.rows(graph.input, len(names) // 2)  # (2n, ...): what follows is said of one end
@@ -195,15 +209,15 @@ class Structured:
         maps += [self._link_graph(graph, end)] if self.links else []
         means, explained = zip(*maps)
         variance = graph.op("Max", graph.op("Sub", [self.prior], graph.total(explained)), [0.0])
-        means, variances = graph.rows(graph.total(means), 2), graph.rows(variance, 2)  # (n, 2): a, b
-        bias = graph.op("MatMul", means, [[-1.0], [1.0]])
+        both, variances = graph.rows(graph.total(means), 2), graph.rows(variance, 2)  # (n, 2): a, b
+        bias = graph.op("MatMul", both, [[-1.0], [1.0]])
         std = graph.op("Sqrt", graph.op("Add", graph.row_sum(variances), [self.floor**2]))
         worst = graph.op("ReduceMax", variances, axes=[1])
         known = graph.op("Sub", [1.0], graph.op("Mul", worst, [1.0 / self.prior]))
         meta = {**meta, "features": names, "offset": [0.0] * len(names), "scale": [1.0] * len(names)}
         return graph.model(len(names), [bias, std, known], meta)
 
-    def _site_graph(self, graph, end):
+    def _site_graph(self, graph: export.Graph, end: str) -> tuple[str, str]:
         """(mean, variance explained) by the site maps, each (2n, 1). end : features of one end."""
         place, who, where = (graph.take(end, some) for some in ([0, 1, 2], [3], [4, 5, 6]))
         place = graph.op("Div", place, [self.options.length])
@@ -218,7 +232,7 @@ class Structured:
         known = _power(graph, values, _known_directions(self.site, self.site_covariance))
         return graph.row_sum(graph.op("Mul", weights, values)), graph.op("Mul", at_site, known)
 
-    def _link_graph(self, graph, end):
+    def _link_graph(self, graph: export.Graph, end: str) -> tuple[str, str]:
         """(mean, variance explained) by the link maps together, each (2n, 1).
 
         A Gaussian of the distance of x = (log distance, unit vector) from a centre c is an exponential of what is linear
@@ -247,12 +261,12 @@ class Structured:
         return mean, _power(graph, values, block_diag(*factors))
 
 
-def _quadratic(phi, covariance):
+def _quadratic(phi: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Variance of each row of phi (n, m) times weights with a covariance (m, m): (n,)."""
     return np.einsum("ni,ni->n", phi @ covariance, phi)
 
 
-def link_inputs(samples, side, viewer):
+def link_inputs(samples: Samples, side: str, viewer: str) -> np.ndarray:
     """Inputs of a link map: logarithm of the distance, unit vector to the other end as the viewer sees it. (n, 4).
 
     side : "a" or "b"; viewer : "T", tag or "A", anchor."""
@@ -262,7 +276,7 @@ def link_inputs(samples, side, viewer):
     return np.stack([far, flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
-def _known_directions(of, covariance):
+def _known_directions(of: Map, covariance: np.ndarray) -> np.ndarray:
     """Of the kernel values of a Map (m,), the RANK directions that the data told most of, as large as what they told:
     (m, RANK)."""
     share, vector = np.linalg.eigh(np.eye(len(covariance)) - covariance)
@@ -270,15 +284,16 @@ def _known_directions(of, covariance):
     return of.whiten @ (vector[:, leading] * np.sqrt(np.maximum(share[leading], 0.0)))
 
 
-def _power(graph, values, directions):
+def _power(graph: export.Graph, values: str, directions: np.ndarray) -> str:
     """Sum of the squares of values (n, m) along directions (m, k): (n, 1)."""
     part = graph.op("MatMul", values, directions)
     return graph.row_sum(graph.op("Mul", part, part))
 
 
-def prepare(all_labels, options, seed):
+def prepare(all_labels: Sequence[Labels], options: Options, seed: int) -> Structured:
     """Structured without weights: sites, centres and kernels for a list of Labels."""
-    ids, positions = [], []
+    ids: list[int] = []
+    positions: list[np.ndarray] = []
     for one in all_labels:
         for i, p in zip(one.anchors.ids, one.anchors.positions):
             if not any(i == k and np.linalg.norm(p - at) < SAME_PLACE for k, at in zip(ids, positions)):

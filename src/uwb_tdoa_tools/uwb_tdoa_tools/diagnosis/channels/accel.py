@@ -1,11 +1,18 @@
 """The accelerometer."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.state import GRAVITY
 
 from .inertial import CELL, ImuResidual, Inertial, cells_in_the_air, features_of, means
+
+if TYPE_CHECKING:
+    from .base import Comparison
 
 SHIFT = 0.05  # s; the cells are those of the gyroscope
 FEWEST_ATTITUDES = 10
@@ -20,13 +27,13 @@ class Accel(Inertial):
     needs = "an accelerometer, and ground truth of position and attitude"
     negligible = 0.01
 
-    def residual(self, comparison):
+    def residual(self, comparison: Comparison) -> ImuResidual | None:
         imu, poses, reference = comparison.flight.imu, comparison.poses, comparison.reference
         if imu is None or not (reference.attitude_known and all(reference.positions_known)):
             return None
         if np.isfinite(poses.q).all(axis=1).sum() <= FEWEST_ATTITUDES:
             return None
-        track, edges = comparison.track, cells_in_the_air(comparison, SHIFT)
+        track, edges = comparison.track, cells_in_the_air(comparison, imu, SHIFT)
         middles = edges[1:-1]
         to_body = Rotation.from_quat(track.attitudes(middles)).inv()
         positions = track.positions(edges)
@@ -41,7 +48,7 @@ class Accel(Inertial):
         return ImuResidual(samples, measured - true, self.unit)
 
 
-def _triangular_means(t, values, edges):
+def _triangular_means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Means of (n, 3) values with the triangular window over two intervals, for every inner edge. With it, the mean
     of a second derivative is the second difference of the function: both sides of the residual see the same filter."""
     place = np.searchsorted(edges, t, side="right") - 1

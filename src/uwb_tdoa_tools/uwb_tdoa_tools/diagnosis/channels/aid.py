@@ -1,6 +1,9 @@
 """What the SENSORS beside inertia and TDOAs say: residuals of their medians over cells."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +17,14 @@ from .inertial import CELL, features_of
 from .knots import knots_of
 from .pairs import APART
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.foundation.flight import Imu
+    from uwb_tdoa_bias.foundation.sensors import Stream
+    from .base import Comparison
+    from .base import Figures
+
 COVARIATES = ("time", "x", "y", "height", "speed", "climb_rate", "acceleration", "turning_rate", "vibration")
 FEWEST_ATTITUDES, FEWEST_CELLS = 10, 8
 
@@ -25,47 +36,55 @@ class AidResidual(ChannelResidual):
 
     samples: AidSamples
     residual: np.ndarray
-    labels: tuple
+    labels: tuple[str, ...]
     unit: str
     floating: bool
 
     @property
-    def _known(self):
+    def _known(self) -> np.ndarray:
         return np.isfinite(self.residual.T.ravel())
 
-    def rows(self):
+    def rows(self) -> Rows:
         samples, (n, k), known = self.samples, self.residual.shape, self._known
         y, t = self.residual.T.ravel()[known], np.tile(samples.t - samples.start, k)[known]
         place = np.tile(samples.p, (k, 1))[known]
         axis = np.repeat(np.arange(k), n)[known]
         return Rows(self._free(y), axis, axis, t, np.ones(len(y)), place)
 
-    def columns(self, effect, keys):
+    def columns(self, effect: Effect, keys: Sequence[str]) -> np.ndarray:
         values = effect.regressors(self.samples, list(keys))
         return self._free(values.transpose(1, 0, 2).reshape(-1, len(keys))[self._known])
 
-    def series(self):
+    def covariate(self, name: str) -> np.ndarray | None:
+        return sensor_covariate(name, self.samples)
+
+    def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         columns = {f"{label} [{self.unit}]": self.residual[:, k] for k, label in enumerate(self.labels)}
         measured = {label: np.isfinite(column) for label, column in columns.items()}  # optical flow tells no vertical velocity
         return {label: (self.samples.t[m], columns[label][m]) for label, m in measured.items() if m.any()}
 
-    def _free(self, values):
+    def _free(self, values: np.ndarray) -> np.ndarray:
         return values - values.mean(axis=0) if self.floating else values
 
 
-class Aid(Channel):
+class Aid(Channel[AidResidual]):
     """The channel of one of the SENSORS, with what its Compared says as attributes."""
 
-    def __init__(self, name):
+    axes: tuple[str, ...]
+    positions: tuple[int, ...]
+    of_attitude: bool
+    floating: bool
+
+    def __init__(self, name: str) -> None:
         self.name = name
         vars(self).update(vars(SENSORS[name].compared))
 
     @property
-    def labels(self):
+    def labels(self) -> tuple[str, ...]:
         """Of its axes: tuple."""
         return tuple(self.name + axis for axis in self.axes)
 
-    def residual(self, comparison):
+    def residual(self, comparison: Comparison) -> AidResidual | None:
         part, reference = getattr(comparison.flight, self.name), comparison.reference
         known = all(reference.positions_known[k] for k in self.positions)
         if part is None or not known or (self.of_attitude and not self._attitude(comparison)):
@@ -86,7 +105,7 @@ class Aid(Channel):
         error = error - comparison.effects.uncorrected(samples)
         return AidResidual(samples, error, self.labels, self.unit, self.floating)
 
-    def smooth_terms(self, residuals):
+    def smooth_terms(self, residuals: Sequence[AidResidual]) -> list[SmoothTerm]:
         out = []
         for name in COVARIATES:
             values = [sensor_covariate(name, part.samples) for part in residuals]
@@ -95,7 +114,7 @@ class Aid(Channel):
                 out += [SmoothTerm(channel=label, covariate=name, knots=knots) for label in self.labels]
         return out
 
-    def health(self, residuals):
+    def health(self, residuals: Sequence[AidResidual]) -> Figures:
         out = []
         t = np.concatenate([part.samples.t + APART * number for number, part in enumerate(residuals)])
         for k, label in enumerate(self.labels):
@@ -105,22 +124,22 @@ class Aid(Channel):
                 out.append({"axis": label, **figures(t[known], r[known])})
         return {"axes": out}
 
-    def _attitude(self, comparison):
+    def _attitude(self, comparison: Comparison) -> bool:
         known = np.isfinite(comparison.poses.q).all(axis=1).sum()
         return comparison.reference.attitude_known and known > FEWEST_ATTITUDES
 
-    def _values(self, part):
+    def _values(self, part: Stream) -> np.ndarray:
         """(n, k) of a stream, NaN for what was not measured."""
         values, std = part.values, getattr(part, "std", 0.0)
         return np.where(np.isfinite(values) & np.isfinite(std), values, np.nan)
 
 
-def _median(values):
+def _median(values: np.ndarray) -> np.ndarray:
     known = np.isfinite(values).any(axis=0)
     return np.where(known, np.nanmedian(np.where(known, values, 0.0), axis=0), np.nan)
 
 
-def _vibration(imu, t):
+def _vibration(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:
     """(n,) m/s^2; None without an IMU."""
     if imu is None:
         return None

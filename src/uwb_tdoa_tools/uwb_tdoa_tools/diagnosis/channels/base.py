@@ -1,48 +1,60 @@
 """What a channel is, and what it makes of a flight."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar, Generic, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet, Track
 from uwb_tdoa_bias.foundation.flight import Flight
 
-from ..references import Reference, View
+from ..references import Reference, ReferenceView
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.effects import AidSamples, Effect, ImuSamples, Samples, SmoothTerm
+    from uwb_tdoa_bias.foundation.flight import Truth
+    from .views import CovariateView
+
+Figures = dict[str, list[dict[str, Any]]]  # of the health of channels: {"pairs", "anchors", "axes", ...: rows}
 
 
 @dataclass(frozen=True)
 class Comparison:
     """A flight beside its reference.
 
-    flight : Flight, its streams corrected by `effects`; view : View; span : (first, last) s of what counts."""
+    flight : Flight, its streams corrected by `effects`; view : ReferenceView; span : (first, last) s of what counts."""
 
     flight: Flight
     reference: Reference
     effects: EffectSet
-    view: View
-    span: tuple
+    view: ReferenceView
+    span: tuple[float, float]
 
     @classmethod
-    def of(cls, flight, reference, effects, span=None):
+    def of(
+        cls, flight: Flight, reference: Reference, effects: EffectSet, span: tuple[float, float] | None = None
+    ) -> Comparison:
         """Comparison of a prepared Flight with a Reference. span : as another Comparison of it has found."""
         view = reference.view(flight, effects)
         corrected = effects.correct_streams(replace(flight, truth=None))
         return cls(corrected, reference, effects, view, span or reference.span(flight, view.poses))
 
     @property
-    def poses(self):
+    def poses(self) -> Truth:
         """Truth: where the flight was, or is believed to have been."""
         return self.view.poses
 
     @cached_property
-    def track(self):
+    def track(self) -> Track:
         """The poses, to be asked at any stamp."""
         return Track(self.poses)
 
     @property
-    def start(self):
+    def start(self) -> float:
         """Stamp of the first TDOA, s, from which slow changes count."""
         return float(self.flight.tdoa.t[0])
 
@@ -66,51 +78,59 @@ class ChannelResidual:
     Subclasses hold `samples`, what effects take (Samples, ImuSamples), and `residual`, one per sample.
     """
 
-    samples: object
+    samples: Samples | ImuSamples | AidSamples
     residual: np.ndarray
 
-    def of_floor(self):
+    def of_floor(self) -> ChannelResidual | None:
         """The ChannelResidual of what is near the floor, which is not among its rows; None if there is no telling of it."""
         return None
 
-    def rows(self):
+    def rows(self) -> Rows:
         """Rows for a fit."""
         raise NotImplementedError
 
-    def columns(self, effect, keys):
+    def columns(self, effect: Effect, keys: Sequence[str]) -> np.ndarray:
         """Regressors of an Effect for the parameters `keys`, averaged as the rows are: (m, len(keys))."""
         raise NotImplementedError
 
-    def place_in_room(self, series):
+    def covariate(self, name: str) -> np.ndarray | None:
+        """Values of a covariate, of OF_TDOA, OF_ARRIVAL or OF_IMU, at what is looked at; None where it is not known."""
+        raise NotImplementedError
+
+    def place_in_room(self, series: int) -> str:
         """What a series number of Rows is of in the room, such as a pair of anchors; "" if it is of the vehicle."""
         return ""
 
-    def series(self):
+    def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """{label with unit: (t (k,) s, residual (k,))}, to be plotted and judged."""
         raise NotImplementedError
 
 
-class Channel:
+ChannelResiduals = dict[str, ChannelResidual]  # of one flight, by the name of the channel
+Own = TypeVar("Own", bound=ChannelResidual)
+
+
+class Channel(Generic[Own]):
     """A kind of measurement. One channel, one file: subclass it and list it in CHANNELS."""
 
-    name: ClassVar[str]
-    unit: ClassVar[str]
-    negligible: ClassVar[float]  # root mean square, in `unit`, of a contribution that is not worth a term
-    needs: ClassVar[str]  # what a recording must hold for it, in words
-    maps: ClassVar[tuple] = ()  # covariates whose functions, each too weak alone, are tried together
+    name: str
+    unit: str
+    negligible: float  # root mean square, in `unit`, of a contribution that is not worth a term
+    needs: str  # what a recording must hold for it, in words
+    maps: ClassVar[tuple[str, ...]] = ()  # covariates whose functions, each too weak alone, are tried together
 
-    def residual(self, comparison):
+    def residual(self, comparison: Comparison) -> Own | None:
         """ChannelResidual of a Comparison; None if the flight or its reference does not show this channel."""
         raise NotImplementedError
 
-    def smooth_terms(self, residuals):
+    def smooth_terms(self, residuals: Sequence[Own]) -> list[SmoothTerm]:
         """SmoothTerms without values: whatever the ChannelResiduals of some flights may depend on."""
         return []
 
-    def views(self, residuals):
-        """[View] of the rows of the ChannelResiduals of some flights: whatever a part of them may depend on."""
+    def views(self, residuals: Sequence[Own]) -> list[CovariateView]:
+        """[CovariateView] of the rows of the ChannelResiduals of some flights: what a part of them may depend on."""
         return []
 
-    def health(self, residuals):
+    def health(self, residuals: Sequence[Own]) -> Figures:
         """{"pairs", "anchors", "axes" or "cross_correlation": [dict of figures]} of the ChannelResiduals of some flights."""
         return {}

@@ -1,5 +1,9 @@
 """Figures of a series of residuals."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
 LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s
@@ -7,12 +11,12 @@ TAIL = 4.0  # spreads
 FEWEST = 20  # pairs of samples that a correlation is told of
 
 
-def figures(t, r):
+def figures(t: np.ndarray | None, r: np.ndarray) -> dict[str, Any]:
     """Bias (median), spread (1.48 MAD), tails (share beyond 4 spreads), count, and with rising stamps t (n,), s,
     autocorrelation at 0.1 to 2 s, of residuals r (n,): dict."""
     bias = float(np.median(r))
     spread = float(1.4826 * np.median(np.abs(r - bias)))
-    out = {
+    out: dict[str, Any] = {
         "count": len(r),
         "bias": bias,
         "spread": spread,
@@ -23,7 +27,7 @@ def figures(t, r):
     return out
 
 
-def autocorrelation(t, r, lag):
+def autocorrelation(t: np.ndarray, r: np.ndarray, lag: float) -> float | None:
     """Correlation of a series r at rising stamps t with itself `lag` seconds later; None without such pairs."""
     r = np.clip(r - np.median(r), *np.array([-5.0, 5.0]) * max(1.4826 * np.median(np.abs(r - np.median(r))), 1e-12))
     later = np.searchsorted(t, t + lag)

@@ -1,11 +1,19 @@
 """The gyroscope."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects.covariates import OF_IMU
 
 from .inertial import CELL, ImuResidual, Inertial, cells_in_the_air, features_of, means
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Imu, Truth
+    from .base import Comparison
 
 SHIFT = 0.05  # s, for derivatives by time, of what was measured: noise of the truth would shrink what is fitted to them
 STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration and rad/s, below which the vehicle stands
@@ -24,7 +32,7 @@ class Gyro(Inertial):
     needs = "a gyroscope, and ground truth of the attitude or some seconds at rest before take-off"
     negligible = 5e-4
 
-    def residual(self, comparison):
+    def residual(self, comparison: Comparison) -> ImuResidual | None:
         imu, poses = comparison.flight.imu, comparison.poses
         if imu is None:
             return None
@@ -32,7 +40,7 @@ class Gyro(Inertial):
             return self._at_rest(comparison, imu)
         if np.isfinite(poses.q).all(axis=1).sum() <= FEWEST_ATTITUDES:
             return None
-        edges = cells_in_the_air(comparison, SHIFT)
+        edges = cells_in_the_air(comparison, imu, SHIFT)
         measured, true = means(imu.t, imu.gyro, edges), _true_rates(poses, edges)
         before, after = (means(imu.t, imu.gyro, edges + shift) for shift in (-SHIFT, SHIFT))
         middles = 0.5 * (edges[:-1] + edges[1:])
@@ -40,7 +48,7 @@ class Gyro(Inertial):
         samples = self._samples(comparison, middles, measured, features, change)
         return ImuResidual(samples, measured - true - comparison.effects.uncorrected(samples), self.unit)
 
-    def _at_rest(self, comparison, imu):
+    def _at_rest(self, comparison: Comparison, imu: Imu) -> ImuResidual | None:
         edges = np.arange(imu.t[0], imu.t[-1], CELL)
         features, measured = means(imu.t, features_of(imu), edges), means(imu.t, imu.gyro, edges)
         moving = features[:, OF_IMU.index("vibration")] > STILL_FORCE
@@ -56,7 +64,7 @@ class Gyro(Inertial):
         return ImuResidual(samples, measured - comparison.effects.uncorrected(samples), self.unit)
 
 
-def _true_rates(truth, edges):
+def _true_rates(truth: Truth, edges: np.ndarray) -> np.ndarray:
     """Mean turning rates in body axes between edges, (n, 3) rad/s: sums of the turns from pose to pose."""
     known = np.isfinite(truth.q).all(axis=1)
     t, first = np.unique(truth.t[known], return_index=True)

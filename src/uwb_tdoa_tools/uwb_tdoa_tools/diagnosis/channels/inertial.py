@@ -1,7 +1,9 @@
 """What gyroscope and accelerometer share: residuals of means over cells, axis by axis."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,6 +18,13 @@ from .knots import knots_of
 from .pairs import APART
 from .views import views_of_axes
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.foundation.flight import Imu
+    from .base import Comparison, Figures
+    from .views import CovariateView
+
 CELL = 0.25  # s over which both sides of a residual are averaged
 OF_POSE = ("x", "y", "height", "speed", "climb_rate", "acceleration")  # covariates that TDOAs have too
 
@@ -28,27 +37,30 @@ class ImuResidual(ChannelResidual):
     residual: np.ndarray
     unit: str
 
-    def rows(self):
+    def rows(self) -> Rows:
         samples, n = self.samples, len(self.samples)
         t, place = np.tile(samples.t - samples.start, 3), np.tile(samples.p, (3, 1))
         axis = np.repeat(np.arange(3), n)
         return Rows(self.residual.T.ravel(), axis, axis, t, np.ones(3 * n), place)
 
-    def columns(self, effect, keys):
+    def columns(self, effect: Effect, keys: Sequence[str]) -> np.ndarray:
         values = effect.regressors(self.samples, list(keys))
         return values.transpose(1, 0, 2).reshape(-1, len(keys))
 
-    def series(self):
+    def covariate(self, name: str) -> np.ndarray | None:
+        return sensor_covariate(name, self.samples)
+
+    def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         name = self.samples.channel
         return {f"{name}.{axis} [{self.unit}]": (self.samples.t, self.residual[:, k]) for k, axis in enumerate("xyz")}
 
 
-class Inertial(Channel):
+class Inertial(Channel[ImuResidual]):
     """A channel of an inertial sensor."""
 
     axes: ClassVar[str] = "xyz"
 
-    def smooth_terms(self, residuals):
+    def smooth_terms(self, residuals: Sequence[ImuResidual]) -> list[SmoothTerm]:
         out = []
         for name in self._covariates(residuals):
             knots = knots_of(np.concatenate([sensor_covariate(name, part.samples) for part in residuals]), name)
@@ -56,22 +68,25 @@ class Inertial(Channel):
                 out += [SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots) for axis in self.axes]
         return out
 
-    def views(self, residuals):
+    def views(self, residuals: Sequence[ImuResidual]) -> list[CovariateView]:
         channels, names = [f"{self.name}.{axis}" for axis in self.axes], self._covariates(residuals)
         parts = [part.samples for part in residuals]
         values = {name: np.concatenate([np.tile(sensor_covariate(name, one), 3) for one in parts]) for name in names}
         return views_of_axes(channels, values, np.concatenate([np.repeat(np.arange(3), len(one)) for one in parts]))
 
     @staticmethod
-    def _covariates(residuals):
+    def _covariates(residuals: Sequence[ImuResidual]) -> tuple[str, ...]:
         return (*OF_IMU, *OF_POSE, *extra_names([part.samples for part in residuals]))
 
-    def health(self, residuals):
+    def health(self, residuals: Sequence[ImuResidual]) -> Figures:
         t = np.concatenate([part.samples.t + APART * number for number, part in enumerate(residuals)])
         r = np.concatenate([part.residual for part in residuals])
         return {"axes": [{"axis": f"{self.name}.{axis}", **figures(t, r[:, k])} for k, axis in enumerate(self.axes)]}
 
-    def _samples(self, comparison, t, reading, features, change=None):
+    def _samples(
+        self, comparison: Comparison, t: np.ndarray, reading: np.ndarray, features: np.ndarray,
+        change: np.ndarray | None = None,
+    ) -> ImuSamples:  # fmt: skip
         """ImuSamples of this channel at the middles t (n,) of cells."""
         track = comparison.track
         q = track.attitudes(t)
@@ -84,20 +99,20 @@ class Inertial(Channel):
         return ImuSamples(self.name, t, place, comparison.start, reading, change, up, features, motion, extra)
 
 
-def features_of(imu):
+def features_of(imu: Imu) -> np.ndarray:
     """Covariates OF_IMU along the stream: (n, len(OF_IMU))."""
     return ImuFeatures()(imu.t, imu.gyro, imu.accel)
 
 
-def cells_in_the_air(comparison, shift):
-    """Edges of the cells, s, of what counts and is covered by IMU and reference, `shift` s more at both ends."""
-    imu, poses, (first, last) = comparison.flight.imu, comparison.poses, comparison.span
+def cells_in_the_air(comparison: Comparison, imu: Imu, shift: float) -> np.ndarray:
+    """Edges of the cells, s, of what counts and is covered by Imu and reference, `shift` s more at both ends."""
+    poses, (first, last) = comparison.poses, comparison.span
     low = max(first, imu.t[0], poses.t[0]) + CELL + shift
     high = min(last, imu.t[-1], poses.t[-1]) - CELL - shift
     return np.arange(low, high, CELL)
 
 
-def means(t, values, edges):
+def means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Means of (n, k) values over the intervals between edges: the integral of the linear interpolation."""
     dt = np.diff(t)[:, None]
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(0.5 * (values[1:] + values[:-1]) * dt, axis=0)])

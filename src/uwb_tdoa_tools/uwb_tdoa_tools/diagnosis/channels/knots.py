@@ -1,5 +1,7 @@
 """Where the pieces of a function of a covariate meet."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
@@ -8,7 +10,7 @@ PIECES = 4
 FEWEST = 100  # values
 
 
-def knots_of(values, name):
+def knots_of(values: np.ndarray, name: str) -> tuple[float, ...] | None:
     """Quantiles of the values (n,) of a covariate, or for one of names these names: tuple; None if it hardly varies."""
     values = values[np.isfinite(values)]
     if len(values) < FEWEST:

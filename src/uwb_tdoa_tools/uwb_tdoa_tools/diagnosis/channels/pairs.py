@@ -1,14 +1,23 @@
 """Health of TDOAs: of pairs and of anchors."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from .figures import FEWEST, figures
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .base import Figures
+    from .tdoa import TdoaResidual
 
 APART = 1e4  # s between the stamps of two flights: nothing of one is near the other
 STRONGEST = 10
 
 
-def health(parts):
+def health(parts: Sequence[TdoaResidual]) -> Figures:
     """{"pairs", "anchors", "cross_correlation"} of the TdoaResiduals of some flights in the air."""
     ids = parts[0].samples.anchors.ids
     t, r, a, b = (np.concatenate(column) for column in zip(*map(_columns, enumerate(parts))))
@@ -24,13 +33,13 @@ def health(parts):
     return {"pairs": pairs, "anchors": each, "cross_correlation": _crossed(t, r, label, ids)}
 
 
-def _columns(numbered):
+def _columns(numbered: tuple[int, TdoaResidual]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     number, part = numbered
     rows, samples = part.airborne, part.samples
     return samples.t[rows] + APART * number, part.residual[rows], samples.a[rows], samples.b[rows]
 
 
-def _crossed(t, r, label, anchors):
+def _crossed(t: np.ndarray, r: np.ndarray, label: np.ndarray, anchors: np.ndarray) -> list[dict[str, Any]]:
     """The strongest correlations between half-second means of two pairs: [{"pairs", "correlation"}]."""
     labels, place = np.unique(label, return_inverse=True)
     cell = np.unique((t * 2.0).astype(int), return_inverse=True)[1]
@@ -38,7 +47,7 @@ def _crossed(t, r, label, anchors):
     at = cell * len(labels) + place
     count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
     mean = np.bincount(at, r, shape[0] * shape[1]).reshape(shape) / np.maximum(count, 1)
-    out = []
+    out: list[dict[str, Any]] = []
     for i in range(len(labels)):
         for k in range(i):
             both = (count[:, i] > 0) & (count[:, k] > 0)

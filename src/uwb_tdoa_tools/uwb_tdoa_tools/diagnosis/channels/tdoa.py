@@ -4,8 +4,11 @@ Neighbouring TDOAs are alike, so that hundreds a second are not hundreds of fact
 cells of half a second, near the floor of half the height at most, without the outliers of the cell; what likeness is left between cells is counted in the fit.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +23,13 @@ from .base import Channel, ChannelResidual, Rows
 from .extra import extra_at, extra_names
 from .knots import knots_of
 from .views import views_of_pairs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.foundation.flight import Imu
+    from .base import Comparison, Figures
+    from .views import CovariateView
 
 CELL = 0.5  # s
 LOWEST, LEVEL = 0.02, 0.5  # m, and by how much the logarithm of a height may differ within a cell near the floor, where heights matter
@@ -43,34 +53,40 @@ class TdoaResidual(ChannelResidual):
     floor_known: bool = False
     innovations: Innovations | None = None
 
-    def of_floor(self):
+    def of_floor(self) -> TdoaResidual | None:
         """The TdoaResidual that looks at those near the floor alone; None if there is no telling of them, or they are few."""
         near = ~self.airborne & (np.abs(self.residual) < WILD)
         return replace(self, fitted=near) if self.floor_known and near.sum() >= FEWEST_ON_FLOOR else None
 
     @cached_property
-    def cells(self):
+    def cells(self) -> Cells:
         """How the TDOAs that are looked at are averaged."""
         return Cells(self)
 
-    def rows(self):
+    def rows(self) -> Rows:
         cells, samples = self.cells, self.samples
         place = np.stack([cells.mean(column) for column in samples.p.T], axis=1)
         return Rows(cells.mean(self.residual), np.zeros_like(cells.pair), cells.pair, cells.t - samples.start, cells.size, place)
 
-    def columns(self, effect, keys):
+    def columns(self, effect: Effect, keys: Sequence[str]) -> np.ndarray:
         values = np.nan_to_num(effect.regressors(self.samples, list(keys)))
         if self.innovations is not None:
             values = self.innovations.by_bias(values)
         return np.stack([self.cells.mean(column) for column in values.T], axis=1)
 
-    def series(self):
+    def covariate(self, name: str) -> np.ndarray | None:
+        if name in OF_ARRIVAL:
+            return _of_arrivals(OF_ARRIVAL[name], self.samples)[:, self.fitted].ravel()
+        values = OF_TDOA[name](self.samples)
+        return None if values is None else values[self.fitted]
+
+    def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         return {"TDOA [m]": (self.samples.t[self.airborne], self.residual[self.airborne])}
 
-    def place_in_room(self, series):
-        return "-".join(str(self.samples.anchors.ids[row]) for row in self.arrivals(series))
+    def place_in_room(self, series: int) -> str:
+        return "-".join(str(self.samples.anchors.ids[row]) for row in divmod(series, len(self.samples.anchors)))
 
-    def arrivals(self, series):
+    def arrivals(self, series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Anchor rows (a, b) of series numbers (m,) in Rows."""
         return np.divmod(series, len(self.samples.anchors))
 
@@ -78,7 +94,7 @@ class TdoaResidual(ChannelResidual):
 class Cells:
     """The cells of one flight, and the averages over them."""
 
-    def __init__(self, part):
+    def __init__(self, part: TdoaResidual) -> None:
         samples, chosen = part.samples, np.flatnonzero(part.fitted)
         n = len(samples.anchors)
         t = samples.t[chosen]
@@ -103,12 +119,12 @@ class Cells:
         start = np.searchsorted(self.group, np.arange(len(self.size)))
         self.pair = samples.a[self.chosen][start] * n + samples.b[self.chosen][start]
 
-    def mean(self, values):
+    def mean(self, values: np.ndarray) -> np.ndarray:
         """Means of values of all TDOAs (n,) over the cells: (m,)."""
         return np.bincount(self.group, values[self.chosen]) / self.size
 
 
-class Tdoa(Channel):
+class Tdoa(Channel[TdoaResidual]):
     """Differences of the distances to two anchors."""
 
     name = "tdoa"
@@ -117,7 +133,7 @@ class Tdoa(Channel):
     negligible = 0.004
     maps = ("x", "y", "height", "range")
 
-    def residual(self, comparison):
+    def residual(self, comparison: Comparison) -> TdoaResidual | None:
         flight, anchors, poses = comparison.flight, comparison.flight.anchors, comparison.poses
         raw = flight.tdoa
         a, b = anchors.index(raw.a), anchors.index(raw.b)
@@ -144,13 +160,13 @@ class Tdoa(Channel):
         airborne = (t >= first) & (t <= last)
         return TdoaResidual(samples, residual, airborne, airborne, comparison.reference.knows_floor, innovations)
 
-    def smooth_terms(self, residuals):
+    def smooth_terms(self, residuals: Sequence[TdoaResidual]) -> list[SmoothTerm]:
         out, chosen = [], [part.fitted for part in residuals]
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
-            values = [_covariate(name, part.samples) for part in residuals]
+            known = _covariates(name, residuals)
             knots = None
-            if all(v is not None for v in values):
-                knots = knots_of(np.concatenate([v[rows] for v, rows in zip(values, chosen)]), name)
+            if known is not None:
+                knots = knots_of(np.concatenate([v[rows] for v, rows in zip(known, chosen)]), name)
             if knots is not None:
                 out.append(SmoothTerm(covariate=name, form="common", knots=knots))
                 if name not in CATEGORIES and not name.startswith(EXTRA):
@@ -162,41 +178,50 @@ class Tdoa(Channel):
                 out += [SmoothTerm(covariate=name, form=form, knots=knots) for form in ("arrival", "anchor")]
         return out
 
-    def views(self, residuals):
+    def views(self, residuals: Sequence[TdoaResidual]) -> list[CovariateView]:
         if any(part.innovations is not None for part in residuals):
             return []  # what the path follows is not left in them
         cells = [part.cells for part in residuals]
         ends = [np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)]) for part in residuals]
         of_tdoa, of_arrival, quick = {}, {}, {}
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
-            values = [_covariate(name, part.samples) for part in residuals]
-            if all(v is not None for v in values) and name in QUICK:
-                quick[name] = np.concatenate([v[cell.chosen] for cell, v in zip(cells, values)])
-            elif all(v is not None for v in values):
-                of_tdoa[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, values)])
+            known = _covariates(name, residuals)
+            if known is not None and name in QUICK:
+                quick[name] = np.concatenate([v[cell.chosen] for cell, v in zip(cells, known)])
+            elif known is not None:
+                of_tdoa[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
         for name, function in OF_ARRIVAL.items():
             both = [_of_arrivals(function, part.samples) for part in residuals]
             means = [[cell.mean(v) for v in values] for cell, values in zip(cells, both)]
             of_arrival[name] = np.concatenate(means, axis=1)
-        slow = views_of_pairs(*np.concatenate(ends, axis=1), of_tdoa, of_arrival)
+        a, b = np.concatenate(ends, axis=1)
+        slow = views_of_pairs(a, b, of_tdoa, of_arrival)
         first = np.cumsum([0, *(len(cell.size) for cell in cells)])
-        cell = np.concatenate([cell.group + start for cell, start in zip(cells, first)])
-        return slow + views_of_pairs(*np.concatenate(ends, axis=1)[:, cell], quick, {}, cell)
+        cell = np.concatenate([part.group + start for part, start in zip(cells, first)])
+        return slow + views_of_pairs(a[cell], b[cell], quick, {}, cell)
 
-    def health(self, residuals):
+    def health(self, residuals: Sequence[TdoaResidual]) -> Figures:
         return pairs.health(residuals)
 
 
-def _covariate(name, samples):
-    return OF_TDOA[name](samples) if name in OF_TDOA else samples.extra[name.removeprefix(EXTRA)]
+def _covariates(name: str, residuals: Sequence[TdoaResidual]) -> list[np.ndarray] | None:
+    """A covariate of OF_TDOA, or "extra.STREAM.COLUMN", of each: (n,); None where one of them does not hold it."""
+    known = []
+    for part in residuals:
+        extra = part.samples.extra or {}
+        values = OF_TDOA[name](part.samples) if name in OF_TDOA else extra.get(name.removeprefix(EXTRA))
+        if values is None:
+            return None
+        known.append(values)
+    return known
 
 
-def _of_arrivals(function, samples):
+def _of_arrivals(function: Callable[[Samples, np.ndarray], np.ndarray], samples: Samples) -> np.ndarray:
     """(2, n): of the first and of the second anchor."""
     return function(samples, np.concatenate([samples.a, samples.b])).reshape(2, -1)
 
 
-def _vibration(imu, t):
+def _vibration(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:
     if imu is None:
         return None
     features = ImuFeatures()(imu.t, imu.gyro, imu.accel)

@@ -6,7 +6,11 @@ Each gives (gram (k, k), vector (k,)) of normal equations of what the anchors' c
 further parameters are off by.
 """
 
+from typing import Union
+
 from .distance import Distance
 from .mark import Mark
 
-__all__ = ["Distance", "Mark"]
+Constraint = Union[Distance, Mark]
+
+__all__ = ["Constraint", "Distance", "Mark"]

@@ -1,9 +1,14 @@
 """A distance between two anchors, by laser or by radio."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
 
 @dataclass(frozen=True)
@@ -16,7 +21,7 @@ class Distance:
     std: float
     flight: ClassVar[None] = None  # it is of the anchors
 
-    def equations(self, anchors, columns):
+    def equations(self, anchors: Anchors, columns: int) -> tuple[np.ndarray, np.ndarray]:
         """The distance of two Anchors is off by what their shifts along the line between them tell. columns : number of
         parameters."""
         first, second = anchors.index(np.array([self.a, self.b]))

@@ -1,5 +1,7 @@
 """A place where the tag was."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +16,16 @@ class Mark:
     flight: str
     first: float
     last: float
-    position: tuple
+    position: tuple[float, ...]
     std: float
 
-    def stamps(self, begin):
+    def stamps(self, begin: float) -> np.ndarray:
         """(m,) s. begin : stamp of the first TDOA, s."""
         return begin + np.linspace(self.first, self.last, WITHIN)
 
-    def equations(self, t, estimate, covariance, moved):
+    def equations(
+        self, t: np.ndarray, estimate: np.ndarray, covariance: np.ndarray, moved: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The estimate, averaged over the mark, is off by what the parameters do to it.
 
         t (m,) s: `stamps`; estimate (m, 3) m, covariance (m, 3, 3) m^2, moved (m, 3, k): its derivative by the parameters, all at the stamps.
@@ -30,6 +34,6 @@ class Mark:
         weight = 1.0 / (np.diag(covariance[WITHIN // 2]) + self.std**2)
         return (columns * weight[:, None]).T @ columns, columns.T @ (weight * off)
 
-    def off(self, estimate, moved):
+    def off(self, estimate: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """((3,) m, by how much the estimate is off; (3, k), by how much it is less so for each unit of the parameters)."""
         return estimate.mean(axis=0) - self.position, moved.mean(axis=0)

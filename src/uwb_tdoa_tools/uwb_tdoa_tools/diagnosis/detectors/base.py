@@ -1,9 +1,18 @@
 """What a detector is."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import Effect
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..channels import ChannelResiduals
+    from ..regression.fit import Fit
+    from ..regression.table import Table
+    from ..regression.terms import Candidate
 
 
 @dataclass(frozen=True, eq=False)
@@ -12,7 +21,7 @@ class Detection:
 
     effect: Effect
     channel: str
-    evidence: dict
+    evidence: dict[str, float]
 
 
 class Detector:
@@ -22,14 +31,14 @@ class Detector:
     candidates of the selection (`search`). One without any is judged on what all others leave (`detect`).
     """
 
-    effect: ClassVar[type]
+    effect: ClassVar[type[Effect]]
     on_floor: ClassVar[bool] = False  # looks at what is near the floor, the others at what is in the air
     disguises: ClassVar[bool] = False  # what it searches for dominates its channel: unless found first, it counts as noise
 
-    def search(self, table, model, chosen):
+    def search(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
         """[Candidate] for the residual of `model`, a Fit of the chosen Candidates to the Table."""
         return []
 
-    def detect(self, residuals):
+    def detect(self, residuals: Sequence[ChannelResiduals]) -> Detection | None:
         """Detection in what the whole model leaves, [{channel: ChannelResidual}], one dict a flight; or None."""
         return None

@@ -1,5 +1,9 @@
 """Which anchors are late near the floor, and below which height."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.optimize import nnls
 
@@ -7,6 +11,12 @@ from uwb_tdoa_bias.effects import EFFECTS
 
 from ..regression.terms import Candidate, Term
 from .base import Detector
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from ..channels.tdoa import TdoaResidual
+    from ..regression.fit import Fit
+    from ..regression.table import Table
 
 NEAR = 0.4  # m above z = 0; higher up nobody has seen it
 HEIGHTS = np.geomspace(0.05, 0.3, 12)  # m, that are tried
@@ -28,8 +38,8 @@ class FloorMultipathDetector(Detector):
     effect = EFFECTS["floor_multipath"]
     on_floor = True
 
-    def search(self, table, model, chosen):
-        parts = [part for _, channel, _, part in table.parts if channel == "tdoa"]
+    def search(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
+        parts = table.tdoa_parts
         rows = table.rows_of("tdoa")
         place = table.place[rows]
         low = np.flatnonzero(place[:, 2] < NEAR)
@@ -58,7 +68,7 @@ class FloorMultipathDetector(Detector):
         return [Candidate((term,), 2.0 * np.log(len(HEIGHTS)) * len(some))]
 
 
-def _below(height, part):
+def _below(height: float, part: TdoaResidual) -> np.ndarray:
     """What a delay of each anchor adds to the rows of a TdoaResidual if it is late below a height, m, and never above: (n, anchors). A row of
     which nobody knows whether it is late would fit neither."""
     samples, low = part.samples, part.samples.p[:, 2] < height
@@ -69,10 +79,10 @@ def _below(height, part):
 class _Trials:
     """Delays of anchors in a residual (n,), m, of so many TDOAs (n,) each, below one of the heights of columns (heights, n, anchors)."""
 
-    def __init__(self, columns, residual, count):
+    def __init__(self, columns: np.ndarray, residual: np.ndarray, count: np.ndarray) -> None:
         self._columns, self._y, self._count = columns, residual, np.minimum(count, ENOUGH)
 
-    def best(self):
+    def best(self) -> tuple[np.ndarray, np.ndarray]:
         """(delays (anchors,) m, places of the heights (anchors,))."""
         count = self._columns.shape[2]
         at = self._best(np.full(count, k) for k in range(len(self._columns)))
@@ -83,17 +93,17 @@ class _Trials:
                 at = self._best(tried)
         return self._fit(at)[1], at
 
-    def _best(self, tried):
+    def _best(self, tried: Iterable[np.ndarray]) -> np.ndarray:
         return min(tried, key=lambda at: self._fit(at)[0])
 
-    def noises(self, at):
+    def noises(self, at: np.ndarray) -> np.ndarray:
         """(anchors,) m: standard deviation of what is left of each while it is late."""
         x = self._columns[at, :, np.arange(len(at))].T
         power = np.minimum(np.abs(self._y - x @ self._fit(at)[1]), WILD) ** 2
         root, both = np.sqrt(self._count), np.hstack([x**2, np.ones((len(x), 1))])
         return np.sqrt(nnls(root[:, None] * both, root * power)[0][:-1])
 
-    def _fit(self, at):
+    def _fit(self, at: np.ndarray) -> tuple[float, np.ndarray]:
         """(loss, delays) of robust least squares. None is early: else those that are on time could be, and the others not late."""
         x, weight = self._columns[at, :, np.arange(len(at))].T, self._count
         for _ in range(ITERATIONS):

@@ -1,6 +1,6 @@
 """Steps of the ground below the tag."""
 
-from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_bias.effects.floor_step import FloorStep
 
 from .intervals import IntervalDetector
 
@@ -8,4 +8,4 @@ from .intervals import IntervalDetector
 class FloorStepDetector(IntervalDetector):
     """Steps, one after the other."""
 
-    effect = EFFECTS["floor_step"]
+    effect = FloorStep

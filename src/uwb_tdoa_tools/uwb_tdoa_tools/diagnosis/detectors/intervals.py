@@ -1,9 +1,19 @@
 """Searches for intervals of a flight."""
 
+from __future__ import annotations
+
+from typing import ClassVar, TYPE_CHECKING
+
 import numpy as np
 
 from ..regression.terms import Candidate, Term
 from .base import Detector
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..regression.fit import Fit
+    from ..regression.table import Table
+    from uwb_tdoa_bias.effects.interval_error import IntervalEffect
 
 BIN = 1.0  # s
 SHORTEST = 2  # bins
@@ -11,7 +21,9 @@ LONGEST = 0.7  # share of a flight; what lasts longer is constant
 LEAST_GAIN = 10.0  # twice a log-likelihood
 
 
-def best_interval(t, score, power, prior, signed=False):
+def best_interval(
+    t: np.ndarray, score: np.ndarray, power: np.ndarray, prior: float, signed: bool = False
+) -> tuple[float, dict[str, float], float]:
     """Best (gain, {limit: value}, price of the search) over intervals of t (n,), s.
 
     score, power (n,): products with the residual and with itself of a regressor, both weighted; prior : information of what
@@ -37,9 +49,10 @@ def best_interval(t, score, power, prior, signed=False):
 class IntervalDetector(Detector):
     """Tries all intervals of one flight for an IntervalEffect."""
 
+    effect: ClassVar[type[IntervalEffect]]
     disguises = True
 
-    def search(self, table, model, chosen):
+    def search(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
         (channel,) = self.effect.channels
         if table.flights != 1 or channel not in table.present:  # only a flight alone has a time of its own
             return []

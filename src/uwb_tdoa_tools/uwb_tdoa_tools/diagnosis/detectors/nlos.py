@@ -1,5 +1,9 @@
 """An anchor that was blocked for a while, or from a region."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.distance import cdist
 
@@ -8,6 +12,11 @@ from uwb_tdoa_bias.effects import EFFECTS
 from ..regression.terms import Candidate, Term
 from .base import Detector
 from .intervals import LEAST_GAIN, LONGEST, best_interval
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..regression.fit import Fit
+    from ..regression.table import Table
 
 RADII = (0.6, 1.0, 1.5)  # m
 CENTRES = 60
@@ -19,9 +28,9 @@ class NlosDetector(Detector):
 
     effect = EFFECTS["nlos"]
 
-    def search(self, table, model, chosen):
+    def search(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
         rows = table.rows_of("tdoa")
-        part = next(part for _, channel, _, part in table.parts if channel == "tdoa")
+        part = table.tdoa_parts[0]
         a, b = part.arrivals(table.series[rows])
         information, residual = model.information(table)[rows], model.residual[rows]
         keys = {key for candidate in chosen if candidate.name == self.effect.name for key in candidate.terms[0].keys}
@@ -45,13 +54,13 @@ class NlosDetector(Detector):
 class _Spheres:
     """Spheres about some of the places (n, 3) m that were flown; the same for every anchor, so found once."""
 
-    def __init__(self, place):
+    def __init__(self, place: np.ndarray) -> None:
         self._centres = place[:: max(1, len(place) // CENTRES)]
         away = cdist(self._centres, place)
         self._inside = np.concatenate([away <= radius for radius in RADII]).astype(float)  # all of a radius after the other
         self._constant = self._inside.mean(axis=1) > LONGEST
 
-    def best(self, score, power):
+    def best(self, score: np.ndarray, power: np.ndarray) -> tuple[float, dict[str, float], float]:
         """Best (gain, {limit: value}, price of the search), as `best_interval`."""
         score, power = (self._inside @ np.stack([score, power], axis=1)).T
         gain = np.where(self._constant, 0.0, np.maximum(score, 0.0) ** 2 / (power + PRIOR))

@@ -1,11 +1,20 @@
 """Do errors outlast one measurement?"""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
 
 from .base import Detection, Detector
 from .series import series_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..channels import ChannelResiduals
+    from .series import Series
 
 SURE = 4.0  # standard errors
 LAGS = np.array([0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5])  # s, edges of the bins of the autocovariance
@@ -19,7 +28,7 @@ class NoiseCorrelationDetector(Detector):
 
     effect = EFFECTS["noise_correlation"]
 
-    def detect(self, residuals):
+    def detect(self, residuals: Sequence[ChannelResiduals]) -> Detection | None:
         sums = [_products(series) for series in series_of(residuals)]  # per block: products and counts by lag
         product, count = (np.concatenate([s[k] for s in sums]) for k in range(2))
         filled = count.sum(axis=0) > FEWEST
@@ -45,7 +54,7 @@ class NoiseCorrelationDetector(Detector):
         return Detection(effect, "tdoa", {"standard_errors": round(float(covariance[0] / error), 1)})
 
 
-def _products(series):
+def _products(series: Series) -> tuple[np.ndarray, np.ndarray]:
     """(blocks, bins) sums of products of residuals of one pair, and their counts, by the time between them."""
     scale = 1.4826 * np.median(np.abs(series.residual))
     label = series.label()

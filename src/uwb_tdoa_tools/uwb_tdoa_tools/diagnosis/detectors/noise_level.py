@@ -1,11 +1,20 @@
 """Is a pair noisier than the others?"""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
 
+from ..channels import tdoa_parts
 from .base import Detection, Detector
 from .series import series_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..channels import ChannelResiduals
 
 NEAR = 0.3  # s, within which two TDOAs of a pair share their slow error
 FEWEST, FEWEST_LINKS = 30, 3
@@ -18,9 +27,9 @@ class NoiseLevelDetector(Detector):
 
     effect = EFFECTS["noise_level"]
 
-    def detect(self, residuals):
-        ids = next(flight["tdoa"] for flight in residuals if "tdoa" in flight).samples.anchors.ids
-        steps = {}
+    def detect(self, residuals: Sequence[ChannelResiduals]) -> Detection | None:
+        ids = tdoa_parts(residuals)[0].samples.anchors.ids
+        steps: dict[int, list[np.ndarray]] = {}
         for series in series_of(residuals):
             first, second = series.steps()
             near = series.t[second] - series.t[first] < NEAR

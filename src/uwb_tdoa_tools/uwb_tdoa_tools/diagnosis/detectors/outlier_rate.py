@@ -1,11 +1,20 @@
 """How many TDOAs are plainly wrong?"""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
 
 from .base import Detection, Detector
 from .series import series_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..channels import ChannelResiduals
+    from .series import Series
 
 LEAST = 0.3  # m
 SPREADS = 5.0  # of what a pair scatters about the median of its neighbours in time
@@ -17,16 +26,16 @@ class OutlierRateDetector(Detector):
 
     effect = EFFECTS["outlier_rate"]
 
-    def detect(self, residuals):
+    def detect(self, residuals: Sequence[ChannelResiduals]) -> Detection | None:
         shares = [share for series in series_of(residuals) for share in _shares(series)]
-        share, error = np.mean(shares), np.std(shares) / np.sqrt(len(shares))
+        share, error = float(np.mean(shares)), float(np.std(shares) / np.sqrt(len(shares)))
         if share - 2.0 * error < self.effect.negligible:
             return None
         effect = self.effect({"share": share}, {"share": error}, "diagnose")
         return Detection(effect, "tdoa", {"standard_errors": round(float(share / max(error, 1e-9)), 1)})
 
 
-def _shares(series):
+def _shares(series: Series) -> list[float]:
     """Share of outliers in every block."""
     r = series.residual
     away = np.abs(r - np.median(np.stack([np.roll(r, k) for k in AROUND]), axis=0))

@@ -1,10 +1,19 @@
 """TDOA residuals in the air, sorted by pair and time: what the detectors of noise look at."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..channels import tdoa_parts
 from ..regression.table import BLOCK
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..channels import ChannelResiduals
+    from ..channels.tdoa import TdoaResidual
 
 
 @dataclass(frozen=True)
@@ -19,7 +28,7 @@ class Series:
     block: np.ndarray
 
     @classmethod
-    def of(cls, part):
+    def of(cls, part: TdoaResidual) -> Series:
         """Series of a TdoaResidual."""
         samples, rows = part.samples, np.flatnonzero(part.airborne)
         pair = samples.a * 100000 + samples.b
@@ -28,16 +37,16 @@ class Series:
         block = ((t - t.min()) / BLOCK).astype(int)
         return cls(t, part.residual[order], samples.a[order], samples.b[order], pair[order], block)
 
-    def steps(self, lag=1):
+    def steps(self, lag: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """(places, following places) of one pair, `lag` apart in order."""
         first = np.flatnonzero(self.pair[lag:] == self.pair[:-lag])
         return first, first + lag
 
-    def label(self):
+    def label(self) -> np.ndarray:
         """(n,) pairs numbered from 0 on without gaps."""
         return np.unique(self.pair, return_inverse=True)[1]
 
 
-def series_of(residuals):
+def series_of(residuals: Sequence[ChannelResiduals]) -> list[Series]:
     """[Series] of [{channel: ChannelResidual}]."""
-    return [Series.of(flight["tdoa"]) for flight in residuals if "tdoa" in flight]
+    return [Series.of(part) for part in tdoa_parts(residuals)]

@@ -1,6 +1,6 @@
 """A velocity that is lost for a while."""
 
-from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_bias.effects.velocity_slip import VelocitySlip
 
 from .intervals import IntervalDetector
 
@@ -8,4 +8,4 @@ from .intervals import IntervalDetector
 class VelocitySlipDetector(IntervalDetector):
     """Losses, one after the other."""
 
-    effect = EFFECTS["velocity_slip"]
+    effect = VelocitySlip

@@ -1,6 +1,6 @@
 """What a flight is compared with, and how well each coordinate of it is known. One kind of reference, one file."""
 
-from .base import Reference, View
+from .base import Reference, ReferenceView
 from .ground_truth import GroundTruth
 from .heights import Heights
 from .marks import Marks
@@ -10,4 +10,7 @@ from .path import OdometryPath
 
 REFERENCES = {"truth": GroundTruth, "heights": Heights, "marks": Marks, "odometry": Odometry, "nothing": Nothing}  # made of a FilterConfig and constraints
 
-__all__ = ["REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "Odometry", "OdometryPath", "Reference", "View"]
+__all__ = [
+    "REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "Odometry", "OdometryPath", "Reference",
+    "ReferenceView",
+]  # fmt: skip

@@ -1,7 +1,9 @@
 """What a reference is."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
@@ -10,17 +12,24 @@ from uwb_tdoa_bias.foundation.flight import Truth
 
 from ...scoring.metrics import airborne
 
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.effects import EffectSet
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from uwb_tdoa_ekf.sensitivity import Innovations
+    from ..constraints import Constraint
+
 MARGIN = 0.5  # s left out at both ends of the airborne part
 SHORTEST = 5.0  # s in the air that can be diagnosed
 
 
 @dataclass(frozen=True)
-class View:
+class ReferenceView:
     """Where a flight was, as far as a reference tells. poses : Truth, known or estimated; innovations : Innovations of the
     run that estimated them, None where they are known."""
 
     poses: Truth
-    innovations: object = None
+    innovations: Innovations | None = None
 
 
 class Reference:
@@ -33,26 +42,29 @@ class Reference:
     attitude_known: ClassVar[bool] = True
     knows_floor: ClassVar[bool] = False  # positions before lift-off and after landing, where an estimate may be metres off
     judges: ClassVar[bool] = True  # errors of the filter's positions can be told with it
-    words: ClassVar[str]  # what a report says the figures rest on
+    constraints: tuple[Constraint, ...] = ()  # what is known beside (`diagnosis/constraints`)
+    words: str  # what a report says the figures rest on
 
-    def prepare(self, flight):
+    def prepare(self, flight: Flight) -> Flight:
         """The Flight without what must not be used. Raises InputError where it lacks what the reference is."""
         return flight
 
-    def settled(self, flight, base, config=None):
+    def settled(
+        self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
+    ) -> tuple[Flight, tuple[str, ...]]:
         """(Flight, sentences): a prepared one, in which what this compares with was put right where it is plainly wrong itself. base :
         EffectSet that is in the model; config : FilterConfig."""
         return flight, ()
 
-    def view(self, flight, effects):
-        """View of a prepared Flight under the EffectSet `effects`."""
+    def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
+        """ReferenceView of a prepared Flight under the EffectSet `effects`."""
         raise NotImplementedError
 
-    def shift_std(self, name):
+    def shift_std(self, name: str) -> np.ndarray:
         """(3,) m: standard deviation of what all positions of the prepared flight of a name may be off by together, each axis."""
         return np.zeros(3)
 
-    def span(self, flight, poses):
+    def span(self, flight: Flight, poses: Truth) -> tuple[float, float]:
         """(first, last) stamp, s, of what is diagnosed: in the air, without its ends. Raises InputError if that is short."""
         first, last = airborne(poses)
         first, last = first + MARGIN, last - MARGIN

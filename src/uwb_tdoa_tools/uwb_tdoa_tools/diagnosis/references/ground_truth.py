@@ -1,11 +1,23 @@
 """Motion capture: every pose is known."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ...scoring.alignment import NONE
 from ...scoring.settling import settled
-from .base import Reference, View
+from .base import Reference, ReferenceView
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.effects import EffectSet
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from ..constraints import Constraint
+    from .path import OdometryPath
 
 
 class GroundTruth(Reference):
@@ -14,17 +26,24 @@ class GroundTruth(Reference):
     words = "the recorded ground truth"
     knows_floor = True
 
-    def __init__(self, config=None, constraints=(), align=NONE):
+    def __init__(
+        self, config: FilterConfig | None = None, constraints: Sequence[Constraint | OdometryPath] = (),
+        align: str = NONE,
+    ) -> None:  # fmt: skip
         """config : FilterConfig and constraints, which no known pose needs; align : as of `settled`."""
         self._align = align
 
-    def prepare(self, flight):
+    def prepare(self, flight: Flight) -> Flight:
         if flight.truth is None or len(flight.truth) < 2:
             raise InputError(f"{flight.name}: holds no ground truth to compare with; give --no-truth.")
         return flight
 
-    def settled(self, flight, base, config=None):
+    def settled(
+        self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
+    ) -> tuple[Flight, tuple[str, ...]]:
         return settled(flight, base, config, self._align)
 
-    def view(self, flight, effects):
-        return View(shifted(flight, "truth", -effects.stamp_offset("truth")).truth)
+    def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
+        truth = shifted(flight, "truth", -effects.stamp_offset("truth")).truth
+        assert truth is not None  # `prepare` has refused a flight without
+        return ReferenceView(truth)

@@ -1,17 +1,27 @@
 """No reference: the filter's own estimate is all there is."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.sensitivity import record_innovations
 
-from .base import Reference, View
+from .base import Reference, ReferenceView
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.effects import EffectSet
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from ..constraints import Constraint
 
 TRUTHS = "_truth"  # how streams are called in which a simulation tells what was true
 
 
-def without_truth(flight):
+def without_truth(flight: Flight) -> Flight:
     """The Flight without anything of where it really was."""
     extra = {name: stream for name, stream in flight.extra.items() if not name.endswith(TRUTHS)}
     return replace(flight, truth=None, extra=extra)
@@ -26,14 +36,14 @@ class Nothing(Reference):
     judges = False
     words = "nothing but the flights themselves"
 
-    def __init__(self, config=None, constraints=()):
+    def __init__(self, config: FilterConfig | None = None, constraints: Sequence[Constraint] = ()) -> None:
         """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`)."""
         self._config, self.constraints = config, tuple(constraints)
 
-    def prepare(self, flight):
+    def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)
 
-    def view(self, flight, effects):
+    def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
         innovations = record_innovations(flight, self._config, Corrector(flight.anchors, effects))
         estimate = innovations.run.odometry
-        return View(Truth(estimate.t, estimate.p, estimate.q), innovations)
+        return ReferenceView(Truth(estimate.t, estimate.p, estimate.q), innovations)

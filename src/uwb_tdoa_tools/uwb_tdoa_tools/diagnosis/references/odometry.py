@@ -1,6 +1,9 @@
 """Another odometry or SLAM, whose frame is its own and drifts."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +15,12 @@ from uwb_tdoa_ekf.smoother import smooth
 from .ground_truth import GroundTruth
 from .nothing import without_truth
 from .path import SPACING, OdometryPath
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from ..constraints import Constraint
 
 FEWEST = 5  # stamps to lay it beside the filter's path
 
@@ -26,15 +35,17 @@ class Odometry(GroundTruth):
     attitude_known = False
     knows_floor = False  # the path begins and ends above it
 
-    def __init__(self, config=None, constraints=()):
+    def __init__(
+        self, config: FilterConfig | None = None, constraints: Sequence[Constraint | OdometryPath] = ()
+    ) -> None:
         """config : FilterConfig; constraints : OdometryPaths, and Marks that lie on them."""
         self._config, self._paths = config, {one.flight: one for one in constraints if isinstance(one, OdometryPath)}
         self._marks = [one for one in constraints if one.flight is not None and not isinstance(one, OdometryPath)]
         through = "laid through marks" if self._marks else "laid beside the filter's path: a shift of all of a flight is not seen"
-        self._shift_std = {}
+        self._shift_std: dict[str, float] = {}
         self.words = f"another odometry in a frame of its own, {through}"
 
-    def prepare(self, flight):
+    def prepare(self, flight: Flight) -> Flight:
         path = self._paths.get(flight.name)
         if path is None:
             raise InputError(f"{flight.name}: --odometry holds no path of it; record one, or give --no-truth.")
@@ -42,7 +53,7 @@ class Odometry(GroundTruth):
         own = smooth(alone, self._config, Corrector(flight.anchors)).odometry
         first, last = path.aloft or (0.0, 0.0)  # by itself: laid a little too high, the time on the floor would count as in the air
         chosen = (own.t >= first) & (own.t <= last)
-        t = np.arange(*own.t[chosen][[0, -1]], SPACING) if chosen.any() else ()
+        t = np.arange(own.t[chosen][0], own.t[chosen][-1], SPACING) if chosen.any() else np.empty(0)
         if len(t) < FEWEST:
             raise InputError(f"{flight.name}: its odometry is above the floor for {len(t)} stamps only; fly for half a minute.")
         estimate = np.stack([np.interp(t, own.t, column) for column in own.p.T], axis=1)
@@ -50,5 +61,5 @@ class Odometry(GroundTruth):
         p, self._shift_std[flight.name] = path.laid(t, estimate, marks, begin, own.t[chosen])
         return replace(alone, truth=Truth(own.t[chosen], p, own.q[chosen]))
 
-    def shift_std(self, name):
+    def shift_std(self, name: str) -> np.ndarray:
         return np.full(3, self._shift_std[name])

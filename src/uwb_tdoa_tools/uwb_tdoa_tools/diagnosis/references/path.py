@@ -1,9 +1,16 @@
 """The path of another odometry or SLAM, in a frame of its own."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..constraints import Mark
 
 SPACING = 2.0  # s between the stamps at which it is compared
 ALOFT = 0.3  # m above where it was lowest from which on it counts: on the floor TDOAs are metres off
@@ -25,17 +32,19 @@ class OdometryPath:
     p: np.ndarray
     drift: float
 
-    def at(self, t):
+    def at(self, t: np.ndarray) -> np.ndarray:
         """(m, 3) m in its own frame."""
         return np.stack([np.interp(t, self.t, column) for column in self.p.T], axis=1)
 
     @property
-    def aloft(self):
+    def aloft(self) -> tuple[float, float] | None:
         """(first, last) s: between which it was above where it was lowest by ALOFT; None if it never was."""
         high = self.t[self.p[:, 2] > self.p[:, 2].min() + ALOFT]
         return (float(high[0]), float(high[-1])) if len(high) else None
 
-    def laid(self, t, estimate, marks, begin, wanted):
+    def laid(
+        self, t: np.ndarray, estimate: np.ndarray, marks: Sequence[Mark], begin: float, wanted: np.ndarray
+    ) -> tuple[np.ndarray, float]:
         """Where the tag was at stamps `wanted` (k,), in the frame of an estimate (m, 3) m at stamps t (m,) and of Marks: (k, 3) m; and
         standard deviation of what all of that is off by together, each axis, m.
 
@@ -60,7 +69,7 @@ class OdometryPath:
         std = np.sqrt(self._walk(some, some).mean() - mean @ information @ mean)
         return turn.apply(self.at(wanted)) + shift + cross @ (information @ away), float(std)
 
-    def _walk(self, one, other):
+    def _walk(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         """(k, n) m^2: covariance of one axis of where the frame is, at stamps one (k,) and other (n,)."""
         since = np.minimum(one[:, None], other) - self.t[0]
         return FRAME_STD**2 + self.drift**2 * np.maximum(since, 0.0)

@@ -1,6 +1,9 @@
 """What a finding could be mistaken for in these very flights, and what the flights cannot tell at all."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,6 +11,11 @@ from uwb_tdoa_bias.effects import EFFECTS
 
 from .fit import prior_sizes
 from .terms import columns_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .select import Selection
+    from .terms import Candidate, Column
 
 ALIKE = 0.9  # share of a finding's contribution that another effect would explain as well
 DISTINCT = 0.4  # smallest weight that is worth naming in a direction
@@ -32,10 +40,10 @@ class Unobservable:
     no channel there."""
 
     effect: str
-    direction: dict | None
+    direction: dict[str, float] | None
 
 
-def flight_to_tell(effect, other):
+def flight_to_tell(effect: str, other: str) -> str:
     """Which flight would tell two effects apart, by name: a sentence."""
     for name, opposite in ((effect, other), (other, effect)):
         sentence = EFFECTS[name].distinguished_by.get(opposite) if name in EFFECTS else None
@@ -44,7 +52,7 @@ def flight_to_tell(effect, other):
     return ANY_FLIGHT
 
 
-def alternatives(selection, candidate, candidates):
+def alternatives(selection: Selection, candidate: Candidate, candidates: Sequence[Candidate]) -> list[Alternative]:
     """[Alternative] of a chosen Candidate, the nearest first: `candidates`, all declared ones, that explain at least ALIKE
     of what it contributes beyond the rest of the model, and rivals whose criterion is as good."""
     rivals = selection.rivals[selection.chosen.index(candidate)]
@@ -56,7 +64,7 @@ def alternatives(selection, candidate, candidates):
     ]
 
 
-def _shares(selection, candidate, candidates):
+def _shares(selection: Selection, candidate: Candidate, candidates: Sequence[Candidate]) -> dict[str, float]:
     table, model = selection.table, selection.fit
     root = np.sqrt(model.information(table))
     others = columns_of([one for one in selection.chosen if one is not candidate])
@@ -65,11 +73,12 @@ def _shares(selection, candidate, candidates):
         rest = np.vstack([table.matrix(others) * root[:, None], np.diag(1.0 / prior_sizes(others))])
         basis = np.linalg.qr(rest)[0][: len(root)]
 
-    def free(x):
+    def free(x: np.ndarray) -> np.ndarray:
         return x if basis is None else x - basis @ (basis.T @ x)
 
     part = free((table.matrix(candidate.columns) @ model.values(candidate.columns)) * root)
-    power, out = float(part @ part), {}
+    power = float(part @ part)
+    out: dict[str, float] = {}
     for name, columns in _whole(candidates).items():
         columns = [column for column in columns if column not in others]
         if name == candidate.name or not columns or power == 0.0:
@@ -82,15 +91,15 @@ def _shares(selection, candidate, candidates):
     return out
 
 
-def _whole(candidates):
+def _whole(candidates: Sequence[Candidate]) -> dict[str, Sequence[Column]]:
     """{effect: all its Columns}: the first set of an effect is all of it."""
-    out = {}
+    out: dict[str, Sequence[Column]] = {}
     for candidate in candidates:
         out.setdefault(candidate.name, candidate.columns)
     return out
 
 
-def unobservable(selection, candidates):
+def unobservable(selection: Selection, candidates: Sequence[Candidate]) -> list[Unobservable]:
     """[Unobservable]: combinations of parameters of a declared effect of which the flights tell less than plausibility
     does, by the eigenvectors of the information of a fit of that effect alone."""
     table, out = selection.table, []

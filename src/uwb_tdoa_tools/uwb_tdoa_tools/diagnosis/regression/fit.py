@@ -5,11 +5,19 @@ Taylor, JASA 1989). Rows are not independent: each axis of a channel has a scale
 channel is divided by an inflation that is measured on the residuals of blocks.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .table import AXES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .table import Table
+    from .terms import Column
 
 NU = 4.0
 ITERATIONS = 12
@@ -22,7 +30,7 @@ class Fit:
     """columns, beta (k,), cov (k, k): block sandwich, not below the model's; residual (n,), weight (n,) 0 to 1.25;
     scale, inflation, size (groups,): spread of a row, loss of independence, effective number of rows."""
 
-    columns: tuple
+    columns: tuple[Column, ...]
     beta: np.ndarray
     cov: np.ndarray
     residual: np.ndarray
@@ -31,23 +39,23 @@ class Fit:
     inflation: np.ndarray
     size: np.ndarray
 
-    def information(self, table):
+    def information(self, table: Table) -> np.ndarray:
         """What each row of the Table counts for, (n,), in independent rows per squared unit."""
         return self.weight / (self.scale**2 * self.inflation)[table.group]
 
-    def likelihood(self, table):
+    def likelihood(self, table: Table) -> float:
         """Twice the log-likelihood of Student's t, in independent rows, less what the prior says of beta."""
         scale = self.scale[table.group]
         rows = 2.0 * np.log(scale) + (NU + 1.0) * np.log1p((self.residual / scale) ** 2 / NU)
         return -float(np.sum(rows / self.inflation[table.group]) + np.sum((self.beta / prior_sizes(self.columns)) ** 2))
 
-    def values(self, columns):
+    def values(self, columns: Sequence[Column]) -> np.ndarray:
         """beta of some Columns, (k,)."""
         place = {column: k for k, column in enumerate(self.columns)}
         return self.beta[[place[column] for column in columns]]
 
 
-def solve(gram, vector, sizes):
+def solve(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Solution of normal equations with a Gaussian prior of standard deviations `sizes`: (beta, covariance, number of
     parameters that the data tell: each counts by how little the prior says of it). What the data do not tell stays
     0."""
@@ -59,12 +67,12 @@ def solve(gram, vector, sizes):
     return cov @ vector, cov, float(len(vector) - np.trace(inverse))
 
 
-def prior_sizes(columns):
+def prior_sizes(columns: Sequence[Column]) -> np.ndarray:
     """Plausible sizes of Columns: (k,)."""
     return np.array([column.typical for column in columns])
 
 
-def fit(table, columns, inflation=None):
+def fit(table: Table, columns: Sequence[Column], inflation: np.ndarray | None = None) -> Fit:
     """Fit of some Columns of a Table. inflation : (groups,), measured on this very fit if None."""
     x, group, sizes = table.matrix(columns), table.group, prior_sizes(columns)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
@@ -91,7 +99,7 @@ def fit(table, columns, inflation=None):
     return Fit(tuple(columns), beta, cov, residual, weight, scale, inflation, np.maximum(size, 1.0))
 
 
-def refit(table, columns, model, rows=None):
+def refit(table: Table, columns: Sequence[Column], model: Fit, rows: np.ndarray | None = None) -> Fit:
     """Fit of some Columns with the weights and scales of another Fit; rows : (n,) bool, those that it is made to alone, with the
     covariance of the model."""
     x, sizes, root = table.matrix(columns), prior_sizes(columns), model.information(table)
@@ -104,7 +112,7 @@ def refit(table, columns, model, rows=None):
     return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=residual)
 
 
-def _scales(table, residual):
+def _scales(table: Table, residual: np.ndarray) -> np.ndarray:
     """Scale of Student's t per group, by the fixed point of its likelihood."""
     out = _one_each(table)
     for k, rows in table.groups:
@@ -112,12 +120,12 @@ def _scales(table, residual):
     return out
 
 
-def _one_each(table):
+def _one_each(table: Table) -> np.ndarray:
     """(groups,) of 1, of all channels whether they have rows or not."""
     return np.ones(AXES * len(table.channels))
 
 
-def student_scale(r):
+def student_scale(r: np.ndarray) -> float:
     """Scale of Student's t for residuals r (n,)."""
     scale = max(1.4826 * np.median(np.abs(r)), 1e-9)
     for _ in range(15):
@@ -126,7 +134,7 @@ def student_scale(r):
     return scale
 
 
-def _covariance(table, x, residual, root, sizes):
+def _covariance(table: Table, x: np.ndarray, residual: np.ndarray, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Sandwich over blocks, at least the model's own."""
     _, bread, _ = solve((x * root[:, None]).T @ x, np.zeros(x.shape[1]), sizes)
     blocks = int(table.block.max()) + 1
@@ -140,7 +148,9 @@ def _covariance(table, x, residual, root, sizes):
     return sandwich * np.outer(grow, grow)
 
 
-def measure_inflation(table, residual, weight, scale, columns):
+def measure_inflation(
+    table: Table, residual: np.ndarray, weight: np.ndarray, scale: np.ndarray, columns: Sequence[Column]
+) -> np.ndarray:
     """By how much fewer the independent rows of each channel are: (groups,), at least 1. Of its axes the median: what one has that the
     others have not is an effect.
 
@@ -162,7 +172,7 @@ def measure_inflation(table, residual, weight, scale, columns):
     return out
 
 
-def _temporal(table, rows, r):
+def _temporal(table: Table, rows: np.ndarray | slice, r: np.ndarray) -> float:
     key, t = table.flight[rows] * 100000 + table.series[rows], table.t[rows]
     order, total = np.lexsort((t, key)), 1.0
     for lag in range(1, 13):
@@ -178,7 +188,7 @@ def _temporal(table, rows, r):
     return total
 
 
-def _clustered(blocks, x, r):
+def _clustered(blocks: np.ndarray, x: np.ndarray, r: np.ndarray) -> float:
     block = np.unique(blocks, return_inverse=True)[1]
     count, ratios = block.max() + 1, []
     if count < MIN_BLOCKS:

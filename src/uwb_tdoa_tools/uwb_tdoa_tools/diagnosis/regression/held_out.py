@@ -1,11 +1,21 @@
 """What a term is worth on data that did not take part in fitting it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .fit import NU, prior_sizes, solve
 from .terms import columns_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .fit import Fit
+    from .select import Selection
+    from .table import Table
+    from .terms import Column
 
 FOLDS = 4
 CLIP = 5.0  # spreads that an outlier counts as
@@ -21,7 +31,7 @@ class HeldOut:
     explained: float
 
 
-def held_out(selection, by_flight=False):
+def held_out(selection: Selection, by_flight: bool = False) -> list[HeldOut]:
     """[HeldOut] of every chosen Candidate: fitted with and without it on the other folds, with the weights and scales of
     the whole fit. by_flight : a fold is a flight; else blocks are dealt out in turn."""
     table, model, chosen = selection.table, selection.fit, selection.chosen
@@ -32,8 +42,8 @@ def held_out(selection, by_flight=False):
         rest = folds.residual(columns_of(chosen[:k] + chosen[k + 1 :]))
         touched = np.any(table.matrix(candidate.columns) != 0.0, axis=1)
         gain = (_loss(table, model, rest) - _loss(table, model, whole)) / model.inflation[table.group]
-        sums = np.bincount(table.block[touched], gain[touched])
-        sums = sums[np.unique(table.block[touched])] if touched.any() else np.zeros(1)
+        blocks, of_blocks = np.unique(table.block[touched]), np.bincount(table.block[touched], gain[touched])
+        sums = of_blocks[blocks] if touched.any() else np.zeros(1)
         t = sums.sum() / max(np.sqrt(len(sums)) * sums.std(), 1e-9)
         out.append(HeldOut(float(sums.sum()), float(t), _explained(table, model, rest, whole, touched)))
     return out
@@ -42,7 +52,7 @@ def held_out(selection, by_flight=False):
 class _Folds:
     """Normal equations of all columns, fold by fold."""
 
-    def __init__(self, table, model, columns, folds):
+    def __init__(self, table: Table, model: Fit, columns: Sequence[Column], folds: np.ndarray) -> None:
         self.table, self.folds = table, folds
         self._place = {column: k for k, column in enumerate(columns)}
         self._x, self._sizes = table.matrix(columns), prior_sizes(columns)
@@ -53,7 +63,7 @@ class _Folds:
             self._parts[fold] = weighted[rows].T @ self._x[rows], weighted[rows].T @ table.y[rows]
         self._gram, self._vector = (sum(part[k] for part in self._parts.values()) for k in range(2))
 
-    def residual(self, columns):
+    def residual(self, columns: Sequence[Column]) -> np.ndarray:
         """Residual of every row under the fit of the other folds: (n,)."""
         out = self.table.y.copy()
         if not columns:
@@ -66,12 +76,12 @@ class _Folds:
         return out
 
 
-def _loss(table, model, residual):
+def _loss(table: Table, model: Fit, residual: np.ndarray) -> np.ndarray:
     """Minus twice the log-likelihood of Student's t, row by row."""
     return (NU + 1.0) * np.log1p((residual / model.scale[table.group]) ** 2 / NU)
 
 
-def _explained(table, model, before, after, touched):
+def _explained(table: Table, model: Fit, before: np.ndarray, after: np.ndarray, touched: np.ndarray) -> float:
     """Share of the variance, with outliers at CLIP spreads, that goes from `before` to `after` in the group that gains most, over the
     rows (n,) bool that are touched."""
     best = 0.0

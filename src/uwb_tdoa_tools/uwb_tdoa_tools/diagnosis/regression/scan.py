@@ -6,7 +6,10 @@ model holds already (Schur complement), give all shapes of a subset and a covari
 candidates and are judged like all others; they pay for the number that was looked at.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +20,14 @@ from uwb_tdoa_bias.effects.shapes import SHAPES
 from .fit import prior_sizes, refit
 from .terms import Candidate, Term, columns_of
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from ..channels.views import CovariateView
+    from .fit import Fit
+    from .table import Table
+
+    _Item = tuple[float, "_Shapes", str, tuple[float, ...], int]  # gain, shapes, shape, knots, how many were tried
+
 BINS = 16  # between whose edges steps, intervals and rises begin and end
 PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of a wave between the ends
 WIDEST = 10  # bins of an interval; a longer one is two steps
@@ -25,7 +36,7 @@ NOISY = 1.5  # times the noise of most series that any may have
 FINER = 9  # places between two bins where a knot is tried again
 FEWEST = 12  # values of a subset
 PROPOSED = 16  # functions
-SHAPES_FIRST = 3  # of one View
+SHAPES_FIRST = 3  # of one CovariateView
 HUBER = 3.0  # scales; a larger residual counts as that of a heavy tail, but more than in Student's t
 LEAST_GAIN = 20.0  # twice a log-likelihood
 _ENDS = np.array([(first, last) for first in range(3) for last in (-1, -2, -3)])  # edges between which a line rises
@@ -33,28 +44,29 @@ ANGLES = ("bearing", "bearing_in_tag", "bearing_in_anchor")
 
 
 class _Shapes:
-    """A View as columns x (k, columns) at `rows` of a Table; edges (bins + 1,)."""
+    """A CovariateView as columns x (k, columns) at `rows` of a Table; edges (bins + 1,)."""
 
-    def __init__(self, view, offset, edges):
+    def __init__(self, view: CovariateView, offset: int, edges: np.ndarray) -> None:
         """offset : first row of the channel."""
-        self.view, self.offset, self.edges, self.x = view, offset, edges, 0.0
+        self.view, self.offset, self.edges = view, offset, edges
         used = np.flatnonzero(np.any([(signs != 0.0) for signs, _ in view.sides], axis=0))
+        x: np.ndarray = np.zeros(())
         for signs, values in view.sides:
             known = np.where(np.isfinite(values[used]), signs[used], 0.0)
-            self.x = self.x + known[:, None] * _columns(np.nan_to_num(values[used]), edges, view.covariate)
+            x = x + known[:, None] * _columns(np.nan_to_num(values[used]), edges, view.covariate)
         if view.cell is not None:
             used, cell = np.unique(view.cell[used], return_inverse=True)
-            self.x = np.stack([np.bincount(cell, column) for column in self.x.T], axis=1) / np.bincount(cell)[:, None]
-        self.x = self.x.astype(np.float32)  # of all views together the most that a diagnosis holds
+            x = np.stack([np.bincount(cell, column) for column in x.T], axis=1) / np.bincount(cell)[:, None]
+        self.x = x.astype(np.float32)  # of all views together the most that a diagnosis holds
         self.rows = used + offset
 
 
 class Scan:
     """All shapes of all views of a Table's channels: called as `search` of `select`."""
 
-    def __init__(self, table, views):
-        """views : {channel: [View]}, of the rows of each channel."""
-        groups = {}
+    def __init__(self, table: Table, views: Mapping[str, Sequence[CovariateView]]) -> None:
+        """views : {channel: [CovariateView]}, of the rows of each channel."""
+        groups: dict[tuple[int, bool, bool], list[_Shapes]] = {}
         for channel, some in views.items():
             for view, edges in ((view, _edges(view)) for view in some):
                 if edges is not None:
@@ -62,9 +74,9 @@ class Scan:
                     groups.setdefault(kind, []).append(_Shapes(view, table.rows_of(channel).start, edges))
         self._groups = [_Group(several, WIDEST) for several in groups.values()]
         self.even = _noise_of_series(table) ** -2.0  # weights (n,) that are fair to noisy series, and know no outliers
-        self._price = SmoothTerm.price + 2.0 * np.log(max(sum(map(len, groups.values())), 1))
+        self._price = SmoothTerm.price + 2.0 * np.log(max(sum(len(several) for several in groups.values()), 1))
 
-    def __call__(self, table, model, chosen):
+    def __call__(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
         """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows. What looks like outliers to
         the fit counts for more: it may be what acts on a few rows alone. Series that are noisier than others count for less."""
         scale = HUBER * model.scale[table.group] / np.sqrt(self.even)
@@ -75,7 +87,7 @@ class Scan:
         found = _best_first(table, [self._refined(table, model, chosen, item) for item in found])
         return [self._candidate(*item[1:]) for item in _various(found)]
 
-    def _refined(self, table, model, chosen, item):
+    def _refined(self, table: Table, model: Fit, chosen: Sequence[Candidate], item: _Item) -> _Item:
         """An item of `gains` with its inner knots moved by parts of a bin, if that gains more."""
         gain, shapes, shape, knots, tried = item
         if len(knots) < 3 or shapes.view.covariate in CATEGORIES:
@@ -88,21 +100,21 @@ class Scan:
         best = max(moved, key=lambda each: each[0], default=item)
         return (*best[:4], tried * FINER) if best[0] > gain else item
 
-    def gains(self, table, model, chosen):
+    def gains(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[_Item]:
         """[(gain, _Shapes, shape, knots, how many were tried)], the best first after what its coefficients and its search cost: what a
         Fit of the chosen Candidates would gain, twice a log-likelihood, with the weights that it has."""
         held = _held(table, model, chosen)
         found = [item for group in self._groups for item in group.best(*held)]
         return _best_first(table, found)
 
-    def _candidate(self, shapes, shape, knots, tried):
+    def _candidate(self, shapes: _Shapes, shape: str, knots: tuple[float, ...], tried: int) -> Candidate:
         view = shapes.view
         effect = SmoothTerm(channel=view.channel, covariate=view.covariate, form=view.form, knots=knots, shape=shape)
         keys = effect.keys_of((view.key,))
         return Candidate((Term(effect, keys),), self._price + 2.0 * np.log(tried))
 
 
-def _noise_of_series(table):
+def _noise_of_series(table: Table) -> np.ndarray:
     """How much noisier the series of each row is than most of its group, (n,), at least 1: by differences of successive rows, of
     which steps and trends are a small part."""
     order = np.lexsort((table.t, table.series, table.flight, table.channel))
@@ -117,17 +129,19 @@ def _noise_of_series(table):
     return np.maximum(out, 1.0)
 
 
-def _various(found):
-    """Items of `gains` in their order, but of one View no more than SHAPES_FIRST before those of others: a dozen shapes of one
-    function are one idea."""
-    early, late, count = [], [], {}
+def _various(found: Iterable[_Item]) -> list[_Item]:
+    """Items of `gains` in their order, but of one CovariateView no more than SHAPES_FIRST before those of others: a
+    dozen shapes of one function are one idea."""
+    early: list[_Item] = []
+    late: list[_Item] = []
+    count: dict[int, int] = {}
     for item in found:
         count[id(item[1].view)] = count.get(id(item[1].view), 0) + 1
         (early if count[id(item[1].view)] <= SHAPES_FIRST else late).append(item)
     return early + late
 
 
-def _best_first(table, found):
+def _best_first(table: Table, found: Iterable[_Item]) -> list[_Item]:
     costs = {shape: count * np.log(len(table.y)) for shape, (_, count) in SHAPES.items()}
     return sorted(found, key=lambda item: costs[item[2]] + 2.0 * np.log(item[4]) - item[0])
 
@@ -135,7 +149,7 @@ def _best_first(table, found):
 class _Group:
     """Shapes with as many columns, judged together."""
 
-    def __init__(self, several, widest):
+    def __init__(self, several: list[_Shapes], widest: int) -> None:
         """several : [_Shapes]; widest : bins of an interval."""
         view, edges = several[0].view, several[0].edges
         self._several, n = several, len(edges) - 1
@@ -145,7 +159,7 @@ class _Group:
         good = (i > 0) & ((j == n) | (j - i <= widest))
         self._from, self._to = i[good], j[good]
 
-    def best(self, held, information, residual):
+    def best(self, held: np.ndarray, information: np.ndarray, residual: np.ndarray) -> list[_Item]:
         """[(gain, _Shapes, shape, knots, tried)]: the best of each shape of each view, with how many were tried.
 
         held (n, k): an orthonormal base, weighted, of what the model holds.
@@ -156,11 +170,11 @@ class _Group:
         level, cross = vector[:, :n].sum(axis=1)[:, None], own[:, :, :n].sum(axis=2)
         power = cross[:, :n].sum(axis=1)[:, None] + prior
 
-        def of_one(first, crossed, square):
+        def of_one(first: np.ndarray, crossed: np.ndarray, square: np.ndarray) -> np.ndarray:
             rest = square + prior - crossed**2 / power
             return level**2 / power + (first - crossed * level / power) ** 2 / np.maximum(rest, 1e-9 * (square + prior))
 
-        def of_two(first, second):
+        def of_two(first: np.ndarray, second: np.ndarray) -> np.ndarray:
             small = np.empty((len(vector), len(first), 3, 3))
             some = np.empty((len(vector), len(first), 3))
             places = first, second
@@ -195,7 +209,9 @@ class _Group:
             *self._pick("wave", of_two(at, at + waves), None),
         ]
 
-    def _pick(self, shape, gains, knots):
+    def _pick(
+        self, shape: str, gains: np.ndarray, knots: Callable[[np.ndarray, int], Iterable[float]] | None
+    ) -> Iterator[_Item]:
         """The best of the gains (views, tried) of each view."""
         if not gains.shape[1]:
             return
@@ -206,20 +222,22 @@ class _Group:
             yield float(gains[row, k]), shapes, shape, tuple(map(float, at)), gains.shape[1]
 
 
-def _prior(view):
+def _prior(view: CovariateView) -> float:
     """Information that stands for plausible sizes of its functions."""
     line = SmoothTerm(channel=view.channel, covariate=view.covariate, form=view.form, knots=(0.0, 1.0), shape="line")
     return line.typical_of("c0") ** -2
 
 
-def _products(shapes, held, information, residual):
+def _products(
+    shapes: _Shapes, held: np.ndarray, information: np.ndarray, residual: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Of the columns with the residual (columns,), and with each other (columns, columns) free of what is held."""
     weighted = shapes.x * information[shapes.rows, None]
     half = held[shapes.rows].T @ weighted
     return weighted.T @ residual[shapes.rows], weighted.T @ shapes.x - half.T @ half
 
 
-def _held(table, model, chosen):
+def _held(table: Table, model: Fit, chosen: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(orthonormal base, weighted, of what the chosen Candidates hold (n, k), information (n,), residual (n,))."""
     information, base = model.information(table), columns_of(chosen)
     b = table.matrix(base)
@@ -227,7 +245,7 @@ def _held(table, model, chosen):
     return b @ np.linalg.cholesky(np.linalg.inv(gram)) if base else b, information, model.residual
 
 
-def _edges(view):
+def _edges(view: CovariateView) -> np.ndarray | None:
     """Edges of its bins, quantiles of the covariate; None where it hardly varies."""
     counted = np.concatenate([values[signs != 0.0] for signs, values in view.sides])
     counted = counted[np.isfinite(counted)]
@@ -244,7 +262,7 @@ def _edges(view):
     return edges if len(edges) > 2 * len(set(_ENDS[:, 0])) else None
 
 
-def _columns(v, edges, covariate):
+def _columns(v: np.ndarray, edges: np.ndarray, covariate: str) -> np.ndarray:
     """Bins, lines, rises beyond and below the inner edges, sines, cosines, squares of the lines: (n, columns)."""
     low, high = edges[0], edges[-1]
     held = np.clip(v, low, high)
@@ -259,7 +277,7 @@ def _columns(v, edges, covariate):
     return np.hstack([bins, lines, beyond, below, np.sin(phase), np.cos(phase), lines**2])
 
 
-def _periods(edges, covariate):
+def _periods(edges: np.ndarray, covariate: str) -> np.ndarray:
     if covariate in ANGLES:
         return 2.0 * np.pi / np.arange(1, 4)
     return (edges[-1] - edges[0]) / np.array(PERIODS)

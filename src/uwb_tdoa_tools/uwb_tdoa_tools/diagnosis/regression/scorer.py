@@ -4,12 +4,21 @@ All that candidates need of the rows is computed for all of them at once: produc
 (an axis of a channel). A candidate is then a small system of equations on top of that of the base (Schur complement).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .fit import prior_sizes, solve
 from .table import AXES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .fit import Fit
+    from .table import Table
+    from .terms import Candidate, Column
 
 AT_ONCE = 128  # columns whose products with the base are made together, so that a copy of all of them is never held
 
@@ -27,7 +36,7 @@ class Gain:
 class Scorer:
     """Judges sets of Columns on top of a base, with the weights, scales and inflation of one Fit."""
 
-    def __init__(self, table, base, model, others):
+    def __init__(self, table: Table, base: Sequence[Column], model: Fit, others: Sequence[Column]) -> None:
         """base : Columns that are in the model already; model : Fit, whose weights count; others : Columns that may be
         judged."""
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
@@ -38,16 +47,16 @@ class Scorer:
         self._channels = [table.channels[group // AXES] for group, _ in table.groups]
         self._sizes = prior_sizes(list(self._place))
         sizes = self._sizes[self._base]
-        gram = sum(part.cross[:, self._base] for part in self._parts)
-        vector = sum(part.vector[self._base] for part in self._parts)
+        gram = sum((part.cross[:, self._base] for part in self._parts), start=np.zeros(()))
+        vector = sum((part.vector[self._base] for part in self._parts), start=np.zeros(()))
         beta, _, self._determined = solve(gram, vector, sizes)
         self._inverse = np.linalg.inv(gram * np.outer(sizes, sizes) + np.eye(len(sizes))) if len(sizes) else gram
         self._squares = [part.squares(beta, self._base) for part in self._parts]
         self._penalty = float(np.sum((beta / sizes) ** 2))
 
-    def _part(self, table, columns, root, rows):
+    def _part(self, table: Table, columns: list[Column], root: np.ndarray, rows: np.ndarray | slice) -> _Part:
         root, y = root[rows], table.y[rows]
-        weighted = (table.matrix([columns[place] for place in self._base], rows) * root[:, None]).T
+        weighted = (table.matrix([columns[place] for place in self._base.tolist()], rows) * root[:, None]).T
         cross, vector = np.empty((len(self._base), len(columns))), np.empty(len(columns))
         for first in range(0, len(columns), AT_ONCE):
             some = slice(first, first + AT_ONCE)
@@ -55,7 +64,7 @@ class Scorer:
             cross[:, some], vector[some] = weighted @ x, x.T @ (root * y)
         return _Part(table, columns, rows, root, cross, vector, float(root @ y**2))
 
-    def judge(self, columns):
+    def judge(self, columns: Sequence[Column]) -> Gain | None:
         """Gain of having some Columns too; None if all are there already."""
         all_places = np.array([self._place[column] for column in columns])
         new = np.unique(all_places[all_places >= len(self._base)])
@@ -77,7 +86,7 @@ class Scorer:
         values = dict(zip(both.tolist(), beta.tolist()))
         return Gain(np.array([values[place] for place in all_places.tolist()]), float(determined - self._determined), float(gain))
 
-    def price(self, candidate, determined, choices):
+    def price(self, candidate: Candidate, determined: float, choices: int) -> float:
         """What the parameters of a Candidate, `determined` of them by the data, must at least gain, if it is one of `choices`."""
         rows = sum(size for size, name in zip(self._group_sizes, self._channels) if name in candidate.channels)
         return determined * np.log(max(rows, 10.0)) + 2.0 * np.log(max(choices, 2)) + candidate.price
@@ -88,19 +97,19 @@ class _Part:
     """One group: its rows in a Table of some columns, with weights root (n,); cross (base, k) and vector (k,): X' W X and X' W y;
     power : y' W y."""
 
-    table: object
-    columns: list
-    rows: object
+    table: Table
+    columns: list[Column]
+    rows: np.ndarray | slice
     root: np.ndarray
     cross: np.ndarray
     vector: np.ndarray
     power: float
 
-    def gram(self, places):
+    def gram(self, places: np.ndarray) -> np.ndarray:
         x = self.table.matrix([self.columns[place] for place in places], self.rows)
         return x.T @ (x * self.root[:, None])
 
-    def squares(self, beta, places, own=None):
+    def squares(self, beta: np.ndarray, places: np.ndarray, own: np.ndarray | None = None) -> float:
         """Weighted sum of squares that beta (k,) of the columns at `places`, those of the base first, leaves. own : gram
         of those after the base."""
         base = self.cross.shape[0]

@@ -5,7 +5,10 @@ independent rows. A parameter costs log(rows) as in the Bayesian information cri
 costs 2 log C (Chen and Chen, Biometrika 2008, extended BIC): that holds the false-alarm rate of the whole catalogue.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import Any, Protocol, TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +18,11 @@ from .scorer import Scorer
 from .table import Table
 from .terms import columns_of
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Sequence
+    from .scan import Scan
+    from .terms import Candidate
+
 MAX_STEPS = 14
 FITTED = 6  # of what a scan proposes
 FEW, LARGE, GOOD_PART = 3, 6, 0.5  # columns of one and of a group, and the share of its criterion that the one must reach
@@ -23,12 +31,20 @@ AMBIGUOUS = 10.0  # less difference in the criterion is no decision
 ALIKE = 0.1  # share of the criterion by which a function may be worse than another one that it is much like
 
 
+class Search(Protocol):
+    """What finds more Candidates for the residual of a Fit of the chosen ones to a Table."""
+
+    def __call__(self, table: Table, model: Fit, chosen: Sequence[Candidate], /) -> list[Candidate]:
+        """They, none or several."""
+        ...
+
+
 @dataclass(frozen=True)
 class Rival:
     """A Candidate that could stand in the place of a chosen one, and by how much its criterion is worse."""
 
     gap: float
-    candidate: object
+    candidate: Candidate
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,34 +53,37 @@ class Selection:
     criterion that each is worth beside the others; rivals : for each, (Rival, ...), once somebody has looked for them."""
 
     table: Table
-    chosen: tuple
+    chosen: tuple[Candidate, ...]
     fit: Fit
-    loss: tuple
-    rivals: tuple
+    loss: tuple[float, ...]
+    rivals: tuple[tuple[Rival, ...], ...]
 
-    def only(self, candidates):
+    def only(self, candidates: Collection[Candidate]) -> Selection:
         """Selection of some of the chosen Candidates, fitted anew."""
         chosen = self._chosen_of(candidates)
         return replace(self, **chosen, fit=fit(self.table, columns_of(chosen["chosen"]), self.fit.inflation))
 
-    def kept(self, candidates):
+    def kept(self, candidates: Collection[Candidate]) -> Selection:
         """Selection of some of the chosen Candidates, fitted with the present weights: what the others explain is not taken for
         outliers."""
         chosen = self._chosen_of(candidates)
         return replace(self, **chosen, fit=refit(self.table, columns_of(chosen["chosen"]), self.fit))
 
-    def _chosen_of(self, candidates):
+    def _chosen_of(self, candidates: Collection[Candidate]) -> dict[str, Any]:
         places = [k for k, candidate in enumerate(self.chosen) if candidate in candidates]
         return {name: tuple(getattr(self, name)[k] for k in places) for name in ("chosen", "loss", "rivals")}
 
-    def plus(self, candidate):
+    def plus(self, candidate: Candidate) -> Selection:
         """Selection with one more Candidate, whose columns the table has."""
         chosen = (*self.chosen, candidate)
         model = fit(self.table, columns_of(chosen), self.fit.inflation)
         return replace(self, chosen=chosen, fit=model, loss=(*self.loss, 0.0), rivals=(*self.rivals, ()))
 
 
-def select(table, candidates, inflation, search=None, scan=None, start=(), progress=lambda: None):
+def select(
+    table: Table, candidates: list[Candidate], inflation: np.ndarray, search: Search | None = None,
+    scan: Scan | None = None, start: Iterable[Candidate] = (), progress: Callable[[], object] = lambda: None,
+) -> Selection:  # fmt: skip
     """Selection among `candidates`, whose columns the Table holds.
 
     search(table, fit, chosen) -> more Candidates, found for this residual; scan : a Scan, of whose Candidates the first few are fitted,
@@ -74,11 +93,11 @@ def select(table, candidates, inflation, search=None, scan=None, start=(), progr
     chosen = list(start)
     model = fit(table, columns_of(chosen), inflation)
     for _ in range(MAX_STEPS):
-        scanned = scan(table, model, chosen) if scan else []
+        scanned, even = (scan(table, model, chosen), scan.even) if scan else ([], np.empty(0))
         found = (search(table, model, chosen) if search else []) + scanned[FITTED:]
         wider = table.with_terms([term for candidate in found for term in candidate.terms])
         ranked = rank(wider, candidates + found, chosen, model)
-        ranked += [(_fitted(table, chosen, model, one, len(candidates), scan.even), one) for one in scanned[:FITTED]]
+        ranked += [(_fitted(table, chosen, model, one, len(candidates), even), one) for one in scanned[:FITTED]]
         ranked.sort(key=lambda item: -item[0])
         progress()
         if not ranked or ranked[0][0] <= 0.0:
@@ -93,7 +112,7 @@ def select(table, candidates, inflation, search=None, scan=None, start=(), progr
     return Selection(table, tuple(chosen), model, tuple(loss), ((),) * len(chosen))
 
 
-def _sparse_first(ranked):
+def _sparse_first(ranked: list[tuple[float, Candidate]]) -> Candidate:
     """The best Candidate; if that is a large group, the best of few parameters that does a good part of what it does: what
     the group is needed for besides will show."""
     criterion, best = ranked[0]
@@ -101,7 +120,9 @@ def _sparse_first(ranked):
     return best if len(best.columns) <= LARGE else next(few, best)
 
 
-def _fitted(table, chosen, model, candidate, choices, even):
+def _fitted(
+    table: Table, chosen: Sequence[Candidate], model: Fit, candidate: Candidate, choices: int, even: np.ndarray
+) -> float:
     """Criterion of one Candidate more, by the likelihoods of both fits, or by least squares with the weights `even`, (n,), if that
     says less: the one believes what noisy series show by chance, the other what outliers do. Minus infinity for what nobody would
     model."""
@@ -114,11 +135,12 @@ def _fitted(table, chosen, model, candidate, choices, even):
     if judged is None:  # the model holds it
         return -np.inf
     least_squares = Scorer(table, columns_of(chosen), replace(wider, weight=even), candidate.columns).judge(candidate.columns)
+    assert least_squares is not None  # nor is it then
     gain = min(wider.likelihood(table) - model.likelihood(table), least_squares.gain)
     return gain - scorer.price(candidate, judged.determined, choices)
 
 
-def worth(selection, choices):
+def worth(selection: Selection, choices: int) -> float:
     """Criterion of a whole Selection: what its fit explains, less the price of all that is chosen."""
     chosen, total = selection.chosen, selection.fit.likelihood(selection.table)
     for k, candidate in enumerate(chosen):
@@ -128,7 +150,9 @@ def worth(selection, choices):
     return total
 
 
-def rank(table, candidates, chosen, model):
+def rank(
+    table: Table, candidates: Sequence[Candidate], chosen: Sequence[Candidate], model: Fit
+) -> list[tuple[float, Candidate]]:
     """[(criterion, Candidate)], best first; without those that are far from worth it, of negligible or of impossible size."""
     scorer, out = Scorer(table, columns_of(chosen), model, columns_of(candidates)), []
     for candidate in candidates:
@@ -141,7 +165,7 @@ def rank(table, candidates, chosen, model):
     return sorted(out, key=lambda item: -item[0])
 
 
-def acceptable(table, candidate, beta):
+def acceptable(table: Table, candidate: Candidate, beta: np.ndarray) -> bool:
     """Whether values beta (k,) of a Candidate could be, and move a channel by more than what nobody would model."""
     if not (candidate.sizable(beta) and candidate.plausible(beta)):
         return False
@@ -154,7 +178,7 @@ def acceptable(table, candidate, beta):
     return False
 
 
-def _backward(table, chosen, model, choices):
+def _backward(table: Table, chosen: list[Candidate], model: Fit, choices: int) -> tuple[list[Candidate], Fit]:
     """Drop what is no longer worth its price, once others are in, or has become negligible or impossible."""
     while len(chosen) > 1:
         losses = _losses(table, chosen, model, choices)
@@ -169,7 +193,7 @@ def _backward(table, chosen, model, choices):
     return chosen, model
 
 
-def _losses(table, chosen, model, choices):
+def _losses(table: Table, chosen: list[Candidate], model: Fit, choices: int) -> list[float]:
     """Criterion that each chosen Candidate is worth beside the others."""
     out = []
     for k, candidate in enumerate(chosen):
@@ -182,7 +206,9 @@ def _losses(table, chosen, model, choices):
     return out
 
 
-def with_rivals(selection, candidates, scan, progress):
+def with_rivals(
+    selection: Selection, candidates: list[Candidate], scan: Scan | None, progress: Callable[[], object]
+) -> Selection:
     """Selection with, for each chosen Candidate, the other effects that could replace it, and functions that would do nearly
     as much. scan : Scan of functions, or None."""
     table, chosen, model, out = selection.table, list(selection.chosen), selection.fit, []
@@ -196,8 +222,10 @@ def with_rivals(selection, candidates, scan, progress):
         several = [c for c in candidates + found if c.title != candidate.title]
         ranked = rank(wider, [*several, candidate], others, rest)
         own = next((score for score, ranked_one in ranked if ranked_one is candidate), None)
-        near = {}
-        for score, other in ranked if own is not None else []:
+        near: dict[str, Rival] = {}
+        for score, other in ranked:
+            if own is None:
+                break
             least = own - (AMBIGUOUS if other.declared else max(AMBIGUOUS, ALIKE * own))
             if other is not candidate and score > least and set(other.channels) & set(candidate.channels):
                 near.setdefault(other.title, Rival(float(own - score), other))

@@ -1,11 +1,20 @@
 """Residuals of several flights and channels, and regressors, as one immutable table of a linear fit."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..channels import CHANNELS
+from ..channels import CHANNELS, TdoaResidual
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Iterable, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from ..channels import ChannelResidual, ChannelResiduals
+    from .terms import Column, Term
 
 BLOCK = 5.0  # s, taken as independent of each other
 AXES = 3  # of a channel at most
@@ -21,7 +30,7 @@ class Table:
     parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column: (n,)}, X, whose columns tables share.
     """
 
-    channels: tuple
+    channels: tuple[str, ...]
     y: np.ndarray
     channel: np.ndarray
     group: np.ndarray
@@ -31,45 +40,50 @@ class Table:
     t: np.ndarray
     count: np.ndarray
     place: np.ndarray
-    parts: tuple
-    columns: dict
+    parts: tuple[tuple[int, str, int, ChannelResidual], ...]
+    columns: dict[Column, np.ndarray]
 
     @property
-    def present(self):
+    def present(self) -> tuple[str, ...]:
         """Names of the channels that have rows."""
         return tuple(self.channels[place] for place in np.unique(self.channel))
 
+    @property
+    def tdoa_parts(self) -> list[TdoaResidual]:
+        """Of its parts those of TDOAs."""
+        return [part for *_, part in self.parts if isinstance(part, TdoaResidual)]
+
     @cached_property
-    def groups(self):
+    def groups(self) -> list[tuple[int, slice | np.ndarray]]:
         """[(number, rows)] of the groups that have rows: a slice, where they lie together, or bool (n,)."""
         return [(k, self._rows_of_group(k)) for k in np.unique(self.group).tolist()]
 
-    def _rows_of_group(self, group):
+    def _rows_of_group(self, group: int) -> slice | np.ndarray:
         inside = self.group == group
         first, count = int(np.argmax(inside)), int(inside.sum())
         together = slice(first, first + count)
         return together if inside[together].all() else inside
 
     @property
-    def flights(self):
+    def flights(self) -> int:
         """How many."""
         return int(self.flight.max()) + 1
 
-    def rows_of(self, channel):
+    def rows_of(self, channel: str) -> slice:
         """Slice of the rows of a channel, by its name."""
         place = self.channels.index(channel)
         return slice(*np.searchsorted(self.channel, [place, place + 1]))
 
-    def matrix(self, columns, rows=slice(None)):
+    def matrix(self, columns: Sequence[Column], rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """X of some Columns, (n, k), or some of its rows."""
         out = np.empty((len(self.y[rows]), len(columns)), order="F")
         for place, column in enumerate(columns):
             out[:, place] = self.columns[column][rows]
         return out
 
-    def with_terms(self, terms):
+    def with_terms(self, terms: Iterable[Term]) -> Table:
         """A Table that has the columns of some Terms too, at the values that their effects have."""
-        wanted = {}
+        wanted: dict[Hashable, tuple[Effect, dict[str, Column]]] = {}
         for term in terms:
             effect, keys = wanted.setdefault(term.effect.identity, (term.effect, {}))
             keys.update((column.key, column) for column in term.columns if column not in self.columns)
@@ -86,7 +100,7 @@ class Table:
             columns.update(zip(keys.values(), x.T))
         return replace(self, columns=columns)
 
-    def with_contribution(self, effects):
+    def with_contribution(self, effects: Iterable[tuple[Effect, Sequence[Column]]]) -> Table:
         """A Table whose y also holds what Effects, at their values, contribute; it has their columns."""
         y = self.y.copy()
         for effect, columns in effects:
@@ -95,9 +109,10 @@ class Table:
         return replace(self, y=y)
 
 
-def table_of(residuals):
+def table_of(residuals: Sequence[ChannelResiduals]) -> Table:
     """Table without columns of [{name of a channel: ChannelResidual}], one dict for each flight."""
-    parts, pieces = [], {key: [] for key in ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")}
+    parts, each = [], ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
+    pieces: dict[str, list[np.ndarray]] = {key: [] for key in each}
     rows = [{name: part.rows() for name, part in flight.items()} for flight in residuals]
     start = [min(part.t.min() for part in flight.values()) for flight in rows]
     blocks = [1 + max(int((part.t.max() - t) / BLOCK) for part in flight.values()) for flight, t in zip(rows, start)]

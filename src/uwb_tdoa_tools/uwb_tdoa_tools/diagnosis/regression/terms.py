@@ -1,17 +1,24 @@
 """What a fit gives values: parameters of effects."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
-from uwb_tdoa_bias.effects import Effect
+from uwb_tdoa_bias.effects import Effect, SmoothTerm
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Iterable
+    import numpy as np
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
 
 class Column(NamedTuple):
     """A parameter of an effect, as a regressor. effect : identity of the Effect; key : name of the parameter; typical :
     plausible size, in its unit: standard deviation of its prior."""
 
-    effect: tuple
+    effect: tuple[Hashable, ...]
     key: str
     typical: float
 
@@ -21,73 +28,78 @@ class Term:
     """An Effect and those of its parameters, `keys`, that a fit gives values. Values that it has already are fixed."""
 
     effect: Effect
-    keys: tuple
+    keys: tuple[str, ...]
 
     @cached_property
-    def columns(self):
+    def columns(self) -> tuple[Column, ...]:
         """A Column for each of the keys."""
         effect = self.effect
         return tuple(Column(effect.identity, key, effect.typical_of(key)) for key in self.keys)
+
+    @property
+    def function(self) -> SmoothTerm | None:
+        """Its Effect, if that is a function without a name."""
+        return self.effect if isinstance(self.effect, SmoothTerm) else None
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """Terms that come into a model together. price : of the search that found them, twice a log-likelihood."""
 
-    terms: tuple
+    terms: tuple[Term, ...]
     price: float = 0.0
 
     @cached_property
-    def columns(self):
+    def columns(self) -> tuple[Column, ...]:
         """The Columns of all terms."""
         return tuple(column for term in self.terms for column in term.columns)
 
     @property
-    def channels(self):
+    def channels(self) -> tuple[str, ...]:
         """Names of the channels where it acts."""
         return tuple(dict.fromkeys(name for term in self.terms for name in term.effect.channels))
 
     @property
-    def name(self):
+    def name(self) -> str:
         """Name of its effect."""
         return self.terms[0].effect.name
 
     @property
-    def title(self):
+    def title(self) -> str:
         """Name of its effect, or what a function without a name depends on."""
         return self.name if self.declared else self.label
 
     @property
-    def declared(self):
+    def declared(self) -> bool:
         """Whether it is in the catalogue, not a function without a name."""
-        return not self.terms[0].effect.settings
+        return self.terms[0].function is None
 
     @property
-    def label(self):
+    def label(self) -> str:
         """How it is called in reports."""
-        labels = [term.effect.label_of(term.keys) for term in self.terms]
-        return labels[0] + "".join(f" + {term.effect.covariate}" for term in self.terms[1:])
+        more = (f" + {term.function.covariate}" for term in self.terms[1:] if term.function)
+        return "".join((self.terms[0].effect.label_of(self.terms[0].keys), *more))
 
-    def plausible(self, beta):
+    def plausible(self, beta: np.ndarray) -> bool:
         """Whether values of its columns, (k,), could be."""
         values = dict(zip(((column.effect, column.key) for column in self.columns), beta.tolist()))
         return all(
             term.effect.plausible({key: values[term.effect.identity, key] for key in term.keys}) for term in self.terms
         )
 
-    def sizable(self, beta):
+    def sizable(self, beta: np.ndarray) -> bool:
         """Whether at least half of the values of its columns, (k,), are worth having; a smaller group says as much."""
         limits = [term.effect.negligible for term in self.terms for _ in term.keys]
         return sum(abs(value) >= limit for value, limit in zip(beta.tolist(), limits)) >= 0.5 * len(limits)
 
 
-def candidates_of(effect, anchors, pairs):
+def candidates_of(effect: Effect, anchors: Anchors, pairs: np.ndarray) -> list[Candidate]:
     """A Candidate for every set of parameters of an Effect that makes sense, the full set first. anchors : Anchors;
     pairs : (m, 2) ids of the pairs that were heard."""
     sets = [keys for keys in effect.groups(anchors, pairs) if keys]
     return [Candidate((Term(effect, tuple(keys)),), effect.price) for keys in sets]
 
 
-def columns_of(candidates):
+def columns_of(candidates: Iterable[Candidate]) -> list[Column]:
     """All Columns of some Candidates, each once: list."""
     return list(dict.fromkeys(column for candidate in candidates for column in candidate.columns))

@@ -1,19 +1,26 @@
 """Positions and delays of anchors that were found: values that make the data fit, which is not the same as a survey."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..prior import DELAY, POSITION
 from .markup import paragraphs, section, table
+
+if TYPE_CHECKING:
+    from ..diagnose import Diagnosis
 
 TITLE = "Values that make these data fit; measure again before you move an anchor"
 HEAD = ("anchor", "x, cm", "y, cm", "z, cm", "late by, cm")
 SURE = 2.0  # standard deviations from which a value is marked
 
 
-def rows(diagnosis):
+def rows(diagnosis: Diagnosis) -> list[list[str]]:
     """[[cell]] of a table, those of HEAD first that have any value, then a row for each anchor of which a position or a delay was found; []
     without any."""
-    found = {}
+    found: dict[str, dict[str, tuple[float, float]]] = {}
     for finding in diagnosis.findings:
         if finding.effect.name in (POSITION, DELAY) and not finding.on_floor and finding.flight is None:
             for key, value in finding.effect.values.items():
@@ -24,7 +31,7 @@ def rows(diagnosis):
     return [list(row) for row in zip(*told)]
 
 
-def _cell(known):
+def _cell(known: tuple[float, float] | None) -> str:
     if known is None:
         return ""
     value, std = known
@@ -32,7 +39,7 @@ def _cell(known):
     return f"{100.0 * value:+.0f} ± {100.0 * std:.0f}{'' if sure else ' ?'}"
 
 
-def lines(diagnosis):
+def lines(diagnosis: Diagnosis) -> list[str]:
     """The same for the screen."""
     several = rows(diagnosis)
     if not several:
@@ -40,7 +47,7 @@ def lines(diagnosis):
     return [f"{TITLE} (? less than {SURE:g} standard deviations):", *("".join(f"{cell:>12s}" for cell in row) for row in several)]
 
 
-def fitted(diagnosis):
+def fitted(diagnosis: Diagnosis) -> str:
     """The section of the page; "" without any."""
     several = rows(diagnosis)
     if not several:

@@ -1,5 +1,9 @@
 """Curves: the error over time, what measurements leave, and functions without a name."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.effects.covariates import UNITS
@@ -13,6 +17,16 @@ from .pictures import AFTER, BEFORE, COLOURS, FULL, WIDTH, drawing, embedded
 from .room import changed, flown
 from .runs import CM, labels
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from matplotlib.figure import Figure
+    from uwb_tdoa_bias.effects import SmoothTerm
+    from ..channels import ChannelResiduals
+    from ..diagnose import Diagnosis
+    from .room import Flown
+
+    _Curve = tuple[str, str, Flown]  # title, colour
+
 BINS = 300  # of a curve over time; of each the largest is drawn
 MOST = 12  # flights whose errors are drawn
 PAIRS, FEWEST = 16, 20  # that are drawn, and measurements of each
@@ -21,7 +35,7 @@ POINTS = 3000  # of a series of residuals
 ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 2, "frameon": False}  # of a legend
 
 
-def errors_over_time(diagnosis):
+def errors_over_time(diagnosis: Diagnosis) -> str:
     """Markup: the 3D error of every judged flight before and after, the largest marked."""
     sides = [("before", BEFORE, diagnosis.before), ("after", AFTER, diagnosis.after)] if changed(diagnosis) else []
     sides = sides or [("error", AFTER, diagnosis.before)]
@@ -39,14 +53,14 @@ def errors_over_time(diagnosis):
     return paragraphs([note], "note") + "".join(_errors(name, each, top) for name, each in runs[:MOST])
 
 
-def _errors(name, each, top):
+def _errors(name: str, each: Sequence[_Curve], top: float) -> str:
     """One picture; each : [(title, colour, Flown)]; top : cm, largest error that is to be seen."""
     largest = listed(f"{CM * run.distance.max():.0f} cm ({title})" for title, _, run in each)
     wide, narrow = (_drawn_errors(name, each, top, width) for width in (FULL, WIDTH))
     return embedded(wide, f"Position error over time, {name}: at most {largest}", narrow=narrow)
 
 
-def _drawn_errors(name, each, top, width):
+def _drawn_errors(name: str, each: Sequence[_Curve], top: float, width: float) -> Figure:
     figure, ax = drawing(2.4, width)
     peaks = []
     for title, colour, run in each:
@@ -68,7 +82,7 @@ def _drawn_errors(name, each, top, width):
     return figure
 
 
-def _peaks(t, values):
+def _peaks(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A series with the largest value of each of some bins."""
     if len(t) <= BINS:
         return t, values
@@ -77,7 +91,7 @@ def _peaks(t, values):
     return t[starts], largest
 
 
-def residual_series(diagnosis):
+def residual_series(diagnosis: Diagnosis) -> str:
     """Markup: what every channel leaves in the first flight, before and after."""
     before, after = (_series(found[0]) for found in (diagnosis.attribution.residuals, diagnosis.remaining))
     note = (
@@ -91,12 +105,12 @@ def residual_series(diagnosis):
     )
 
 
-def _series(flight):
+def _series(flight: ChannelResiduals) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """{channel: (stamps, residuals)} of {channel: ChannelResidual}."""
     return {label: series for part in flight.values() for label, series in part.series().items()}
 
 
-def _residuals(name, *sides):
+def _residuals(name: str, *sides: tuple[np.ndarray, np.ndarray]) -> str:
     figure, ax = drawing(1.8)
     for side, colour, title in zip(sides, (BEFORE, AFTER), ("before", "after")):
         t, r = (values[:: max(1, len(values) // POINTS)] for values in side)
@@ -112,7 +126,7 @@ def _residuals(name, *sides):
     return embedded(figure, f"Residual of {name} over time, standard deviation {scatter}")
 
 
-def pairs(diagnosis):
+def pairs(diagnosis: Diagnosis) -> str:
     """Markup: offset and scatter of every pair of anchors, before and after."""
     after = {item["pair"]: item for item in health(diagnosis.remaining)["pairs"]}
     before = {
@@ -129,7 +143,7 @@ def pairs(diagnosis):
     return embedded(wide, "Offset and scatter of the residual of every pair of anchors, before and after", caption, narrow)
 
 
-def _drawn_pairs(names, sides, width):
+def _drawn_pairs(names: Sequence[str], sides: tuple[dict[str, Any], dict[str, Any]], width: float) -> Figure:
     before, after = sides
     figure, ax = drawing(3.0, width)
     for shift, side, colour, title in ((-0.15, before, BEFORE, "before"), (0.15, after, AFTER, "after")):
@@ -143,12 +157,12 @@ def _drawn_pairs(names, sides, width):
     return figure
 
 
-def functions(diagnosis):
+def functions(diagnosis: Diagnosis) -> str:
     """Markup: functions without a name, in the model or not."""
-    return grid([_function(f.effect) for f in diagnosis.findings if not f.declared][:FUNCTIONS])
+    return grid([_function(finding.function) for finding in diagnosis.findings if finding.function][:FUNCTIONS])
 
 
-def _function(effect):
+def _function(effect: SmoothTerm) -> str:
     at = np.linspace(effect.knots[0], effect.knots[-1], 60)
     prefixes = sorted({key.rpartition("c")[0] for key in effect.values})
     figure, ax = drawing(2.6)

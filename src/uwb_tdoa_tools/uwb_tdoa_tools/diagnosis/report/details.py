@@ -1,6 +1,9 @@
 """What is there for who wants to know more: values, errors, residuals, health, words."""
 
+from __future__ import annotations
+
 from html import escape
+from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.effects.wording import rounded, significant
 
@@ -12,8 +15,13 @@ from .markup import folded, paragraphs, table
 from .runs import CM, labels
 from .words import used
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from ..channels.base import Figures
+    from ..diagnose import Diagnosis
 
-def details(diagnosis):
+
+def details(diagnosis: Diagnosis) -> list[str]:
     """Folded parts."""
     return [
         folded("Every value in effects.yaml", _values(diagnosis)),
@@ -27,13 +35,13 @@ def details(diagnosis):
     ]
 
 
-def terms(text):
+def terms(text: str) -> str:
     """Meanings of the terms that a text uses."""
     rows = "".join(f"<dt><b>{escape(name)}</b></dt><dd>{escape(meaning)}</dd>" for name, meaning in used(text).items())
     return folded("What abbreviations and names of effects mean", f"<dl>{rows}</dl>" if rows else "")
 
 
-def _values(diagnosis):
+def _values(diagnosis: Diagnosis) -> str:
     note = (
         "Standard deviations are those of the fit. A value smaller than two of them is not significant: by itself "
         "it could be chance, beside the others it may still help. Values without one were set, not estimated. "
@@ -46,7 +54,8 @@ def _values(diagnosis):
             std, (unit, factor) = effect.std.get(key), for_people(effect.unit, key)
             sure = "" if std is None else ("yes" if key in known else "no")
             spread = None if std is None else factor * std
-            rows.append((effect.name, key, rounded(factor * value, spread), "" if std is None else rounded(spread, spread), unit, sure))
+            error = "" if spread is None else rounded(spread, spread)
+            rows.append((effect.name, key, rounded(factor * value, spread), error, unit, sure))
     if not rows:
         return ""
     head = ("effect", "parameter", "value", "standard deviation", "unit", "significant")
@@ -62,7 +71,7 @@ EVIDENCE = {
 }
 
 
-def _evidence(diagnosis):
+def _evidence(diagnosis: Diagnosis) -> str:
     if not diagnosis.findings:
         return ""
     note = (
@@ -88,7 +97,7 @@ FIGURES = (  # key, title, factor
 )  # fmt: skip
 
 
-def _errors(diagnosis):
+def _errors(diagnosis: Diagnosis) -> str:
     before, after = diagnosis.before, diagnosis.after
     shown = [item for item in FIGURES if before["pooled"].get(item[0]) is not None]
     names = [*labels(diagnosis), "all"]
@@ -105,7 +114,7 @@ def _errors(diagnosis):
     return paragraphs([note], "note") + table(head, rows, numbers=range(1, len(head)))
 
 
-def phases(diagnosis):
+def phases(diagnosis: Diagnosis) -> str:
     """The error of every run in each phase of its recording, before and after."""
     sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
     found = [[row.get("phases", {}) for row in side] for side in sides]
@@ -125,30 +134,31 @@ def phases(diagnosis):
     return paragraphs([note], "note") + _of_phases(names, few) + rest
 
 
-def _of_phases(names, columns):
+def _of_phases(names: Sequence[str], columns: Mapping[str, Sequence[dict[str, Any]]]) -> str:
     """A row for each phase, a column for each run."""
     rows = [(TITLES[name], *(_phase(first.get(name), second.get(name)) for first, second in columns.values())) for name in names]
     return table(("", *columns), rows, numbers=range(1, 1 + len(columns)))
 
 
-def _phase(*sides):
+def _phase(before: dict[str, Any] | None, after: dict[str, Any] | None) -> str:
     """A cell of figures of one phase, before and after."""
-    if None in sides:
+    if before is None or after is None:
         return ""
+    sides = before, after
     errors, judged = (" → ".join(_figure(side, key, "", factor) for side in sides) for key, factor in (("rmse_3d", CM), ("nees_mean", 1.0)))
     return f"{errors}; NEES {judged}"
 
 
-def _figure(row, key, title, factor):
+def _figure(row: dict[str, Any], key: str, title: str, factor: float) -> str:
     value = row.get(key)
     return "?" if value is None else f"{value * factor:.{1 if factor > 1.0 else 2}f}"
 
 
-def _interval(row):
+def _interval(row: dict[str, Any]) -> str:
     return " to ".join(f"{bound * CM:.1f}" for bound in row["rmse_3d_ci"] or ()) or "?"
 
 
-def _refused(diagnosis):
+def _refused(diagnosis: Diagnosis) -> str:
     added = {finding.effect.label for finding in diagnosis.findings if finding.added}
     rows = [
         (f"a further part of {item.what}" if item.what in added else item.what, item.why) for item in diagnosis.refused
@@ -156,7 +166,7 @@ def _refused(diagnosis):
     return table(("what", "why not"), rows) if rows else ""
 
 
-def _health(health):
+def _health(health: Figures) -> str:
     note = (
         "Offset: median of what is left; scatter: its spread, as standard deviation of the bulk; far off: share "
         "beyond four times the scatter; likeness: correlation with what is left 0.1 s later, 0 for white noise. "
@@ -179,7 +189,7 @@ def _health(health):
     return "".join(parts)
 
 
-def _row(item, name):
+def _row(item: dict[str, Any], name: str) -> tuple[Any, ...]:
     near = next(iter((item.get("autocorrelation") or {}).values()), None)
     offset, scatter = (f"{item[key]:.2g}" for key in ("bias", "spread"))
     return item[name], item["count"], offset, scatter, f"{item['tails']:.1%}", "" if near is None else f"{near:.2f}"

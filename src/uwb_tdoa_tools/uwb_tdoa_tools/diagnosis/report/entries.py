@@ -1,7 +1,10 @@
 """Findings as a reader wants them: what came into the model together is one entry, with its worth and its doubts."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +12,13 @@ from uwb_tdoa_bias.effects import LabelEffect
 from uwb_tdoa_bias.effects.wording import listed, measured, significant
 
 from ..over_flights import in_words
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Iterable, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from ..diagnose import Diagnosis
+    from ..findings import Finding, Refused
+    from ..regression.confounding import Alternative
 
 CM = 100.0  # in a metre
 OR = "or"
@@ -27,52 +37,53 @@ class Entry:
     "" for what is added; alternatives : (Alternative, ...).
     """
 
-    findings: tuple
+    findings: tuple[Finding, ...]
     title: str
     values: str
     why_not: str
-    alternatives: tuple
+    alternatives: tuple[Alternative, ...]
 
     @property
-    def added(self):
+    def added(self) -> bool:
         """Whether it is in the model that is written."""
         return self.findings[0].added
 
     @property
-    def worth(self):
+    def worth(self) -> float | None:
         """m by which the 3D RMSE is larger without it; None if nobody tried."""
         return self.findings[0].worth
 
     @property
-    def advice(self):
+    def advice(self) -> tuple[str, ...]:
         """What a person can do about it: (sentence, ...)."""
         return tuple(sentence for finding in self.findings for sentence in finding.effect.advice())
 
     @property
-    def matters(self):
+    def matters(self) -> bool:
         """Whether it is worth doing something about: a fault, or the position gains from taking it out, as far as anybody knows."""
         fault = any(isinstance(finding.effect, LabelEffect) for finding in self.findings)  # a plain mistake, to be put right whatever it is worth
         return self.added and (fault or self.worth is None or self.worth >= WORTH_DOING)
 
     @property
-    def over_flights(self):
+    def over_flights(self) -> str:
         """A sentence on how flights differ in it; "" for a single one."""
         return in_words(self.findings[0].shares)
 
     @property
-    def undecided(self):
+    def undecided(self) -> list[Alternative]:
         """Alternatives that fit nearly as well, the nearest first."""
-        return sorted((other for other in self.alternatives if other.gap is not None), key=lambda other: other.gap)
+        gaps = [(other.gap, other) for other in self.alternatives if other.gap is not None]
+        return [other for _, other in sorted(gaps, key=lambda pair: pair[0])]
 
     @property
-    def imitators(self):
+    def imitators(self) -> list[Alternative]:
         """Alternatives that explain as much, but would need more, or less plausible, values."""
         return [other for other in self.alternatives if other.gap is None]
 
 
-def entries(diagnosis):
+def entries(diagnosis: Diagnosis) -> list[Entry]:
     """[Entry] of a Diagnosis, the most prominent first; what all anchors share over the room after what is told of some."""
-    groups = {}
+    groups: dict[Hashable, list[Finding]] = {}
     for finding in diagnosis.findings:
         key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
         groups.setdefault(key, []).append(finding)
@@ -80,7 +91,7 @@ def entries(diagnosis):
     return sorted(out, key=lambda entry: (len(entry.findings) > 1, -entry.findings[0].prominence))
 
 
-def worth_in_words(entry):
+def worth_in_words(entry: Entry) -> str:
     """ "1.5 cm" """
     if entry.worth is None:
         return "not told by errors in the air" if entry.findings[0].on_floor else "not known"
@@ -89,12 +100,12 @@ def worth_in_words(entry):
     return f"{entry.worth * CM:.1f} cm" if entry.worth > 0.0 else f"nothing ({entry.worth * CM:.1f} cm)"
 
 
-def undecided_in_words(entry):
+def undecided_in_words(entry: Entry) -> list[str]:
     """What it could as well be, and how to tell, one sentence each: list."""
     return [f"Could as well be {names}; to tell: {flight}." for names, flight in by_flight(entry.undecided)]
 
 
-def doubt_in_words(entry):
+def doubt_in_words(entry: Entry) -> list[str]:
     """What else it could be, and how to tell, one sentence each: list."""
     imitated = by_flight(entry.imitators)
     return undecided_in_words(entry) + [
@@ -102,7 +113,7 @@ def doubt_in_words(entry):
     ]
 
 
-def certainty_in_words(entry):
+def certainty_in_words(entry: Entry) -> str:
     """What there is to say where nothing else is named: a sentence."""
     first = entry.findings[0]
     if first.candidates:
@@ -111,25 +122,25 @@ def certainty_in_words(entry):
     return f"Was not compared with others{f'; may be confused with {listed(like, OR)}' if like else ''}."
 
 
-def by_flight(alternatives):
+def by_flight(alternatives: Iterable[Alternative]) -> list[tuple[str, str]]:
     """[(names in words, flight that tells)], one for each such flight."""
-    groups = {}
+    groups: dict[str, list[str]] = {}
     for other in alternatives:
         groups.setdefault(other.tell_apart, []).append(other.effect)
     return [(listed(names, "or"), flight) for flight, names in groups.items()]
 
 
-def for_people(unit, key=""):
+def for_people(unit: str, key: str = "") -> tuple[str, float]:
     """(unit, factor) of a value of an effect: angles in degrees. Of units of several kinds, that of the key."""
     if unit == "m, rad":
         unit = "m" if key in ("x", "y", "z") else "rad"
     return (unit.replace("rad", "degrees"), DEGREES) if unit in ("rad", "rad/s") else (unit, 1.0)
 
 
-def by_anchor(effect):
+def by_anchor(effect: Effect) -> dict[int, dict[str, tuple[float, float | None]]]:
     """{anchor: {"x", "y", "z" or "": (value, std or None)}} of those values of an Effect that are significant, where each is of one anchor, in
     the order of anchors; {} of other effects."""
-    out = {}
+    out: dict[int, dict[str, tuple[float, float | None]]] = {}
     for key in significant(effect):
         parts = re.fullmatch(r"(\d+)(?:\.([xyz]))?", key)
         if not parts:
@@ -138,26 +149,27 @@ def by_anchor(effect):
     return dict(sorted(out.items()))
 
 
-def _entry(findings, refused):
+def _entry(findings: tuple[Finding, ...], refused: Sequence[Refused]) -> Entry:
     first = findings[0]
     others = {other.effect: other for finding in findings for other in finding.alternatives}
     return Entry(findings, _title(findings), _values(first), _why_not(first, refused), tuple(others.values()))
 
 
-def _title(findings):
-    effect = findings[0].effect
-    if findings[0].declared:
-        return effect.name
-    subject, _, first = effect.label.rpartition(" over ")
-    covariates = listed(name.replace("_", " ") for name in (first, *(finding.effect.covariate for finding in findings[1:])))
-    several = subject == effect.channel
-    return f"{subject} over {covariates}{FORMS.get(effect.form, '') if several else ''}"
+def _title(findings: Sequence[Finding]) -> str:
+    function = findings[0].function
+    if function is None:
+        return findings[0].effect.name
+    subject, _, first = function.label.rpartition(" over ")
+    others = (finding.function.covariate for finding in findings[1:] if finding.function)
+    covariates = listed(name.replace("_", " ") for name in (first, *others))
+    several = subject == function.channel
+    return f"{subject} over {covariates}{FORMS.get(function.form, '') if several else ''}"
 
 
-def _values(finding):
+def _values(finding: Finding) -> str:
     effect = finding.effect
-    if not finding.declared:
-        return f"a function without a name ({effect.shape})"
+    if finding.function:
+        return f"a function without a name ({finding.function.shape})"
     told = significant(effect)
     fitted_first = sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0]))
     unit, factors = effect.unit.replace("rad", "degrees"), {key: for_people(effect.unit, key)[1] for key in effect.values}
@@ -173,7 +185,7 @@ def _values(finding):
     return f"{words} ({unit})" + (f"; {vague} not significant" if vague else "")
 
 
-def _why_not(finding, refused):
+def _why_not(finding: Finding, refused: Sequence[Refused]) -> str:
     if finding.added:
         return ""
     if finding.flight:

@@ -1,16 +1,25 @@
 """Where a model leaves most of the measurements unexplained: of which pairs, when and where."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..regression.table import BLOCK
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from ..channels import ChannelResidual
+    from ..diagnose import Diagnosis
 
 LARGE, ABOVE = 0.15, 3.0  # m, and times the root mean square of all, that a pair may be off for BLOCK s before it is named
 NAMED = 3
 
 
-def left_over(diagnosis):
+def left_over(diagnosis: Diagnosis) -> tuple[str, ...]:
     """(sentence, ...), the largest first; () where nothing stands out."""
-    found = []
+    found: list[tuple[float, str]] = []
     for flight, residuals in zip(diagnosis.flights, diagnosis.remaining):
         for part in residuals.values():
             found += _of_part(part, f" of {flight.name}" if len(diagnosis.flights) > 1 else "")
@@ -18,7 +27,7 @@ def left_over(diagnosis):
     return (f"What is left is largest for {'; '.join(places)}.",) if places else ()
 
 
-def _of_part(part, of):
+def _of_part(part: ChannelResidual, of: str) -> Iterator[tuple[float, str]]:
     rows = part.rows()
     block = (rows.t / BLOCK).astype(int)
     usual = np.sqrt(np.median(rows.y**2) / 0.455)  # the median of squares is 0.455 of their mean, for Gaussian noise

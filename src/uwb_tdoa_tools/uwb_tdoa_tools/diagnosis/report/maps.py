@@ -1,16 +1,27 @@
 """The room from above and from the side: anchors, what was found there, and where the estimate errs."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Ellipse
 from uwb_tdoa_bias.effects.wording import listed
 
 from .markup import grid, paragraphs
 from .pictures import FOUND, REGION, WIDTH, drawing, embedded, plt
 from .room import CELL, VIEWS, changed, estimated, flown, mean_errors, shifts_and_regions
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from matplotlib.axes import Axes
+    from matplotlib.quiver import Quiver
+    from ..diagnose import Diagnosis
+    from .room import Flown
 
 POINTS = 1500  # of all paths
 GAP = 1.0  # s without an estimate that breaks a path
@@ -25,7 +36,7 @@ COLOURS = LinearSegmentedColormap.from_list("error", plt.get_cmap("viridis_r")(n
 ARROW = {"arrowstyle": "-|>", "color": FOUND, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
 
 
-def maps(diagnosis):
+def maps(diagnosis: Diagnosis) -> str:
     """Markup: one map before and one after; one alone if nothing has changed, or nobody knows the errors."""
     sides = [(name, flown(side["scores"])) for name, side in (("before", diagnosis.before), ("after", diagnosis.after))]
     if not any(runs for _, runs in sides):
@@ -49,7 +60,7 @@ class Arrows:
     key: int
 
     @classmethod
-    def of(cls, diagnosis, sides):
+    def of(cls, diagnosis: Diagnosis, sides: Sequence[Sequence[Flown]]) -> Arrows:
         """For a Diagnosis; sides : lists of Flown."""
         errors = [mean_errors(runs, view)[1] for runs in sides for view in VIEWS]
         lengths = np.concatenate([np.zeros(1), *(np.linalg.norm(error, axis=1) for error in errors)])
@@ -63,12 +74,14 @@ class Arrows:
         )
 
 
-def _drawn(diagnosis, title, runs, norm, arrows):
+def _drawn(diagnosis: Diagnosis, title: str, runs: Sequence[Flown], norm: Normalize | None, arrows: Arrows) -> str:
     low, high = _limits(diagnosis, runs)
     size = high - low
     tall = WIDTH * 0.87 * (size[1] + size[2]) / size[0]
     figure, axes = drawing(min(tall, 2.0 * WIDTH) + 1.6, nrows=2, height_ratios=size[1:])
-    figure.get_layout_engine().set(w_pad=0.1)
+    engine = figure.get_layout_engine()
+    assert isinstance(engine, ConstrainedLayoutEngine)  # as `drawing` asks for
+    engine.set(w_pad=0.1)
     for ax, view in zip(axes, VIEWS):
         _path(ax, diagnosis, runs, view, norm)
         _anchors(ax, diagnosis, view, arrows.enlarged)
@@ -88,7 +101,7 @@ def _drawn(diagnosis, title, runs, norm, arrows):
     return embedded(figure, _alt(diagnosis, title, runs))
 
 
-def _limits(diagnosis, runs):
+def _limits(diagnosis: Diagnosis, runs: Sequence[Flown]) -> tuple[np.ndarray, np.ndarray]:
     """(lowest (3,), highest (3,)) m of what is drawn."""
     paths = [run.p for run in runs] or list(map(estimated, diagnosis.remaining))
     places = [diagnosis.flights[0].anchors.positions, *paths]
@@ -96,7 +109,7 @@ def _limits(diagnosis, runs):
     return low - MARGIN, high + MARGIN
 
 
-def _path(ax, diagnosis, runs, view, norm):
+def _path(ax: Axes, diagnosis: Diagnosis, runs: Sequence[Flown], view: list[int], norm: Normalize | None) -> None:
     if not runs:
         for flight in diagnosis.remaining:
             path = estimated(flight)
@@ -112,13 +125,13 @@ def _path(ax, diagnosis, runs, view, norm):
         ax.add_collection(lines)
 
 
-def _anchors(ax, diagnosis, view, enlarged):
+def _anchors(ax: Axes, diagnosis: Diagnosis, view: list[int], enlarged: int) -> None:
     anchors = diagnosis.flights[0].anchors
     places = dict(zip(anchors.ids.tolist(), anchors.positions[:, view]))
     shifts, regions = shifts_and_regions(diagnosis)
     for region in regions:
         centre = region.centre[view]
-        ax.add_patch(Circle(centre, region.radius, fill=False, ec=REGION, ls="--", lw=1.4, zorder=3))
+        ax.add_patch(Circle((centre[0], centre[1]), region.radius, fill=False, ec=REGION, ls="--", lw=1.4, zorder=3))
         ax.plot(*zip(centre, places[region.anchor]), color=REGION, ls=":", lw=1.0, zorder=3)
     for anchor, (by, std) in shifts.items():
         tip = places[anchor] + enlarged * by[view]
@@ -129,15 +142,16 @@ def _anchors(ax, diagnosis, view, enlarged):
     _names(ax, places, {anchor: by[view] for anchor, (by, _) in shifts.items()})
 
 
-def _names(ax, places, shifts):
+def _names(ax: Axes, places: Mapping[int, np.ndarray], shifts: Mapping[int, np.ndarray]) -> None:
     """Ids beside anchors, where their arrows do not point; those that stand one behind the other share a label."""
-    middle, labels = np.mean(list(places.values()), axis=0), {}
+    middle = np.mean(list(places.values()), axis=0)
+    labels: dict[tuple[float, ...], list[int]] = {}
     for anchor, place in places.items():
         near = next((known for known in labels if np.linalg.norm(place - known) < BESIDE), tuple(place))
         labels.setdefault(near, []).append(anchor)
     for together in labels.values():
         own = np.array([places[anchor] for anchor in together])
-        way = -np.sum([shifts.get(anchor, (0.0, 0.0)) for anchor in together], axis=0)
+        way = -np.sum([shifts.get(anchor, np.zeros(2)) for anchor in together], axis=0)
         if not way.any():
             way = np.array([0.0, np.sign(own.mean(axis=0)[1] - middle[1]) or 1.0])
         way /= np.linalg.norm(way)
@@ -147,7 +161,7 @@ def _names(ax, places, shifts):
         )  # fmt: skip
 
 
-def _arrows(ax, runs, view, enlarged):
+def _arrows(ax: Axes, runs: Sequence[Flown], view: list[int], enlarged: int) -> Quiver | None:
     """Quiver of the mean errors; None without any."""
     places, errors = mean_errors(runs, view)
     if not len(places):
@@ -156,7 +170,7 @@ def _arrows(ax, runs, view, enlarged):
     return ax.quiver(*places.T, *errors.T, color="k", zorder=6, **how)
 
 
-def _alt(diagnosis, title, runs):
+def _alt(diagnosis: Diagnosis, title: str, runs: Sequence[Flown]) -> str:
     shifts, regions = shifts_and_regions(diagnosis)
     out = [f"Map of {len(diagnosis.flights[0].anchors)} anchors from above and from the side"]
     if runs:
@@ -171,7 +185,7 @@ def _alt(diagnosis, title, runs):
     return "; ".join(out)
 
 
-def _caption(diagnosis, runs, enlarged):
+def _caption(diagnosis: Diagnosis, runs: Sequence[Flown], enlarged: int) -> str:
     shifts, regions = shifts_and_regions(diagnosis)
     times = f", drawn {enlarged} times as long as they are" if enlarged > 1 else ""
     out = ["Triangles: anchors with their numbers."]

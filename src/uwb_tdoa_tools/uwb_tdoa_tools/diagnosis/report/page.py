@@ -1,5 +1,9 @@
 """The report: one page of HTML that holds everything itself."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from .anchors import fitted
 from .curves import errors_over_time
 from .details import details, phases, terms
@@ -9,8 +13,11 @@ from .markup import page, paragraphs, section
 from .sections import head, not_told, to_do, worth
 from .verdict import faults_in_words, truth_in_words, verdict
 
+if TYPE_CHECKING:
+    from ..diagnose import Diagnosis
 
-def html(diagnosis):
+
+def html(diagnosis: Diagnosis) -> str:
     """The page of a Diagnosis: verdict, what to do, what each effect is worth, map, errors, what could not be told, and
     folded details."""
     found = entries(diagnosis)

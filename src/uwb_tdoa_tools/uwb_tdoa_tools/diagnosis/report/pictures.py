@@ -1,11 +1,17 @@
 """Pictures inside of a page. Importing this takes a second: it loads the drawing library."""
 
+from __future__ import annotations
+
 import base64
 import io
 from html import escape
+from typing import Any, TYPE_CHECKING
 
 from ...scoring.plots import plt
 from .style import NARROW
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Told apart by colour-blind eyes (Okabe and Ito); the purple and the yellow are darker than theirs.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a8437f", "#e69f00", "#56b4e9", "#000000", "#8c8c00")
@@ -21,13 +27,13 @@ _FONT = {
 }  # fmt: skip
 
 
-def drawing(height, width=WIDTH, **options):
+def drawing(height: float, width: float = WIDTH, **options: Any) -> tuple[Figure, Any]:
     """(Figure, axes), height and width in inches; options as of plt.subplots."""
     with plt.rc_context(_FONT):
         return plt.subplots(figsize=(width, height), layout="constrained", **options)
 
 
-def embedded(figure, alt, caption="", narrow=None):
+def embedded(figure: Figure, alt: str, caption: str = "", narrow: Figure | None = None) -> str:
     """<figure> with a drawn Figure, as SVG, or as PNG where that is smaller and it matters; the Figure is closed.
 
     alt : what it shows, for who cannot see it; caption : how to read it, if nothing else says so; narrow : the same for a narrow screen.
@@ -39,7 +45,7 @@ def embedded(figure, alt, caption="", narrow=None):
     return f"<figure>{image}{f'<figcaption>{escape(caption)}</figcaption>' if caption else ''}</figure>"
 
 
-def _source(figure):
+def _source(figure: Figure) -> tuple[str, int]:
     """(data URL, pixels of width) of a Figure, which is closed."""
     with plt.rc_context(_FONT):
         figure.draw_without_rendering()
@@ -53,7 +59,7 @@ def _source(figure):
     return f"data:image/{kind};base64,{base64.b64encode(kinds[kind]).decode()}", width
 
 
-def _saved(figure, kind, **options):
+def _saved(figure: Figure, kind: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=SHARP, **options)
     return buffer.getvalue()

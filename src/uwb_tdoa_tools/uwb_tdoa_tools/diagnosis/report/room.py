@@ -1,10 +1,19 @@
 """What is known of places: where the estimate errs, where anchors seem to stand, from where they are blocked."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.effects.marks import Region, Shift
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from ...scoring.metrics import Score
+    from ..channels import ChannelResiduals
+    from ..diagnose import Diagnosis
 
 VIEWS = ([0, 1], [0, 2])  # x and y from above, x and z from the side
 CELL = 1.0  # m
@@ -20,12 +29,12 @@ class Flown:
     error: np.ndarray
 
     @property
-    def distance(self):
+    def distance(self) -> np.ndarray:
         """(n,) m, between estimate and truth."""
         return np.linalg.norm(self.error, axis=1)
 
 
-def flown(scores):
+def flown(scores: Iterable[Score]) -> list[Flown]:
     """[Flown] of Scores; without those that hold no estimate."""
     out = []
     for score in scores:
@@ -35,7 +44,7 @@ def flown(scores):
     return out
 
 
-def mean_errors(runs, view):
+def mean_errors(runs: Sequence[Flown], view: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Mean errors of [Flown] in cells of a view, two axes: (true places (k, 2) m, mean errors (k, 2) m)."""
     if not runs:
         return np.empty((0, 2)), np.empty((0, 2))
@@ -47,9 +56,11 @@ def mean_errors(runs, view):
     return means[0][filled], means[1][filled]
 
 
-def shifts_and_regions(diagnosis):
+def shifts_and_regions(diagnosis: Diagnosis) -> tuple[dict[int, tuple[np.ndarray, np.ndarray]], list[Region]]:
     """({anchor id: (by (3,), std (3,))} m, [Region]) of the model that is written, of anchors of the flights."""
-    anchors, shifts, regions = diagnosis.flights[0].anchors, {}, []
+    anchors = diagnosis.flights[0].anchors
+    shifts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    regions = []
     for mark in (mark for effect in diagnosis.effects.effects for mark in effect.marks(anchors)):
         if mark.anchor not in anchors.ids:
             continue
@@ -61,12 +72,12 @@ def shifts_and_regions(diagnosis):
     return shifts, regions
 
 
-def changed(diagnosis):
+def changed(diagnosis: Diagnosis) -> bool:
     """Whether errors in the air differ before and after: something was added that does not act near the floor alone."""
     return any(finding.added and not finding.on_floor for finding in diagnosis.findings)
 
 
-def estimated(flight):
+def estimated(flight: ChannelResiduals) -> np.ndarray:
     """(n, 3) m, the path in the air of {channel: ChannelResidual} as estimated, where nobody knows better."""
     rows = next(iter(flight.values())).rows()
     return rows.place[np.argsort(rows.t, kind="stable")]

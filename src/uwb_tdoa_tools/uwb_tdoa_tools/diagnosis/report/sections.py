@@ -1,6 +1,9 @@
 """What everybody should read: verdict, what to do, what each effect is worth, what could not be told."""
 
+from __future__ import annotations
+
 from html import escape
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects.wording import listed, measured
 
@@ -8,10 +11,17 @@ from .entries import LEAST_WORTH, WORTH_DOING, by_anchor, certainty_in_words, do
 from .markup import bar, folded, listing, paragraphs, section, stacked, table
 from .unclear import by_remedy, untold
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from ..diagnose import Diagnosis
+    from .entries import Entry
+    from .verdict import Verdict
+
 MANY = 3  # anchors that a sentence names with their values
 
 
-def head(diagnosis, verdict):
+def head(diagnosis: Diagnosis, verdict: Verdict) -> str:
     """Title and verdict."""
     names = ", ".join(flight.name for flight in diagnosis.flights)
     box = f'<div class="verdict {verdict.kind}">{paragraphs(verdict.sentences)}</div>'
@@ -28,7 +38,7 @@ def head(diagnosis, verdict):
     )
 
 
-def to_do(diagnosis, found):
+def to_do(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
     """What to do in the hall, and how to let the filter do the rest. found : [Entry]."""
     added = [entry for entry in found if entry.added]
     urgent = [entry for entry in added if entry.matters and entry.advice]
@@ -47,7 +57,7 @@ def to_do(diagnosis, found):
     return section("What to do in the hall", *parts, _apply(diagnosis.applying) if added and diagnosis.applying else "")
 
 
-def _asked(entry):
+def _asked(entry: Entry) -> str:
     """Markup of its advice: sentences; values of more than MANY anchors as a table."""
     out = []
     for finding in entry.findings:
@@ -61,7 +71,7 @@ def _asked(entry):
     return "".join(out)
 
 
-def _of_anchors(effect, anchors):
+def _of_anchors(effect: Effect, anchors: Mapping[int, Mapping[str, tuple[float, float | None]]]) -> str:
     """A table of values by anchor, lengths in cm."""
     unit, factor = ("cm", 100.0) if effect.unit == "m" else for_people(effect.unit)
     parts = sorted({part for values in anchors.values() for part in values})
@@ -71,7 +81,7 @@ def _of_anchors(effect, anchors):
     return note + table(head, [(anchor, *row) for anchor, row in zip(anchors, cells)], numbers=range(1, len(head)))
 
 
-def _cell(found, factor):
+def _cell(found: tuple[float, float | None] | None, factor: float) -> str:
     """ "+12.3 ± 0.5" """
     if found is None:
         return ""
@@ -80,7 +90,7 @@ def _cell(found, factor):
     return text if text.startswith("-") else f"+{text}"
 
 
-def _known_with(entry):
+def _known_with(entry: Entry) -> list[str]:
     """What has to be known with its advice: [sentence]."""
     worth = (
         []
@@ -91,7 +101,7 @@ def _known_with(entry):
     return worth + ([f"Make sure first: this {doubt[0].lower()}{doubt[1:]}"] if doubt else [])
 
 
-def _apply(applying):
+def _apply(applying: Iterable[tuple[str, str]]) -> str:
     lines = "".join(
         f"<dt><code>{escape(command)}</code></dt><dd class='note'>{escape(what)}</dd>" for command, what in applying
     )
@@ -103,7 +113,7 @@ def _apply(applying):
     return f"<h3>Apply effects.yaml</h3>{paragraphs([text])}<dl>{lines}</dl>"
 
 
-def worth(diagnosis, found):
+def worth(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
     """What was found, and what each is worth in centimetres of position. found : [Entry]."""
     if not found:
         return ""
@@ -120,18 +130,18 @@ def worth(diagnosis, found):
     return section("What each effect is worth", paragraphs(note, "note"), stacked(head, rows))
 
 
-def _name(entry):
+def _name(entry: Entry) -> str:
     effect = entry.findings[0].effect
     physics = effect.physics if entry.findings[0].declared else "structure that no effect of the catalogue explains"
     more = f"<br><small>{escape(entry.over_flights)}</small>" if entry.over_flights else ""
     return f"<b>{escape(entry.title)}</b><br><small>{escape(physics)}</small>{more}"
 
 
-def _else(entry):
+def _else(entry: Entry) -> str:
     return "<br>".join(map(escape, doubt_in_words(entry) or [certainty_in_words(entry)]))
 
 
-def _worth(entry, largest):
+def _worth(entry: Entry, largest: float) -> str:
     if entry.why_not:
         return f"not in effects.yaml: {escape(entry.why_not)}"
     if entry.worth is None:
@@ -140,7 +150,7 @@ def _worth(entry, largest):
     return f"{drawn}{escape(worth_in_words(entry))}"
 
 
-def not_told(diagnosis):
+def not_told(diagnosis: Diagnosis) -> str:
     """What could not be told, and what would."""
     items = untold(diagnosis)
     parts = [

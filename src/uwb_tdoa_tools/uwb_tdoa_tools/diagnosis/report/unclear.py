@@ -1,6 +1,9 @@
 """What could not be told, and what would tell."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,6 +11,11 @@ from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.effects.wording import listed
 
 from ..channels import CHANNELS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from ..diagnose import Diagnosis
+    from ..regression.confounding import Unobservable
 
 NOTHING = 1e-9  # largest contribution, relative to those of its parts, of a combination that cancels
 NAMED = 6  # parameters of a combination that are named
@@ -26,7 +34,7 @@ class Untold:
     harmless: bool
 
 
-def untold(diagnosis):
+def untold(diagnosis: Diagnosis) -> list[Untold]:
     """[Untold], one for each of diagnosis.unobservable."""
     out = []
     for item in diagnosis.unobservable:
@@ -35,16 +43,16 @@ def untold(diagnosis):
     return out
 
 
-def by_remedy(items):
+def by_remedy(items: Iterable[Untold]) -> dict[str, list[str]]:
     """{what would tell: [effect and what of it, in words]} of Untolds that could do harm."""
-    groups = {}
+    groups: dict[str, dict[str, list[str]]] = {}
     for item in items:
         if not item.harmless:
             groups.setdefault(item.told_by, {}).setdefault(item.effect, []).append(item.what)
     return {told_by: [_few(*each) for each in effects.items()] for told_by, effects in groups.items()}
 
 
-def _few(effect, whats):
+def _few(effect: str, whats: list[str]) -> str:
     if whats == [""]:
         return effect
     if len(whats) > 2 or "combination" in whats[0]:
@@ -52,7 +60,7 @@ def _few(effect, whats):
     return f"{effect} ({'; '.join(whats)})"
 
 
-def _what(item):
+def _what(item: Unobservable) -> str:
     if item.direction is None:
         return ""
     if len(item.direction) == 1:
@@ -65,14 +73,14 @@ def _what(item):
     return f"{together} against {listed(second)}" if second else together
 
 
-def _told_by(item, diagnosis):
+def _told_by(item: Unobservable, diagnosis: Diagnosis) -> str:
     effect = EFFECTS[item.effect]
     alone = not all(diagnosis.reference.positions_known)
     if item.direction is None:
         if alone and effect.needs_reference:
             return GROUND_TRUTH
         return CHANNELS[(effect.witnesses or effect.channels)[0]].needs
-    size, parts = _contribution(item, diagnosis)
+    size, parts = _contribution(item.effect, item.direction, diagnosis)
     if parts > 0.0 and size <= NOTHING * parts:
         return CANCELS
     if parts == 0.0 and effect.uses_attitude:
@@ -82,9 +90,10 @@ def _told_by(item, diagnosis):
     return "a flight through other places, headings, heights and speeds"
 
 
-def _contribution(item, diagnosis):
-    """Largest contribution to any row: of the combination, and of its parts alone."""
+def _contribution(effect: str, direction: dict[str, float], diagnosis: Diagnosis) -> tuple[float, float]:
+    """Largest contribution of an effect to any row: of the combination of its parameters, {key: weight}, and of its
+    parts alone."""
     table = diagnosis.attribution.selection.table
     columns = {(column.effect[0], column.key): column for column in table.columns}
-    x = table.matrix([columns[item.effect, key] for key in item.direction])
-    return np.abs(x @ list(item.direction.values())).max(), np.abs(x).max()
+    x = table.matrix([columns[effect, key] for key in direction])
+    return float(np.abs(x @ list(direction.values())).max()), float(np.abs(x).max())

@@ -1,12 +1,20 @@
 """The verdict: the error before and after, on which data, and how sure that is."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.effects.wording import listed
 
 from ...scoring.phases import NEAR_THE_FLOOR, TITLES
 from ..calibration import LEFT
 from .left_over import left_over
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..diagnose import Diagnosis
+    from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
 
 CM = 100.0  # in a metre
 ERROR = "The position error (3D RMSE)"
@@ -18,16 +26,16 @@ class Verdict:
     be chance), "same" (nothing is added, or on the floor alone), "nothing" (nothing was found) or "unknown" (no ground truth)."""
 
     headline: str
-    more: tuple
+    more: tuple[str, ...]
     kind: str
 
     @property
-    def sentences(self):
+    def sentences(self) -> tuple[str, ...]:
         """All of it: tuple."""
         return (self.headline, *self.more)
 
 
-def verdict(diagnosis):
+def verdict(diagnosis: Diagnosis) -> Verdict:
     """Verdict of a Diagnosis."""
     if diagnosis.after["pooled"].get("rmse_3d") is None:
         return _without_truth(diagnosis)
@@ -36,9 +44,9 @@ def verdict(diagnosis):
     return _judged(diagnosis)
 
 
-def faults_in_words(diagnosis):
+def faults_in_words(diagnosis: Diagnosis) -> list[str]:
     """What is wrong with the numbers of the flights: a sentence for each, with the flights and the evidence of the first."""
-    groups = {}
+    groups: dict[str, list[tuple[str, NumbersFinding]]] = {}
     for name, found in diagnosis.numbers.items():
         for item in found:
             groups.setdefault(item.cause, []).append((name, item))
@@ -48,30 +56,30 @@ def faults_in_words(diagnosis):
     ]
 
 
-def truth_in_words(diagnosis):
+def truth_in_words(diagnosis: Diagnosis) -> list[str]:
     """What was wrong with clocks and frames of the ground truth: sentences."""
     return [f"{name}: {sentence}." for name, said in diagnosis.of_truth.items() for sentence in said]
 
 
-def centimetres(value):
+def centimetres(value: float) -> str:
     """ "20.2 cm" of metres."""
     return f"{value * CM:.1f} cm"
 
 
-def percent(interval):
+def percent(interval: Sequence[float]) -> str:
     """ "66 to 72 %" of shares."""
     return f"{interval[0] * 100:.0f} to {interval[1] * 100:.0f} %"
 
 
-def _share(value):
+def _share(value: float) -> str:
     return f"{value * 100:.0f} %"
 
 
-def _bounds(interval):
+def _bounds(interval: Sequence[float] | None) -> str:
     return f"{interval[0] * CM:.1f} to {interval[1] * CM:.1f}" if interval else "unknown"
 
 
-def _judged(diagnosis):
+def _judged(diagnosis: Diagnosis) -> Verdict:
     before, after = diagnosis.before["pooled"], diagnosis.after["pooled"]
     gain, interval = 1.0 - after["rmse_3d"] / before["rmse_3d"], after.get("rmse_3d_gain_ci")
     change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
@@ -88,7 +96,7 @@ def _judged(diagnosis):
     return Verdict(f"It is not certain that the position error (3D RMSE) falls: {change}.", tuple(more), "unsure")
 
 
-def _intervals(before, after, gain):
+def _intervals(before: dict[str, Any], after: dict[str, Any], gain: Sequence[float] | None) -> str:
     sides = [f"{_bounds(side['rmse_3d_ci'])} cm {name}" for side, name in ((before, "before"), (after, "after"))]
     share = 1.0 - after["rmse_3d"] / before["rmse_3d"]
     return (
@@ -98,7 +106,7 @@ def _intervals(before, after, gain):
     )
 
 
-def _nothing_added(diagnosis):
+def _nothing_added(diagnosis: Diagnosis) -> Verdict:
     pooled, found = diagnosis.before["pooled"], len({finding.key for finding in diagnosis.findings})
     interval = f"95 % interval {_bounds(pooled['rmse_3d_ci'])} cm"
     error = f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {_flights(diagnosis)}."
@@ -115,7 +123,7 @@ def _nothing_added(diagnosis):
     return Verdict(f"{what} not make the position better; nothing is added to the model.", more, "same")
 
 
-def _without_truth(diagnosis):
+def _without_truth(diagnosis: Diagnosis) -> Verdict:
     before, after = (side["pooled"]["residual_spread"] for side in (diagnosis.before, diagnosis.after))
     scatter = f"Innovations (measured minus predicted TDOAs) scatter by {centimetres(before)}"
     if not diagnosis.findings:
@@ -140,18 +148,18 @@ def _without_truth(diagnosis):
 _UNKNOWN = "Without ground truth nobody knows the position error, neither before nor after."
 
 
-def _names(diagnosis):
+def _names(diagnosis: Diagnosis) -> list[str]:
     """Of the flights that were judged, each once."""
     return list(dict.fromkeys(run["flight"] for run in diagnosis.before["runs"]))
 
 
-def _flights(diagnosis):
+def _flights(diagnosis: Diagnosis) -> str:
     count = len(_names(diagnosis))
     seconds = sum(score.last - score.first for score in diagnosis.before["scores"])
     return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s in the air"
 
 
-def _over_phases(diagnosis):
+def _over_phases(diagnosis: Diagnosis) -> list[str]:
     """The errors outside of the air, which those above do not hold."""
     before, after = (side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after))
     parts = []
@@ -161,21 +169,21 @@ def _over_phases(diagnosis):
     return [f"Outside of that, before and after: {'; '.join(parts)}."] if parts else []
 
 
-def _of_phase(figures):
+def _of_phase(figures: dict[str, Any]) -> str:
     """The 3D RMSE and the NEES of a phase."""
     if figures["rmse_3d"] is None:
         return "unknown"
     return centimetres(figures["rmse_3d"]) + ("" if figures["nees_mean"] is None else f" (NEES {figures['nees_mean']:.1f})")
 
 
-def _shared(diagnosis):
+def _shared(diagnosis: Diagnosis) -> list[str]:
     """What errors against a reference that knows only a part do not tell."""
     if all(diagnosis.reference.positions_known):
         return []
     return [f"Errors are against {diagnosis.reference.words}: an error that both share is not in them."]
 
 
-def _caveats(diagnosis):
+def _caveats(diagnosis: Diagnosis) -> list[str]:
     out, base = [], len(diagnosis.effects) - sum(finding.added for finding in diagnosis.findings)
     if base > 0:
         out.append(f"Before is with the {base} effect{'s' if base > 1 else ''} that the model held already.")
@@ -186,7 +194,7 @@ def _caveats(diagnosis):
     return out
 
 
-def _worse(diagnosis):
+def _worse(diagnosis: Diagnosis) -> list[str]:
     runs = list(zip(diagnosis.before["runs"], diagnosis.after["runs"]))
     worse = [(b["rmse_3d"], a["rmse_3d"], b["flight"]) for b, a in runs if a["rmse_3d"] > b["rmse_3d"]]
     if not worse or len(runs) == 1:
@@ -196,7 +204,7 @@ def _worse(diagnosis):
     return [f"On {len(worse)} of {len(runs)} runs the error grows, {much}."]
 
 
-def _diverged(diagnosis):
+def _diverged(diagnosis: Diagnosis) -> list[str]:
     before, after = (sum(run["diverged"] for run in side["runs"]) for side in (diagnosis.before, diagnosis.after))
     if not before and not after:
         return []

@@ -1,5 +1,7 @@
 """Words that a reader may not know, each spelled out once."""
 
+from __future__ import annotations
+
 import re
 
 from uwb_tdoa_bias.effects import EFFECTS
@@ -25,12 +27,12 @@ TERMS = {
 _ABBREVIATION = re.compile(r"\b(?:[A-Z]{2,}s?|3D)\b")
 
 
-def abbreviations(text):
+def abbreviations(text: str) -> set[str]:
     """Those of a text: set."""
     return set(_ABBREVIATION.findall(text))
 
 
-def used(text):
+def used(text: str) -> dict[str, str]:
     """{term: meaning} of the TERMS and effects that a text names; a plural is explained with its singular."""
     effects = {name: f"{effect.physics}." for name, effect in EFFECTS.items() if re.search(rf"\b{name}\b", text)}
     found = {name.lower() for name in re.findall(r"\w+", " ".join([text, *effects.values()]))}
