@@ -12,6 +12,7 @@ from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet, T
 from uwb_tdoa_bias.foundation.survey import read_survey  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag  # noqa: E402
 from uwb_tdoa_tools.commands import check, convert, debias, demo, diagnose, evaluate, inject, localize, survey  # noqa: E402
+from uwb_tdoa_tools.diagnosis.references import REFERENCES  # noqa: E402
 from uwb_tdoa_tools.localizing.estimate import with_antenna  # noqa: E402
 from uwb_tdoa_tools.scoring.judge import Judge  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
@@ -114,11 +115,17 @@ def test_no_option_of_the_estimate_goes_with_an_odometry_that_was_recorded(desk,
     refused(evaluate, ["flight.bag", "--odometry", "flight.bag", *more], sentence, capsys)
 
 
-@pytest.mark.parametrize("more", [("--marks", "m.yaml"), ("--distances", "d.csv"), ("--odometry", "/vio")])
-@pytest.mark.parametrize("reference", ["truth", "heights"])
-def test_what_a_reference_does_not_use_is_refused(desk, capsys, reference, more):
-    sentence = f"{more[0]}: no part of it is used with --reference {reference}"
-    refused(diagnose, ["flight.bag", "--reference", reference, *more, "--out", "out"], sentence, capsys)
+KNOWN = {"marks": "m.yaml", "distances": "d.csv", "odometry": "/vio"}
+
+
+@pytest.mark.parametrize("reference, option", [(reference, option) for reference, some in diagnose.UNUSED.items() for option in some])
+def test_what_a_reference_does_not_use_is_refused(desk, capsys, reference, option):
+    sentence = f"--{option}: no part of it is used with --reference {reference}"
+    refused(diagnose, ["flight.bag", "--reference", reference, f"--{option}", KNOWN[option], "--out", "out"], sentence, capsys)
+
+
+def test_every_reference_says_which_options_it_does_not_use():
+    assert diagnose.UNUSED.keys() == REFERENCES.keys()
 
 
 @pytest.mark.parametrize("more", [("--std", "0.2"), ("--height-std", "0.1"), ("--trusted", "0"), ("--trusted-std", "0.01")])

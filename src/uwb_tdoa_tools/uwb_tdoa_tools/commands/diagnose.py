@@ -27,6 +27,10 @@ assume with them; --config of evaluate) and report.html."""
 
 MOST = 300_000  # TDOAs; what they take: docs/speed.md
 FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/speed.md)
+UNUSED = {  # by references, of the options of what is known
+    "truth": ("marks", "distances", "odometry"), "heights": ("marks", "distances", "odometry"), "odometry": ("distances",),
+    "marks": ("odometry",), "nothing": ("odometry",),
+}  # fmt: skip
 
 
 def main(argv=None):
@@ -76,8 +80,7 @@ def parser():
 
 def _diagnose(args):
     out = cli.output_folder(args.out)
-    if args.reference in ("truth", "heights"):
-        options.refuse(args, ("marks", "distances", "odometry"), f"no part of it is used with --reference {args.reference}")
+    options.refuse(args, UNUSED[args.reference], f"no part of it is used with --reference {args.reference}")
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
     found = reading.find(args.flights)
