@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from random_samples import random_samples
 from scipy.spatial.transform import Rotation
+import yaml
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import (
@@ -384,3 +385,21 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
     single = [corrector.correct("velocity", Velocity(*(column[k : k + 1] for column in (t, v, std)))).columns for k in range(n)]
     for column, whole in enumerate((late, turned, wider)):
         np.testing.assert_allclose(np.concatenate([each[column] for each in single]), whole, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "channel, covariate", [
+        ("gyro.x", "tilt"), ("gyro.y", "interval"), ("accel.z", "previous_anchor"), ("height", "tilt"), ("height", "extra.battery.voltage"),
+        ("velocity.x", "rate_x"), ("gyro.x", "range"), ("tdoa", "accel"),
+    ],
+)  # fmt: skip
+def test_a_function_of_what_its_channel_does_not_have_is_refused_when_it_is_read(tmp_path, channel, covariate):
+    entry = {"channel": channel, "covariate": covariate, "form": "common", "knots": [0.0, 1.0], "values": {"c0": 0.1}}
+    (tmp_path / "effects.yaml").write_text(yaml.safe_dump({"effects": {"smooth_term_1": entry}}))
+    with pytest.raises(InputError, match=f"function of '{covariate}' acts on '{channel}'; forms are .*, covariates of this channel time, "):
+        EffectSet.from_yaml(tmp_path / "effects.yaml")
+
+
+def test_a_function_of_no_channel_is_refused_with_those_that_there_are():
+    with pytest.raises(InputError, match="acts on 'gyro'; channels are tdoa, gyro.x, .* and velocity.z"):
+        SmoothTerm(channel="gyro", covariate="time", knots=(0.0, 1.0))

@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from known_effects import clean_flight
@@ -38,6 +40,16 @@ def test_every_function_that_is_looked_for_has_columns(parts, name):
     for term in terms:
         keys = term.keys(anchors)
         assert np.isfinite(parts[name].columns(term, keys)).all()
+
+
+@pytest.mark.parametrize("channel, covariate", [("height", "vibration"), ("velocity.x", "vibration"), ("gyro.x", "extra.battery.voltage")])
+def test_a_function_of_what_a_flight_does_not_hold_adds_nothing(channel, covariate):
+    flight, name = clean_flight(100, 40.0, aided=True), channel.partition(".")[0]
+    flight = flight if name == "gyro" else replace(flight, imu=None)
+    term = SmoothTerm({"c0": 0.3, "c1": 0.3, "c2": 0.3}, channel=channel, covariate=covariate, knots=(0.0, 1.0))
+    plain, part = (residuals(flight, GroundTruth(), EffectSet(effects))[name] for effects in ((), (term,)))
+    np.testing.assert_array_equal(part.residual, plain.residual)
+    assert part.covariate(covariate) is None and not part.columns(term, term.keys()).any()
 
 
 def test_without_reference_the_residual_is_the_innovation_and_a_shift_of_all_leaves_little_trace():

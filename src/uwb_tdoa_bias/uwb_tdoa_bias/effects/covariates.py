@@ -70,6 +70,9 @@ OF_IMU = (
     "time", "vibration", "turning_rate", "rate_x", "rate_y", "rate_z", "accel", "accel_x", "accel_y", "accel_z",
 )  # fmt: skip
 
+# Those of OF_TDOA that samples of the other sensors of a vehicle hold too.
+OF_AIDS = ("time", "x", "y", "height", "speed", "climb_rate", "acceleration", "turning_rate", "vibration")
+
 # Which of position (0, 1, 2) and velocity (3, 4, 5) of the tag, as the filter estimates them, change a covariate of TDOAs at once. Not
 # that of the speed: its direction is anybody's guess where a tag is slow, and following it did harm.
 STATES = {**dict.fromkeys(("x", "y", "height", *OF_ARRIVAL), (0, 1, 2)), "climb_rate": (5,)}
@@ -88,16 +91,16 @@ EXTRA = "extra."  # before the name of what else a log holds: "extra.STREAM.COLU
 OF_ACCEL = ("accel", "accel_x", "accel_y", "accel_z")  # specific force, m/s^2
 
 
-def sensor_covariate(name: str, samples: ImuSamples | AidSamples) -> np.ndarray:
-    """Covariate `name`, of a pose in OF_TDOA, of ImuSamples also of OF_IMU and "extra.NAME": (n,)."""
+def sensor_covariate(name: str, samples: ImuSamples | AidSamples) -> np.ndarray | None:
+    """Covariate `name`, one of OF_AIDS, of ImuSamples also one of OF_IMU or "extra.NAME": (n,); None if the samples do not
+    hold it."""
     if name.startswith(EXTRA):
-        # who asks has seen that samples hold it, here and below
-        return samples.extra[name.removeprefix(EXTRA)]  # type: ignore[union-attr,index]  # as said
+        return (samples.extra or {}).get(name.removeprefix(EXTRA)) if isinstance(samples, ImuSamples) else None
     if samples.channel == "accel" and name in OF_ACCEL:  # the measured one shares its noise with the residual
         return _norm(samples.reading) if name == "accel" else samples.reading[:, "xyz".index(name[-1])]
     if name in OF_IMU and isinstance(samples, ImuSamples):
         return samples.features[:, OF_IMU.index(name)]
-    return OF_TDOA[name](samples)  # type: ignore[return-value]  # as said
+    return OF_TDOA[name](samples)
 
 
 class ImuFeatures:

@@ -15,10 +15,13 @@ from ..foundation.sensors import DIAGNOSED, SENSORS
 from .base import Effect, known_anchors, once_per_anchors
 from .samples import tile
 from .domain import FADE, bounded, share
-from .covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_STATE, OF_TDOA, STATES, sensor_covariate
+from .covariates import (
+    CATEGORIES, EXTRA, OF_AIDS, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_STATE, OF_TDOA, STATES, sensor_covariate,
+)  # fmt: skip
 from .sensor_function import SensorFunction
 from .shapes import SHAPES, functions
 from .smooth_words import sentences
+from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -42,7 +45,8 @@ class SmoothTerm(Effect):
     """A function of one covariate, held constant beyond its knots; `values` are its coefficients c0, c1, ...
 
     channel : "tdoa", "gyro.x" ... "accel.z", or of AID_CHANNELS
-    covariate : a name of covariates.OF_TDOA, or for "tdoa" of OF_ARRIVAL, for the inertial channels of OF_IMU
+    covariate : for "tdoa" a name of covariates.OF_TDOA or OF_ARRIVAL, for other channels of OF_AIDS, for the inertial ones
+        of OF_IMU too; or, but for AID_CHANNELS, "extra.STREAM.COLUMN". Where a recording does not hold it, it adds nothing
     form : for "tdoa" only: "common", the same f(covariate) on every d_ab; "arrival", f of each anchor's own
         covariate, as d_ab = f_b - f_a; "anchor", the same with a function for each anchor, coefficients "3.c0", ...;
         "pair": f on d_ab and -f on d_ba, coefficients "0-1.c0", ...; "direction": f on d_ab alone
@@ -77,12 +81,16 @@ class SmoothTerm(Effect):
             self.knots = ()
         if len(self.knots) < 2 or not (np.diff(self.knots) > 0.0).all():
             raise InputError(f"effects: smooth_term: knots: {self.knots!r} are not two or more rising numbers.")
-        known = {**dict.fromkeys(IMU_CHANNELS, (*OF_IMU, *OF_TDOA)), **dict.fromkeys(AID_CHANNELS, OF_TDOA)}
-        known["tdoa"] = (*OF_TDOA, *OF_ARRIVAL)
-        extra = self.covariate.startswith(EXTRA)
+        known: dict[str, tuple[str, ...]] = {"tdoa": (*OF_TDOA, *OF_ARRIVAL)}
+        known |= dict.fromkeys(IMU_CHANNELS, tuple(dict.fromkeys((*OF_IMU, *OF_AIDS))))
+        known |= dict.fromkeys(AID_CHANNELS, OF_AIDS)
+        extra = self.covariate.startswith(EXTRA) and self.channel not in AID_CHANNELS
         if self.form not in FORMS or self.channel not in known or not (extra or self.covariate in known[self.channel]):
+            remedy = f"channels are {listed(known)}"
+            if self.channel in known:
+                remedy = f"forms are {listed(FORMS)}, covariates of this channel {listed(known[self.channel])}"
             raise InputError(
-                f"effects: smooth_term: no {self.form!r} function of {self.covariate!r} acts on {self.channel!r}."
+                f"effects: smooth_term: no {self.form!r} function of {self.covariate!r} acts on {self.channel!r}; {remedy}."
             )
         if self.shape != "spline" and SHAPES.get(self.shape, (0,))[0] != len(self.knots):
             shapes = ", ".join(f"{shape} ({count})" for shape, (count, _) in SHAPES.items())
@@ -263,8 +271,9 @@ class SmoothTerm(Effect):
     def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
         if samples.channel != "tdoa":
             out = np.zeros((*samples.reading.shape, len(keys)))
-            basis = self.basis(sensor_covariate(self.covariate, samples))
-            out[:, self._axis] = basis[:, [int(key[1:]) for key in keys]]
+            values = sensor_covariate(self.covariate, samples)
+            if values is not None:
+                out[:, self._axis] = self.basis(values)[:, [int(key[1:]) for key in keys]]
             return out
         n, out = len(samples), np.zeros((len(samples), len(keys)))
         values, both = self._covariate(samples)

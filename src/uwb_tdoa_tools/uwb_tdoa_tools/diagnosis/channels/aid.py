@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import AidSamples, SmoothTerm, aid_samples
-from uwb_tdoa_bias.effects.covariates import OF_IMU, sensor_covariate
+from uwb_tdoa_bias.effects.covariates import OF_AIDS, OF_IMU, sensor_covariate
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
-from .base import Channel, ChannelResidual, Rows
+from .base import Channel, ChannelResidual, Rows, covariate_of
 from .figures import figures
 from .inertial import CELL, features_of
 from .knots import knots_of
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from .base import Comparison
     from .base import Figures
 
-COVARIATES = ("time", "x", "y", "height", "speed", "climb_rate", "acceleration", "turning_rate", "vibration")
 FEWEST_ATTITUDES, FEWEST_CELLS = 10, 8
 
 
@@ -107,9 +106,9 @@ class Aid(Channel[AidResidual]):
 
     def smooth_terms(self, residuals: Sequence[AidResidual]) -> list[SmoothTerm]:
         out = []
-        for name in COVARIATES:
-            values = [sensor_covariate(name, part.samples) for part in residuals]
-            knots = None if any(some is None for some in values) else knots_of(np.concatenate(values), name)
+        for name in OF_AIDS:
+            values = covariate_of(name, residuals)
+            knots = None if values is None else knots_of(values, name)
             if knots is not None:
                 out += [SmoothTerm(channel=label, covariate=name, knots=knots) for label in self.labels]
         return out

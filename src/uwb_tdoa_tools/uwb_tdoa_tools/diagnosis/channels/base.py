@@ -94,7 +94,8 @@ class ChannelResidual:
         raise NotImplementedError
 
     def covariate(self, name: str) -> np.ndarray | None:
-        """Values of a covariate, of OF_TDOA, OF_ARRIVAL or OF_IMU, at what is looked at; None where it is not known."""
+        """Values (n,) of a covariate, of OF_TDOA, OF_ARRIVAL or OF_IMU, or "extra.STREAM.COLUMN", at what is looked at; None
+        where it is not known."""
         raise NotImplementedError
 
     def place_in_room(self, series: int) -> str:
@@ -104,6 +105,12 @@ class ChannelResidual:
     def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """{label with unit: (t (k,) s, residual (k,))}, to be plotted and judged."""
         raise NotImplementedError
+
+
+def covariate_of(name: str, residuals: Sequence[ChannelResidual]) -> np.ndarray | None:
+    """Values of a covariate at all that is looked at in several ChannelResiduals: (n,); None where one does not know it."""
+    known = [values for values in (part.covariate(name) for part in residuals) if values is not None]
+    return np.concatenate(known) if len(known) == len(residuals) else None
 
 
 ChannelResiduals = dict[str, ChannelResidual]  # of one flight, by the name of the channel

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.effects import ImuSamples, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, sensor_covariate
 
-from .base import Channel, ChannelResidual, Rows
+from .base import Channel, ChannelResidual, Rows, covariate_of
 from .extra import extra_at, extra_names
 from .figures import figures
 from .knots import knots_of
@@ -63,16 +63,20 @@ class Inertial(Channel[ImuResidual]):
     def smooth_terms(self, residuals: Sequence[ImuResidual]) -> list[SmoothTerm]:
         out = []
         for name in self._covariates(residuals):
-            knots = knots_of(np.concatenate([sensor_covariate(name, part.samples) for part in residuals]), name)
+            values = covariate_of(name, residuals)
+            knots = None if values is None else knots_of(values, name)
             if knots is not None:
                 out += [SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots) for axis in self.axes]
         return out
 
     def views(self, residuals: Sequence[ImuResidual]) -> list[CovariateView]:
         channels, names = [f"{self.name}.{axis}" for axis in self.axes], self._covariates(residuals)
-        parts = [part.samples for part in residuals]
-        values = {name: np.concatenate([np.tile(sensor_covariate(name, one), 3) for one in parts]) for name in names}
-        return views_of_axes(channels, values, np.concatenate([np.repeat(np.arange(3), len(one)) for one in parts]))
+        axis = np.concatenate([np.repeat(np.arange(3), len(part.samples)) for part in residuals])
+        values = {}
+        for name in names:
+            known = (part.covariate(name) for part in residuals)
+            values[name] = np.concatenate([np.tile(one, 3) for one in known if one is not None])
+        return views_of_axes(channels, values, axis)
 
     @staticmethod
     def _covariates(residuals: Sequence[ImuResidual]) -> tuple[str, ...]:

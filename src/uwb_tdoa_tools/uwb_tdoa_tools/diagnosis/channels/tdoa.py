@@ -19,7 +19,7 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.sensitivity import Innovations
 
 from . import pairs
-from .base import Channel, ChannelResidual, Rows
+from .base import Channel, ChannelResidual, Rows, covariate_of
 from .extra import extra_at, extra_names
 from .knots import knots_of
 from .views import views_of_pairs
@@ -77,7 +77,7 @@ class TdoaResidual(ChannelResidual):
     def covariate(self, name: str) -> np.ndarray | None:
         if name in OF_ARRIVAL:
             return _of_arrivals(OF_ARRIVAL[name], self.samples)[:, self.fitted].ravel()
-        values = OF_TDOA[name](self.samples)
+        values = _covariate(name, self.samples)
         return None if values is None else values[self.fitted]
 
     def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -161,19 +161,17 @@ class Tdoa(Channel[TdoaResidual]):
         return TdoaResidual(samples, residual, airborne, airborne, comparison.reference.knows_floor, innovations)
 
     def smooth_terms(self, residuals: Sequence[TdoaResidual]) -> list[SmoothTerm]:
-        out, chosen = [], [part.fitted for part in residuals]
+        out = []
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
-            known = _covariates(name, residuals)
-            knots = None
-            if known is not None:
-                knots = knots_of(np.concatenate([v[rows] for v, rows in zip(known, chosen)]), name)
+            values = covariate_of(name, residuals)
+            knots = None if values is None else knots_of(values, name)
             if knots is not None:
                 out.append(SmoothTerm(covariate=name, form="common", knots=knots))
                 if name not in CATEGORIES and not name.startswith(EXTRA):
                     out.append(SmoothTerm(covariate=name, form="anchor", knots=knots))
-        for name, function in OF_ARRIVAL.items():
-            values = [_of_arrivals(function, part.samples)[:, rows] for part, rows in zip(residuals, chosen)]
-            knots = knots_of(np.concatenate(values, axis=1).ravel(), name)
+        for name in OF_ARRIVAL:
+            values = covariate_of(name, residuals)
+            knots = None if values is None else knots_of(values, name)
             if knots is not None:
                 out += [SmoothTerm(covariate=name, form=form, knots=knots) for form in ("arrival", "anchor")]
         return out
@@ -185,10 +183,12 @@ class Tdoa(Channel[TdoaResidual]):
         ends = [np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)]) for part in residuals]
         of_tdoa, of_arrival, quick = {}, {}, {}
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
-            known = _covariates(name, residuals)
-            if known is not None and name in QUICK:
+            known = [v for v in (_covariate(name, part.samples) for part in residuals) if v is not None]
+            if len(known) < len(residuals):
+                continue
+            if name in QUICK:
                 quick[name] = np.concatenate([v[cell.chosen] for cell, v in zip(cells, known)])
-            elif known is not None:
+            else:
                 of_tdoa[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
         for name, function in OF_ARRIVAL.items():
             both = [_of_arrivals(function, part.samples) for part in residuals]
@@ -204,16 +204,9 @@ class Tdoa(Channel[TdoaResidual]):
         return pairs.health(residuals)
 
 
-def _covariates(name: str, residuals: Sequence[TdoaResidual]) -> list[np.ndarray] | None:
-    """A covariate of OF_TDOA, or "extra.STREAM.COLUMN", of each: (n,); None where one of them does not hold it."""
-    known = []
-    for part in residuals:
-        extra = part.samples.extra or {}
-        values = OF_TDOA[name](part.samples) if name in OF_TDOA else extra.get(name.removeprefix(EXTRA))
-        if values is None:
-            return None
-        known.append(values)
-    return known
+def _covariate(name: str, samples: Samples) -> np.ndarray | None:
+    """One of OF_TDOA, or "extra.STREAM.COLUMN": (n,); None where the samples do not hold it."""
+    return OF_TDOA[name](samples) if name in OF_TDOA else (samples.extra or {}).get(name.removeprefix(EXTRA))
 
 
 def _of_arrivals(function: Callable[[Samples, np.ndarray], np.ndarray], samples: Samples) -> np.ndarray:
