@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_ekf.debias import fit
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.debiasing.judge import fly, judge
+from uwb_tdoa_tools.debiasing.evaluation import evaluate_map, fly
 from uwb_tdoa_tools.debiasing.parts import LEAST, part_of
 from uwb_tdoa_tools.debiasing.report import about_figures
 from uwb_tdoa_tools.readers import inputs
@@ -87,7 +87,7 @@ def _case(task, data, diagnosed):
         for run in judging:
             row = rows.setdefault(run[1].name, {})
             row[words or "before"] = _figures(run[1])
-            row |= {name: _figures(judge(run, one, effects)) for name, one in maps.items()}
+            row |= {name: _figures(evaluate_map(run, one, effects)) for name, one in maps.items()}
         about |= {name: about_figures(one) for name, one in maps.items()}
     return {
         "case": case,

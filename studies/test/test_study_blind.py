@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
-from uwb_tdoa_tools.diagnosis.findings import Finding
+from uwb_tdoa_tools.diagnosis.findings import EffectFinding
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative
 
 from studies.diagnosis import blind, grammar
@@ -61,7 +61,7 @@ def test_a_shape_is_as_large_as_it_says(shape):
 
 
 def finding(effect, alternatives=()):
-    return Finding(effect, effect.channels[0], {"criterion": 50.0}, 0.1, alternatives)
+    return EffectFinding(effect, effect.channels[0], {"criterion": 50.0}, 0.1, alternatives)
 
 
 def test_a_claim_is_what_was_put_in(flight):

@@ -57,7 +57,9 @@ def split(flights, plain, seed, fit, kinds):
             model, _ = models.save(trained, Path(folder))
             network = Network(model) if model else None
             shares = sorted({borne_out.share, 1.0})
-            errors = {flight.name: shrinking.judged(flight, plain, trained.effects, network, shares) for flight in others}
+            errors = {
+                flight.name: shrinking.errors_by_share(flight, plain, trained.effects, network, shares) for flight in others
+            }
         yield {"seed": seed, "kind": kind, "left_out": borne_out.as_dict()["left_out"], "judged": _text(errors)}
 
 

@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_tools.diagnosis.findings import Finding
+from uwb_tdoa_tools.diagnosis.findings import EffectFinding
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 
 # Keys of diagnosis.json that are names of something: of parameters, anchors, lags.
@@ -31,7 +31,7 @@ def said(page):
 
 def finding(effect, added=True, worth=0.02, alternatives=(), tried=True, channel="tdoa"):
     candidates = (Candidate((Term(effect, tuple(effect.std)),)),) if tried else ()
-    return Finding(effect, channel, {}, 0.1, tuple(alternatives), candidates, added, worth)
+    return EffectFinding(effect, channel, {}, 0.1, tuple(alternatives), candidates, added, worth)
 
 
 def delay(value=0.3, std=0.01):

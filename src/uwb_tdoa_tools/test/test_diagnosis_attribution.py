@@ -4,7 +4,7 @@ import pytest
 import undeclared
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, LabelEffect, SmoothTerm
 from uwb_tdoa_tools.diagnosis import attribution
-from uwb_tdoa_tools.diagnosis.attribution import _simpler, _straightened, attribute, effects_of, residuals_of
+from uwb_tdoa_tools.diagnosis.attribution import _relinearised, _simpler, attribute, effects_of, residuals_of
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
@@ -61,7 +61,7 @@ def test_an_anchor_that_is_far_off_is_fitted_where_it_is(flight):
     table = table_of(at(())).with_terms([term for candidate in candidates for term in candidate.terms])
     selection = select(table, candidates, np.ones(3 * len(table.channels)))
     before = np.std(table_of(at(effects_of(selection))).y - selection.fit.residual)
-    after = _straightened(selection, at, candidates)
+    after = _relinearised(selection, at, candidates)
     assert before > 0.02
     assert np.std(table_of(at(effects_of(after))).y - after.fit.residual) < 0.002
     (effect,) = effects_of(after)

@@ -87,7 +87,7 @@ def test_the_scorer_gives_what_the_whole_equations_would(data):
     candidate = data.draw(st.sampled_from(candidates))
     model = fit(table, base, np.ones(3 * len(CHANNELS)))
     model = type(model)(**{**vars(model), "weight": rng.uniform(0.5, 1.5, len(table.y))})
-    judged = Scorer(table, base, model, candidate.columns).judge(candidate.columns)
+    judged = Scorer(table, base, model, candidate.columns).gain(candidate.columns)
     both = list(dict.fromkeys([*base, *candidate.columns]))
     if set(candidate.columns) <= set(base):
         assert judged is None

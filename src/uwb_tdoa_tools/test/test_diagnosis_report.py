@@ -11,7 +11,7 @@ from reports import Tags, delay, finding, judged, keys_of, said
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.wording import measured
 from uwb_tdoa_tools.diagnosis import diagnose
-from uwb_tdoa_tools.diagnosis.findings import Finding, Refused
+from uwb_tdoa_tools.diagnosis.findings import EffectFinding, Refused
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative, Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
@@ -143,7 +143,7 @@ def test_without_ground_truth_what_is_not_borne_out_is_not_added_with_the_reason
 def test_what_came_into_the_model_together_is_one_entry_with_one_worth(result):
     terms = [SmoothTerm({"3.c0": 0.1}, {"3.c0": 0.01}, "", "tdoa", name, "anchor", (0.0, 1.0)) for name in ("x", "y")]
     together = Candidate(tuple(Term(term, ("3.c0",)) for term in terms))
-    findings = [Finding(term, "tdoa", {}, 0.2, (), (together,), True, 0.015) for term in terms]
+    findings = [EffectFinding(term, "tdoa", {}, 0.2, (), (together,), True, 0.015) for term in terms]
     (entry,) = entries(replace(result, findings=findings))
     assert entry.title == "tdoa of anchor 3 over x and y" and worth_in_words(entry) == "1.5 cm"
 

@@ -50,5 +50,6 @@ def test_two_processes_give_the_same_to_the_bit():
     flights, told = [EFFECTS["anchor_delay"]({"3": 0.4}).inject(flight(seed)) for seed in range(3)], []
     for jobs in (1, 2):
         over = partial(parallel.over, jobs=jobs)
-        told.append(shrinking.bear_out("structured", flights, shrinking.uncorrected(flights, over), 0, OPTIONS, over=over))
+        plain = shrinking.uncorrected(flights, over)
+        told.append(shrinking.bear_out("structured", flights, plain, 0, OPTIONS, map_function=over))
     assert told[0] == told[1] and set(told[0].errors) == {one.name for one in flights}

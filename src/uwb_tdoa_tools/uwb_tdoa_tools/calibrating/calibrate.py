@@ -93,7 +93,7 @@ def with_truth(
         progress("judging")
         before, after = (_rmse(holdout, *side) for side in ((base, config), (found.effects, _with_noise(config, std))))
         calibration = replace(calibration, before=before, after=after, judged_on=_names(holdout))
-    return _judged(calibration, len(found.effects) > len(base))
+    return _assessed(calibration, len(found.effects) > len(base))
 
 
 def without_truth(
@@ -116,7 +116,7 @@ def without_truth(
         found = survey(flights, tape, base, config, (), said)  # what was judged, of all of it
     std = found.surveyed.tdoa_std
     calibration = Calibration(found.anchors, found.effects, std, "slow innovations", before, after, on, found.why_not, found.as_text())
-    calibration = _judged(calibration, True)
+    calibration = _assessed(calibration, True)
     return calibration if calibration.why_not else replace(calibration, why_not=_why_not_blindly(calibration))
 
 
@@ -132,7 +132,7 @@ def _why_not_blindly(calibration: Calibration) -> str | None:
     return None
 
 
-def _judged(calibration: Calibration, something: bool) -> Calibration:
+def _assessed(calibration: Calibration, something: bool) -> Calibration:
     """The Calibration with why it is not to be used; something : whether there is anything to use."""
     if calibration.why_not is not None:
         return calibration

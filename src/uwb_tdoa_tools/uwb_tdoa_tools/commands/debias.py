@@ -8,7 +8,7 @@ from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 
 from .. import cli, options, parallel
 from ..debiasing import report
-from ..debiasing.judge import Estimator
+from ..debiasing.evaluation import Estimator
 from ..debiasing.mapping import fit_map
 from ..debiasing.shrinking import bear_out
 

@@ -86,7 +86,9 @@ def _write(args, several, over, progress):
     training, validation = ([flights[name] for name in some] for some in names)
     name = args.name or args.model
     progress(f"training on {len(training)} flights, then without each")
-    result, borne_out = shrinking.train(args.model, training, validation, args.seed, name, progress=cli.show, over=over)
+    result, borne_out = shrinking.train(
+        args.model, training, validation, args.seed, name, progress=cli.show, map_function=over
+    )
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
     label, x, *errors = result.curve

@@ -13,7 +13,7 @@ from .parts import LEAST, part_of, static_parts
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from uwb_tdoa_ekf.debias import BiasMap
-    from .judge import Estimator, Scored
+    from .evaluation import Estimator, Scored
 
 
 def fit_map(

@@ -16,7 +16,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from ..readers.tables import read_numbers
 from ..scoring.evaluation import judging_truth
 from ..scoring.metrics import position_at
-from .judge import Estimator
+from .evaluation import Estimator
 
 if TYPE_CHECKING:
     from uwb_tdoa_ekf.estimator import Odometry

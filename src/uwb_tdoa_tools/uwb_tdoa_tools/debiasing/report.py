@@ -6,13 +6,13 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .judge import judge
+from .evaluation import evaluate_map
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.debias import BiasMap
-    from .judge import Scored
+    from .evaluation import Scored
 
 _RUN = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean")
 
@@ -47,7 +47,7 @@ def rows(flown: Iterable[Scored], bias_map: BiasMap, effects: EffectSet | None =
     that the map knows."""
     out = []
     for flight, score, odometry in flown:
-        after = judge((flight, score, odometry), bias_map, effects)
+        after = evaluate_map((flight, score, odometry), bias_map, effects)
         sides = {"before": score.row(), "after": after.row()}
         airborne = odometry.p[(odometry.t >= score.first) & (odometry.t <= score.last)]
         figures = {side: {name: row[name] for name in _RUN} for side, row in sides.items()}

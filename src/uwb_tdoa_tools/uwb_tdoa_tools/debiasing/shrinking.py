@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any, TYPE_CHECKING
 
 from ..scoring.borne_out import SHARES, BorneOut, choose
-from .judge import judge
+from .evaluation import evaluate_map
 from .mapping import fit_map
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
-    from .judge import Estimator, Scored
+    from .evaluation import Estimator, Scored
 
 FEWEST = 2  # flights; one alone leaves none to judge
 
@@ -30,5 +30,5 @@ def bear_out(
         name = flight.name if flight.name not in errors else f"{flight.name} ({number})"
         errors[name] = {None: score.row()["rmse_3d"]}
         for share in SHARES:
-            errors[name][share] = judge(one, made.scaled(share), estimator.effects).row()["rmse_3d"]
+            errors[name][share] = evaluate_map(one, made.scaled(share), estimator.effects).row()["rmse_3d"]
     return BorneOut(choose(errors), errors)

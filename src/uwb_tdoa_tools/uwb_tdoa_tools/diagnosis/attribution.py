@@ -17,7 +17,7 @@ from .channels import CHANNELS, residuals
 from .detectors import DETECTORS
 from .deviations import with_deviations
 from .domains import Seen
-from .findings import Finding, Refused
+from .findings import EffectFinding, Refused
 from .over_flights import of_one, shares
 from .regression.confounding import alternatives
 from .regression.fit import fit
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ..parallel import MapFunction
     from .channels.views import CovariateView
     from .detectors import Detection, Detector
-    from .judging import Kept
+    from .validation import ValidatedSelection
     from .references import Reference
     from .regression.fit import Fit
     from .regression.select import Search
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from .channels import ChannelResidual, ChannelResiduals
 
 ROUNDS = 2  # of linearising about what was found
-STRAIGHT = 0.1  # of the channel's scale: root mean square by which a linear model may be off
+LINEARITY_LIMIT = 0.1  # of the channel's scale: root mean square by which a linear model may be off
 MAPS_GAIN, MAPS_SURE = 20.0, 3.0  # held-out log-likelihood, twice, and its t value over blocks, that maps must bring
 DISGUISED = 4  # times that what disguises itself as noise is searched for before noise is measured
 SAME_STORY = 0.05  # share of what a model explains that a simpler one may explain less
@@ -85,12 +85,12 @@ class Attribution:
         """Effects found near the floor that the filter may be told: tuple. Functions without a name would go on in the air."""
         return tuple(effect for effect in effects_of(self.floor) if effect.weighed) if self.floor else ()
 
-    def of(self, kept: Kept) -> Attribution:
-        """The Attribution of what was Kept."""
-        return replace(self, selection=with_deviations(kept.selection), detections=kept.detections, alone=())
+    def of(self, validated: ValidatedSelection) -> Attribution:
+        """The Attribution of a ValidatedSelection."""
+        return replace(self, selection=with_deviations(validated.selection), detections=validated.detections, alone=())
 
-    def findings(self) -> list[Finding]:
-        """[Finding], those by regression first, those of one flight alone last."""
+    def findings(self) -> list[EffectFinding]:
+        """[EffectFinding], those by regression first, those of one flight alone last."""
         out = _findings(self.selection, self.candidates, self.names)
         out += map(_of_detection, self.detections)
         if self.floor:
@@ -104,18 +104,19 @@ class Attribution:
 def attribute(
     flights: Sequence[Flight], reference: Reference, base: EffectSet = EffectSet(),
     kinds: Collection[str] | None = None, undeclared: bool = True, progress: Callable[[], object] = lambda: None,
-    over: MapFunction = map,
+    map_function: MapFunction = map,
 ) -> Attribution:  # fmt: skip
     """Attribution of the residuals of Flights, which the Reference has prepared, to effects beyond `base`.
 
     kinds : names of the declared effects to look for, None for all; undeclared : look for functions without a name too;
-    progress() is called now and then; over(function, items) : as map, but for the time and the process in which each is done.
+    progress() is called now and then; map_function(function, items) : as map, but for the time and the process in
+    which each is done.
     """
     wanted = [detector for name, detector in DETECTORS.items() if kinds is None or name in kinds]
     detectors = [detector for detector in wanted if not detector.on_floor]
 
     def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
-        return residuals_of(flights, reference, EffectSet((*base.effects, *model)), progress, over)
+        return residuals_of(flights, reference, EffectSet((*base.effects, *model)), progress, map_function)
 
     search = partial(_search, detectors)
     under_base = at(())
@@ -147,7 +148,7 @@ def attribute(
     if undeclared:
         smooth = _smooth(current, installation)
         selection = _with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress)
-        selection = _straightened(selection, at, declared + smooth)
+        selection = _relinearised(selection, at, declared + smooth)
         selection = _that_hold_on_other_data(selection, refused)
     selection = with_rivals(selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress)
     if undeclared and len(flights) >= FOR_MAPS:
@@ -158,7 +159,7 @@ def attribute(
     names = tuple(flight.name for flight in flights)
     alone: tuple[tuple[str, Selection], ...] = ()
     if undeclared and len(flights) > 1 and all(reference.positions_known):
-        alone = tuple((names[k], own) for k, own in of_one(remaining, inflation, _views, search, over))
+        alone = tuple((names[k], own) for k, own in of_one(remaining, inflation, _views, search, map_function))
     near = [(name, part) for name, part in zip(names, map(near_floor, remaining)) if part]
     floor = None
     if near:
@@ -226,13 +227,13 @@ def _merged_as(effect: Effect) -> Hashable:
 
 def residuals_of(
     flights: Sequence[Flight], reference: Reference, effects: EffectSet,
-    progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+    progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
 ) -> list[ChannelResiduals]:  # fmt: skip
-    """[`channels.residuals`] of Flights. progress, over : as of `attribute`."""
+    """[`channels.residuals`] of Flights. progress, map_function : as of `attribute`."""
     if not all(reference.positions_known):
-        over = map  # with all that the filter knows of the path, they take as long to send as to find
+        map_function = map  # with all that the filter knows of the path, they take as long to send as to find
     out = []
-    for of_flight in over(partial(residuals, reference=reference, effects=effects), flights):
+    for of_flight in map_function(partial(residuals, reference=reference, effects=effects), flights):
         out.append(of_flight)
         progress()
     return out
@@ -322,7 +323,7 @@ def _inflation(table: Table, declared: Sequence[Candidate], search: Search) -> n
     return model.inflation
 
 
-def _straightened(
+def _relinearised(
     selection: Selection, at: Callable[[Sequence[Effect]], list[ChannelResiduals]], candidates: Sequence[Candidate]
 ) -> Selection:
     """The selection fitted anew in a Table about its own values, with the columns of `candidates`, where it is not as linear
@@ -330,7 +331,7 @@ def _straightened(
     for _ in range(ROUNDS):
         model = effects_of(selection)
         current, table = at(model), selection.table
-        y, limit = _linearised(current, (), model).y, STRAIGHT * selection.fit.scale[table.group]
+        y, limit = _linearised(current, (), model).y, LINEARITY_LIMIT * selection.fit.scale[table.group]
         if len(y) == len(table.y) and np.mean(((y - table.y) / limit) ** 2) <= 1.0:
             break
         table = _linearised(current, [*candidates, *selection.chosen], model)
@@ -418,9 +419,9 @@ def recurs(candidate: Candidate) -> bool:
     return not any(key.endswith((".start", ".end")) for term in candidate.terms for key in term.effect.values)
 
 
-def _findings(selection: Selection, candidates: Sequence[Candidate], names: Sequence[str]) -> list[Finding]:
+def _findings(selection: Selection, candidates: Sequence[Candidate], names: Sequence[str]) -> list[EffectFinding]:
     effects = {_merged_as(effect): effect for effect in effects_of(selection)}
-    out: dict[Hashable, Finding] = {}
+    out: dict[Hashable, EffectFinding] = {}
     for candidate, score, loss in zip(selection.chosen, held_out(selection), selection.loss):
         evidence = {
             "criterion": round(float(loss), 1),
@@ -432,7 +433,7 @@ def _findings(selection: Selection, candidates: Sequence[Candidate], names: Sequ
             identity = _merged_as(term.effect)
             beside = [other.function for other in candidate.terms if other is not term] if term.function else []
             covariates = tuple(function.covariate for function in beside if function)
-            finding = Finding(
+            finding = EffectFinding(
                 effects[identity], candidate.channels[0], evidence, score.explained, others, (candidate,),
                 together_with=covariates, shares=shares(selection, candidate, names),
             )  # fmt: skip
@@ -440,8 +441,8 @@ def _findings(selection: Selection, candidates: Sequence[Candidate], names: Sequ
     return list(out.values())
 
 
-def _merged(finding: Finding, other: Finding) -> Finding:
-    """One Finding of two of one effect."""
+def _merged(finding: EffectFinding, other: EffectFinding) -> EffectFinding:
+    """One EffectFinding of two of one effect."""
     evidence = {key: round(finding.evidence[key] + other.evidence[key], 1) for key in other.evidence}
     named = {alternative.effect for alternative in finding.alternatives}
     more = tuple(alternative for alternative in other.alternatives if alternative.effect not in named)
@@ -454,5 +455,5 @@ def _merged(finding: Finding, other: Finding) -> Finding:
     )
 
 
-def _of_detection(detection: Detection) -> Finding:
-    return Finding(detection.effect, detection.channel, detection.evidence, 0.0)
+def _of_detection(detection: Detection) -> EffectFinding:
+    return EffectFinding(detection.effect, detection.channel, detection.evidence, 0.0)

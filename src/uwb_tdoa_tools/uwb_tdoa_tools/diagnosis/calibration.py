@@ -72,10 +72,11 @@ class Calibration:
 
 def calibrate(
     flights: Sequence[Flight], attribution: Attribution, base: EffectSet, config: FilterConfig | None = None,
-    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None,
+    map_function: MapFunction = map,
 ) -> Calibration:  # fmt: skip
     """Calibration from the innovations of prepared Flights. attribution : Attribution of them; base : EffectSet that is in the
-    model, its covariance the prior; config : FilterConfig; constraints : what else is known; over : as of
+    model, its covariance the prior; config : FilterConfig; constraints : what else is known; map_function : as of
     `attribution.attribute`."""
     candidates = attribution.candidates
     whole = {candidate.name: candidate for candidate in reversed(candidates)}  # the first of an effect is all of it
@@ -83,7 +84,7 @@ def calibrate(
     table = table_of(attribution.residuals).with_terms([term for candidate in candidates for term in candidate.terms])
     table = _rows(table, (table.channel == table.channels.index("tdoa")) & (table.count >= FEWEST))
     anchors = flights[0].anchors
-    found = survey(flights, np.full((len(anchors), 3), POSITION_STD), base, config, constraints, progress, over)
+    found = survey(flights, np.full((len(anchors), 3), POSITION_STD), base, config, constraints, progress, map_function)
     columns = columns_of(chosen)
     keys = [*(f"{i}.{axis}" for i in anchors.ids for axis in "xyz"), *map(str, anchors.ids)]
     places = [keys.index(column.key) for column in columns]

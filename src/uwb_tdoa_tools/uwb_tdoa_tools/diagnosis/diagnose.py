@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..checking.numbers import numbers
 from ..parallel import in_one_thread
 from ..scoring.metrics import Score
-from . import judging, output, repairing
+from . import output, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
 from .calibration import merged
 from .findings import Refused, usable
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from ..parallel import MapFunction
     from .channels import ChannelResiduals
     from .channels.base import Figures
-    from .findings import Finding
-    from .judging import Kept
+    from .findings import EffectFinding
+    from .validation import ValidatedSelection
     from .regression.confounding import Unobservable
 
 SAME_PLACE = 0.05  # m by which an anchor may differ between flights of one installation
@@ -41,9 +41,9 @@ SAME_PLACE = 0.05  # m by which an anchor may differ between flights of one inst
 class Diagnosis:
     """What was found in some flights, and what it is worth.
 
-    flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [Finding]; effects :
+    flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [EffectFinding]; effects :
     EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
-    `judging.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
+    `validation.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
     ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes : sentences, what is not as in the last calibration;
     applying : ((command line, what it does), ...), how the effects are put to use;
     of_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its ground truth.
@@ -51,7 +51,7 @@ class Diagnosis:
 
     flights: tuple[Flight, ...]
     reference: Reference
-    findings: list[Finding]
+    findings: list[EffectFinding]
     effects: EffectSet
     refused: list[Refused]
     unobservable: list[Unobservable]
@@ -85,64 +85,71 @@ class Diagnosis:
 def diagnose(
     flights: Sequence[Flight], holdout: Sequence[Flight] = (), base: EffectSet = EffectSet(),
     config: FilterConfig | None = None, reference: Reference | None = None,
-    progress: Callable[[str], object] = lambda what: None, over: MapFunction = map,
+    progress: Callable[[str], object] = lambda what: None, map_function: MapFunction = map,
 ) -> Diagnosis:  # fmt: skip
     """Diagnosis of Flights.
 
     holdout : Flights to judge on; base : EffectSet that is in the model already; config : FilterConfig; reference :
     Reference, by default the recorded ground truth; progress(what) is called every few seconds at least;
-    over : as of `attribute`, of work on single flights.
+    map_function : as of `attribute`, of work on single flights.
     Raises InputError where a flight cannot be used: flights of different anchors, or without the reference.
     """
     reference = reference or GroundTruth()
     same_anchors([*flights, *holdout])
-    flights, holdout = (tuple(map(reference.prepare, some)) for some in (flights, holdout))
+    prepared = [reference.prepare(flight) for flight in (*flights, *holdout)]
 
     def saying(what: str) -> Callable[[], object]:
         return lambda: progress(what)
 
-    looking, count = saying(f"looking at {reference.words}"), len(flights)
+    looking = saying(f"looking at {reference.words}")
     settled = []
-    for one in over(partial(_settled, reference, base, config), [*flights, *holdout]):
+    for one in map_function(partial(_settled, reference, base, config), prepared):
         settled.append(one)
         looking()
     of_truth = {flight.name: said for flight, said in settled if said}
-    flights, holdout = (tuple(flight for flight, _ in some) for some in (settled[:count], settled[count:]))
+    count = len(flights)
+    fitted, held_out = (tuple(flight for flight, _ in some) for some in (settled[:count], settled[count:]))
 
-    repairs = repairing.repaired(flights, base, config, saying("looking at ids and signs")) if reference.judges else {}
-    sound, rest = repairing.sound(flights, base, repairs)
-    attribution = attribute(sound, reference, rest, progress=saying("tracing residuals to effects"), over=over)
+    tells_errors = reference.tells_errors
+    repairs = repairing.repaired(fitted, base, config, saying("looking at ids and signs")) if tells_errors else {}
+    sound, rest = repairing.sound(fitted, base, repairs)
+    tracing = saying("tracing residuals to effects")
+    found = attribute(sound, reference, rest, progress=tracing, map_function=map_function)
     # A finding stays one even if the filter does without it; it is only not added.
     trying = saying("running the filter without each")
-    baseline = judging.Baseline(base, config)
-    if reference.judges:
-        kept = judging.useful(attribution, sound, judging.Baseline(rest, config), trying, over)
+    baseline = validation.Baseline(base, config)
+    if tells_errors:
+        selected = validation.select_by_error(found, sound, validation.Baseline(rest, config), trying, map_function)
     else:
-        kept = judging.borne_out(attribution, sound, rest, config, reference.constraints, trying, over)
-    attribution, kept = repairing.before_others(attribution, kept, repairs)
-    model = attribution.of(kept)
-    effects = merged(base, usable(model.effects).effects, model.selection)
-    judged = judging.judge(model, flights, holdout, baseline, effects, reference, saying("judging"), over)
-    before, after, judged_on = judged
-    refused = [*attribution.refused, *kept.refused]
-    why_not = judging.why_not(before, after, max(reference.shift_std(flight.name).max() for flight in flights)) if reference.judges else None
-    if why_not and len(effects) > len(base) + len(attribution.of_floor):  # of those it tells nothing
+        known = reference.constraints
+        selected = validation.select_calibration(found, sound, rest, config, known, trying, map_function)
+    attribution, validated = repairing.before_others(found, selected, repairs)
+    tried = attribution.of(validated)
+    tried_effects = merged(base, usable(tried.effects).effects, tried.selection)
+    before, with_tried, judged_on = validation.validate(
+        tried, fitted, held_out, baseline, tried_effects, reference, saying("judging"), map_function
+    )
+    refused = [*attribution.refused, *validated.refused]
+    shift_std = max(reference.shift_std(flight.name).max() for flight in fitted) if tells_errors else 0.0
+    why_not = validation.why_not(before, with_tried, shift_std) if tells_errors else None
+    model, effects, after, applied = tried, tried_effects, with_tried, validated
+    if why_not and len(tried_effects) > len(base) + len(attribution.of_floor):  # of those it tells nothing
         refused.append(Refused("all", why_not))
-        after, kept = before, replace(judging.nothing(attribution), worth=kept.worth)
-        model = attribution.of(kept)
+        applied = replace(validation.empty_selection(attribution), worth=validated.worth)
+        model, after = attribution.of(applied), before
         effects = merged(base, attribution.of_floor, model.selection)
-    remaining = residuals_of(flights, reference, effects, saying("judging"), over)
-    baseline.prepare(flights, saying("judging"), over)
-    runs = [baseline.run(flight) for flight in flights]
+    remaining = residuals_of(fitted, reference, effects, saying("judging"), map_function)
+    baseline.prepare(fitted, saying("judging"), map_function)
+    runs = [baseline.run(flight) for flight in fitted]
     scores = [
         Score(flight.name, run.odometry, flight.truth, run.residuals)
-        for flight, run in zip(flights, runs)
-        if reference.judges
+        for flight, run in zip(fitted, runs)
+        if tells_errors
     ]
     return Diagnosis(
-        flights,
+        fitted,
         reference,
-        _findings(attribution, model, kept),
+        _findings(attribution, model, applied),
         effects,
         refused,
         unobservable(attribution.selection, attribution.candidates),
@@ -152,8 +159,8 @@ def diagnose(
         health(attribution.residuals, runs, scores),
         attribution,
         remaining,
-        {flight.name: found for found, flight in zip(over(numbers, flights), flights) if found},
-        kept.changes,
+        {flight.name: faults for faults, flight in zip(map_function(numbers, fitted), fitted) if faults},
+        applied.changes,
         of_truth=of_truth,
     )
 
@@ -164,21 +171,21 @@ def _settled(
     return reference.settled(flight, base, config)
 
 
-def _findings(attribution: Attribution, model: Attribution, kept: Kept) -> list[Finding]:
-    """[Finding]: those that are added, with the values that are written, then the others."""
+def _findings(attribution: Attribution, model: Attribution, applied: ValidatedSelection) -> list[EffectFinding]:
+    """[EffectFinding]: those that are added, with the values that are written, then the others."""
     detected = {detection.effect.name: detection for detection in attribution.detections}
 
-    def judged(finding: Finding, added: bool) -> Finding:
+    def with_worth(finding: EffectFinding, added: bool) -> EffectFinding:
         tried = finding.candidates or (detected[finding.effect.name],)
-        worth = [kept.worth[each] for each in tried if each in kept.worth]
+        worth = [applied.worth[each] for each in tried if each in applied.worth]
         return replace(finding, added=added, worth=float(np.sum(worth)) if worth else None)
 
-    def usable_there(finding: Finding) -> bool:
+    def usable_there(finding: EffectFinding) -> bool:
         return finding.effect.weighed if finding.on_floor else finding.effect.usable
 
-    out = [judged(finding, usable_there(finding)) for finding in model.findings()]
+    out = [with_worth(finding, usable_there(finding)) for finding in model.findings()]
     added = {finding.key for finding in out}
-    return out + [judged(finding, False) for finding in attribution.findings() if finding.key not in added]
+    return out + [with_worth(finding, False) for finding in attribution.findings() if finding.key not in added]
 
 
 def same_anchors(flights: Sequence[Flight]) -> None:

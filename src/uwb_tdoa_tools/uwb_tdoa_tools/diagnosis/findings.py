@@ -17,7 +17,7 @@ LEAST_WORTH = 0.005  # m that a finding may be worth, to come before one that is
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class EffectFinding:
     """An effect that was found.
 
     effect : Effect with values and std; channel : where it shows most; evidence : {figure: number}; explained : share of

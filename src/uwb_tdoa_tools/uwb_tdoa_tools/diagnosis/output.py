@@ -17,7 +17,7 @@ from .report.verdict import faults_in_words, truth_in_words, verdict
 
 if TYPE_CHECKING:
     from .diagnose import Diagnosis
-    from .findings import Finding
+    from .findings import EffectFinding
     from uwb_tdoa_bias.effects import SmoothTerm
 
 WIDTH, LABEL = 120, 10  # columns of the screen, and of them for what a line is
@@ -82,7 +82,7 @@ def _wrapped(label: str, text: str) -> str:
     )  # fmt: skip
 
 
-def _finding(finding: Finding) -> dict[str, Any]:
+def _finding(finding: EffectFinding) -> dict[str, Any]:
     effect = finding.effect
     return {
         "effect": effect.name,
@@ -107,7 +107,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
     }
 
 
-def _function(finding: Finding, effect: SmoothTerm) -> dict[str, Any]:
+def _function(finding: EffectFinding, effect: SmoothTerm) -> dict[str, Any]:
     at = np.linspace(effect.knots[0], effect.knots[-1], 25)
     prefixes = sorted({key.rpartition("c")[0] for key in effect.values})
     return {
@@ -129,11 +129,11 @@ def _function(finding: Finding, effect: SmoothTerm) -> dict[str, Any]:
     }
 
 
-def _over_flights(finding: Finding) -> dict[str, Any]:
+def _over_flights(finding: EffectFinding) -> dict[str, Any]:
     return {"shares": [vars(share) for share in finding.shares], "over_flights": course(finding.shares), "flight": finding.flight}
 
 
-def _alternatives(finding: Finding) -> list[dict[str, Any]]:
+def _alternatives(finding: EffectFinding) -> list[dict[str, Any]]:
     return [
         {"effect": other.effect, "share": other.share, "criterion_gap": other.gap, "tell_apart": other.tell_apart}
         for other in finding.alternatives

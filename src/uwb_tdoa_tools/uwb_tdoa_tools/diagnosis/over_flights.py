@@ -102,14 +102,14 @@ def in_words(several: Sequence[Share]) -> str:
 
 def of_one(
     remaining: list[ChannelResiduals], inflation: np.ndarray, views: Callable[[Table], dict[str, list[CovariateView]]],
-    search: Search, over: MapFunction = map,
+    search: Search, map_function: MapFunction = map,
 ) -> list[tuple[int, Selection]]:  # fmt: skip
     """[(flight, Selection)] of what each flight alone shows of its own, of [{channel: ChannelResidual}] that a model of all leaves.
 
-    inflation : of the fit of all; views(table) -> {channel: [CovariateView]}; search : as `select` takes it; over : as
-    of `attribute`. What another flight shows too is not of one alone."""
+    inflation : of the fit of all; views(table) -> {channel: [CovariateView]}; search : as `select` takes it;
+    map_function : as of `attribute`. What another flight shows too is not of one alone."""
     out = []
-    for number, selection in enumerate(over(partial(_selection, inflation, views, search), remaining)):
+    for number, selection in enumerate(map_function(partial(_selection, inflation, views, search), remaining)):
         if selection is None:
             continue
         own = [candidate for candidate in selection.chosen if not _elsewhere(selection, candidate, remaining, number)]

@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from ..checking.known_path import KnownPath
 from ..checking.repairs import repairs
 from .detectors import Detection
-from .judging import JUDGES, WORSE, Case, score
+from .validation import TRIAL_FLIGHTS, WORSE, ValidationCase, score
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
     from .attribution import Attribution
-    from .judging import Kept
+    from .validation import ValidatedSelection
     from .regression.terms import Candidate
 
 
@@ -53,11 +53,15 @@ def sound(
     return tuple(map(undo.correct_streams, flights)), replace(base, effects=rest)
 
 
-def before_others(attribution: Attribution, kept: Kept, found: dict[Detection, float]) -> tuple[Attribution, Kept]:
-    """(Attribution, Kept) with Detections and what they are worth, as of `repaired`."""
-    attribution = replace(attribution, detections=(*found, *attribution.detections))
+def before_others(
+    attribution: Attribution, validated: ValidatedSelection, found: dict[Detection, float]
+) -> tuple[Attribution, ValidatedSelection]:
+    """(Attribution, ValidatedSelection) with Detections and what they are worth, as of `repaired`."""
     worth: dict[Candidate | Detection, float] = dict(found.items())
-    return attribution, replace(kept, detections=(*found, *kept.detections), worth=worth | kept.worth)
+    return (
+        replace(attribution, detections=(*found, *attribution.detections)),
+        replace(validated, detections=(*found, *validated.detections), worth=worth | validated.worth),
+    )
 
 
 def _common(several: Sequence[Sequence[LabelEffect]]) -> list[LabelEffect]:
@@ -80,8 +84,8 @@ def _error(
 ) -> float:
     """Mean 3D RMSE, m, of some of the flights."""
     errors = []
-    for flight in flights[:: -(-len(flights) // JUDGES)]:
-        case = Case(flight, EffectSet(tuple(effects)))
+    for flight in flights[:: -(-len(flights) // TRIAL_FLIGHTS)]:
+        case = ValidationCase(flight, EffectSet(tuple(effects)))
         errors.append(score(case, run_offline(flight, config, Corrector(flight.anchors, case.effects))).row()["rmse_3d"])
         progress()
     return float(np.mean(errors))

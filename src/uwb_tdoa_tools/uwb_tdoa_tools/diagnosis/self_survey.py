@@ -100,12 +100,12 @@ class Change:
 def survey(
     flights: Sequence[Flight], position_std: np.ndarray, base: EffectSet = EffectSet(),
     config: FilterConfig | None = None, constraints: Sequence[Constraint] = (),
-    progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+    progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
 ) -> Surveyed:  # fmt: skip
     """Surveyed of Flights of the same anchors, which are where they say within position_std, (N, 3) m, or as the covariance of
     `base` says.
 
-    base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known; over : as of
+    base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known; map_function : as of
     `attribution.attribute`. The frame is that of the coordinates with the smallest std. Raises InputError for a flight that is too short.
     """
     config = config or FilterConfig()
@@ -114,7 +114,8 @@ def survey(
     start = np.concatenate([given.positions.ravel(), np.zeros(n)])
 
     def linearised(about: np.ndarray) -> _Equations:
-        return runs.equations(given.at(about[: 3 * n].reshape(n, 3)), about[3 * n :], prior.loose, progress, over)
+        anchors, delays = given.at(about[: 3 * n].reshape(n, 3)), about[3 * n :]
+        return runs.equations(anchors, delays, prior.loose, progress, map_function)
 
     first = last = linearised(start)
     found = solve(first.gram, first.vector, prior, np.zeros(4 * n))
@@ -134,21 +135,22 @@ def survey(
 
 @in_one_thread
 def tdoa_std_of(
-    flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None, over: MapFunction = map
+    flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None, map_function: MapFunction = map
 ) -> float:
-    """m, the tdoa_std that the innovations of Flights call for beside the EffectSet `effects`; their ground truth is not used. over : as
-    of `attribution.attribute`."""
+    """m, the tdoa_std that the innovations of Flights call for beside the EffectSet `effects`; their ground truth is
+    not used. map_function : as of `attribution.attribute`."""
     config, anchors = config or FilterConfig(), flights[0].anchors
     loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
-    return _Runs(flights, effects, config).equations(anchors, np.zeros(len(anchors)), loose, over=over).tdoa_std(config)
+    runs, no_delays = _Runs(flights, effects, config), np.zeros(len(anchors))
+    return runs.equations(anchors, no_delays, loose, map_function=map_function).tdoa_std(config)
 
 
 def noise_of(
-    diagnosis: Diagnosis, config: FilterConfig | None, over: MapFunction, say: Callable[[str], object]
+    diagnosis: Diagnosis, config: FilterConfig | None, map_function: MapFunction, say: Callable[[str], object]
 ) -> float | None:
     """The same of the flights of a Diagnosis beside its effects; None where they are too short to tell, and say(why)."""
     try:
-        return tdoa_std_of(diagnosis.flights, diagnosis.effects, config, over)
+        return tdoa_std_of(diagnosis.flights, diagnosis.effects, config, map_function)
     except InputError as error:
         say(f"no ekf_node.yaml: {error}")
         return None
@@ -216,7 +218,7 @@ class _Runs:
 
     def equations(
         self, anchors: Anchors, delays: np.ndarray, loose: np.ndarray, progress: Callable[[], object] = lambda: None,
-        over: MapFunction = map,
+        map_function: MapFunction = map,
     ) -> _Equations:  # fmt: skip
         """_Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may be."""
         gram: np.ndarray = np.zeros(())
@@ -225,7 +227,7 @@ class _Runs:
         several = []
         here = [[one for one in self._marks if one.flight == flight.name] for flight in self.flights]
         items = [(flight, self.spans.get(flight.name), some) for flight, some in zip(self.flights, here)]
-        told = over(partial(_of_flight, self._base, self._reference, anchors, delays, loose), items)
+        told = map_function(partial(_of_flight, self._base, self._reference, anchors, delays, loose), items)
         for (one, span), flight in zip(told, self.flights):
             self.spans[flight.name] = span
             marks += one.marks

@@ -78,7 +78,7 @@ def write_diagnosis(path: Path, result: Diagnosis, base: EffectSet, config: Filt
     truth as it was judged by."""
     (flight,) = result.flights
     before, after = (Estimator(config, effects)(flight) for effects in (base, result.effects))
-    truth = flight.truth if result.reference.judges else None
+    truth = flight.truth if result.reference.tells_errors else None
     write_rerun(path, flight, after.odometry, after.residuals, result.as_text().splitlines(), truth, before.odometry)
 
 

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 
 from ..diagnosis.attribution import Attribution, attribute, effects_of
 from ..diagnosis.findings import usable
-from ..diagnosis.judging import Baseline, useful
+from ..diagnosis.validation import Baseline, select_by_error
 from ..diagnosis.references import GroundTruth
 from ..diagnosis.regression.fit import refit
 from ..diagnosis.regression.terms import columns_of
@@ -82,6 +82,6 @@ def find(flights: Sequence[Flight], progress: Callable[[], object] = lambda: Non
     flights, reference = [level(flight) for flight in flights], GroundTruth()
     kinds = PORTABLE if len(constellations(flights)) > 1 else None
     attribution = attribute(flights, reference, kinds=kinds, undeclared=False, progress=progress)
-    kept = useful(attribution, flights, Baseline(EffectSet()), progress)
-    model = attribution.of(kept)
+    validated = select_by_error(attribution, flights, Baseline(EffectSet()), progress)
+    model = attribution.of(validated)
     return Physics(usable(model.effects), model)

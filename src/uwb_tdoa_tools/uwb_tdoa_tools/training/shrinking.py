@@ -36,19 +36,19 @@ FOLDS = 5
 def bear_out(
     kind: str, flights: Sequence[Flight], plain: Mapping[str, float], seed: int,
     options: structured.Options = structured.Options(), found: physics.Physics | None = None,
-    progress: Callable[[str], object] = lambda text: None, over: MapFunction = map,
+    progress: Callable[[str], object] = lambda text: None, map_function: MapFunction = map,
 ) -> BorneOut:  # fmt: skip
     """BorneOut of a kind of model trained on Flights.
 
-    plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with effects; over(function, folds) :
-    as map, but for the time and the process in which each is done.
+    plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with effects;
+    map_function(function, folds) : as map, but for the time and the process in which each is done.
     """
     order = np.random.default_rng(seed).permutation(len(flights))
     errors: dict[str, dict[float | None, float]] = {}
     folds = [order[k :: min(FOLDS, len(flights))].tolist() for k in range(min(FOLDS, len(flights)))]
     rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
     known = [found and physics.Physics(found.fitted_to(others)) for others in rest]
-    for told in over(partial(_left_out, kind, flights, plain, seed, options), list(zip(folds, rest, known))):
+    for told in map_function(partial(_left_out, kind, flights, plain, seed, options), list(zip(folds, rest, known))):
         of_fold = {name: dict(pairs) for name, pairs in told.items()}
         for name, of in of_fold.items():
             progress("{} left out: {:.3f} m without, {:.3f} m with all".format(name, of[None], of[1.0]))
@@ -56,12 +56,13 @@ def bear_out(
     return BorneOut(choose(errors), errors)
 
 
-def uncorrected(flights: Sequence[Flight], over: MapFunction = map) -> dict[str, float]:
-    """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction. over : as of `bear_out`."""
-    return {flight.name: error for error, flight in zip(over(_error, flights), flights)}
+def uncorrected(flights: Sequence[Flight], map_function: MapFunction = map) -> dict[str, float]:
+    """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction. map_function : as
+    of `bear_out`."""
+    return {flight.name: error for error, flight in zip(map_function(_error, flights), flights)}
 
 
-def judged(
+def errors_by_share(
     flight: Flight, plain: Mapping[str, float], effects: EffectSet | None, network: Network | None,
     shares: Sequence[float] = SHARES,
 ) -> dict[float | None, float]:  # fmt: skip
@@ -79,16 +80,17 @@ def judged(
 def train(
     kind: str, training: Sequence[Flight], validation: Sequence[Flight], seed: int, name: str,
     options: structured.Options = structured.Options(), progress: Callable[[str], object] = lambda text: None,
-    over: MapFunction = map,
+    map_function: MapFunction = map,
 ) -> tuple[models.Trained, BorneOut]:  # fmt: skip
-    """(Trained, BorneOut): `models.train`, and as much of it as is borne out. over : as of `bear_out`."""
+    """(Trained, BorneOut): `models.train`, and as much of it as is borne out. map_function : as of `bear_out`."""
     flights = [*training, *validation]
     found = None
     if kind.startswith("physics"):
         progress("looking for effects")
         found = physics.find(flights)
     trained = models.train(kind, training, validation, seed, name, options, progress, found)
-    borne_out = bear_out(kind, flights, uncorrected(flights, over), seed, options, found, progress, over)
+    plain = uncorrected(flights, map_function)
+    borne_out = bear_out(kind, flights, plain, seed, options, found, progress, map_function)
     if trained.model:
         trained = replace(trained, meta={**trained.meta, "share": borne_out.share})
     return trained, borne_out
@@ -107,7 +109,8 @@ def _left_out(
         trained = models.train(kind, some[:-1] or some, some[-1:], seed, kind, options, found=known, curve=False)
         model, _ = models.save(trained, Path(folder))
         network = Network(model) if model else None
-    return {flights[k].name: list(judged(flights[k], plain, trained.effects, network).items()) for k in left_out}
+    errors = {flights[k].name: errors_by_share(flights[k], plain, trained.effects, network) for k in left_out}
+    return {name: list(of_flight.items()) for name, of_flight in errors.items()}
 
 
 @in_one_thread

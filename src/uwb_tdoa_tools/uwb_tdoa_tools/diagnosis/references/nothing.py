@@ -33,7 +33,7 @@ class Nothing(Reference):
 
     positions_known = (False, False, False)
     attitude_known = False
-    judges = False
+    tells_errors = False
     words = "nothing but the flights themselves"
 
     def __init__(self, config: FilterConfig | None = None, constraints: Sequence[Constraint] = ()) -> None:

@@ -34,7 +34,7 @@ class Gain:
 
 
 class Scorer:
-    """Judges sets of Columns on top of a base, with the weights, scales and inflation of one Fit."""
+    """Gains of sets of Columns on top of a base, with the weights, scales and inflation of one Fit."""
 
     def __init__(self, table: Table, base: Sequence[Column], model: Fit, others: Sequence[Column]) -> None:
         """base : Columns that are in the model already; model : Fit, whose weights count; others : Columns that may be
@@ -64,7 +64,7 @@ class Scorer:
             cross[:, some], vector[some] = weighted @ x, x.T @ (root * y)
         return _Part(table, columns, rows, root, cross, vector, float(root @ y**2))
 
-    def judge(self, columns: Sequence[Column]) -> Gain | None:
+    def gain(self, columns: Sequence[Column]) -> Gain | None:
         """Gain of having some Columns too; None if all are there already."""
         all_places = np.array([self._place[column] for column in columns])
         new = np.unique(all_places[all_places >= len(self._base)])

@@ -131,13 +131,14 @@ def _fitted(
     if not acceptable(table, candidate, wider.values(candidate.columns)):
         return -np.inf
     scorer = Scorer(table, columns_of(chosen), wider, candidate.columns)
-    judged = scorer.judge(candidate.columns)
-    if judged is None:  # the model holds it
+    gained = scorer.gain(candidate.columns)
+    if gained is None:  # the model holds it
         return -np.inf
-    least_squares = Scorer(table, columns_of(chosen), replace(wider, weight=even), candidate.columns).judge(candidate.columns)
+    even_scorer = Scorer(table, columns_of(chosen), replace(wider, weight=even), candidate.columns)
+    least_squares = even_scorer.gain(candidate.columns)
     assert least_squares is not None  # nor is it then
     gain = min(wider.likelihood(table) - model.likelihood(table), least_squares.gain)
-    return gain - scorer.price(candidate, judged.determined, choices)
+    return gain - scorer.price(candidate, gained.determined, choices)
 
 
 def worth(selection: Selection, choices: int) -> float:
@@ -145,8 +146,8 @@ def worth(selection: Selection, choices: int) -> float:
     chosen, total = selection.chosen, selection.fit.likelihood(selection.table)
     for k, candidate in enumerate(chosen):
         scorer = Scorer(selection.table, columns_of(chosen[:k]), selection.fit, candidate.columns)
-        judged = scorer.judge(candidate.columns)
-        total -= scorer.price(candidate, judged.determined if judged else 0.0, choices)
+        gained = scorer.gain(candidate.columns)
+        total -= scorer.price(candidate, gained.determined if gained else 0.0, choices)
     return total
 
 
@@ -156,11 +157,11 @@ def rank(
     """[(criterion, Candidate)], best first; without those that are far from worth it, of negligible or of impossible size."""
     scorer, out = Scorer(table, columns_of(chosen), model, columns_of(candidates)), []
     for candidate in candidates:
-        judged = scorer.judge(candidate.columns)
-        if judged is None or judged.determined < LEAST_DETERMINED:
+        gained = scorer.gain(candidate.columns)
+        if gained is None or gained.determined < LEAST_DETERMINED:
             continue
-        criterion = judged.gain - scorer.price(candidate, judged.determined, len(candidates))
-        if criterion > -AMBIGUOUS and acceptable(table, candidate, judged.beta):
+        criterion = gained.gain - scorer.price(candidate, gained.determined, len(candidates))
+        if criterion > -AMBIGUOUS and acceptable(table, candidate, gained.beta):
             out.append((criterion, candidate))
     return sorted(out, key=lambda item: -item[0])
 
@@ -198,11 +199,11 @@ def _losses(table: Table, chosen: list[Candidate], model: Fit, choices: int) -> 
     out = []
     for k, candidate in enumerate(chosen):
         scorer = Scorer(table, columns_of(chosen[:k] + chosen[k + 1 :]), model, candidate.columns)
-        judged = scorer.judge(candidate.columns)
-        if judged is None:  # others hold all of its columns
+        gained = scorer.gain(candidate.columns)
+        if gained is None:  # others hold all of its columns
             out.append(-scorer.price(candidate, 0.0, choices))
         else:
-            out.append(judged.gain - scorer.price(candidate, judged.determined, choices))
+            out.append(gained.gain - scorer.price(candidate, gained.determined, choices))
     return out
 
 

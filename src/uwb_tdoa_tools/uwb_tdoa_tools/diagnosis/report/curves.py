@@ -174,17 +174,17 @@ def _function(effect: SmoothTerm) -> str:
     if len(prefixes) == 1:
         spread, course = effect.spread(at, prefixes[0]), effect.curve(at, prefixes[0])
         ax.fill_between(at, course - spread, course + spread, color=COLOURS[0], alpha=0.2, lw=0)
-    over, part = effect.covariate.replace("_", " "), CHANNELS[effect.channel.partition(".")[0]]
+    covariate, part = effect.covariate.replace("_", " "), CHANNELS[effect.channel.partition(".")[0]]
     ax.set(
-        xlabel=f"{over} [{UNITS.get(effect.covariate, 'as recorded')}]",
+        xlabel=f"{covariate} [{UNITS.get(effect.covariate, 'as recorded')}]",
         ylabel=f"part of {effect.channel} [{part.unit}]",
     )
     ax.grid(alpha=0.25, lw=0.5)
     if len(prefixes) > 1:
         ax.legend(title="anchor", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    caption = f"What depends on {over} without having a name, a curve for each anchor."
+    caption = f"What depends on {covariate} without having a name, a curve for each anchor."
     if len(prefixes) == 1:
         caption = f"{described(effect, prefixes[0].rstrip('.'))}. The band is twice the standard deviation wide.".capitalize()
     return embedded(
-        figure, f"Function of {over} in {effect.label.rpartition(' over ')[0]}", caption
+        figure, f"Function of {covariate} in {effect.label.rpartition(' over ')[0]}", caption
     )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Sequence
     from uwb_tdoa_bias.effects import Effect
     from ..diagnose import Diagnosis
-    from ..findings import Finding, Refused
+    from ..findings import EffectFinding, Refused
     from ..regression.confounding import Alternative
 
 CM = 100.0  # in a metre
@@ -37,7 +37,7 @@ class Entry:
     "" for what is added; alternatives : (Alternative, ...).
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[EffectFinding, ...]
     title: str
     values: str
     why_not: str
@@ -83,7 +83,7 @@ class Entry:
 
 def entries(diagnosis: Diagnosis) -> list[Entry]:
     """[Entry] of a Diagnosis, the most prominent first; what all anchors share over the room after what is told of some."""
-    groups: dict[Hashable, list[Finding]] = {}
+    groups: dict[Hashable, list[EffectFinding]] = {}
     for finding in diagnosis.findings:
         key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
         groups.setdefault(key, []).append(finding)
@@ -149,13 +149,13 @@ def by_anchor(effect: Effect) -> dict[int, dict[str, tuple[float, float | None]]
     return dict(sorted(out.items()))
 
 
-def _entry(findings: tuple[Finding, ...], refused: Sequence[Refused]) -> Entry:
+def _entry(findings: tuple[EffectFinding, ...], refused: Sequence[Refused]) -> Entry:
     first = findings[0]
     others = {other.effect: other for finding in findings for other in finding.alternatives}
     return Entry(findings, _title(findings), _values(first), _why_not(first, refused), tuple(others.values()))
 
 
-def _title(findings: Sequence[Finding]) -> str:
+def _title(findings: Sequence[EffectFinding]) -> str:
     function = findings[0].function
     if function is None:
         return findings[0].effect.name
@@ -166,7 +166,7 @@ def _title(findings: Sequence[Finding]) -> str:
     return f"{subject} over {covariates}{FORMS.get(function.form, '') if several else ''}"
 
 
-def _values(finding: Finding) -> str:
+def _values(finding: EffectFinding) -> str:
     effect = finding.effect
     if finding.function:
         return f"a function without a name ({finding.function.shape})"
@@ -185,7 +185,7 @@ def _values(finding: Finding) -> str:
     return f"{words} ({unit})" + (f"; {vague} not significant" if vague else "")
 
 
-def _why_not(finding: Finding, refused: Sequence[Refused]) -> str:
+def _why_not(finding: EffectFinding, refused: Sequence[Refused]) -> str:
     if finding.added:
         return ""
     if finding.flight:

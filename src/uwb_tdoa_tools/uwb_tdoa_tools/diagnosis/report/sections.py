@@ -124,7 +124,7 @@ def worth(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
         "By how much the position error (3D RMSE) grows if this one alone is left out, each flight with effects "
         "fitted to the others, or every other 5 s of a single one. Effects that can stand in for each other are each worth less "
         "than both together: the figures need not add up to the gain of all."
-        if diagnosis.reference.judges
+        if diagnosis.reference.tells_errors
         else "Nobody knows what each is worth for the position: without ground truth there is no error to compare."
     ]
     return section("What each effect is worth", paragraphs(note, "note"), stacked(head, rows))

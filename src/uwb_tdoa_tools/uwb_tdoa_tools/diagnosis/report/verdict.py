@@ -41,7 +41,7 @@ def verdict(diagnosis: Diagnosis) -> Verdict:
         return _without_truth(diagnosis)
     if not any(finding.added for finding in diagnosis.findings):
         return _nothing_added(diagnosis)
-    return _judged(diagnosis)
+    return _with_errors(diagnosis)
 
 
 def faults_in_words(diagnosis: Diagnosis) -> list[str]:
@@ -79,7 +79,7 @@ def _bounds(interval: Sequence[float] | None) -> str:
     return f"{interval[0] * CM:.1f} to {interval[1] * CM:.1f}" if interval else "unknown"
 
 
-def _judged(diagnosis: Diagnosis) -> Verdict:
+def _with_errors(diagnosis: Diagnosis) -> Verdict:
     before, after = diagnosis.before["pooled"], diagnosis.after["pooled"]
     gain, interval = 1.0 - after["rmse_3d"] / before["rmse_3d"], after.get("rmse_3d_gain_ci")
     change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"

@@ -49,7 +49,7 @@ def fly(
 
 @dataclass(frozen=True)
 class Estimator:
-    """What positions are estimated with; estimator((path, survey)) is what `judge.fly` gives. Can be pickled.
+    """What positions are estimated with; estimator((path, survey)) is what `fly` gives. Can be pickled.
 
     reading : Reading; config : FilterConfig; effects : EffectSet or None, of the TDOAs before the filter; align : as of
     `settled`.
@@ -64,7 +64,7 @@ class Estimator:
         return fly(self.reading.read(recording), self.config, self.effects, self.align)
 
 
-def judge(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = None) -> Score:
+def evaluate_map(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = None) -> Score:
     """Score of a flight from `fly` with its positions corrected by a BiasMap. effects : those it was flown with."""
     flight, _, odometry = flown
     return Score(flight.name, debiased(odometry, bias_map), judging_truth(flight, effects))

@@ -13,8 +13,11 @@ from uwb_tdoa_ekf.offline import poses_of, run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.detectors import Detection
-from uwb_tdoa_tools.diagnosis.judging import Baseline, Case, _gain_interval, borne_out, compare, cross_fitted, judge, score, useful, why_not
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
+from uwb_tdoa_tools.diagnosis.validation import (
+    Baseline, ValidationCase, _gain_interval, compare, cross_fitted, score, select_by_error, select_calibration, validate,
+    why_not,
+)  # fmt: skip
 
 TRUTH = GroundTruth()
 NONE = EffectSet()
@@ -59,14 +62,14 @@ def test_parts_of_a_flight_are_judged_by_the_errors_within_them(flights):
 
 
 def test_what_helps_is_kept_and_said_what_it_is_worth(flights, attribution):
-    kept = useful(attribution, flights, Baseline(NONE))
+    kept = select_by_error(attribution, flights, Baseline(NONE))
     assert kept.candidates == attribution.selection.chosen and not kept.refused
     assert kept.worth[kept.candidates[0]] > 0.05
 
 
 def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
     clean = [clean_flight(seed, 30.0) for seed in (100, 101)]
-    kept = useful(attribution, clean, Baseline(NONE))
+    kept = select_by_error(attribution, clean, Baseline(NONE))
     assert kept.candidates == () and "the filter does better without it" in kept.refused[0].why
 
 
@@ -78,7 +81,7 @@ def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
 def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recurs):
     flight = effect.inject(clean_flight(100, 30.0))
     found = attribute([flight], TRUTH)
-    kept = useful(found, [flight], Baseline(NONE))
+    kept = select_by_error(found, [flight], Baseline(NONE))
     assert found.selection.chosen and bool(kept.candidates) == recurs
     assert all(kept.worth[candidate] > 0.02 for candidate in found.selection.chosen[:1])
     if not recurs:
@@ -88,7 +91,7 @@ def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recu
 def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights):
     two = [EFFECTS["gyro_bias"]({"z": 0.006}).inject(flight) for flight in flights]
     found = [attribute(some, TRUTH, undeclared=False) for some in (two, two[:1])]
-    several, alone = (useful(one, some, Baseline(NONE)) for one, some in zip(found, (two, two[:1])))
+    several, alone = (select_by_error(one, some, Baseline(NONE)) for one, some in zip(found, (two, two[:1])))
     assert {candidate.name for candidate in several.candidates} == {"anchor_delay", "gyro_bias"}
     assert {candidate.name for candidate in alone.candidates} == {"anchor_delay"}
     assert "of one flight, worth less than 5% of the error" in alone.refused[-1].why
@@ -102,7 +105,7 @@ def test_what_no_node_can_take_out_is_not_tried():
     turned = np.outer(np.nan_to_num(0.15 * np.minimum(acceleration - 1.0, 1.5)), [1.0, 0.0, 0.0])
     flight = replace(flight, imu=replace(flight.imu, gyro=flight.imu.gyro + turned))
     found = attribute([flight], TRUTH)
-    kept = useful(found, [flight], Baseline(NONE))
+    kept = select_by_error(found, [flight], Baseline(NONE))
     assert [candidate.label for candidate in kept.candidates] == ["gyro.x over acceleration"]
     assert not kept.worth and not kept.refused
 
@@ -110,7 +113,7 @@ def test_what_no_node_can_take_out_is_not_tried():
 def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_not_is_not(flights, attribution):
     def judged(std):
         noise = Detection(EFFECTS["noise_level"]({"0-1": std, "1-2": std}), "tdoa", {})
-        return useful(replace(attribution, detections=(noise,)), noisy, Baseline(NONE)), noise
+        return select_by_error(replace(attribution, detections=(noise,)), noisy, Baseline(NONE)), noise
 
     rng = np.random.default_rng(0)
     noisy = [EFFECTS["noise_level"]({"0-1": 0.3, "1-2": 0.3}).inject(flight, rng) for flight in flights]  # no gate rejects that
@@ -144,7 +147,7 @@ def test_a_baseline_runs_each_flight_once(flights):
 
 def test_before_and_after_with_intervals(flights):
     told = EffectSet((effect_of("anchor_delay", True, 1),))
-    before, after = compare([Case(flight, told) for flight in flights], Baseline(NONE))
+    before, after = compare([ValidationCase(flight, told) for flight in flights], Baseline(NONE))
     assert after["pooled"]["rmse_3d"] < 0.5 * before["pooled"]["rmse_3d"]
     low, high = after["pooled"]["rmse_3d_ci"]
     assert low < after["pooled"]["rmse_3d"] < high
@@ -163,7 +166,7 @@ def test_before_and_after_with_intervals(flights):
 def test_halves_of_a_flight_count_what_is_before_and_after_the_fit_once(flights):
     single = attribute(flights[:1], TRUTH, undeclared=False)
     cases, run = cross_fitted(single, flights[:1], NONE, (), ()), Baseline(NONE).run(flights[0])
-    parts, whole = [score(case, run).phases() for case in cases], score(Case(flights[0], NONE), run).phases()
+    parts, whole = [score(case, run).phases() for case in cases], score(ValidationCase(flights[0], NONE), run).phases()
     for name, figures in whole.items():
         assert sum(part[name]["duration"] for part in parts) == pytest.approx(figures["duration"]), name
         assert figures["count"] <= sum(part[name]["count"] for part in parts) <= figures["count"] + 10, name  # on an edge, in both
@@ -172,19 +175,19 @@ def test_halves_of_a_flight_count_what_is_before_and_after_the_fit_once(flights)
 def test_without_flights_held_out_it_is_said_that_the_choice_was_made_on_the_same(flights, attribution):
     chosen_on = "chosen on all of them"
     baseline = Baseline(NONE)
-    assert chosen_on in judge(attribution, flights, (), baseline, NONE, TRUTH)[2]
-    assert chosen_on not in judge(attribution, flights[:1], flights[1:], baseline, NONE, TRUTH)[2]
+    assert chosen_on in validate(attribution, flights, (), baseline, NONE, TRUTH)[2]
+    assert chosen_on not in validate(attribution, flights[:1], flights[1:], baseline, NONE, TRUTH)[2]
 
 
 def test_without_truth_positions_and_delays_of_anchors_are_applied_if_they_explain_the_innovations():
     reference, clean = Nothing(), [clean_flight(seed, 40.0) for seed in (100, 101)]
     prepared = [reference.prepare(effect_of("anchor_delay", True, 1).inject(flight)) for flight in clean]
     attribution = attribute(prepared, reference, undeclared=False)
-    kept = borne_out(attribution, prepared, NONE)
+    kept = select_calibration(attribution, prepared, NONE)
     assert {candidate.name for candidate in kept.candidates} == {"anchor_position", "anchor_delay"}
     assert all("nobody can tell" in refused.why for refused in kept.refused)
     calm = [residuals(reference.prepare(flight), reference, NONE) for flight in clean]
-    refused = borne_out(replace(attribution, residuals=calm), clean, NONE)
+    refused = select_calibration(replace(attribution, residuals=calm), clean, NONE)
     assert refused.candidates == () and "of what is slow in the innovations" in refused.refused[0].why
 
 
@@ -192,7 +195,7 @@ def test_a_flight_that_the_filter_gives_no_estimate_of_ends_in_a_sentence(flight
     tdoa = flights[0].tdoa
     few = replace(flights[0], imu=None, tdoa=replace(tdoa, **{f.name: getattr(tdoa, f.name)[:3] for f in fields(tdoa)}))
     with pytest.raises(InputError, match=f"{few.name}: the filter gives no estimate"):
-        compare([Case(few, NONE)], Baseline(NONE))
+        compare([ValidationCase(few, NONE)], Baseline(NONE))
 
 
 def test_a_gain_that_a_shift_of_the_reference_can_feign_is_none():

@@ -47,7 +47,7 @@ Made = TypeVar("Made")
 
 BOOTSTRAPS = 400
 Z95 = 1.96  # standard deviations from the middle of a 95 % interval to its ends
-JUDGES = 3  # flights, or halves of one, on which trials are judged
+TRIAL_FLIGHTS = 3  # flights, or halves of one, on which trials are judged
 # Standard deviations by which a gain must be above zero where the reference itself may be off. What is fitted follows what the
 # references have in common, in whatever direction that is: chi with three degrees of freedom, 99.9 %.
 SURE = 4.0
@@ -60,7 +60,7 @@ USED = next(value for value, name in VERDICTS.items() if name == "used")
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class ValidationCase:
     """A flight to judge on, and an EffectSet that it took no part in fitting. spans : ((first, last), ...) s, None for all; reach : the
     same for phases, which those at either end of the flight go on to its begin and its end for."""
 
@@ -71,7 +71,7 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
+class ValidatedSelection:
     """What makes the filter no worse: selection : Selection; detections; refused : (Refused, ...) of the others; worth :
     {candidate or detection: m by which the mean 3D RMSE is larger without it, of others when they were left out}; changes : sentences, what is not as in the
     last calibration."""
@@ -88,20 +88,20 @@ class Kept:
         return self.selection.chosen
 
 
-def nothing(attribution: Attribution, refused: Iterable[Refused] = ()) -> Kept:
-    """Kept of an Attribution of which nothing is."""
-    return Kept(attribution.selection.only(()), (), tuple(refused), {})
+def empty_selection(attribution: Attribution, refused: Iterable[Refused] = ()) -> ValidatedSelection:
+    """ValidatedSelection of an Attribution of which nothing is."""
+    return ValidatedSelection(attribution.selection.only(()), (), tuple(refused), {})
 
 
 def cross_fitted(
     attribution: Attribution, flights: Sequence[Flight], base: EffectSet, candidates: Sequence[Candidate],
     detections: Sequence[Detection], most: int | None = None,
-) -> list[Case]:  # fmt: skip
-    """[Case]: each flight, or each half of a single one, every other block, with the effects of `candidates` fitted to the others alone; `most` of
-    them, evenly taken, if there are more."""
+) -> list[ValidationCase]:  # fmt: skip
+    """[ValidationCase]: each flight, or each half of a single one, every other block, with the effects of `candidates`
+    fitted to the others alone; `most` of them, evenly taken, if there are more."""
     table, selection = attribution.selection.table, attribution.selection
     if len(flights) > 1:
-        parts = [(Case(flights[k], base), k, table.flight != k) for k in range(len(flights))]
+        parts = [(ValidationCase(flights[k], base), k, table.flight != k) for k in range(len(flights))]
     else:
         # in turns, so that both parts are of all of the flight
         start, since = float(flights[0].tdoa.t[0]), table.t - table.t.min()
@@ -111,7 +111,8 @@ def cross_fitted(
         edges[-1] = start + table.t.max()
         spans = list(zip(edges[:-1].tolist(), edges[1:].tolist()))
         reach = [(-np.inf, spans[0][1]), *spans[1:-1], (spans[-1][0], np.inf)] if len(spans) > 1 else EVERYTHING
-        parts = [(Case(flights[0], base, tuple(spans[k::2]), tuple(reach[k::2])), 0, number % 2 != k) for k in range(2)]
+        halves = [ValidationCase(flights[0], base, tuple(spans[k::2]), tuple(reach[k::2])) for k in range(2)]
+        parts = [(half, 0, number % 2 != k) for k, half in enumerate(halves)]
     out, columns = [], columns_of(candidates)
     for case, k, rows in parts[:: -(-len(parts) // (most or len(parts)))]:
         others = replace(selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows))
@@ -121,22 +122,23 @@ def cross_fitted(
     return out
 
 
-def useful(
+def select_by_error(
     attribution: Attribution, flights: Sequence[Flight], baseline: Baseline,
-    progress: Callable[[], object] = lambda: None, over: MapFunction = map,
-) -> Kept:  # fmt: skip
-    """Kept: what makes the filter no worse where it was not fitted.
+    progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
+) -> ValidatedSelection:  # fmt: skip
+    """ValidatedSelection of what makes the filter no worse where it was not fitted.
 
     Candidates go, one by one, if the error is smaller without, or of a single flight hardly larger; detections stay only if it is
-    smaller with them. At most JUDGES flights are judged. Trials run the filter with the corrections that it would get at the poses of a run with all.
+    smaller with them. At most TRIAL_FLIGHTS flights are judged. Trials run the filter with the corrections that it
+    would get at the poses of a run with all.
     After one has gone, those that seemed to do harm too are tried again first; in the end all are tried beside what is kept.
     What happened at a time of a single flight is tried, so that its worth is known, and not kept.
-    over : as of `attribute`.
+    map_function : as of `attribute`.
     """
     candidates, refused = list(attribution.selection.chosen), []
     detections: list[Detection] = []
     least = WORTH_OF_ONE if len(flights) == 1 else -WORSE
-    trials = _Trials(attribution, flights, baseline, progress, over)
+    trials = _Trials(attribution, flights, baseline, progress, map_function)
     error = trials.start(candidates, detections)
     without: dict[Candidate, float] = {}
     worth: dict[Candidate | Detection, float] = {}
@@ -170,7 +172,8 @@ def useful(
     for momentary in (one for one in candidates if len(flights) == 1 and _momentary(one)):
         refused.append(Refused(momentary.label, f"it happened at a time of this flight; of another one that tells nothing: {SECOND}"))
         candidates = [one for one in candidates if one is not momentary]
-    return Kept(attribution.selection.kept(candidates), tuple(detections), tuple(refused), worth)  # fitted as in the trials
+    selection = attribution.selection.kept(candidates)  # fitted as in the trials
+    return ValidatedSelection(selection, tuple(detections), tuple(refused), worth)
 
 
 def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -195,28 +198,30 @@ def _momentary(candidate: Candidate) -> bool:
 _NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
 
 
-def borne_out(
+def select_calibration(
     attribution: Attribution, flights: Sequence[Flight], base: EffectSet, config: FilterConfig | None = None,
-    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None, over: MapFunction = map,
-) -> Kept:  # fmt: skip
-    """Kept, where the reference tells no errors: positions and delays of anchors together, or nothing.
+    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None,
+    map_function: MapFunction = map,
+) -> ValidatedSelection:  # fmt: skip
+    """ValidatedSelection, where the reference tells no errors: positions and delays of anchors together, or nothing.
 
     A model that is wrong makes innovations smaller too, by pushing the path to where they are. On measured flights
     functions of the place, fitted to some, made innovations of others smaller and doubled the error of the position.
-    over : as of `attribute`.
+    map_function : as of `attribute`.
     """
     selection = attribution.selection
     if not selection.chosen and base.covariance is None and not constraints:
-        return nothing(attribution)
-    calibration = calibrate(flights, attribution, base, config, constraints, progress, over)
+        return empty_selection(attribution)
+    calibration = calibrate(flights, attribution, base, config, constraints, progress, map_function)
     changes = tuple(change.as_text() for change in calibration.changes)
     if calibration.why_not is None:
         applied = {candidate.name for candidate in calibration.selection.chosen}
         labels = [candidate.label for candidate in selection.chosen if candidate.name not in applied]
         labels += [detection.effect.label for detection in attribution.detections]
-        return Kept(calibration.selection, (), tuple(Refused(label, _NOT_TOLD) for label in labels), {}, changes)
+        refused = tuple(Refused(label, _NOT_TOLD) for label in labels)
+        return ValidatedSelection(calibration.selection, (), refused, {}, changes)
     label = " + ".join(candidate.label for candidate in selection.chosen or calibration.selection.chosen)
-    return nothing(attribution, [Refused(label, calibration.why_not)])
+    return empty_selection(attribution, [Refused(label, calibration.why_not)])
 
 
 class Baseline:
@@ -233,12 +238,13 @@ class Baseline:
         return self._runs[id(flight)][1]
 
     def prepare(
-        self, flights: Sequence[Flight], progress: Callable[[], object] = lambda: None, over: MapFunction = map
+        self, flights: Sequence[Flight], progress: Callable[[], object] = lambda: None, map_function: MapFunction = map
     ) -> None:
-        """Make the runs of Flights that there are none of yet. over : as of `attribute`."""
+        """Make the runs of Flights that there are none of yet. map_function : as of `attribute`."""
         missing = [flight for flight in flights if id(flight) not in self._runs]
         missing = list({id(flight): flight for flight in missing}.values())
-        for run, flight in zip(over(partial(_run, self.config), [Case(flight, self.base) for flight in missing]), missing):
+        cases = [ValidationCase(flight, self.base) for flight in missing]
+        for run, flight in zip(map_function(partial(_run, self.config), cases), missing):
             self._runs[id(flight)] = flight, run  # the flight, so that its id stays
             progress()
 
@@ -249,10 +255,10 @@ class _Trials:
 
     def __init__(
         self, attribution: Attribution, flights: Sequence[Flight], baseline: Baseline, progress: Callable[[], object],
-        over: MapFunction,
+        map_function: MapFunction,
     ) -> None:  # fmt: skip
         self._attribution, self._flights, self._baseline, self._progress = attribution, flights, baseline, progress
-        self._over = over
+        self._map_function = map_function
         self._poses: Sequence[Poses | None] = [None]
 
     def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
@@ -266,27 +272,30 @@ class _Trials:
         return [float(np.mean(errors)) for errors in self._tried(_error, models)]
 
     def _tried(
-        self, function: Callable[[FilterConfig | None, tuple[Case, Poses | None]], Made], models: Sequence[Model]
-    ) -> list[list[Made]]:
+        self, function: Callable[[FilterConfig | None, tuple[ValidationCase, Poses | None]], Made],
+        models: Sequence[Model],
+    ) -> list[list[Made]]:  # fmt: skip
         """[[function of each trial] of each model], all at once."""
         attribution, flights, base = self._attribution, self._flights, self._baseline.base
         fitted = [
-            cross_fitted(attribution, flights, base, candidates, detections, JUDGES)
+            cross_fitted(attribution, flights, base, candidates, detections, TRIAL_FLIGHTS)
             for candidates, detections in models
         ]
         told = []
-        for of_case in self._over(partial(function, self._baseline.config), zip(sum(fitted, []), cycle(self._poses))):
+        trials = zip(sum(fitted, []), cycle(self._poses))
+        for of_case in self._map_function(partial(function, self._baseline.config), trials):
             told.append(of_case)
             self._progress()
         return [told[k : k + len(fitted[0])] for k in range(0, len(told), len(fitted[0]))]
 
 
-def _error(config: FilterConfig | None, trial: tuple[Case, Poses | None]) -> float:
+def _error(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:
     return _error_and_poses(config, trial)[0]
 
 
-def _error_and_poses(config: FilterConfig | None, trial: tuple[Case, Poses | None]) -> tuple[float, Poses]:
-    """(3D RMSE, m, poses of the run) of a trial: a Case, and the poses that it is corrected at, None for those of the run itself."""
+def _error_and_poses(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> tuple[float, Poses]:
+    """(3D RMSE, m, poses of the run) of a trial: a ValidationCase, and the poses that it is corrected at, None for
+    those of the run itself."""
     case, poses = trial
     anchors, effects = case.flight.anchors, case.effects
     corrector = Corrector(anchors, effects) if poses is None else RehearsedCorrector(anchors, effects, poses)
@@ -294,28 +303,30 @@ def _error_and_poses(config: FilterConfig | None, trial: tuple[Case, Poses | Non
     return score(case, run).row()["rmse_3d"], poses_of(run.odometry)
 
 
-def judge(
+def validate(
     attribution: Attribution, flights: Sequence[Flight], holdout: Sequence[Flight], baseline: Baseline,
-    effects: EffectSet, reference: Reference, progress: Callable[[], object] = lambda: None, over: MapFunction = map,
+    effects: EffectSet, reference: Reference, progress: Callable[[], object] = lambda: None,
+    map_function: MapFunction = map,
 ) -> tuple[dict[str, Any], dict[str, Any], str]:  # fmt: skip
     """(before, after, on what): the errors on the hold-out flights if there are any, or cross-fitted, or, where the
-    reference tells no errors, what the filter's own innovations say. As `compare` gives them. over : as of `attribute`."""
+    reference tells no errors, what the filter's own innovations say. As `compare` gives them. map_function : as of
+    `attribute`."""
     progress()
     if holdout:
-        cases, on = [Case(flight, effects) for flight in holdout], "flights that took no part in the fit"
-    elif reference.judges:
+        cases, on = [ValidationCase(flight, effects) for flight in holdout], "flights that took no part in the fit"
+    elif reference.tells_errors:
         cases = cross_fitted(attribution, flights, baseline.base, attribution.selection.chosen, attribution.detections)
         on = "each half of the flight, every other 5 s, with effects fitted to the other"
         if len(flights) > 1:
             on = "each flight with effects fitted to the others"
         on += SELECTED_ON
     else:
-        cases = [Case(flight, effects) for flight in flights]
+        cases = [ValidationCase(flight, effects) for flight in flights]
         on = "the flights that were fitted, by their innovations alone"
-    if reference.judges:
-        before, after = compare(cases, baseline, progress, reference.shift_std, over)
+    if reference.tells_errors:
+        before, after = compare(cases, baseline, progress, reference.shift_std, map_function)
     else:
-        before, after = _innovations(cases, baseline, progress, over)
+        before, after = _innovations(cases, baseline, progress, map_function)
     return before, after, on
 
 
@@ -340,17 +351,18 @@ def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> 
 
 
 def compare(
-    cases: Sequence[Case], baseline: Baseline, progress: Callable[[], object] = lambda: None,
-    shift_std: Callable[[str], np.ndarray] = lambda name: np.zeros(3), over: MapFunction = map,
+    cases: Sequence[ValidationCase], baseline: Baseline, progress: Callable[[], object] = lambda: None,
+    shift_std: Callable[[str], np.ndarray] = lambda name: np.zeros(3), map_function: MapFunction = map,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, phases too, besides
     residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts
-    what the references of whole flights may be off by too. shift_std : of a Reference; over : as of `attribute`."""
+    what the references of whole flights may be off by too. shift_std : of a Reference; map_function : as of
+    `attribute`."""
     sides: list[dict[str, Any]] = []
     draws = []
     for after in (False, True):
         scores, rows, blocks = [], [], []
-        for run, case in zip(_runs(cases, baseline, after, progress, over), cases):
+        for run, case in zip(_runs(cases, baseline, after, progress, map_function), cases):
             case = case if after else replace(case, effects=baseline.base)
             scores.append(score(case, run))
             blocks.append(_blocks(scores[-1]))
@@ -366,8 +378,8 @@ def compare(
     return sides
 
 
-def score(case: Case, run: Run) -> Score:
-    """Score of a Run on a Case. Raises InputError where there is no estimate."""
+def score(case: ValidationCase, run: Run) -> Score:
+    """Score of a Run on a ValidationCase. Raises InputError where there is no estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
     out = Score(case.flight.name, run.odometry, truth, run.residuals, case.flight.tdoa.t, case.spans, case.reach)
     if not len(out.t):
@@ -376,29 +388,30 @@ def score(case: Case, run: Run) -> Score:
 
 
 def _runs(
-    cases: Sequence[Case], baseline: Baseline, after: bool, progress: Callable[[], object], over: MapFunction
-) -> Iterator[Run]:
+    cases: Sequence[ValidationCase], baseline: Baseline, after: bool, progress: Callable[[], object],
+    map_function: MapFunction,
+) -> Iterator[Run]:  # fmt: skip
     """Runs of Cases in turn, before or after."""
     if not after:
-        baseline.prepare([case.flight for case in cases], progress, over)
+        baseline.prepare([case.flight for case in cases], progress, map_function)
         yield from (baseline.run(case.flight) for case in cases)
         return
-    for run in over(partial(_run, baseline.config), cases):
+    for run in map_function(partial(_run, baseline.config), cases):
         progress()
         yield run
 
 
-def _run(config: FilterConfig | None, case: Case) -> Run:
+def _run(config: FilterConfig | None, case: ValidationCase) -> Run:
     return run_offline(case.flight, config, Corrector(case.flight.anchors, case.effects))
 
 
 def _innovations(
-    cases: Sequence[Case], baseline: Baseline, progress: Callable[[], object], over: MapFunction
+    cases: Sequence[ValidationCase], baseline: Baseline, progress: Callable[[], object], map_function: MapFunction
 ) -> list[dict[str, Any]]:
     sides = []
     for after in (False, True):
         rows = []
-        for run, case in zip(_runs(cases, baseline, after, progress, over), cases):
+        for run, case in zip(_runs(cases, baseline, after, progress, map_function), cases):
             used = run.residuals.verdict == USED
             nis = run.residuals.innovation[used] ** 2 / run.residuals.variance[used]
             figures: dict[str, Any] = {"nis_mean": float(np.mean(nis)), "residual_spread": _spread(run)}
