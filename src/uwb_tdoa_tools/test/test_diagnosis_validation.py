@@ -15,7 +15,7 @@ from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.diagnosis.validation import (
-    Baseline, ValidationCase, _gain_interval, compare, cross_fitted, score, select_by_error, select_calibration, validate,
+    Baseline, ValidationCase, _gain_interval, compare, cross_fitted, score, select_by_error, select_calibration, validation_cases,
     why_not,
 )  # fmt: skip
 
@@ -174,9 +174,8 @@ def test_halves_of_a_flight_count_what_is_before_and_after_the_fit_once(flights)
 
 def test_without_flights_held_out_it_is_said_that_the_choice_was_made_on_the_same(flights, attribution):
     chosen_on = "chosen on all of them"
-    baseline = Baseline(NONE)
-    assert chosen_on in validate(attribution, flights, (), baseline, NONE, TRUTH)[2]
-    assert chosen_on not in validate(attribution, flights[:1], flights[1:], baseline, NONE, TRUTH)[2]
+    assert chosen_on in validation_cases(attribution, flights, (), NONE, NONE, TRUTH)[1]
+    assert chosen_on not in validation_cases(attribution, flights[:1], flights[1:], NONE, NONE, TRUTH)[1]
 
 
 def test_without_truth_positions_and_delays_of_anchors_are_applied_if_they_explain_the_innovations():

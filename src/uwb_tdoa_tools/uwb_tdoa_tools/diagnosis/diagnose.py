@@ -126,9 +126,9 @@ def diagnose(
     attribution, validated = repairing.before_others(found, selected, repairs)
     tried = attribution.of(validated)
     tried_effects = merged(base, usable(tried.effects).effects, tried.selection)
-    before, with_tried, judged_on = validation.validate(
-        tried, fitted, held_out, baseline, tried_effects, reference, saying("judging"), map_function
-    )
+    progress("judging")
+    cases, judged_on = validation.validation_cases(tried, fitted, held_out, base, tried_effects, reference)
+    before, with_tried = validation.validate(cases, baseline, reference, saying("judging"), map_function)
     refused = [*attribution.refused, *validated.refused]
     shift_std = max(reference.shift_std(flight.name).max() for flight in fitted) if tells_errors else 0.0
     why_not = validation.why_not(before, with_tried, shift_std) if tells_errors else None

@@ -303,31 +303,35 @@ def _error_and_poses(config: FilterConfig | None, trial: tuple[ValidationCase, P
     return score(case, run).row()["rmse_3d"], poses_of(run.odometry)
 
 
-def validate(
-    attribution: Attribution, flights: Sequence[Flight], holdout: Sequence[Flight], baseline: Baseline,
-    effects: EffectSet, reference: Reference, progress: Callable[[], object] = lambda: None,
-    map_function: MapFunction = map,
-) -> tuple[dict[str, Any], dict[str, Any], str]:  # fmt: skip
-    """(before, after, on what): the errors on the hold-out flights if there are any, or cross-fitted, or, where the
-    reference tells no errors, what the filter's own innovations say. As `compare` gives them. map_function : as of
-    `attribute`."""
-    progress()
+def validation_cases(
+    attribution: Attribution, flights: Sequence[Flight], holdout: Sequence[Flight], base: EffectSet, effects: EffectSet,
+    reference: Reference,
+) -> tuple[list[ValidationCase], str]:  # fmt: skip
+    """(cases, on what, in words) to validate an Attribution on: the hold-out Flights if there are any; or those it was
+    fitted
+    to, cross-fitted or, where the Reference tells no errors, as they are. base : EffectSet that was in the model;
+    effects : EffectSet with what was found."""
     if holdout:
-        cases, on = [ValidationCase(flight, effects) for flight in holdout], "flights that took no part in the fit"
-    elif reference.tells_errors:
-        cases = cross_fitted(attribution, flights, baseline.base, attribution.selection.chosen, attribution.detections)
-        on = "each half of the flight, every other 5 s, with effects fitted to the other"
-        if len(flights) > 1:
-            on = "each flight with effects fitted to the others"
-        on += SELECTED_ON
-    else:
-        cases = [ValidationCase(flight, effects) for flight in flights]
+        return [ValidationCase(flight, effects) for flight in holdout], "flights that took no part in the fit"
+    if not reference.tells_errors:
         on = "the flights that were fitted, by their innovations alone"
+        return [ValidationCase(flight, effects) for flight in flights], on
+    on = "each half of the flight, every other 5 s, with effects fitted to the other"
+    if len(flights) > 1:
+        on = "each flight with effects fitted to the others"
+    cases = cross_fitted(attribution, flights, base, attribution.selection.chosen, attribution.detections)
+    return cases, on + SELECTED_ON
+
+
+def validate(
+    cases: Sequence[ValidationCase], baseline: Baseline, reference: Reference,
+    progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
+) -> tuple[dict[str, Any], dict[str, Any]]:  # fmt: skip
+    """(before, after) of cases: the errors, or, where the Reference tells none, what the filter's own innovations say.
+    As `compare` gives them. map_function : as of `attribute`."""
     if reference.tells_errors:
-        before, after = compare(cases, baseline, progress, reference.shift_std, map_function)
-    else:
-        before, after = _innovations(cases, baseline, progress, map_function)
-    return before, after, on
+        return compare(cases, baseline, progress, reference.shift_std, map_function)
+    return _innovations(cases, baseline, progress, map_function)
 
 
 def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> str | None:
@@ -353,7 +357,7 @@ def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> 
 def compare(
     cases: Sequence[ValidationCase], baseline: Baseline, progress: Callable[[], object] = lambda: None,
     shift_std: Callable[[str], np.ndarray] = lambda name: np.zeros(3), map_function: MapFunction = map,
-) -> list[dict[str, Any]]:  # fmt: skip
+) -> tuple[dict[str, Any], dict[str, Any]]:  # fmt: skip
     """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, phases too, besides
     residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts
     what the references of whole flights may be off by too. shift_std : of a Reference; map_function : as of
@@ -375,7 +379,7 @@ def compare(
         draws.append(blocks)
     names = [case.flight.name for case in cases]
     sides[1]["pooled"]["rmse_3d_gain_ci"] = _gain_interval(draws[0], draws[1], names, shift_std)
-    return sides
+    return sides[0], sides[1]
 
 
 def score(case: ValidationCase, run: Run) -> Score:
@@ -407,7 +411,7 @@ def _run(config: FilterConfig | None, case: ValidationCase) -> Run:
 
 def _innovations(
     cases: Sequence[ValidationCase], baseline: Baseline, progress: Callable[[], object], map_function: MapFunction
-) -> list[dict[str, Any]]:
+) -> tuple[dict[str, Any], dict[str, Any]]:
     sides = []
     for after in (False, True):
         rows = []
@@ -419,7 +423,7 @@ def _innovations(
         pooled_figures: dict[str, Any] = {"rmse_3d": None}
         pooled_figures |= {key: float(np.mean([row[key] for row in rows])) for key in ("nis_mean", "residual_spread")}
         sides.append({"runs": rows, "pooled": pooled_figures, "scores": []})
-    return sides
+    return sides[0], sides[1]
 
 
 def _spread(run: Run) -> float | None:
