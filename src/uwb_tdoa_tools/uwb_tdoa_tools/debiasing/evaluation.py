@@ -60,7 +60,7 @@ class Estimator:
     effects: EffectSet | None = None
     align: str = NONE
 
-    def __call__(self, recording: tuple[Path, Path | None]) -> Scored:
+    def __call__(self, recording: tuple[Path, str | Path | None]) -> Scored:
         return fly(self.reading.read(recording), self.config, self.effects, self.align)
 
 

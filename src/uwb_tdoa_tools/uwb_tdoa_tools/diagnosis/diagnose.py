@@ -144,7 +144,7 @@ def diagnose(
     scores = [
         Score(flight.name, run.odometry, flight.truth, run.residuals)
         for flight, run in zip(fitted, runs)
-        if tells_errors
+        if tells_errors and flight.truth is not None
     ]
     return Diagnosis(
         fitted,

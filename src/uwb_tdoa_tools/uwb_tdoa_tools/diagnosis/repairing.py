@@ -91,7 +91,7 @@ def _error(
     return float(np.mean(errors))
 
 
-def _evidence(flight: Flight, effects: Iterable[Effect], effect: Effect) -> dict[str, float]:
+def _evidence(flight: Flight, effects: Iterable[Effect], effect: LabelEffect) -> dict[str, float]:
     """Median error, m, at the true place of the TDOAs that the effect changes, with it and without."""
     one = KnownPath(EffectSet(tuple(effects)).correct_streams(flight))
     other = one.without(effect)

@@ -385,6 +385,7 @@ def compare(
 def score(case: ValidationCase, run: Run) -> Score:
     """Score of a Run on a ValidationCase. Raises InputError where there is no estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
+    assert truth is not None  # of a Reference that tells errors
     out = Score(case.flight.name, run.odometry, truth, run.residuals, case.flight.tdoa.t, case.spans, case.reach)
     if not len(out.t):
         raise InputError(f"{case.flight.name}: the filter gives no estimate in the part to judge on; see what evaluate says.")

@@ -53,7 +53,7 @@ class Localizer:
     left: bool = False
     rerun: Path | None = None
 
-    def __call__(self, recording: tuple[Path, Path | None]) -> Located:
+    def __call__(self, recording: tuple[Path, str | Path | None]) -> Located:
         flight, name = self.reading.read(recording), name_of(recording[0])
         run = self.estimator(flight)
         belief = believe(flight, run, self.estimator.effects is not None)
@@ -87,7 +87,7 @@ def name_of(path: str | Path) -> str:
     return name
 
 
-def check_names(recordings: Sequence[tuple[Path, Path | None]]) -> None:
+def check_names(recordings: Sequence[tuple[Path, str | Path | None]]) -> None:
     """Raise InputError if two of some recordings, (path, survey), would be written to the same files."""
     seen: dict[str, Path] = {}
     for path, _ in recordings:

@@ -73,7 +73,7 @@ def _plane(ax: Axes, odometry: Odometry, anchors: Anchors, lost: np.ndarray, pla
         ax.plot(*odometry.p[-1, [u, v]], "s", ms=5, color="tab:blue")
     ax.plot(anchors.positions[:, u], anchors.positions[:, v], "^", ms=8, color="0.2")
     for names, place in labels(anchors.ids.tolist(), anchors.positions[:, (u, v)]):
-        ax.annotate(names, place, textcoords="offset points", xytext=(6, 5), fontsize=9)
+        ax.annotate(names, (place[0], place[1]), textcoords="offset points", xytext=(6, 5), fontsize=9)
     both = np.concatenate([anchors.positions, known])[:, (u, v)]
     lower, upper = both.min(axis=0) - MARGIN, both.max(axis=0) + MARGIN
     ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal", title=name, xlabel=f"{'xyz'[u]} [m]", ylabel=f"{'xyz'[v]} [m]")

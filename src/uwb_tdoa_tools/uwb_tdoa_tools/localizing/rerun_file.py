@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.estimator import Odometry, Residuals
+    from ..bags.bag import RecordedOdometry
     from ..diagnosis.diagnose import Diagnosis
 
 HELP = "write a recording for the viewer Rerun, too (.rrd; of one flight; needs pip install rerun-sdk)"
@@ -38,8 +39,8 @@ def is_there(say: Callable[[str], object]) -> bool:
 
 
 def write_rerun(
-    path: Path, flight: Flight, odometry: Odometry, residuals: Residuals | None, verdict: Sequence[str],
-    truth: Truth | None = None, before: Odometry | None = None,
+    path: Path, flight: Flight, odometry: Odometry | RecordedOdometry, residuals: Residuals | None,
+    verdict: Sequence[str], truth: Truth | None = None, before: Odometry | RecordedOdometry | None = None,
 ) -> None:  # fmt: skip
     """Write a .rrd file: the Odometry of a Flight among its anchors, Residuals or None, sentences, the ground truth where it is
     to be shown, and another Odometry, as it was before something was corrected, or None. Time is s since the first TDOA."""
@@ -82,7 +83,7 @@ def write_diagnosis(path: Path, result: Diagnosis, base: EffectSet, config: Filt
     write_rerun(path, flight, after.odometry, after.residuals, result.as_text().splitlines(), truth, before.odometry)
 
 
-def _write_poses(rerun: ModuleType, stream: Any, odometry: Odometry, begin: float) -> None:
+def _write_poses(rerun: ModuleType, stream: Any, odometry: Odometry | RecordedOdometry, begin: float) -> None:
     """The tag and its ellipsoid of three standard deviations, at most RATE times a second."""
     cells = np.floor((odometry.t - begin) * RATE) if len(odometry.t) else np.zeros(0)
     rows = np.flatnonzero(np.diff(cells, prepend=-np.inf) > 0.0)
