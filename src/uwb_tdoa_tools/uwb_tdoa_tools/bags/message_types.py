@@ -1,8 +1,11 @@
 """ROS 2 message types for reading and writing bags without a ROS installation."""
 
+from __future__ import annotations
+
 import os
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from rosbags.interfaces import MessageDefinitionFormat, Nodetype
@@ -12,12 +15,17 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.limits import DEFINITION_BYTES
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
+
 OUR_PACKAGE = "uwb_tdoa_msgs"
 OUR_TYPES = (
     "Tdoa", "TdoaCorrected", "TdoaResidual", "Anchor", "AnchorArray", "EstimatorStatus",
     *(of.message.rpartition("/")[2] for of in SENSORS.values() if of.message.startswith(OUR_PACKAGE)),
 )  # fmt: skip
-ADDED = {  # fields that our types were given since they were first recorded, the latest last, and what is meant where they lack
+# Fields that our types were given since they were first recorded, the latest last, and what is meant where they lack.
+ADDED: dict[str, tuple[dict[str, Any], ...]] = {
     f"{OUR_PACKAGE}/msg/Tdoa": ({"variance": 0.0},),
     f"{OUR_PACKAGE}/msg/TdoaCorrected": ({"variance": 0.0}, {"bias_slope": np.zeros(6), "bias_state": np.zeros(6)}),
 }
@@ -25,7 +33,7 @@ _SOURCE_TREE = Path(__file__).resolve().parents[3]  # where our packages lie sid
 
 
 @lru_cache(maxsize=1)
-def typestore():
+def typestore() -> Typestore:
     """The types of ROS 2 Jazzy and of uwb_tdoa_msgs; `add_type` adds others."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name in OUR_TYPES:
@@ -33,7 +41,7 @@ def typestore():
     return store
 
 
-def add_type(store, msgtype):
+def add_type(store: Typestore, msgtype: str) -> None:
     """Make a type like "pkg/msg/Name" known to a store, with the types it is made of, from installed .msg files."""
     if msgtype in store.fielddefs:
         return
@@ -47,7 +55,7 @@ def add_type(store, msgtype):
                 add_type(store, field[1])
 
 
-def check_type(path, connection):
+def check_type(path: str | Path, connection: Connection) -> None:
     """Raise InputError unless we know the type of a topic, in the version in which it was recorded."""
     store = typestore()
     add_type(store, connection.msgtype)
@@ -59,24 +67,25 @@ def check_type(path, connection):
         )
 
 
-def earlier_types(path, connection):
+def earlier_types(path: str | Path, connection: Connection) -> Typestore | None:
     """The types as of when a topic was recorded, if its type has been ADDED fields since; None if not. Raises InputError."""
     versions = _earlier(connection.msgtype)
     recorded = _recorded_hash(path, connection) if versions else None
     return next((store for store in versions if store.hash_rihs01(connection.msgtype) == recorded), None)
 
 
-def upgraded(data, msgtype, store):
+def upgraded(data: bytes, msgtype: str, store: Typestore) -> bytes:
     """Bytes of a message of `earlier_types`, as of its type now."""
-    message, defaults = store.deserialize_cdr(data, msgtype), {}
+    message = store.deserialize_cdr(data, msgtype)
+    defaults: dict[str, Any] = {}
     for fields in ADDED[msgtype]:
         defaults |= fields
     known = {name: getattr(message, name) for name, _ in store.fielddefs[msgtype][1]}
-    return typestore().serialize_cdr(typestore().types[msgtype](**{**defaults, **known}), msgtype)
+    return bytes(typestore().serialize_cdr(typestore().types[msgtype](**{**defaults, **known}), msgtype))
 
 
 @lru_cache(maxsize=None)
-def _earlier(msgtype):
+def _earlier(msgtype: str) -> tuple[Typestore, ...]:
     """The types as before each addition of fields to one of them: tuple of stores."""
     out, added = [], ADDED.get(msgtype, ())
     for k in range(len(added)):
@@ -87,7 +96,7 @@ def _earlier(msgtype):
     return tuple(out)
 
 
-def _recorded_hash(path, connection):
+def _recorded_hash(path: str | Path, connection: Connection) -> str:
     """Hash of the type that a topic was recorded with; empty where the bag does not say. Raises InputError."""
     recorded = connection.digest
     if not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG:  # a data file without metadata.yaml
@@ -103,14 +112,14 @@ def _recorded_hash(path, connection):
 
 
 @lru_cache(maxsize=64)
-def _hash_of(definition, msgtype):
+def _hash_of(definition: str, msgtype: str) -> str:
     """Hash of a type by a definition that a bag holds."""
     of_bag = get_typestore(Stores.EMPTY)
     of_bag.register(get_types_from_msg(definition, msgtype))
     return of_bag.hash_rihs01(msgtype)
 
 
-def _definition(msgtype):
+def _definition(msgtype: str) -> str:
     package, _, name = msgtype.split("/")
     prefixes = [
         Path(prefix) / "share" for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix
