@@ -11,11 +11,14 @@ Topic (in a bag always absolute)   type                              what
 The time of a message is its header stamp. `Flight.extra` has no message type and stays behind.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 import heapq
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TYPE_CHECKING, TypeVar
 
 import numpy as np
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -35,16 +38,28 @@ from .integrity import metadata
 from .mcap import Damaged
 from .message_types import check_type, typestore
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys.store import Typestore
+    from uwb_tdoa_ekf.estimator import Odometry
+    from .files import BagReader
+
+    Topics = dict[str, tuple[str, Qos, Iterable[tuple[int, Any]]]]  # {topic: (type, QoS, (stamp ns, message) in order)}
+
 __all__ = [
     "Names", "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry",
     "write_bag", "write_odometry",
 ]  # fmt: skip
 
+Made = TypeVar("Made")  # a stream of a Flight
+
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
 _TOLD = "source", "format", "protocol"  # of that meta: texts that are read again, to be told; nothing is computed with them
 
 
-def _qos(durability, depth):
+def _qos(durability: QosDurability, depth: int) -> Qos:
     """Reliable, because a reliable publisher serves reliable and best-effort subscriptions, and loses nothing."""
     endless = QosTime(9223372036, 854775807)
     return Qos(
@@ -72,13 +87,13 @@ class RecordedOdometry:
     q: np.ndarray
     covariance: np.ndarray
     twist_covariance: np.ndarray
-    remarks: tuple = ()
+    remarks: tuple[str, ...] = ()
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.t)
 
 
-def write_bag(flight, out, storage="mcap", force=False):
+def write_bag(flight: Flight, out: str | Path, storage: str = "mcap", force: bool = False) -> dict[str, int]:
     """Write a Flight as a ROS 2 bag. Returns {topic: number of messages}.
 
     out : path of the new bag, a directory. It appears only when it is complete. An existing path is refused; with force
@@ -109,7 +124,9 @@ def write_bag(flight, out, storage="mcap", force=False):
         return _write(writer, topics, store)
 
 
-def write_odometry(odometry, anchors, out, storage="mcap", force=False):
+def write_odometry(
+    odometry: Odometry, anchors: Anchors, out: str | Path, storage: str = "mcap", force: bool = False
+) -> dict[str, int]:
     """Write an Odometry among Anchors as a bag with odometry, uwb/anchors and /tf_static; see `write_bag`."""
     store = typestore()
     if not len(odometry):
@@ -120,7 +137,7 @@ def write_odometry(odometry, anchors, out, storage="mcap", force=False):
         return _write(writer, topics, store)
 
 
-def _of_anchors(anchors, first, store, antenna=None):
+def _of_anchors(anchors: Anchors, first: int, store: Typestore, antenna: Sequence[float] | None = None) -> Topics:
     """{topic: (type, QoS, [(stamp ns, message)])} of Anchors, to be written before anything else. first : ns, of the bag; antenna : (3,) m."""
     array = bag_messages.anchors_message(anchors, first, store)  # at equal stamps this order holds: anchors before what needs them
     frames = bag_messages.transforms_message(anchors, first, store, antenna)
@@ -130,7 +147,7 @@ def _of_anchors(anchors, first, store, antenna=None):
     }
 
 
-def _write(writer, topics, store):
+def _write(writer: Writer, topics: Topics, store: Typestore) -> dict[str, int]:
     """Write {topic: (type, QoS, (stamp ns, message) in order)} to an open bag, in order of stamps. Returns {topic: number of messages}."""
     counts, streams = dict.fromkeys(topics, 0), []
     for topic, (msgtype, qos, outgoing) in topics.items():
@@ -142,16 +159,21 @@ def _write(writer, topics, store):
     return counts
 
 
-def _serialized(connection, outgoing, store):
+def _serialized(
+    connection: Connection, outgoing: Iterable[tuple[int, Any]], store: Typestore
+) -> Iterator[tuple[int, Connection, memoryview]]:
     for stamp, message in outgoing:
         yield stamp, connection, store.serialize_cdr(message, connection.msgtype)
 
 
-def _about_flight(flight):
+def _about_flight(flight: Flight) -> str:
     return json.dumps({"name": flight.name, "meta": flight.meta, "written_by": written_by()}, default=str)
 
 
-def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth=True):
+def read_bag(
+    path: str | Path, namespace: str = "", anchors: Anchors | None = None, salvage: bool = False,
+    topics: dict[str, str] | None = None, truth: bool = True,
+) -> Flight:  # fmt: skip
     """Flight of a bag that was written here, by `ros2 bag record` or by our `record`; other topics are ignored.
 
     namespace : where the tag's topics are in the bag, e.g. "tag1" for /tag1/uwb/tdoa.
@@ -170,7 +192,11 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth
         meta = {**about["meta"], "bag": str(path)}
         remarks, name_of, frames = [], Names(namespace, topics), {}
 
-        def stream(topic, msgtype, row, make, sound=bag_messages.sound):
+        def stream(
+            topic: str, msgtype: str, row: Callable[[Any], tuple[float, ...]],
+            make: Callable[[np.ndarray, np.ndarray], Made],
+            sound: Callable[[np.ndarray], np.ndarray] = bag_messages.sound,
+        ) -> Made | None:  # fmt: skip
             found = _find(path, connections, name_of(topic), msgtype)
             stamps, rows, falls, frames[topic] = _table(path, reader, found, row)
             if falls:
@@ -186,7 +212,7 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth
             return make(stamps, rows) if len(stamps) else None
 
         tdoa = stream("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of)
-        sensors = {
+        sensors: dict[str, Any] = {
             name: stream(sensor.topics[0][0], sensor.message, *bag_messages.of_sensor(sensor)) for name, sensor in SENSORS.items()
         }
         if tdoa is None and any(sensors[name] is not None for name in LOCATING):
@@ -215,7 +241,9 @@ def read_bag(path, namespace="", anchors=None, salvage=False, topics=None, truth
     return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, **sensors)
 
 
-def read_odometry(path, namespace="", salvage=False, topics=None):
+def read_odometry(
+    path: str | Path, namespace: str = "", salvage: bool = False, topics: dict[str, str] | None = None
+) -> RecordedOdometry:
     """RecordedOdometry of a nav_msgs/Odometry topic, in order of header stamps; raises InputError.
 
     nav_msgs/Odometry has the velocity in the child frame; it is turned into the world frame here. An estimate may be
@@ -237,7 +265,9 @@ def read_odometry(path, namespace="", salvage=False, topics=None):
     return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6), remarks)
 
 
-def late_tdoas(path, namespace="", salvage=False, topics=None):
+def late_tdoas(
+    path: str | Path, namespace: str = "", salvage: bool = False, topics: dict[str, str] | None = None
+) -> int:
     """How many TDOAs came too late for the filter that made the odometry of a bag, by the uwb/residual beside it.
 
     0 where that was not recorded. Arguments as of `read_odometry`. Raises InputError."""
@@ -247,7 +277,7 @@ def late_tdoas(path, namespace="", salvage=False, topics=None):
         return sum(residual.verdict == residual.VERDICT_LATE for _, _, residual in readable(path, reader, found))
 
 
-def read_fields(path, topic, namespace=""):
+def read_fields(path: str | Path, topic: str, namespace: str = "") -> dict[str, np.ndarray]:
     """Columns of a recorded topic whose messages have a header, e.g. uwb/residual or uwb/tdoa_corrected.
 
     Returns {"t": (n,) s, field: (n,) array, ...} for every field that is one number or one string, in order of header
@@ -270,11 +300,11 @@ def read_fields(path, topic, namespace=""):
     return columns
 
 
-def _connections(reader):
+def _connections(reader: BagReader) -> dict[str, Connection]:
     return {connection.topic: connection for connection in reader.connections}
 
 
-def _about(path):
+def _about(path: str | Path) -> dict[str, Any]:
     """{"name", "meta"} of the flight, as `write_bag` left them in the bag's custom data, what is _TOLD of it; of bags of others, and
     where they cannot be read, the name of the file and nothing."""
     out = {"name": Path(path).stem, "meta": {}}
@@ -291,7 +321,9 @@ def _about(path):
     return out
 
 
-def _not_finite(path, topic, stamps, rows, sound):
+def _not_finite(
+    path: str | Path, topic: str, stamps: np.ndarray, rows: np.ndarray, sound: Callable[[np.ndarray], np.ndarray]
+) -> InputError:
     row, column = np.argwhere(~sound(rows))[0]
     return InputError(
         f"{path}: {topic}, message {row + 1} of {len(rows)} at {stamps[row]:.3f} s: its number {column + 1} is "
@@ -302,18 +334,20 @@ def _not_finite(path, topic, stamps, rows, sound):
 class Names:
     """Absolute names of our topics in a bag."""
 
-    def __init__(self, namespace="", topics=None):
+    def __init__(self, namespace: str = "", topics: dict[str, str] | None = None) -> None:
         """namespace, topics : see `read_bag`."""
         self._namespace, self._topics = namespace.strip("/"), topics or {}
 
-    def __call__(self, topic):
+    def __call__(self, topic: str) -> str:
         """Where a topic of ours is, e.g. "uwb/tdoa"."""
         name = self._topics.get(topic, topic)
         absolute = name.startswith("/") or not self._namespace
         return f"/{name.strip('/')}" if absolute else f"/{self._namespace}/{name.strip('/')}"
 
 
-def _find(path, connections, topic, msgtype=None):
+def _find(
+    path: str | Path, connections: dict[str, Connection], topic: str, msgtype: str | None = None
+) -> list[Connection]:
     """The connection of a topic as a list, empty if it is not there; raises InputError if its type is another."""
     connection = connections.get(topic)
     if connection is None:
@@ -324,10 +358,13 @@ def _find(path, connections, topic, msgtype=None):
     return [connection]
 
 
-def _table(path, reader, connections, row):
+def _table(
+    path: str | Path, reader: BagReader, connections: list[Connection], row: Callable[[Any], tuple[float, ...]]
+) -> tuple[np.ndarray, np.ndarray, int, Counter[str]]:
     """Stamps (n,) s, the other columns (n, k) of row(message) in order of stamps, how often the stamps fell, and
     {frame_id: messages}."""
-    rows, frames = [], Counter()
+    rows = []
+    frames: Counter[str] = Counter()
     for _, _, message in readable(path, reader, connections):
         rows.append(row(message))
         frames[message.header.frame_id] += 1
@@ -342,7 +379,9 @@ def _table(path, reader, connections, row):
     return stamps / 1e9, table, falls, frames
 
 
-def _read_anchors(path, reader, connections, topic):
+def _read_anchors(
+    path: str | Path, reader: BagReader, connections: dict[str, Connection], topic: str
+) -> Anchors | None:
     """The last Anchors of a topic, or None."""
     found = _find(path, connections, topic, "uwb_tdoa_msgs/msg/AnchorArray")
     last = None
@@ -356,7 +395,7 @@ def _read_anchors(path, reader, connections, topic):
         raise InputError(f"{path}: {topic}: {error}") from error
 
 
-def _others(connections, namespace):
+def _others(connections: dict[str, Connection], namespace: str) -> str:
     """Where the bag has such a topic instead, for an error message."""
     places = sorted(topic.removesuffix("/uwb/tdoa") for topic in connections if topic.endswith("/uwb/tdoa"))
     places = [place for place in places if place.strip("/") != namespace.strip("/")]

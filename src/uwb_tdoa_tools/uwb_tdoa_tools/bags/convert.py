@@ -1,6 +1,9 @@
 """A recording of any kind as a bag."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +12,13 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 
 from .bag import check_output, write_bag
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+    from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+    from uwb_tdoa_bias.foundation.sensors import Stream
+
+    Timed = Tdoas | Imu | Truth | Stream
 
 SENSORS = "tdoa", "imu", "truth", *AIDS  # streams of a Flight, each on its own clock
 
@@ -21,17 +31,17 @@ class Converted:
 
     flight: str
     bag: str
-    messages: dict
+    messages: dict[str, int]
     start: float
     end: float
     anchors: int
     tdoa_unknown_anchor: int
-    left_out: dict
-    meta: dict
-    apart: list
+    left_out: dict[str, int]
+    meta: dict[str, Any]
+    apart: list[str]
 
 
-def convert(read, out, storage="mcap", force=False):
+def convert(read: Callable[[], Flight], out: str | Path, storage: str = "mcap", force: bool = False) -> Converted:
     """Write a recording as a bag, see `write_bag`. read : callable, gives the Flight. Returns Converted. Raises
     InputError."""
     check_output(out, force)  # before the work, not after it
@@ -53,7 +63,7 @@ def convert(read, out, storage="mcap", force=False):
     )
 
 
-def shifted(flight, offsets):
+def shifted(flight: Flight, offsets: dict[str, float]) -> Flight:
     """The Flight with offsets {of SENSORS: s} added to the stamps of what it holds. Raises InputError for a sensor that it does not hold."""
     changed = {}
     for sensor, offset in offsets.items():
@@ -64,7 +74,7 @@ def shifted(flight, offsets):
     return replace(flight, **changed)
 
 
-def _from_zero_on(flight):
+def _from_zero_on(flight: Flight) -> Flight:
     """The Flight without what its other sensors say before 0 s, where the TDOAs are not: a clock that was moved may begin there, and a bag has no
     place for it."""
     changed, said = {}, list(flight.meta.get("remarks", ()))
@@ -77,15 +87,15 @@ def _from_zero_on(flight):
     return replace(flight, **changed, meta={**flight.meta, "remarks": said}) if changed else flight
 
 
-def _held(flight):
+def _held(flight: Flight) -> list[str]:
     return [name for name in SENSORS if getattr(flight, name) is not None and len(getattr(flight, name).t)]
 
 
-def _overlaps(one, other):
+def _overlaps(one: Timed, other: Timed) -> bool:
     return one.t[-1] >= other.t[0] and one.t[0] <= other.t[-1]
 
 
-def _apart(flight):
+def _apart(flight: Flight) -> list[str]:
     """Sentences on sensors whose stamps have no time in common with those of the TDOAs: they are on another clock."""
     begin, end, said = flight.tdoa.t[0], flight.tdoa.t[-1], []
     for name in _held(flight):

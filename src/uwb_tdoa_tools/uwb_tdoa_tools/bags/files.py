@@ -1,5 +1,7 @@
 """Bags as files: opening them, going through their messages, and making new ones that are never half-written."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -8,6 +10,7 @@ import re
 import shutil
 import sys
 import tempfile
+from typing import Any, TYPE_CHECKING
 
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
@@ -20,12 +23,27 @@ from .mcap import Damaged
 from .message_types import earlier_types, typestore, upgraded
 from .salvage import salvage as write_sound_part
 
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _FILE_MAGIC = (b"\x89MCAP0\r\n", b"SQLite format 3\0")
 
 
+class BagReader(Reader):
+    """A Reader that knows what of a bag cannot be read.
+
+    remarks : sentences on what is missing in a damaged one; unreadable : {topic: messages that are none of its type};
+    most : bytes that its messages may hold together.
+    """
+
+    remarks: list[str]
+    unreadable: Counter[str]
+    most: int
+
+
 @contextmanager
-def new_bag(out, storage="mcap", force=False):
+def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iterator[Writer]:
     """A rosbags Writer whose bag appears at `out` only if the block ends without an exception."""
     out = Path(out)
     if storage not in STORAGES:
@@ -47,7 +65,7 @@ def new_bag(out, storage="mcap", force=False):
         shutil.rmtree(scratch)
 
 
-def check_output(out, force=False):
+def check_output(out: str | Path, force: bool = False) -> None:
     """Raise InputError if a new bag cannot be put at `out`: something is there that force may not replace."""
     out = Path(out)
     if not out.name:
@@ -60,7 +78,7 @@ def check_output(out, force=False):
         raise InputError(f"{out}: exists and is not a bag, so --force does not replace it; choose another name.")
 
 
-def is_bag(path):
+def is_bag(path: str | Path) -> bool:
     """Whether a path is meant as a bag: a directory with metadata.yaml, .mcap or .db3 files, or such a file."""
     path = Path(path)
     if path.is_dir():
@@ -72,7 +90,7 @@ def is_bag(path):
 
 
 @contextmanager
-def open_bag(path, salvage=False):
+def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
     """An open rosbags Reader of a bag directory or data file; raises InputError with what is wrong with it.
 
     salvage : read what is sound of a cut or damaged one; the Reader's `remarks` are sentences on what is missing.
@@ -93,7 +111,7 @@ def open_bag(path, salvage=False):
                 reader.close()
 
 
-def _opened(path, folder, salvage):
+def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
     remarks, readable = [], path
     try:
         if salvage:
@@ -105,7 +123,7 @@ def _opened(path, folder, salvage):
                 readable = folder
                 unpack(path, folder)
                 check_whole(folder)
-        reader = Reader(readable)
+        reader = BagReader(readable)
         with _closing_second_connections(reader):
             reader.open()
         _take_qos_of_metadata(reader)
@@ -122,7 +140,7 @@ def _opened(path, folder, salvage):
 
 
 @contextmanager
-def _closing_second_connections(reader):
+def _closing_second_connections(reader: Reader) -> Iterator[None]:
     """rosbags opens each SQLite file twice, and closes it once: each file that was read would stay open."""
     before = {*map(id, _connections())}
     yield
@@ -132,21 +150,26 @@ def _closing_second_connections(reader):
             connection.close(True)
 
 
-def _connections():
+def _connections() -> list[Any]:
     """All that are open to SQLite files of rosbags."""
     return sys.modules["apsw"].connections() if "apsw" in sys.modules else []
 
 
-def _take_qos_of_metadata(reader):
+def _take_qos_of_metadata(reader: Reader) -> None:
     """Have data files offer each topic as metadata.yaml says: rosbags skips the messages of a topic of which they say another QoS."""
-    told = {(one.topic, one.msgtype): one.ext.offered_qos_profiles for one in reader.connections}
+    told = {
+        (one.topic, one.msgtype): one.ext.offered_qos_profiles  # type: ignore[union-attr]  # a bag of ROS 2
+        for one in reader.connections
+    }
     for file in getattr(reader.storage, "storages", ()):
         for k, one in enumerate(file.connections):
             qos = told.get((one.topic, one.msgtype), one.ext.offered_qos_profiles)
             file.connections[k] = one._replace(ext=one.ext._replace(offered_qos_profiles=qos))
 
 
-def messages(path, reader, connections):
+def messages(
+    path: str | Path, reader: BagReader, connections: list[Connection]
+) -> Iterator[tuple[Connection, int, bytes]]:
     """Yield (connection, stamp ns, bytes) of the given connections in the bag's order, as their types are now, without those that
     cannot be read as such, which are counted in `reader.unreadable`; raises InputError, also if there are more or fewer than the bag
     says, or they hold more bytes than its files."""
@@ -166,9 +189,9 @@ def messages(path, reader, connections):
         room -= len(data)
         if room < 0:
             raise _damaged(path, f"its messages hold more than {reader.most} bytes")
-        if earlier[connection.id]:
+        if store := earlier[connection.id]:
             try:
-                data = upgraded(data, connection.msgtype, earlier[connection.id])
+                data = upgraded(data, connection.msgtype, store)
             except Exception:  # as in _opened
                 reader.unreadable[connection.topic] += 1
                 continue
@@ -179,7 +202,9 @@ def messages(path, reader, connections):
             raise _damaged(path, f"{what} on {topic}")
 
 
-def readable(path: Path, reader: Reader, connections: list) -> Iterator[tuple]:
+def readable(
+    path: str | Path, reader: BagReader, connections: list[Connection]
+) -> Iterator[tuple[Connection, int, Any]]:
     """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher sends them, is counted too."""
     for connection, stamp, data in messages(path, reader, connections):
         try:
@@ -192,12 +217,12 @@ def readable(path: Path, reader: Reader, connections: list) -> Iterator[tuple]:
         yield connection, stamp, message
 
 
-def remarks_of(reader: Reader) -> list[str]:
+def remarks_of(reader: BagReader) -> list[str]:
     """Sentences on what is missing in what was read so far."""
     return [*reader.remarks, *(f"{topic}: {count} messages left out, they cannot be read." for topic, count in reader.unreadable.items())]
 
 
-def _damaged(path, error):
+def _damaged(path: str | Path, error: Exception | str) -> InputError:
     said = " ".join(str(error).split()) or type(error).__name__
     return InputError(
         f"{path}: the bag is cut or damaged ({said}); copy it again, record it again, or {SALVAGE}."

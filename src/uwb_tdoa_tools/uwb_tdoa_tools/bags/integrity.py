@@ -1,8 +1,11 @@
 """Whether the files of a bag are whole, as far as their format can tell, before anything else is done with them."""
 
+from __future__ import annotations
+
 from pathlib import Path
 import re
 import sqlite3
+from typing import Any, TYPE_CHECKING
 from urllib.parse import quote
 import zlib
 
@@ -14,6 +17,9 @@ from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 from . import mcap
 from .mcap import Damaged, zstd
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 SUM_KEY = "uwb_tdoa_tools.crc32"  # in the bag's custom data: CRC-32 of its data file, 8 hexadecimal digits
 NO_SUM = "--------"
 _BLOCK = 1 << 20  # bytes that are read at once
@@ -24,7 +30,7 @@ _TYPES = (  # columns of an SQLite bag and what they hold
 )
 
 
-def check(path):
+def check(path: str | Path) -> None:
     """Raise Damaged, or InputError for metadata.yaml, unless the files of a bag (directory or data file) are whole.
 
     The checksums that MCAP files hold and that `seal` left in metadata.yaml, the structure of SQLite files, and that
@@ -44,17 +50,17 @@ def check(path):
             _check_data(file, packed_messages=information["compression_mode"] == "message")
 
 
-def data_files(path, information):
+def data_files(path: Path, information: dict[str, Any]) -> list[Path]:
     """Paths of the data files of a bag directory."""
     return [path / Path(name).name for name in information["relative_file_paths"]]
 
 
-def is_packed(information):
+def is_packed(information: dict[str, Any]) -> bool:
     """Whether rosbag2 has compressed the data files as a whole."""
     return information["compression_mode"] == "file"
 
 
-def unpack(path, folder):
+def unpack(path: Path, folder: Path) -> None:
     """Write a bag whose files are compressed as a whole to an empty folder, unpacked. Raises Damaged, InputError."""
     information = metadata(path)
     names, size, files = [], 0, data_files(path, information)
@@ -76,7 +82,7 @@ def unpack(path, folder):
     (folder / "metadata.yaml").write_text(content)
 
 
-def metadata(path):
+def metadata(path: Path) -> dict[str, Any]:
     """What metadata.yaml of a bag directory says, with what we use in it present and of the right kind: dict. Raises
     InputError, and Damaged."""
     content = read_yaml(path / "metadata.yaml")
@@ -110,7 +116,7 @@ def metadata(path):
     return information
 
 
-def seal(path):
+def seal(path: str | Path) -> None:
     """Put the checksums of a bag that rosbags has just written in their places. It must hold SUM_KEY: NO_SUM."""
     (data,) = (file for file in Path(path).iterdir() if file.name != "metadata.yaml")
     if data.suffix == ".mcap":
@@ -122,7 +128,7 @@ def seal(path):
     file.write_text(sealed)
 
 
-def open_sqlite(file):
+def open_sqlite(file: str | Path) -> sqlite3.Connection:
     """A connection that only reads, a file that is cut as well, in which nothing is but tables and indexes of columns: what is
     computed (views, virtual tables, checks, expressions) may take for ever. Raises Damaged."""
     connection = sqlite3.connect(f"file:{quote(str(Path(file).absolute()))}?mode=ro&immutable=1", uri=True)
@@ -136,13 +142,13 @@ def open_sqlite(file):
         raise Damaged(str(error)) from error
 
 
-def is_mcap(file):
+def is_mcap(file: Path) -> bool:
     """Whether a data file is MCAP, by its first bytes; else it must be SQLite."""
     with file.open("rb") as opened:
         return opened.read(len(mcap.MAGIC)) == mcap.MAGIC
 
 
-def _check_data(file, packed_messages=False):
+def _check_data(file: Path, packed_messages: bool = False) -> None:
     if is_mcap(file):
         mcap.check(file)
         contents = (content[22:] for kind, content in mcap.sound(file) if kind == mcap.MESSAGE)
@@ -161,7 +167,7 @@ def _check_data(file, packed_messages=False):
         left -= size
 
 
-def sqlite_messages(file):
+def sqlite_messages(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
     """Yields (id, topic id, stamp, data) of an SQLite file in the order of the ids. Raises Damaged where it is."""
     connection, last = open_sqlite(file), None
     query = f"SELECT id, topic_id, timestamp, iif(length(data) <= {MESSAGE_BYTES}, data, NULL) FROM messages ORDER BY id"
@@ -177,7 +183,7 @@ def sqlite_messages(file):
         connection.close()
 
 
-def _check_sqlite(file):
+def _check_sqlite(file: Path) -> None:
     connection = open_sqlite(file)
     try:
         connection.execute("PRAGMA writable_schema=OFF")
@@ -196,7 +202,7 @@ def _check_sqlite(file):
         connection.close()
 
 
-def _sum(file):
+def _sum(file: Path) -> str:
     total = 0
     with file.open("rb") as opened:
         while block := opened.read(_BLOCK):

@@ -3,15 +3,21 @@
 Sizes are compared with the file, or bounded, before anything is read or unpacked.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 import struct
 import sys
+from typing import BinaryIO, TYPE_CHECKING
 import zlib
 
 import lz4.frame
 
 from uwb_tdoa_bias.foundation.limits import CHUNK_BYTES, most_unpacked
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -36,17 +42,17 @@ class Record:
     size: int
 
     @property
-    def content(self):
+    def content(self) -> int:
         """Where its content starts."""
         return self.start + 9
 
     @property
-    def end(self):
+    def end(self) -> int:
         """Where the next one starts."""
         return self.start + 9 + self.size
 
 
-def check(path):
+def check(path: str | Path) -> None:
     """Raise Damaged unless the file is whole: its records fill it, and the checksums that it has are right."""
     with open(path, "rb") as file:
         last = _size(file)
@@ -54,7 +60,9 @@ def check(path):
             raise Damaged("it does not start as MCAP does")
         if last < 16 or _at(file, last - 8, 8) != MAGIC:
             raise Damaged("it does not end as MCAP does: the recording was cut")
-        chunks, footer, begin, left = {}, None, (0, 8), most_unpacked(last)
+        chunks: dict[int, tuple[int, bytes, int, int]] = {}
+        footer, left = None, most_unpacked(last)
+        begin: tuple[int, ...] = (0, 8)
         for record in records(file, 8, last - 8):
             if footer is not None:
                 raise Damaged(f"byte {record.start}: a record follows the footer")
@@ -75,9 +83,9 @@ def check(path):
         _check_sum(file, footer, (start or footer.start,), footer.content + 16, 16)
 
 
-def sound(path):
-    """What is left of a file: yields (kind, content) of the schemas, channels and messages, and (CHUNK, Damaged) for a chunk that is
-    damaged, up to where no record follows, and raises Damaged there."""
+def sound(path: str | Path) -> Iterator[tuple[int, bytes]]:
+    """What is left of a file: yields (kind, content) of the schemas, channels and messages, and (CHUNK, b"") for a
+    chunk that is damaged, up to where no record follows, and raises Damaged there."""
     with open(path, "rb") as file:
         last = _size(file)
         left = most_unpacked(last)
@@ -91,14 +99,14 @@ def sound(path):
                     data = unpacked(file, record, left)
                     left -= len(data)
                     yield from inner(data)
-                except Damaged as damage:
-                    yield CHUNK, damage
+                except Damaged:
+                    yield CHUNK, b""
             elif record.kind in (DATA_END, FOOTER):
                 return
         raise Damaged("it ends early")
 
 
-def records(file, start, end):
+def records(file: BinaryIO, start: int, end: int) -> Iterator[Record]:
     """Records one after the other that fill file[start:end]. Raises Damaged where they do not."""
     while start < end:
         if start + 9 > end:
@@ -111,7 +119,7 @@ def records(file, start, end):
         start = record.end
 
 
-def inner(data):
+def inner(data: bytes) -> Iterator[tuple[int, bytes]]:
     """(kind, content) of the schemas, channels and messages within a chunk. Raises Damaged."""
     at = 0
     while at < len(data):
@@ -125,7 +133,7 @@ def inner(data):
         at += size
 
 
-def unpacked(file, record, most=CHUNK_BYTES):
+def unpacked(file: BinaryIO, record: Record, most: int = CHUNK_BYTES) -> bytes:
     """Content of a chunk, at most so many bytes, its size and checksum verified. Raises Damaged."""
     size, crc, compression, packed_at, packed_size = _chunk(file, record)
     if size > min(most, CHUNK_BYTES):
@@ -147,7 +155,7 @@ def unpacked(file, record, most=CHUNK_BYTES):
     return data
 
 
-def set_sums(path):
+def set_sums(path: str | Path) -> None:
     """Fill in the checksums that rosbags leaves at zero: of each chunk, of the data and of the summary."""
     with open(path, "r+b") as file:
         last = _size(file)
@@ -163,7 +171,7 @@ def set_sums(path):
                 _put(file, record.content + 16, _sum(file, start or record.start, record.content + 16))
 
 
-def _chunk(file, record):
+def _chunk(file: BinaryIO, record: Record) -> tuple[int, int, bytes, int, int]:
     """(unpacked size, checksum or 0, compression, where the packed content starts, its size)."""
     if record.size < 40:
         raise Damaged(f"byte {record.start}: a chunk has {record.size} bytes, too few")
@@ -178,13 +186,13 @@ def _chunk(file, record):
     return size, crc, name, at, packed
 
 
-def _described(file, record):
+def _described(file: BinaryIO, record: Record) -> tuple[int, bytes, int, int]:
     """What an index must say of a chunk: (start, size of the record, compression, packed and unpacked size)."""
     size, _, compression, _, packed = _chunk(file, record)
     return record.end - record.start, compression, packed, size
 
 
-def _check_index(file, record, chunks):
+def _check_index(file: BinaryIO, record: Record, chunks: dict[int, tuple[int, bytes, int, int]]) -> None:
     """Raise Damaged unless a chunk index describes one of the chunks."""
     data = _at(file, record.content, record.size)
     try:
@@ -198,7 +206,7 @@ def _check_index(file, record, chunks):
         raise Damaged(f"byte {record.start}: an entry of the index does not fit to any chunk")
 
 
-def _check_sum(file, record, starts, last, at):
+def _check_sum(file: BinaryIO, record: Record, starts: tuple[int, ...], last: int, at: int) -> None:
     """Raise Damaged unless the checksum at `at` in a record is 0, none, or that of the file from one of the starts to
     last."""
     (stored,) = struct.unpack("<I", _at(file, record.content + at, 4))
@@ -206,14 +214,14 @@ def _check_sum(file, record, starts, last, at):
         raise Damaged(f"byte {record.start}: the checksum of the bytes before it is wrong")
 
 
-def _sum(file, first, last):
+def _sum(file: BinaryIO, first: int, last: int) -> int:
     total = 0
     for start in range(first, last, _BLOCK):
         total = zlib.crc32(_at(file, start, min(_BLOCK, last - start)), total)
     return total
 
 
-def _at(file, start, size):
+def _at(file: BinaryIO, start: int, size: int) -> bytes:
     file.seek(start)
     data = file.read(size)
     if len(data) != size:
@@ -221,10 +229,10 @@ def _at(file, start, size):
     return data
 
 
-def _put(file, at, number):
+def _put(file: BinaryIO, at: int, number: int) -> None:
     file.seek(at)
     file.write(struct.pack("<I", number))
 
 
-def _size(file):
+def _size(file: BinaryIO) -> int:
     return Path(file.name).stat().st_size

@@ -5,8 +5,11 @@ What was not measured is marked as the messages say: an orientation of (0, 0, 0,
 covariances of 0 for unknown.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from functools import reduce
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -17,11 +20,21 @@ from uwb_tdoa_bias.foundation.sensors import Sensor, Stream
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER, UNKNOWN_VARIANCE
 from uwb_tdoa_ekf.frames import to_odometry
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from rosbags.typesys.store import Typestore
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_ekf.estimator import Odometry
+
+    # A message has no type here: rosbags makes the classes while it runs.
+    RowOfMessage = Callable[[Any], tuple[float, ...]]
+    StreamOfRows = Callable[[np.ndarray, np.ndarray], Stream]  # of stamps (n,) s and rows (n, k)
+    Sound = Callable[[np.ndarray], np.ndarray]  # of rows (n, k): (n, k) bool
 
 BODY_FRAME, ANTENNA_FRAME = "base_link", "uwb_antenna"
 
 
-def nanoseconds(name, t):
+def nanoseconds(name: str, t: np.ndarray) -> np.ndarray:
     """(n,) int stamps of (n,) s; raises InputError, with the name of the stream, for what a ROS stamp cannot hold."""
     bad = np.flatnonzero(~((t >= 0) & (t < 2**31)))
     if len(bad):
@@ -29,16 +42,17 @@ def nanoseconds(name, t):
     return np.rint(np.asarray(t, dtype=float) * 1e9).astype(np.int64)
 
 
-def stamp_of(header):
+def stamp_of(header: Any) -> int:
     """Nanoseconds of a header's stamp. (Dividing them by 1e9 gives back the very float that was written.)"""
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
-def sound(rows):
+def sound(rows: np.ndarray) -> np.ndarray:
+    """Which numbers of rows (n, k) may be there: (n, k) bool."""
     return np.abs(rows) <= LARGEST_NUMBER  # NaN is not
 
 
-def imu_messages(imu, store):
+def imu_messages(imu: Imu, store: Typestore) -> Iterator[tuple[int, Any]]:
     """Yield (stamp ns, sensor_msgs/Imu)."""
     Message, Vector3 = store.types["sensor_msgs/msg/Imu"], store.types["geometry_msgs/msg/Vector3"]
     no_orientation = store.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 0.0)
@@ -49,16 +63,18 @@ def imu_messages(imu, store):
         yield stamp, Message(header, no_orientation, none, Vector3(*rate), unknown, Vector3(*force), unknown)
 
 
-def imu_row(message):
+def imu_row(message: Any) -> tuple[float, ...]:
+    """Of a sensor_msgs/Imu: its stamp, ns, rates (3), rad/s, and specific force (3), m/s^2."""
     rate, force = message.angular_velocity, message.linear_acceleration
     return stamp_of(message.header), rate.x, rate.y, rate.z, force.x, force.y, force.z
 
 
-def imu_of(stamps, rows):
+def imu_of(stamps: np.ndarray, rows: np.ndarray) -> Imu:
+    """The Imu of stamps (n,) s and rows (n, 6), of `imu_row` without the stamp."""
     return Imu(stamps, rows[:, 0:3], rows[:, 3:6])
 
 
-def sensor_messages(sensor: Sensor, stream: Stream, store) -> Iterator[tuple]:
+def sensor_messages(sensor: Sensor, stream: Stream, store: Typestore) -> Iterator[tuple[int, Any]]:
     """Yield (stamp ns, message) of the Stream of a Sensor; what it says nothing of is 0."""
     content = {field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:])) for field, values in sensor.content(stream).items()}
     for k, stamp in enumerate(nanoseconds(sensor.name, stream.t).tolist()):
@@ -70,10 +86,11 @@ def sensor_messages(sensor: Sensor, stream: Stream, store) -> Iterator[tuple]:
         yield stamp, message
 
 
-def _blank(store, kind):
+def _blank(store: Typestore, kind: str) -> Any:
     """A message of a type with nothing but zeros."""
-    values = {}
-    for name, (node, what) in store.get_msgdef(kind).fields:
+    values: dict[str, Any] = {}
+    fields: Any = store.get_msgdef(kind).fields  # nested, as each Nodetype says
+    for name, (node, what) in fields:
         if node == Nodetype.NAME:
             values[name] = _blank(store, what)
         elif node == Nodetype.BASE:
@@ -83,7 +100,7 @@ def _blank(store, kind):
     return store.types[kind](**values)
 
 
-def _set(holder, name, value):
+def _set(holder: object, name: str, value: np.ndarray) -> None:
     """Write a number, an array, or the numbers of a Vector3 into a field."""
     old = getattr(holder, name)
     if hasattr(old, "x"):
@@ -92,23 +109,23 @@ def _set(holder, name, value):
         setattr(holder, name, np.ascontiguousarray(value) if np.ndim(value) else value.item())
 
 
-def of_sensor(sensor: Sensor) -> tuple:
+def of_sensor(sensor: Sensor) -> tuple[RowOfMessage, StreamOfRows, Sound]:
     """(row of a message, Stream of stamps and rows, which numbers of rows may be there), as `read_bag` takes them, of a Sensor."""
 
-    def row(message):
+    def row(message: Any) -> tuple[float, ...]:
         return stamp_of(message.header), *(number for field in sensor.fields for number in _numbers(reduce(getattr, field.split("."), message)))
 
-    def sound_ones(rows):
+    def sound_ones(rows: np.ndarray) -> np.ndarray:
         return np.column_stack(list(sensor.sound(sensor.split(rows)).values()))
 
     return row, lambda stamps, rows: sensor.read(stamps, sensor.split(rows)), sound_ones
 
 
-def _numbers(value):
+def _numbers(value: Any) -> Iterable[float]:
     return _point(value) if hasattr(value, "x") else np.ravel(value).tolist()
 
 
-def tdoa_messages(tdoa, store, antenna=None):
+def tdoa_messages(tdoa: Tdoas, store: Typestore, antenna: Sequence[float] | None = None) -> Iterator[tuple[int, Any]]:
     """Yield (stamp ns, uwb_tdoa_msgs/Tdoa). antenna : where it is on the body, see `transforms_message`."""
     Message, frame = store.types["uwb_tdoa_msgs/msg/Tdoa"], ANTENNA_FRAME if antenna else BODY_FRAME
     columns = (nanoseconds("tdoa", tdoa.t), tdoa.a, tdoa.b, tdoa.d, tdoa.variance)
@@ -116,15 +133,17 @@ def tdoa_messages(tdoa, store, antenna=None):
         yield stamp, Message(_header(store, stamp, frame), *values)
 
 
-def tdoa_row(message):
+def tdoa_row(message: Any) -> tuple[float, ...]:
+    """Of a uwb_tdoa_msgs/Tdoa: its stamp, ns, ids a and b, d_ab, m, and variance, m^2."""
     return stamp_of(message.header), message.anchor_a, message.anchor_b, message.distance_difference, message.variance
 
 
-def tdoas_of(stamps, rows):
+def tdoas_of(stamps: np.ndarray, rows: np.ndarray) -> Tdoas:
+    """The Tdoas of stamps (n,) s and rows (n, 4), of `tdoa_row` without the stamp."""
     return Tdoas(stamps, rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3])
 
 
-def pose_messages(truth, frame, store):
+def pose_messages(truth: Truth, frame: str, store: Typestore) -> Iterator[tuple[int, Any]]:
     """Yield (stamp ns, geometry_msgs/PoseStamped)."""
     Message = store.types["geometry_msgs/msg/PoseStamped"]
     q_or_zero = np.where(np.isfinite(truth.q), truth.q, 0.0)
@@ -132,16 +151,18 @@ def pose_messages(truth, frame, store):
         yield stamp, Message(_header(store, stamp, frame), _pose(store, p, q))
 
 
-def pose_row(message):
+def pose_row(message: Any) -> tuple[float, ...]:
+    """Of a geometry_msgs/PoseStamped: its stamp, ns, position (3), m, and quaternion x y z w."""
     return stamp_of(message.header), *_point(message.pose.position), *_quaternion(message.pose.orientation)
 
 
-def truth_of(stamps, rows):
+def truth_of(stamps: np.ndarray, rows: np.ndarray) -> Truth:
+    """The Truth of stamps (n,) s and rows (n, 7), of `pose_row` without the stamp; a quaternion of zeros is none."""
     q = rows[:, 3:7]
     return Truth(stamps, rows[:, 0:3], np.where((q == 0).all(axis=1, keepdims=True), np.nan, q))
 
 
-def anchors_message(anchors, stamp, store):
+def anchors_message(anchors: Anchors, stamp: int, store: Typestore) -> tuple[int, Any]:
     """(stamp ns, uwb_tdoa_msgs/AnchorArray)."""
     Anchor = store.types["uwb_tdoa_msgs/msg/Anchor"]
     q_or_zero = np.where(np.isfinite(anchors.orientations), anchors.orientations, 0.0)
@@ -152,7 +173,9 @@ def anchors_message(anchors, stamp, store):
     return stamp, store.types["uwb_tdoa_msgs/msg/AnchorArray"](_header(store, stamp, anchors.frame), array)
 
 
-def transforms_message(anchors, stamp, store, antenna=None):
+def transforms_message(
+    anchors: Anchors, stamp: int, store: Typestore, antenna: Sequence[float] | None = None
+) -> tuple[int, Any]:
     """(stamp ns, tf2_msgs/TFMessage) with the anchors as frames anchor_<id>, and the antenna, (3,) m in the body frame.
 
     An unknown orientation is the identity here: tf has no word for "not known".
@@ -178,7 +201,7 @@ def transforms_message(anchors, stamp, store, antenna=None):
     return stamp, types["tf2_msgs/msg/TFMessage"](transforms)
 
 
-def odometry_messages(odometry, frame, store):
+def odometry_messages(odometry: Odometry, frame: str, store: Typestore) -> Iterator[tuple[int, Any]]:
     """Yield (stamp ns, nav_msgs/Odometry) of an Odometry: its twist is in the body frame, and rates are not known."""
     types = store.types
     Message, Vector3 = types["nav_msgs/msg/Odometry"], types["geometry_msgs/msg/Vector3"]
@@ -193,7 +216,7 @@ def odometry_messages(odometry, frame, store):
         yield stamp, Message(_header(store, stamp, frame), BODY_FRAME, pose, Twist(twist, its.ravel()))
 
 
-def odometry_row(message):
+def odometry_row(message: Any) -> tuple[float, ...]:
     """Stamp, position, velocity in the child frame, quaternion, pose covariance (36), twist covariance (36)."""
     return (
         stamp_of(message.header),
@@ -205,21 +228,21 @@ def odometry_row(message):
     )
 
 
-def _header(store, stamp, frame):
+def _header(store: Typestore, stamp: int, frame: str) -> Any:
     time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
     return store.types["std_msgs/msg/Header"](time, frame)
 
 
-def _pose(store, p, q):
+def _pose(store: Typestore, p: Sequence[float], q: Sequence[float]) -> Any:
     types = store.types
     return types["geometry_msgs/msg/Pose"](
         types["geometry_msgs/msg/Point"](*p), types["geometry_msgs/msg/Quaternion"](*q)
     )
 
 
-def _point(v):
+def _point(v: Any) -> tuple[float, float, float]:
     return v.x, v.y, v.z
 
 
-def _quaternion(q):
+def _quaternion(q: Any) -> tuple[float, float, float, float]:
     return q.x, q.y, q.z, q.w

@@ -1,5 +1,9 @@
 """Sensors that are not in the frame of the body: where /tf_static of a bag places them, taken as the nodes take it."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Imu
@@ -10,15 +14,23 @@ from .files import readable
 from .message_types import check_type
 from .messages import BODY_FRAME
 
+if TYPE_CHECKING:
+    from collections import Counter
+    from pathlib import Path
+    from scipy.spatial.transform import Rotation
+    from .files import BagReader
+
+    Place = tuple[Rotation, np.ndarray]  # of a sensor in the body: its turn, and its arm (3,) m
+
 TF_STATIC = "/tf_static"
 
 
-def is_body(frame):
+def is_body(frame: str) -> bool:
     """Whether a frame_id is that of the body, of whatever robot; an empty one is taken for it."""
     return frame.rpartition("/")[2] in (BODY_FRAME, "")
 
 
-def read_frames(path, reader):
+def read_frames(path: str | Path, reader: BagReader) -> Frames:
     """Frames of all messages on /tf_static of an open bag. Raises InputError."""
     frames = Frames()
     connections = [c for c in reader.connections if c.topic == TF_STATIC and c.msgtype == "tf2_msgs/msg/TFMessage"]
@@ -33,7 +45,7 @@ def read_frames(path, reader):
     return frames
 
 
-def place_of(frames, frame):
+def place_of(frames: Frames, frame: str) -> Place | None:
     """(Rotation, arm (3,) m) of a sensor's frame in the body: of the same robot, or of the only one; None if not known."""
     robot = frame.lstrip("/").rpartition("/")[0]
     for body in ([f"{robot}/{BODY_FRAME}"] if robot else []) + [BODY_FRAME]:
@@ -42,12 +54,12 @@ def place_of(frames, frame):
     return None
 
 
-def imu_in_body(imu, place):
+def imu_in_body(imu: Imu, place: Place) -> Imu:
     """The Imu with the samples of one that is at a place (see `place_of`), in the origin of the body."""
     return Imu(imu.t, *ImuMount(*place).in_body(imu.t, imu.gyro, imu.accel))
 
 
-def placed(frames, topic, counts):
+def placed(frames: Frames, topic: str, counts: Counter[str]) -> tuple[Place | None, str | None]:
     """(place or None, remark or None) of the one frame that the messages of a topic have. counts : {frame_id: messages}. A place
     changes the result, so it is remarked on, too."""
     others = sorted(frame for frame in counts if not is_body(frame))

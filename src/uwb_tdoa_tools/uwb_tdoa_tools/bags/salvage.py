@@ -1,9 +1,12 @@
 """What is sound of a cut or damaged bag, as another bag."""
 
+from __future__ import annotations
+
 from collections import Counter
 from pathlib import Path
 import sqlite3
 import struct
+from typing import TYPE_CHECKING
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -14,15 +17,20 @@ from . import integrity, mcap
 from .mcap import Damaged
 from .message_types import check_type, earlier_types, typestore, upgraded
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 MESSAGES = "messages"
 LATEST = 2**63  # ns
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 
 
-def salvage(path, out):
+def salvage(path: str | Path, out: str | Path) -> list[str]:
     """Write what is sound of a bag (directory or data file, with or without metadata.yaml) to a new bag `out`, without
     topics of types that are not installed. Returns remarks on what is missing, list of sentences. Raises InputError."""
-    path, remarks, connections = Path(path), [], {}
+    path = Path(path)
+    remarks: list[str] = []
+    connections: dict[tuple[str, str], Connection | None] = {}
     files = [path] if path.is_file() else _files(path, remarks)
     with Writer(out, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
         for file in files:
@@ -36,7 +44,7 @@ def salvage(path, out):
     return remarks
 
 
-def _files(path, remarks):
+def _files(path: Path, remarks: list[str]) -> list[Path]:
     try:
         return [file for file in integrity.data_files(path, integrity.metadata(path)) if file.is_file()]
     except (Damaged, InputError) as error:
@@ -44,30 +52,34 @@ def _files(path, remarks):
         return sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
 
 
-def _copy(path, file, writer, connections):
+def _copy(
+    path: Path, file: Path, writer: Writer, connections: dict[tuple[str, str], Connection | None]
+) -> tuple[int, Counter[str], str | None]:
     """Copy the messages of a data file. Returns (how many, {what cannot be read: how often}, where they end, as text, or None).
     connections : {(topic, type): Connection of the writer, or None}."""
-    count, lost = 0, Counter()
+    count = 0
+    lost: Counter[str] = Counter()
     try:
         for connection, stamp, data in (_from_mcap if integrity.is_mcap(file) else _from_sqlite)(file, lost):
             key = connection.topic, connection.msgtype
             if key not in connections:
                 connections[key] = _added(path, connection, writer)
-            if connections[key] is not None:
+            target = connections[key]
+            if target is not None:
                 if earlier := earlier_types(path, connection):
                     try:
                         data = upgraded(data, connection.msgtype, earlier)
                     except Exception:  # rosbags raises whatever its parsers run into
                         lost[MESSAGES] += 1
                         continue
-                writer.write(connections[key], stamp, data)
+                writer.write(target, stamp, data)
                 count += 1
     except Damaged as damage:
         return count, lost, str(damage)
     return count, lost, None
 
 
-def _added(path, connection, writer):
+def _added(path: Path, connection: Connection, writer: Writer) -> Connection | None:
     try:
         check_type(path, connection)
     except InputError:
@@ -77,7 +89,7 @@ def _added(path, connection, writer):
     return writer.add_connection(connection.topic, connection.msgtype, typestore=typestore())
 
 
-def _from_mcap(file, lost):
+def _from_mcap(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, int, bytes]]:
     schemas, channels = {}, {}
     for kind, content in mcap.sound(file):
         if kind == mcap.CHUNK:
@@ -102,7 +114,7 @@ def _from_mcap(file, lost):
             yield message
 
 
-def _from_sqlite(file, lost):
+def _from_sqlite(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, int, bytes]]:
     connection, topics = integrity.open_sqlite(file), {}
     try:
         definitions = _definitions(connection)
@@ -119,7 +131,7 @@ def _from_sqlite(file, lost):
         yield topics[topic], stamp, data
 
 
-def _definitions(connection):
+def _definitions(connection: sqlite3.Connection) -> dict[str, tuple[str, str]]:
     """{type: (encoding, text)}; rosbag2 writes them since ROS 2 Iron."""
     query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
     try:
@@ -128,7 +140,7 @@ def _definitions(connection):
         return {}
 
 
-def _texts(content, at, count):
+def _texts(content: bytes, at: int, count: int) -> list[str]:
     """Texts, each after its length. Raises Damaged."""
     found = []
     for _ in range(count):
@@ -140,6 +152,6 @@ def _texts(content, at, count):
     return found
 
 
-def _channel(number, topic, msgtype, encoding, definition):
-    definition = MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), definition)
-    return Connection(number, topic, msgtype, definition, "", 0, ConnectionExtRosbag2("cdr", []), None)
+def _channel(number: int, topic: str, msgtype: str, encoding: str, definition: str) -> Connection:
+    described = MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), definition)
+    return Connection(number, topic, msgtype, described, "", 0, ConnectionExtRosbag2("cdr", []), None)
