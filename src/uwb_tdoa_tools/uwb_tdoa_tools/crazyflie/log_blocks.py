@@ -8,9 +8,15 @@ A variable holds the last value there was: it is sampled when the block is sent,
 on average half a period old. Nothing here knows ROS.
 """
 
+from __future__ import annotations
+
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer
 PERIOD = 0.01  # s, the shortest of a log block
@@ -22,16 +28,19 @@ _PAIR = re.compile(r"tdoa2\.d([0-7])-([0-7])")
 class LogBlock:
     """One log block: the variables that it holds, in their order."""
 
-    def __init__(self, variables, period=PERIOD):
+    def __init__(self, variables: Sequence[str], period: float = PERIOD) -> None:
         """variables : names of log variables; those that are neither TDOAs nor acc and gyro are passed over.
         period : s."""
         found = [(place, _PAIR.fullmatch(name)) for place, name in enumerate(variables)]
         self._pairs = [(place, int(match[1]), int(match[2])) for place, match in found if match]
         there, needed = list(variables), [*RATES, *FORCES]
         self._inertial = [there.index(name) for name in needed] if set(needed) <= set(there) else None
-        self._age, self._last = 0.5 * period, {}
+        self._age = 0.5 * period
+        self._last: dict[int, float] = {}
 
-    def take(self, timestamp, values):
+    def take(
+        self, timestamp: float, values: Sequence[float] | np.ndarray
+    ) -> tuple[list[tuple[float, int, int, float]], tuple[float, np.ndarray, np.ndarray] | None]:
         """([(t, a, b, d)], (t, gyro (3,), accel (3,)) or None) of one message.
 
         timestamp : ms of the vehicle's clock; values : of the variables. t in s of that clock; d in m, of the sign of
@@ -52,10 +61,10 @@ class LogBlock:
 class VehicleClock:
     """The vehicle's clock against ours: messages arrive late, never early, so that the least delay tells the offset."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._offset, self._at = np.inf, 0.0
 
-    def stamp(self, t, arrival):
+    def stamp(self, t: float, arrival: float) -> float:
         """Our time, s, of t, s of the vehicle's clock, in a message that arrived at `arrival`, s of ours."""
         self._offset = min(self._offset + DRIFT * max(arrival - self._at, 0.0), arrival - t)
         self._at = arrival

@@ -1,12 +1,18 @@
 """A recorded flight as it would have come over the radio link: sampled, rounded, repeated, lost and late."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 
 from .log_blocks import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Flight
 
 PAIRS = [f"tdoa2.d{k}-{(k + 1) % 8}" for k in (7, 0, 1, 2, 3, 4, 5, 6)]
 BLOCKS = PAIRS[:6], PAIRS[6:], [*RATES, *FORCES]  # 26 bytes each at most
@@ -24,9 +30,11 @@ class Link:
     jitter: float = 0.004
 
 
-def messages(flight, link, rng):
+def messages(flight: Flight, link: Link, rng: np.random.Generator) -> list[tuple[float, int, float, np.ndarray]]:
     """[(arrival s, block, timestamp ms, values)] of a TDoA2 Flight, as they arrive. block : place in BLOCKS."""
-    tdoa, imu, sent = flight.tdoa, flight.imu, []
+    tdoa, imu = flight.tdoa, flight.imu
+    assert imu is not None, "its inertial samples are sent too"
+    sent: list[tuple[float, int, float, np.ndarray]] = []
     begin, end = max(tdoa.t[0], imu.t[0]), min(tdoa.t[-1], imu.t[-1])
     for number, variables in enumerate(BLOCKS):
         t = np.arange(begin + rng.uniform(0.0, PERIOD), end, PERIOD)
@@ -49,7 +57,7 @@ def messages(flight, link, rng):
     return sorted(sent, key=lambda message: message[0])
 
 
-def streamed(flight, link, seed=0):
+def streamed(flight: Flight, link: Link, seed: int = 0) -> Flight:
     """The Flight that `LogBlock` and `VehicleClock` make of these messages."""
     blocks, clock, tdoas, samples = [LogBlock(variables) for variables in BLOCKS], VehicleClock(), [], []
     for arrival, number, timestamp, values in messages(flight, link, np.random.default_rng(seed)):
@@ -60,7 +68,7 @@ def streamed(flight, link, seed=0):
     return _flight(flight, tdoas, samples)
 
 
-def as_received(flight, link, seed=0):
+def as_received(flight: Flight, link: Link, seed: int = 0) -> Flight:
     """The Flight of a driver that publishes every value of every message, stamped when it arrived."""
     tdoas, samples = [], []
     for arrival, number, _, values in messages(flight, link, np.random.default_rng(seed)):
@@ -72,7 +80,9 @@ def as_received(flight, link, seed=0):
     return _flight(flight, tdoas, samples)
 
 
-def _flight(flight, tdoas, samples):
+def _flight(
+    flight: Flight, tdoas: list[tuple[float, int, int, float]], samples: list[tuple[float, np.ndarray, np.ndarray]]
+) -> Flight:
     """The Flight with other streams, in order of their stamps."""
     t, a, b, d = (np.array(column) for column in zip(*sorted(tdoas, key=lambda row: row[0])))
     samples.sort(key=lambda row: row[0])

@@ -1,7 +1,10 @@
 """Readers: each turns one kind of recording into a Flight. `read_flight` finds out which kind it is."""
 
+from __future__ import annotations
+
 import zlib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_head
@@ -10,10 +13,18 @@ from .names import read_survey
 from .usd_log import MAGIC, read_usd_log
 from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 __all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
 
 
-def read_flight(path, survey=None, namespace="", salvage=False, topics=None, truth=True):
+def read_flight(
+    path: str | Path, survey: str | Path | Anchors | None = None, namespace: str = "", salvage: bool = False,
+    topics: dict[str, str] | None = None, truth: bool = True,
+) -> Flight:  # fmt: skip
     """Flight of a recording of any known kind, told apart by content, not by name.
 
     path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (its directory or its .mcap or .db3 file).
@@ -34,17 +45,17 @@ def read_flight(path, survey=None, namespace="", salvage=False, topics=None, tru
         return read_bag(path, namespace, _anchors(survey), salvage, topics, truth)
     if path.is_dir():
         raise InputError(f"{path}: is a directory without metadata.yaml; give a bag directory or a file.")
-    reader = _reader(path)
-    if survey is None:
+    reader, anchors = _reader(path), _anchors(survey)
+    if anchors is None:
         raise InputError(f"{path}: does not say where the anchors are; give a survey file (--survey FILE).")
-    return reader(path, _anchors(survey), salvage, truth)
+    return reader(path, anchors, salvage, truth)
 
 
-def _anchors(survey):
+def _anchors(survey: str | Path | Anchors | None) -> Anchors | None:
     return read_survey(survey) if isinstance(survey, (str, Path)) else survey
 
 
-def _reader(path):
+def _reader(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:
     head = read_head(path, 1 << 16)
     if head[0] == MAGIC:
         return read_usd_log

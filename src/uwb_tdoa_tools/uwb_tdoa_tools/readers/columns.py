@@ -4,8 +4,11 @@
     flight = read_columns(["ranging.csv", "imu.csv"], columns, anchors)
 """
 
+from __future__ import annotations
+
 from array import array
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +17,13 @@ from uwb_tdoa_bias.foundation.limits import TABLE_CELLS
 
 from .streams import GRAVITY, make_flight
 from .tables import read_table
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from .names import Named
+    from .streams import Streams
+    from .tables import Table
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ticks": 299792458.0 / (128 * 499.2e6), "ns": 0.299792458}
@@ -43,7 +53,7 @@ HELP = (
 )
 
 
-def parse_columns(text):
+def parse_columns(text: str) -> dict[str, tuple[str, float]]:
     """{our column: (their column, factor)} of "OURS=THEIRS[:UNIT],...". Raises InputError."""
     columns = {}
     for entry in text.split(","):
@@ -71,7 +81,9 @@ def parse_columns(text):
     return columns
 
 
-def read_columns(paths, columns, named, salvage=False):
+def read_columns(
+    paths: Sequence[str | Path], columns: dict[str, tuple[str, float]], named: Named, salvage: bool = False
+) -> Flight:
     """Flight of CSV files with a header line each; each stream is taken from the one file that has its columns.
 
     A row counts for a stream if any of its cells is filled: rows of several sensors may be mixed in one file, and each may have a time column
@@ -80,7 +92,9 @@ def read_columns(paths, columns, named, salvage=False):
     records that are not finite, however many. Raises InputError, with the line of the first record that is left out.
     """
     tables = {path: read_table(path, most=TABLE_CELLS, complete=False) for path in paths}
-    wanted, streams, remarks = {path: {} for path in paths}, {}, []
+    wanted: dict[str | Path, dict[str, dict[str, tuple[str, float]]]] = {path: {} for path in paths}
+    streams: Streams = {}
+    remarks: list[str] = []
     for stream, known in STREAMS.items():
         mine = {name: columns[name] for name in known if name in columns}
         if mine:
@@ -96,7 +110,7 @@ def read_columns(paths, columns, named, salvage=False):
     return make_flight(Path(paths[0]).stem, named.anchors, streams, {}, meta, salvage)
 
 
-def _having(tables, mine):
+def _having(tables: dict[str | Path, Table], mine: dict[str, tuple[str, float]]) -> str | Path:
     """The path of the one table that has all columns."""
     names = {theirs for theirs, _ in mine.values()}
     having = [path for path, table in tables.items() if names <= {*table.names}]
@@ -108,22 +122,27 @@ def _having(tables, mine):
     raise InputError(f"{path}: has no column {min(names - {*table.names})!r}; its columns are {', '.join(table.names)}.")
 
 
-def _values(path, table, streams, named, remarks, salvage):
+def _values(
+    path: str | Path, table: Table, streams: dict[str, dict[str, tuple[str, float]]], named: Named, remarks: list[str],
+    salvage: bool,
+) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
     """{stream: {our name: (n,) array}}, in our units, of the rows in which a cell of the stream is filled and all are numbers, or names of
     anchors. streams : {stream: columns} that the table has."""
     values, rows = {stream: {name: array("d") for name in mine} for stream, mine in streams.items()}, 0
-    skipped, first = dict.fromkeys(streams, 0), {}
+    skipped = dict.fromkeys(streams, 0)
+    first: dict[str, str] = {}
     for rows, (line, cells) in enumerate(table, start=1):
         for stream, mine in streams.items():
             texts = {name: cells[theirs].strip() for name, (theirs, _) in mine.items()}
             if all(text.lower() in EMPTY for name, text in texts.items() if name != "t"):
                 continue
             record = {name: named.id_of(text) if name in ANCHORS else _number(text) for name, text in texts.items()}
-            wrong = next((name for name, value in record.items() if value is None), None)
-            if wrong is None:
-                for name, value in record.items():
-                    values[stream][name].append(value)
+            numbers = {name: value for name, value in record.items() if value is not None}
+            if len(numbers) == len(record):
+                for name, number in numbers.items():
+                    values[stream][name].append(number)
             else:
+                wrong = next(name for name in record if name not in numbers)
                 skipped[stream] += 1
                 what = "an anchor of the survey, by its name, or an id 0 ... 65535" if wrong in ANCHORS else "a finite number"
                 first.setdefault(stream, f"line {line}: {mine[wrong][0]} is {texts[wrong][:40]!r}; it must be {what}")
@@ -137,7 +156,7 @@ def _values(path, table, streams, named, remarks, salvage):
     return {stream: {name: np.array(column) * streams[stream][name][1] for name, column in of.items()} for stream, of in values.items()}
 
 
-def _number(text):
+def _number(text: str) -> float | None:
     """A finite number, with a point or a comma, or None."""
     try:
         value = float(text.replace(",", "."))

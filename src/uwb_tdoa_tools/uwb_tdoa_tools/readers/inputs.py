@@ -1,8 +1,11 @@
 """From the paths on a command line to flights: files or folders of recordings, one survey or a folder of them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
@@ -13,16 +16,24 @@ from uwb_tdoa_bias.foundation.foreign_text import printable
 from .. import parallel
 from . import read_flight
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from uwb_tdoa_bias.foundation.flight import Flight
+
+    Recording = tuple[Path, str | Path | None]  # and its survey
+
 HELP = "recordings: raw logs, UTIL CSV files, bags, or folders that hold them"
 SURVEY_HELP = (
     "anchor survey (total station .txt, const .csv or anchors .yaml), or a folder of them: then anchor_KEY.* serves "
     "the recordings whose path contains KEY; counts in place of the anchors that bags hold, which keep their own where no KEY fits"
 )
 
-_TOLD = set()  # surveys of which has been told that they count for bags
+_TOLD: set[str | Path | None] = set()  # surveys of which has been told that they count for bags
 
 
-def find_flights(paths, survey=None, absolute=False):
+def find_flights(
+    paths: Iterable[str | Path], survey: str | Path | None = None, absolute: bool = False
+) -> list[Recording]:
     """Pairs (recording, survey or None), sorted within each folder. Raises InputError where nothing, or no one survey,
     fits.
 
@@ -43,7 +54,7 @@ def find_flights(paths, survey=None, absolute=False):
     return pairs
 
 
-def _survey_of(path, survey):
+def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
     """The survey of a recording, or None for a bag whose own anchors count; what counts for a bag is told once."""
     if survey is None or not _is_bag(path):
         return survey_for(path, survey)
@@ -56,14 +67,14 @@ def _survey_of(path, survey):
     return its_survey
 
 
-def _tell_once(sentence, about=None):
+def _tell_once(sentence: str, about: str | Path | None = None) -> None:
     """Tell a sentence on stderr, and nothing more about the same survey, or about surveys that do not fit (None), in this process."""
     if about not in _TOLD:
         _TOLD.add(about)
         tqdm.write(printable(sentence), file=sys.stderr)
 
 
-def survey_for(path, survey):
+def survey_for(path: str | Path, survey: str | Path | None) -> str | Path | None:
     """The survey of a recording: `survey` itself, or out of a folder the one whose KEY is the longest in the path."""
     if survey is None or not Path(survey).is_dir():
         return survey
@@ -75,7 +86,7 @@ def survey_for(path, survey):
     return keys[fitting[-1]]
 
 
-def tell(path, remarks):
+def tell(path: str | Path, remarks: Iterable[str]) -> None:
     """Tell sentences on a recording, on stderr, beside a progress bar."""
     for remark in remarks:
         tqdm.write(printable(f"{path}: {remark}"), file=sys.stderr)
@@ -92,11 +103,11 @@ class Reading:
 
     survey: str | Path | None = None
     namespace: str = ""
-    topics: dict = field(default_factory=dict)
+    topics: dict[str, str] = field(default_factory=dict)
     salvage: bool = False
     truth: bool = True
 
-    def find(self, paths, absolute=False):
+    def find(self, paths: Iterable[str | Path], absolute: bool = False) -> list[Recording]:
         """Pairs (recording, survey or None), see `find_flights`; none of no paths. Raises InputError where topics of bags are named, and
         there is no bag."""
         found = find_flights(paths, self.survey, absolute)
@@ -104,32 +115,35 @@ class Reading:
             self._refuse_topics(found[0][0])
         return found
 
-    def _refuse_topics(self, path):
+    def _refuse_topics(self, path: Path) -> None:
         for option, given in (("--namespace", self.namespace), ("--topic", self.topics)):
             if given:
                 raise InputError(f"{option}: says where topics are in bags, and {path} is none; leave it out.")
 
-    def read(self, recording):
+    def read(self, recording: Recording) -> Flight:
         """Flight of a pair (recording, survey or None); tells on stderr what is missing in it. Raises InputError."""
         path, survey = recording
         flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, self.truth)
         tell(path, flight.meta.get("remarks", ()))
         return flight
 
-    def one(self, path):
+    def one(self, path: str | Path) -> Flight:
         """Flight of one recording."""
         path = Path(path)
         if not _is_bag(path):
             self._refuse_topics(path)
         return self.read((path, _survey_of(path, self.survey)))
 
-    def flights(self, paths, most=None, jobs=1, dask=None):
+    def flights(
+        self, paths: Iterable[str | Path], most: int | None = None, jobs: int | None = 1, dask: str | None = None
+    ) -> list[Flight]:
         """Flights of recordings and folders, with a progress bar: list. jobs, dask : as of `parallel.over`.
 
         most : TDOAs that they may hold together, the first excepted; of more, as many whole flights as that are drawn at random, alike
         at every call, and the others not held, so that memory and time are bounded.
         """
-        found, read, count = self.find(paths, bool(dask)), {}, 0
+        found, count = self.find(paths, bool(dask)), 0
+        read: dict[int, Flight] = {}
         order = range(len(found)) if most is None else np.random.default_rng(0).permutation(len(found)).tolist()
         for flight, number in zip(parallel.over(self.read, [found[number] for number in order], jobs, dask), order):
             count += len(flight.tdoa)
@@ -143,11 +157,11 @@ class Reading:
         return [read[number] for number in sorted(read)]
 
 
-def _is_bag(path):
+def _is_bag(path: Path) -> bool:
     return path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists()
 
 
-def _recordings(path):
+def _recordings(path: Path) -> Iterator[Path]:
     if path.is_file() or _is_bag(path):
         yield path
         return

@@ -1,7 +1,12 @@
 """Anchors that have names: surveys and recordings call them "NE corner" or "A3", messages have numbers."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 import re
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
 
 from uwb_tdoa_bias.foundation import survey
 from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -9,6 +14,9 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 from .tables import number, read_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 LARGEST_ID = 65535
 
@@ -18,9 +26,9 @@ class Named:
     """anchors : Anchors; ids : {name as in the survey: id}, empty if they are called by their ids."""
 
     anchors: Anchors
-    ids: dict = field(default_factory=dict)
+    ids: dict[str, int] = field(default_factory=dict)
 
-    def id_of(self, text):
+    def id_of(self, text: str) -> int | None:
         """The id of an anchor by its name, or by its id, decimal or as 0x1A2B; None if it is neither."""
         if text in self.ids:
             return self.ids[text]
@@ -30,7 +38,7 @@ class Named:
         return None if self.ids else _whole(text)
 
 
-def read_named(path):
+def read_named(path: str | Path) -> Named:
     """Named of a survey file that `read_survey` reads, or one like it with names of any text in place of the ids: a CSV file name,x,y,z or
     id,x,y,z, or YAML. The id is the number that a name ends with, if all end with different ones; else the line of the survey, from 0 on. Raises
     InputError."""
@@ -46,17 +54,18 @@ def read_named(path):
     ids = [int(end[1]) for end in ends if end]
     if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
         ids = list(range(len(names)))
-    return Named(Anchors(ids, positions, orientations, frame), dict(zip(names, ids)))
+    return Named(Anchors(np.array(ids), positions, orientations, frame), dict(zip(names, ids)))
 
 
-def read_survey(path):
+def read_survey(path: str | Path) -> Anchors:
     """Anchors of a survey file, see `read_named`: of those with names, under the ids that these get."""
     return read_named(path).anchors
 
 
-def _entries(path):
-    """(names, positions, orientations, frame) of a survey with names; no names if it is none."""
-    unknown, none = [float("nan")] * 4, ([], [], [], "map")
+def _entries(path: str | Path) -> tuple[list[str], Any, Any, Any]:
+    """(names, positions, orientations, frame) of a survey with names, as they stand there; no names if it is none."""
+    unknown = [float("nan")] * 4
+    none: tuple[list[str], Any, Any, Any] = ([], [], [], "map")
     try:
         rows = list(read_table(path))
     except InputError:
@@ -75,7 +84,7 @@ def _entries(path):
         return none
 
 
-def _whole(text):
+def _whole(text: str) -> int | None:
     """A whole number 0 ... 65535, decimal or hexadecimal as 0x1A2B, or None."""
     try:
         value = float(int(text, 16)) if text[:2] in ("0x", "0X") else float(text)

@@ -1,8 +1,16 @@
 """Velocity of the pixel counts of an optical flow sensor that looks down, with a range finder and a gyroscope beside it."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.sensors import Velocity
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Imu
+    from uwb_tdoa_bias.foundation.sensors.height import Height
 
 COUNTS = 4.7  # of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, told in tenths: 4.2 to 4.9
 READING_TIME = 0.01  # s that one reading counts over
@@ -13,7 +21,7 @@ NEAREST_RANGE = 0.2  # s to the next range, beyond which the height is not known
 TURN_TIME = 0.02  # s before and after, over which the gyroscope is averaged
 
 
-def velocity_of(t, x, y, height, imu):
+def velocity_of(t: np.ndarray, x: np.ndarray, y: np.ndarray, height: Height, imu: Imu) -> Velocity:
     """Velocity in the body frame, x and y, at up to 25 Hz, where a range is near and the gyroscope is there.
 
     t (n,) s, ascending; x, y (n,) counts of single readings; height : Height; imu : Imu. A sensor that looks down sees

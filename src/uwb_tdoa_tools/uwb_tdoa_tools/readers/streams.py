@@ -1,5 +1,9 @@
 """What the readers of recordings share: putting streams in order, making one IMU stream of two, naming the protocol."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -10,6 +14,12 @@ from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
 from .optical_flow import velocity_of
 
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+
+    Columns = dict[str, np.ndarray]  # of a stream, each (n,)
+    Streams = dict[str, Columns]
+
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
 LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
@@ -18,7 +28,10 @@ DAY = 86400.0  # s
 REFERENCE = 0.95  # of the TDOAs: an anchor that is in so many is what all others are compared with
 
 
-def make_flight(name, anchors, streams, extra, meta, salvage=False, truth=True):
+def make_flight(
+    name: str, anchors: Anchors, streams: Streams, extra: Streams, meta: dict[str, Any], salvage: bool = False,
+    truth: bool = True,
+) -> Flight:  # fmt: skip
     """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams left out.
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
@@ -49,7 +62,8 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False, truth=True):
     tdoa = streams.get("tdoa")
     if tdoa is None:
         raise InputError(f"{meta['source']}: holds no TDOA measurement; record the tag's TDOAs with the flight.")
-    tdoas = Tdoas(tdoa["t"], tdoa["a"], tdoa["b"], tdoa["d"], tdoa["std"] ** 2 if "std" in tdoa else None)
+    variance = tdoa["std"] ** 2 if "std" in tdoa else np.zeros(len(tdoa["t"]))
+    tdoas = Tdoas(tdoa["t"], tdoa["a"], tdoa["b"], tdoa["d"], variance)
     meta["protocol"] = protocol(tdoas)
     imu = poses = None
     if "gyro" in streams and "acc" in streams:
@@ -66,14 +80,15 @@ def make_flight(name, anchors, streams, extra, meta, salvage=False, truth=True):
         baro = _readings(streams["baro"], "baro")
         pressure = Pressure(baro["t"], pressure_at(baro["baro"]))
     if "flow" in streams and imu is not None and height is not None and min(len(imu.t), np.isfinite(height.range).sum()) > 1:
-        velocity = velocity_of(*(np.asarray(streams["flow"][name], dtype=float) for name in "txy"), height, imu)
+        t, x, y = (np.asarray(streams["flow"][name], dtype=float) for name in "txy")
+        velocity = velocity_of(t, x, y, height, imu)
         velocity = velocity if len(velocity.t) else None
     if not meta["remarks"]:
         del meta["remarks"]
     return Flight(name, anchors, tdoas, imu, poses, extra, meta, height=height, pressure=pressure, velocity=velocity)
 
 
-def _sound(key, columns, meta, salvage):
+def _sound(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> Columns:
     """The columns of a stream without what is not finite."""
     columns = {name: np.asarray(values) for name, values in columns.items()}
     judged = dict(columns)
@@ -99,14 +114,14 @@ def _sound(key, columns, meta, salvage):
     return {name: values[~bad] for name, values in columns.items()}
 
 
-def _readings(columns, name):
+def _readings(columns: Columns, name: str) -> Columns:
     """The rows of a sensor that is logged more often than it measures: where its value differs from the one before."""
     values = np.asarray(columns[name], dtype=float)
     new = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
     return {"t": columns["t"][new], name: values[new]}
 
 
-def protocol(tdoas):
+def protocol(tdoas: Tdoas) -> str:
     """ "tdoa2", "tdoa3" or "tdoa, one reference", by which anchors are paired, whatever their ids and the order of the two.
 
     TDoA2 anchors send in turn in fixed slots, and the tag takes the difference of two that follow each other: the pairs are the sides of
@@ -130,7 +145,7 @@ def protocol(tdoas):
     return "tdoa2" if share > 0.5 * (1.0 + n / len(pairs)) and _is_ring(often, n) else "tdoa3"
 
 
-def _is_ring(sides, n):
+def _is_ring(sides: np.ndarray, n: int) -> bool:
     """Whether n sides (n, 2) of n corners close to one ring."""
     neighbours = {corner: [int(other) for side in sides for other in side if corner in side and other != corner] for corner in range(n)}
     if any(len(two) != 2 for two in neighbours.values()):
@@ -144,7 +159,7 @@ def _is_ring(sides, n):
     return len(passed) == n
 
 
-def _imu(gyro, acc, meta):
+def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
     """One stream of both sensors at the gyroscope's stamps.
 
     The firmware reads both at one instant and logs one after the other, some 20 us apart: sample n goes with sample n
@@ -166,5 +181,5 @@ def _imu(gyro, acc, meta):
     return Imu(t, np.deg2rad(rate), force * GRAVITY)
 
 
-def _stack(columns, *names):
+def _stack(columns: Columns, *names: str) -> np.ndarray:
     return np.stack([np.asarray(columns[name], dtype=float) for name in names], axis=1)

@@ -1,10 +1,13 @@
 """CSV tables with a header line. What is read at a time is a row: a file may have many more cells than memory would hold as text."""
 
+from __future__ import annotations
+
 from array import array
 from collections.abc import Iterator
 import csv
 import io
 import math
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -12,18 +15,23 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
 from uwb_tdoa_bias.foundation.limits import ROW_CHARACTERS, SMALL_TABLE_CELLS, TABLE_BYTES, TABLE_CELLS
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
 
 class Rows:
     """Lists of cells, row by row, of CSV content, bytes. line : how many lines were read. Raises csv.Error for what is no CSV, and
     InputError for what is no text."""
 
-    def __init__(self, path, content, **options):
+    def __init__(self, path: str | Path, content: bytes, **options: Any) -> None:
         self._path, self._content, self._read = path, content, 0
         self._file = io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline="")
         self._reader = csv.reader(self._lines(), **options)
 
     @property
     def line(self) -> int:
+        """Lines that were read."""
         return self._reader.line_num
 
     def __iter__(self) -> Iterator[list]:
@@ -35,7 +43,7 @@ class Rows:
             check_text(self._path, self._content)
             raise
 
-    def _lines(self):
+    def _lines(self) -> Iterator[str]:
         while line := self._file.readline(ROW_CHARACTERS):
             self._read += len(line)  # a row goes over several lines where cells do
             if self._read >= ROW_CHARACTERS:
@@ -46,7 +54,7 @@ class Rows:
 class Table:
     """(line, {column: text}) of each row of a CSV file. names : the columns of its header."""
 
-    def __init__(self, path, columns, most, complete=True):
+    def __init__(self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True) -> None:
         self._path, self._most, self._complete = path, most, complete
         content = read_bytes(path, TABLE_BYTES)
         header = content[:ROW_CHARACTERS].lstrip().split(b"\n", 1)[0]
@@ -57,7 +65,7 @@ class Table:
         if missing := [name for name in self._columns if name not in self.names]:
             raise InputError(f"{path}: has no column {missing[0]}; it needs columns {', '.join(self._columns)}.")
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[tuple[int, dict[str, str]]]:
         names, count = {name: self.names.index(name) for name in self._columns}, 0
         for cells in self._cells:
             count += len(cells)
@@ -68,7 +76,7 @@ class Table:
                 raise InputError(f"{self._path}: line {self._rows.line}: has fewer cells than the header; complete it.")
             yield self._rows.line, {name: cells[place] if not short or place < len(cells) else "" for name, place in names.items()}
 
-    def _each(self):
+    def _each(self) -> Iterator[list[str]]:
         """The rows that are not empty."""
         try:
             yield from filter(None, self._rows)
@@ -76,14 +84,16 @@ class Table:
             raise InputError(f"{self._path}: line {self._rows.line}: is no CSV ({error}); correct it there.") from error
 
 
-def read_table(path, columns=None, most=SMALL_TABLE_CELLS, complete=True) -> Table:
+def read_table(
+    path: str | Path, columns: Sequence[str] | None = None, most: int = SMALL_TABLE_CELLS, complete: bool = True
+) -> Table:
     """The Table of a CSV file that has at least the columns, others passed over; default: of all that it has. It may have `most`
     cells, divided by what the header has most of: commas, semicolons or tabs. complete : a row with fewer cells than the header is refused;
     otherwise those that are missing are empty. Raises InputError, also while it is iterated over."""
     return Table(path, columns, most, complete)
 
 
-def read_numbers(path, columns) -> np.ndarray:
+def read_numbers(path: str | Path, columns: Sequence[str]) -> np.ndarray:
     """(n, k) float: the columns of a CSV file, all finite. Raises InputError."""
     out = array("d")
     for line, row in read_table(path, columns, TABLE_CELLS):
@@ -91,7 +101,7 @@ def read_numbers(path, columns) -> np.ndarray:
     return np.array(out).reshape(-1, len(columns))
 
 
-def number(path, line, row, column):
+def number(path: str | Path, line: int, row: dict[str, str], column: str) -> float:
     """A cell as a float. Raises InputError unless it is a finite number."""
     try:
         value = float(row[column])
@@ -102,7 +112,7 @@ def number(path, line, row, column):
     return value
 
 
-def check_text(path, content):
+def check_text(path: str | Path, content: bytes) -> None:
     """Raises InputError for bytes that are no text."""
     try:
         content.decode()

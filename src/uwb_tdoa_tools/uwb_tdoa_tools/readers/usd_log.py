@@ -1,7 +1,10 @@
 """Event logs of the Crazyflie's micro-SD card deck (uSD logger), versions 1 and 2."""
 
+from __future__ import annotations
+
 import zlib
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +14,11 @@ from uwb_tdoa_bias.foundation.foreign_text import harmless
 
 from .streams import SALVAGE, make_flight
 from .usd_scan import scan
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from .streams import Columns
 
 MAGIC = 0xBC
 _CRC_SIZE = 4
@@ -33,7 +41,7 @@ _STREAMS = {  # event name: our stream, {column in the log: column of the stream
 }
 
 
-def read_usd_log(path, anchors, salvage=False, truth=True):
+def read_usd_log(path: str | Path, anchors: Anchors, salvage: bool = False, truth: bool = True) -> Flight:
     """Flight of a micro-SD event log.
 
     TDOAs come from estTDOA (d_B - d_A), or where there is none from the selected ones of estTdoaCand (d_A - d_B), the
@@ -56,7 +64,7 @@ def read_usd_log(path, anchors, salvage=False, truth=True):
         dtypes[name] = np.dtype([("id", "<u2"), ("t", stamp), ("values", np.dtype(fields))])
         size_of_id[number] = dtypes[name].itemsize
     raw = np.frombuffer(data, dtype=np.uint8)
-    meta = {"source": str(path), "format": f"uSD log version {version}", "remarks": []}
+    meta: dict[str, Any] = {"source": str(path), "format": f"uSD log version {version}", "remarks": []}
     whole = int.from_bytes(data[-_CRC_SIZE:], "little") == zlib.crc32(memoryview(data)[:-_CRC_SIZE])
     end = len(data) - _CRC_SIZE if whole or not salvage else len(data)
     offsets, ids, stopped = scan(raw, start, end, size_of_id)
@@ -76,10 +84,10 @@ def read_usd_log(path, anchors, salvage=False, truth=True):
         rows = _gather(raw, offsets[order[first:last]], dtypes[name])
         columns = {field: np.ascontiguousarray(rows["values"][field]) for field, _ in fields}
         columns["t"] = rows["t"] / ticks
-        stream, rename = _STREAMS.get(name, (None, None))
-        if stream is None or (name == _CANDIDATES and "estTDOA" in occurring):
+        if name not in _STREAMS or (name == _CANDIDATES and "estTDOA" in occurring):
             extra[name] = columns
             continue
+        stream, rename = _STREAMS[name]
         if name == _CANDIDATES and _SELECTED in columns:
             selected = columns[_SELECTED] != 0
             columns = {field: values[selected] for field, values in columns.items()}
@@ -93,7 +101,7 @@ def read_usd_log(path, anchors, salvage=False, truth=True):
     return make_flight(Path(path).name, anchors, streams, extra, meta, salvage, truth)
 
 
-def _gather(raw, at, dtype):
+def _gather(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """Records of one kind at the offsets: (n,) structured array."""
     rows = np.empty(len(at), dtype=dtype)
     inside = np.arange(dtype.itemsize)
@@ -103,7 +111,7 @@ def _gather(raw, at, dtype):
     return rows
 
 
-def _tdoa(path, columns):
+def _tdoa(path: str | Path, columns: Columns) -> Columns:
     """The integers and doubles that `Tdoas` holds (the log has bytes and floats)."""
     for name in ("a", "b"):
         values = columns[name].astype(float)
@@ -117,7 +125,7 @@ def _tdoa(path, columns):
     return {column: np.asarray(values, dtype=types[column]) for column, values in columns.items()}
 
 
-def _read_header(path, data):
+def _read_header(path: str | Path, data: bytes) -> tuple[int, dict[int, tuple[str, list[tuple[str, str]]]], int]:
     """Version, {id: (name, [(variable, numpy type), ...])} and where the events start."""
     if data[0] != MAGIC:
         raise InputError(
@@ -126,7 +134,7 @@ def _read_header(path, data):
         )
     at = 1
 
-    def take(size, what):
+    def take(size: int, what: str) -> bytes:
         nonlocal at
         if at + size > len(data) - _CRC_SIZE:
             raise InputError(
@@ -136,10 +144,10 @@ def _read_header(path, data):
         at += size
         return data[at - size : at]
 
-    def number(what):
+    def number(what: str) -> int:
         return int.from_bytes(take(2, what), "little")
 
-    def string(what):
+    def string(what: str) -> str:
         end = data.find(0, at)
         content = take((end if end >= 0 else len(data)) + 1 - at, what)[:-1]
         if not content or not content.isascii() or harmless(content.decode()) != content.decode():
@@ -175,7 +183,7 @@ def _read_header(path, data):
     return version, events, at
 
 
-def _damaged(path, data, whole, stopped):
+def _damaged(path: str | Path, data: bytes, whole: bool, stopped: int) -> InputError:
     """InputError of a log whose checksum is wrong, or whose events do not fill it. stopped: where they end, or -1."""
     if whole:
         return InputError(

@@ -1,9 +1,12 @@
 """CSV files of the UTIL dataset (Zhao et al., IJRR 2024), the full schema of 27 columns or a subset, plain or gzip."""
 
+from __future__ import annotations
+
 import csv
 import io
 import zlib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +16,12 @@ from uwb_tdoa_bias.foundation.limits import CSV_BYTES, CSV_CELLS, most_unpacked
 
 from .streams import SALVAGE, make_flight
 from .tables import Rows, check_text
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from .streams import Columns
 
 GZIP_MAGIC = b"\x1f\x8b"
 _BLOCK = 1 << 24  # bytes that are unpacked at once
@@ -34,7 +43,7 @@ _KNOWN = {name for rename in _STREAMS.values() for name in rename} | {*_QUATERNI
 _ROWS = 4096  # that are text at a time
 
 
-def read_util_csv(path, anchors, salvage=False, truth=True):
+def read_util_csv(path: str | Path, anchors: Anchors, salvage: bool = False, truth: bool = True) -> Flight:
     """Flight of a CSV file in the UTIL schema; it must hold at least t_tdoa, idA, idB and tdoa_meas.
 
     Acceleration g to m/s^2, rates deg/s to rad/s, tof mm to m, baro m of altitude to Pa, flow (pixel
@@ -45,7 +54,7 @@ def read_util_csv(path, anchors, salvage=False, truth=True):
     salvage : read a cut or damaged file up to there, and leave out records that are no numbers; `meta["remarks"]`
         tells what is missing.
     """
-    remarks = []
+    remarks: list[str] = []
     content = _text(path, remarks, salvage)
     header, cells = _table(path, content, remarks, salvage)
 
@@ -76,12 +85,12 @@ def read_util_csv(path, anchors, salvage=False, truth=True):
     return make_flight(name, anchors, streams, {}, meta, salvage, truth)
 
 
-def is_util_csv(line):
+def is_util_csv(line: str) -> bool:
     """Whether a first line of text is a header that `read_util_csv` can use or would explain."""
     return "t_tdoa" in line or "tdoa_meas" in line
 
 
-def _text(path, remarks, salvage):
+def _text(path: str | Path, remarks: list[str], salvage: bool) -> bytes:
     content, most = read_bytes(path), CSV_BYTES
     if content.startswith(GZIP_MAGIC):
         most = most_unpacked(len(content), CSV_BYTES)
@@ -95,9 +104,10 @@ def _text(path, remarks, salvage):
     return content
 
 
-def _unpacked(path, content, most, remarks, salvage):
+def _unpacked(path: str | Path, content: bytes, most: int, remarks: list[str], salvage: bool) -> bytes:
     """What gzip holds, somewhat more than `most` bytes at most: its header does not tell how much that is."""
-    out, problem = io.BytesIO(), "it ends early"
+    out = io.BytesIO()
+    problem: str | None = "it ends early"
     try:
         while content and out.tell() <= most:  # a file may have several members
             unpacker = zlib.decompressobj(zlib.MAX_WBITS | 16)
@@ -119,7 +129,7 @@ def _unpacked(path, content, most, remarks, salvage):
     return out.getvalue()
 
 
-def _table(path, content, remarks, salvage):
+def _table(path: str | Path, content: bytes, remarks: list[str], salvage: bool) -> tuple[list[str], dict[str, _Column]]:
     """Header, and {name: _Column} of the columns that are known, of rows of as many cells."""
     if not content.endswith((b"\n", b"\r")):
         check_text(path, content)
@@ -131,7 +141,9 @@ def _table(path, content, remarks, salvage):
             )
         remarks.append(f"line {line} is cut and left out.")
         content = content[: max(content.rfind(b"\n"), content.rfind(b"\r")) + 1]
-    rows, header, block, columns, count = Rows(path, content), None, [], {}, 0
+    rows, header, count = Rows(path, content), None, 0
+    block: list[list[str]] = []
+    columns: dict[str, _Column] = {}
     try:
         for row in rows:
             if header is None:
@@ -157,7 +169,7 @@ def _table(path, content, remarks, salvage):
     return header, columns
 
 
-def _add(block, header, columns):
+def _add(block: list[list[str]], header: list[str], columns: dict[str, _Column]) -> None:
     """Move rows to the columns."""
     for name, cells in zip(header, zip(*block)):
         if name in columns:
@@ -168,13 +180,15 @@ def _add(block, header, columns):
 class _Column:
     """What is needed of the cells of a column, of which there may be many more than memory would hold as text."""
 
-    def __init__(self):
-        self._parts, self._count = [], 0  # arrays of numbers, NaN for what is none, up to the first empty cell
-        self.end = None  # row of the first empty cell
-        self.odd = None  # (row, text, is a number) of the first cell that is no finite number
-        self.after = None  # row of the first cell after an empty one
+    def __init__(self) -> None:
+        self._parts: list[np.ndarray] = []  # numbers, NaN for what is none, up to the first empty cell
+        self._count = 0
+        self.end: int | None = None  # row of the first empty cell
+        # (row, text, is a number) of the first cell that is no finite number
+        self.odd: tuple[int, str, bool] | None = None
+        self.after: int | None = None  # row of the first cell after an empty one
 
-    def add(self, cells):
+    def add(self, cells: Sequence[str]) -> None:
         """Take more cells, text."""
         cells = [cell.strip() for cell in cells]
         if self.end is None:
@@ -186,7 +200,7 @@ class _Column:
             self.after = next((self._count + k for k, cell in enumerate(cells) if cell and self._count + k > self.end), None)
         self._count += len(cells)
 
-    def _take(self, cells):
+    def _take(self, cells: list[str]) -> None:
         try:
             self._parts.append(np.array(cells, dtype=float))
         except ValueError:
@@ -196,15 +210,15 @@ class _Column:
             self.odd = self._count + bad[0], cells[bad[0]], _is_number(cells[bad[0]])
 
     @property
-    def length(self):
+    def length(self) -> int:
         return self._count if self.end is None else self.end
 
-    def values(self, length):
+    def values(self, length: int) -> np.ndarray:
         """The first numbers, (length,)."""
         return np.concatenate([np.empty(0), *self._parts])[:length]
 
 
-def _check_header(path, header):
+def _check_header(path: str | Path, header: list[str]) -> None:
     missing = [name for name in TDOA_COLUMNS if name not in header]
     if missing:
         raise InputError(
@@ -216,7 +230,7 @@ def _check_header(path, header):
         raise InputError(f"{path}: line 1: column {twice!r} is there twice; every column must be there once.")
 
 
-def _numbers(path, names, cells, salvage):
+def _numbers(path: str | Path, names: Iterable[str], cells: dict[str, _Column], salvage: bool) -> Columns:
     """{name: (n,) float array} of the columns of one sensor: the rows before the first empty cell. NaN for what is no
     number, with salvage."""
     columns = {name: cells[name] for name in names}
@@ -239,7 +253,7 @@ def _numbers(path, names, cells, salvage):
     return {name: column.values(length) for name, column in columns.items()}
 
 
-def _is_number(cell):
+def _is_number(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:
@@ -247,7 +261,7 @@ def _is_number(cell):
     return True
 
 
-def _ids(path, name, values):
+def _ids(path: str | Path, name: str, values: np.ndarray) -> np.ndarray:
     """Whole anchor ids 0 ... 65535 (the authors' converter writes them as 4 or 4.0)."""
     bad = np.flatnonzero((values != np.round(values)) | (values < 0) | (values > 65535))
     if len(bad):
