@@ -3,6 +3,10 @@
 What holds for whole streams is in `uwb_tdoa_ekf.streams`; here geometry and motion say what should have been measured.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.effects.anchor_ids import AnchorIds
@@ -13,17 +17,21 @@ from .known_path import AIRBORNE, KnownPath
 from .motion_rules import TrueMotion
 from .repairs import repairs_of
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 HOLE, LEAP, LEAST_LEAP = 1.0, 20.0, 0.2  # s without ground truth in the air; m/s, and m, between two poses; healthy 0.11
 
 
-def against_truth(flight):
+def against_truth(flight: Flight) -> list[Finding]:
     """[Finding] of a Flight; none without ground truth."""
     if flight.truth is None or len(flight.truth) < 2:
         return []
     return [*of_truth(flight), *_of_tdoas(KnownPath(flight)), *_of_imu(flight)]
 
 
-def _of_tdoas(path):
+def _of_tdoas(path: KnownPath) -> list[Finding]:
     """Ids, then what is wrong beside these, then stamps, where the values can say something of these."""
     repairs = repairs_of(path)
     found = list(pair_rules.ids(path)) if any(effect.name == AnchorIds.name for effect in repairs) else []
@@ -31,7 +39,8 @@ def _of_tdoas(path):
     return found if any(finding.rule.startswith(("ids", "tdoa")) for finding in found) else [*found, *time_rules.tdoas(path)]
 
 
-def _of_imu(flight):
+def _of_imu(flight: Flight) -> list[Finding]:
+    assert flight.truth is not None
     known = np.isfinite(flight.truth.q).all(axis=1)
     if flight.imu is None or known.sum() < 2:
         return []
@@ -42,8 +51,9 @@ def _of_imu(flight):
     return found or [*motion_rules.filtered(motion), *motion_rules.stamps(motion)]
 
 
-def of_truth(flight):
+def of_truth(flight: Flight) -> Iterator[Finding]:
     """Holes and leaps of the ground truth in the air."""
+    assert flight.truth is not None
     of = flight.truth
     up = np.flatnonzero(of.p[:, 2] > AIRBORNE)
     if len(up) < 2:

@@ -1,6 +1,9 @@
 """A recording in order, as the rules that try things see it, and what is found unexplained in it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -8,7 +11,13 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
 from uwb_tdoa_ekf.streams.explain import unexplained
 
+if TYPE_CHECKING:
+    from uwb_tdoa_ekf.streams.explain import Unexplained
+    from .recording import Recording
+
 LONG, SHORT = 60.0, 14.0  # s of the recording that are tried: to be sure, and to choose what is worth being sure of
+Part = TypeVar("Part")  # a stream of arrays
+
 PERIOD = 1.0  # s over which the motion is measured that says which part is tried
 
 
@@ -21,7 +30,7 @@ class Case:
     imu: Imu | None
 
     @classmethod
-    def of(cls, recording):
+    def of(cls, recording: Recording) -> Case:
         """Case of a Recording."""
         tdoa, imu = recording.tdoa, recording.imu
         good = np.flatnonzero(np.isfinite(tdoa.t) & np.isfinite(tdoa.d))
@@ -31,7 +40,7 @@ class Case:
             imu = _rows(imu, good[np.argsort(imu.t[good], kind="stable")])
         return cls(recording.anchors, tdoa, imu if imu is not None and len(imu) else None)
 
-    def part(self, length):
+    def part(self, length: float) -> Case:
         """The `length` s in which the TDOAs move most; the whole if it is not longer."""
         t = self.tdoa.t
         if not len(t) or t[-1] - t[0] <= length:
@@ -45,33 +54,34 @@ class Case:
             self, tdoa=_rows(self.tdoa, slice(first, end)), imu=imu if imu is not None and len(imu) else None
         )
 
-    def with_tdoa(self, **columns):
+    def with_tdoa(self, **columns: np.ndarray) -> Case:
         """The same with other columns of the TDOAs."""
         return replace(self, tdoa=replace(self.tdoa, **columns))
 
-    def with_imu(self, **columns):
+    def with_imu(self, **columns: np.ndarray) -> Case:
         """The same with other columns of the inertial samples."""
+        assert self.imu is not None
         return replace(self, imu=replace(self.imu, **columns))
 
-    def rows(self):
+    def rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows of the anchors of each TDOA: two (n,) arrays, -1 where an id is unknown."""
         return self.anchors.index(self.tdoa.a), self.anchors.index(self.tdoa.b)
 
-    def unexplained(self):
+    def unexplained(self) -> Unexplained:
         """Unexplained of the TDOAs alone."""
         return unexplained(self.tdoa.t, *self.rows(), self.tdoa.d, self.anchors.positions)
 
-    def flight(self):
+    def flight(self) -> Flight:
         """Flight without ground truth."""
         return Flight("checked", self.anchors, self.tdoa, self.imu)
 
 
-def _rows(stream, rows):
+def _rows(stream: Part, rows: np.ndarray | slice) -> Part:
     """Some rows of a stream of arrays."""
     return type(stream)(*(np.ascontiguousarray(column[rows]) for column in vars(stream).values()))
 
 
-def _busiest(case, length):
+def _busiest(case: Case, length: float) -> float:
     """Stamp at which the `length` s begin in which the TDOAs of each pair change most from second to second."""
     t, d = case.tdoa.t, case.tdoa.d
     pair = case.tdoa.a * 65536 + case.tdoa.b

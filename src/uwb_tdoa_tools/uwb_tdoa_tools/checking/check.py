@@ -1,6 +1,9 @@
 """check: all rules over one recording, in the order in which one mistake hides another."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Protocol, TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +16,14 @@ from .case import Case
 from .sensor_rules import sensors
 from .survey_fit import displacement
 from .tdoa_rules import SAME, furthest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .recording import Recording
+    from .survey_fit import SurveyFit
+    from .tdoa_rules import Survey
+    from .wiring import End
 
 ROUNDS = 3  # mistakes that are undone one after the other
 # Where one of these stands, nothing, or not the IMU, can be tried.
@@ -41,23 +52,33 @@ EXPLAINS = {
 }
 
 
+class Installed(Protocol):
+    """What has a name and Anchors: a Recording, or a Flight."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def anchors(self) -> Anchors: ...
+
+
 @dataclass(frozen=True)
 class Report:
     """recording : its name; findings : [Finding], most severe first; facts : {what: text}, what was heard; ends : [End] of
     live topics."""
 
     recording: str
-    findings: list
-    facts: dict
-    ends: tuple = ()
+    findings: list[Finding]
+    facts: dict[str, str]
+    ends: tuple[End, ...] = ()
 
     @property
-    def faulty(self):
+    def faulty(self) -> bool:
         """True if there is an error."""
         return any(finding.severity == ERROR for finding in self.findings)
 
 
-def check(recording, others=()):
+def check(recording: Recording, others: Sequence[Survey] = ()) -> Report:
     """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one."""
     streams = fed(recording)
     found = [*(streams.findings() if len(recording.tdoa) else ()), *sensors(recording)]
@@ -78,12 +99,12 @@ def check(recording, others=()):
         explained = set().union(*(EXPLAINS.get(finding.rule, ()) for finding in tried))
         found = [finding for finding in found if finding.rule not in explained] + tried
     view = coverage.View(recording.anchors, list(streams.tdoa), places)
-    for rule in coverage.RULES:
-        found += (finding for finding in rule(view) if finding.rule not in explained)
+    for covered in coverage.RULES:
+        found += (finding for finding in covered(view) if finding.rule not in explained)
     return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)
 
 
-def fed(recording):
+def fed(recording: Recording) -> StreamRules:
     """StreamRules that have seen all of a Recording."""
     streams, imu, tdoa = StreamRules(recording.anchors), recording.imu, recording.tdoa
     if imu is not None:
@@ -93,22 +114,24 @@ def fed(recording):
     return streams
 
 
-def _undone(case, found):
+def _undone(case: Case, found: list[Finding]) -> Case:
     """The case without the mistakes that the streams show themselves, so that it can be tried."""
-    for finding in found if case.imu is not None else ():
+    for finding in found:
+        if (imu := case.imu) is None:
+            break
         if finding.rule == "imu_force_unit":
-            case = case.with_imu(accel=case.imu.accel * finding.value)
+            case = case.with_imu(accel=imu.accel * finding.value)
         elif finding.rule == "imu_rate_unit":
-            case = case.with_imu(gyro=np.deg2rad(case.imu.gyro))
+            case = case.with_imu(gyro=np.deg2rad(imu.gyro))
         elif finding.rule == "imu_turned":
-            turn = upright(np.median(case.imu.accel, axis=0))
-            case = case.with_imu(accel=case.imu.accel @ turn.T, gyro=case.imu.gyro @ turn.T)
+            turn = upright(np.median(imu.accel, axis=0))
+            case = case.with_imu(accel=imu.accel @ turn.T, gyro=imu.gyro @ turn.T)
         elif finding.rule == "stamps_apart":
-            case = case.with_imu(t=case.imu.t - finding.value)
+            case = case.with_imu(t=imu.t - finding.value)
     return case
 
 
-def upright(force):
+def upright(force: np.ndarray) -> np.ndarray:
     """(3, 3) rotation by quarter turns that brings the axis along which `force` (3,) is largest to +z."""
     k = int(np.argmax(np.abs(force)))
     up = np.sign(force[k]) * np.eye(3)[k]
@@ -116,7 +139,7 @@ def upright(force):
     return np.stack([side, np.cross(up, side), up])
 
 
-def _tried(case, names, others):
+def _tried(case: Case, names: set[str], others: Sequence[Survey]) -> tuple[list[Finding], np.ndarray]:
     """([Finding], places of the tag (k, 3) m): what is found by undoing it."""
     found, given = [], case
     for _ in range(ROUNDS):
@@ -139,13 +162,13 @@ def _tried(case, names, others):
     return found, fit.places
 
 
-def _other_room(mixed):
+def _other_room(mixed: Finding) -> Finding:
     """Many ids mixed up and a faulty inertial sensor at once: rather the survey of another room, of which both are what it looks like."""
     cause = "the survey is of another room, or its ids are mixed up: with many ids exchanged it nearly fits, and the inertial sensor does not"
     return Finding("survey_misfit", ERROR, cause, mixed.evidence, OTHER_SURVEY, mixed.value)
 
 
-def _misfit(fit):
+def _misfit(fit: SurveyFit) -> Iterator[Finding]:
     """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
     gain = tdoa_rules.gained(fit)
     if gain is not None:
@@ -156,7 +179,7 @@ def _misfit(fit):
         yield Finding("survey_misfit", ERROR, cause, evidence, OTHER_SURVEY, gain)
 
 
-def _facts(recording, streams):
+def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
     """What was heard, for people."""
     facts = {}
     for name, windows, unit in (("TDOAs", streams.tdoa, "Hz"), ("IMU", streams.imu, "Hz")):
@@ -174,7 +197,7 @@ def _facts(recording, streams):
     return facts
 
 
-def different_surveys(recordings):
+def different_surveys(recordings: Sequence[Installed]) -> Iterator[Finding]:
     """Findings about Recordings whose surveys differ: anchors of one id that are elsewhere. Their flights do not belong
     together."""
     for one, two in zip(recordings, recordings[1:]):

@@ -1,6 +1,9 @@
 """What the anchors and the motion of the tag let anybody know. A rule takes a View and yields Findings."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,6 +11,10 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding
 
 from .survey_fit import SPREAD, spread
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from uwb_tdoa_ekf.streams.ranging import TdoaWindow
 
 RARE = 0.2  # of what the anchors are heard in the middle; healthy 0.54 at least
 SILENT = 5.0  # s for which an anchor that is heard otherwise is not
@@ -22,11 +29,11 @@ class View:
     tried."""
 
     anchors: Anchors
-    windows: list
+    windows: list[TdoaWindow]
     places: np.ndarray
 
 
-def missing(view):
+def missing(view: View) -> Iterator[Finding]:
     """Anchors of the survey that are never, hardly ever or for a while not heard."""
     if not view.windows:  # a recording of less than a second
         return
@@ -50,7 +57,7 @@ def missing(view):
             yield Finding("anchor_rare", NOTE, f"anchor {number} is hardly heard", evidence, remedy, share)
 
 
-def _silence(windows, heard):
+def _silence(windows: Sequence[TdoaWindow], heard: np.ndarray) -> tuple[float, float]:
     """(first, last stamp or arrival) of the longest run of windows without the anchor; (0, 0) if there is none."""
     longest, begin = (0.0, 0.0), None
     for window, count in zip(windows, heard):
@@ -62,7 +69,7 @@ def _silence(windows, heard):
     return longest
 
 
-def flat(view):
+def flat(view: View) -> Iterator[Finding]:
     """Anchors in one plane tell next to nothing about the distance from it, and nothing about the side."""
     p = view.anchors.positions
     if len(p) < 4:
@@ -81,7 +88,7 @@ def flat(view):
         )
 
 
-def below(view):
+def below(view: View) -> Iterator[Finding]:
     """Everything below zero: z down."""
     z = view.anchors.positions[:, 2]
     if z.max() <= 0.05 and np.ptp(z) > 0.5:
@@ -96,7 +103,7 @@ def below(view):
         )
 
 
-def outside(view):
+def outside(view: View) -> Iterator[Finding]:
     """A tag beyond its anchors."""
     p = view.anchors.positions
     if not len(view.places):
@@ -115,7 +122,7 @@ def outside(view):
         )
 
 
-def still(view):
+def still(view: View) -> Iterator[Finding]:
     """A recording of which little can be learned."""
     if not len(view.places):
         return

@@ -3,11 +3,18 @@
 What changes slowly, as a systematic error does, is taken out first: a mean for each pair, or axis, and block of time.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from .known_path import KnownPath
 
 LONGEST, STEP = 1.5, 0.05  # s that are tried to both sides, and between them
 DELAYS = np.arange(-LONGEST, LONGEST + 0.5 * STEP, STEP)
@@ -24,19 +31,19 @@ class Delays:
 
     power: np.ndarray
 
-    def of_series(self, k):
+    def of_series(self, k: int) -> tuple[float, float]:
         """(ratio, s): what is left of a series with its best delay, over what is left with the best one of all; and that delay."""
         own, common = self.power[k].sum(axis=0), int(np.argmin(self.power.sum(axis=(0, 1))))
         best = int(np.argmin(own))
         return float(own[best] / max(own[common], 1e-12)), float(DELAYS[best] - DELAYS[common])
 
-    def constant(self):
+    def constant(self) -> tuple[float, float]:
         """(ratio, s): what is left with the best delay of all, over what is left without any; and that delay."""
         total = self.power.sum(axis=(0, 1))
         best = int(np.argmin(total))
         return float(total[best] / max(total[NONE], 1e-12)), float(DELAYS[best])
 
-    def exact(self):
+    def exact(self) -> float:
         """s, the best delay of all, between those that are tried: the vertex of a parabola through the three about it."""
         total = self.power.sum(axis=(0, 1))
         k = int(np.clip(np.argmin(total), 1, len(total) - 2))
@@ -44,7 +51,7 @@ class Delays:
         bend = before - 2.0 * here + after
         return float(DELAYS[k] + (0.5 * STEP * np.clip((before - after) / bend, -1.0, 1.0) if bend > 0.0 else 0.0))
 
-    def drift(self):
+    def drift(self) -> tuple[float, float]:
         """(ratio, s): what is left if the delay changes evenly, over what is left with a constant one; from first to last block."""
         of = self.power.sum(axis=0)
         blocks = np.arange(len(of))
@@ -55,7 +62,7 @@ class Delays:
         best = np.unravel_index(np.argmin(left), left.shape)
         return float(left[best] / max(of.sum(axis=0).min(), 1e-12)), float(DELAYS[best[1]] - DELAYS[best[0]])
 
-    def jump(self):
+    def jump(self) -> tuple[float, float, int]:
         """(ratio, s, block): what is left if the delay changes once, over what is left with a constant one; by how much, and the
         first block after that."""
         of = self.power.sum(axis=0)
@@ -67,7 +74,7 @@ class Delays:
         return float(left[k] / max(before[-1].min(), 1e-12)), float(step), k + 1
 
 
-def delays(series, t, error):
+def delays(series: np.ndarray, t: np.ndarray, error: Callable[[float], np.ndarray]) -> Delays:
     """Delays of (n,) samples at t, s, of series numbered from 0; error(delay) -> (n,), what is left of each."""
     block = ((t - t.min()) / BLOCK).astype(int)
     blocks = block.max() + 1
@@ -85,19 +92,19 @@ def delays(series, t, error):
     return Delays(power.reshape(-1, blocks, len(DELAYS)))
 
 
-def _scatter(series, values):
+def _scatter(series: np.ndarray, values: np.ndarray) -> np.ndarray:
     """(series,): robust standard deviation of each, of what is not NaN; 1 where there is none."""
     known = [np.abs(values[(series == k) & np.isfinite(values)]) for k in range(series.max() + 1)]
     return np.array([max(1.4826 * np.median(part), 1e-9) if len(part) else 1.0 for part in known])
 
 
-def of_tdoas(path):
+def of_tdoas(path: KnownPath) -> Delays | None:
     """Delays of the pairs of a KnownPath, in their order; None without any."""
     if not path.pairs:
         return None
     every = max(1, sum(map(len, path.pairs.values())) // MOST)
-    rows = [part[::every] for part in path.pairs.values()]
-    series, rows = np.repeat(np.arange(len(rows)), [len(part) for part in rows]), np.concatenate(rows)
+    parts = [part[::every] for part in path.pairs.values()]
+    series, rows = np.repeat(np.arange(len(parts)), [len(part) for part in parts]), np.concatenate(parts)
     t, samples = path.t[rows], path.samples
     a, b = samples.position_a[rows], samples.position_b[rows]
     return delays(series, t, lambda delay: path.d[rows] - tdoa(path.track.positions(t - delay), a, b))

@@ -5,8 +5,11 @@ What turns both sensors about the vertical cannot be seen, for nobody told the y
 which the tag did not turn.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from itertools import permutations, product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +19,13 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
 from uwb_tdoa_ekf.streams.explain import Unexplained, compare
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from .case import Case
+
+    # ratio of what stays unexplained, its standard errors; (3, 3) for the accelerometer, for the gyroscope
+    Arrangement = tuple[float, float, np.ndarray, np.ndarray]
 
 # s that are tried, to be sure and to choose; Hz to which the samples are averaged
 PART, BRIEF, RATE = 30.0, 14.0, 200.0
@@ -30,7 +40,7 @@ UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
 SCALES = {180.0 / np.pi: "rad/s, divided by 57.3 once too often", 2.0 * np.pi: "revolutions/s, not rad/s"}
 
 
-def fit(case):
+def fit(case: Case) -> Finding | None:
     """What does not fit about the IMU: Finding or None. case : Case whose TDOAs are right."""
     brief = replace(case, imu=averaged(case.imu)).part(PART)
     if brief.imu is None or len(brief.imu) < SLOWEST * PART / 2.0:
@@ -53,7 +63,7 @@ def fit(case):
     return _finding(accel, gyro, evidence, ratio)
 
 
-def averaged(imu):
+def averaged(imu: Imu | None) -> Imu | None:
     """Imu with the means of as many samples each as make about RATE, or as it is; None stays None."""
     if imu is None or len(imu) < 2:
         return None
@@ -65,7 +75,7 @@ def averaged(imu):
     return Imu(*map(np.ascontiguousarray, columns))
 
 
-def _usual():
+def _usual() -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The mistakes that are made most: (accelerometer, gyroscope) as (3, 3) matrices that undo them."""
     for signs in product((1.0, -1.0), repeat=3):
         if signs != (1.0, 1.0, 1.0):
@@ -79,13 +89,13 @@ def _usual():
         yield UPRIGHT, scale * UPRIGHT
 
 
-def _scaled(trials):
+def _scaled(trials: Sequence[Arrangement]) -> np.ndarray | None:
     """The matrix of the gyroscope of the best trial if that is another unit, else None."""
     gyro = min(trials, key=lambda trial: trial[0])[3]
     return gyro if abs(abs(np.linalg.det(gyro)) - 1.0) > 0.1 else None
 
 
-def _all(case, base):
+def _all(case: Case, base: Unexplained) -> list[Arrangement]:
     """Trials of all arrangements of the gyroscope against the accelerometer, and its mirror image; the yaw is free
     anyway."""
     short = case.part(BRIEF)
@@ -101,19 +111,20 @@ def _all(case, base):
     return [(*compare(base, _unexplained(_arranged(case, a, g))), a, g) for _, a, g in arrangements[:CHOSEN]]
 
 
-def _arranged(case, accel, gyro):
+def _arranged(case: Case, accel: np.ndarray, gyro: np.ndarray) -> Case:
     """The samples turned by (3, 3) matrices."""
+    assert case.imu is not None
     return case.with_imu(
         accel=np.ascontiguousarray(case.imu.accel @ accel.T), gyro=np.ascontiguousarray(case.imu.gyro @ gyro.T)
     )
 
 
-def _unexplained(case):
+def _unexplained(case: Case) -> Unexplained:
     residuals = run_offline(case.flight(), LEANING).residuals
     return Unexplained.of(residuals.t, residuals.innovation)
 
 
-def _complexity(accel, gyro):
+def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:
     """How many things must have gone wrong."""
     if np.array_equal(accel, MIRROR) and (np.array_equal(gyro, MIRROR) or np.array_equal(gyro, -MIRROR)):
         return 1.5
@@ -122,7 +133,7 @@ def _complexity(accel, gyro):
     return wrong_signs + moved + 1.0 * np.array_equal(accel, MIRROR)
 
 
-def _finding(accel, gyro, evidence, ratio):
+def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -> Finding:
     scale = abs(np.linalg.det(gyro)) ** (1.0 / 3.0)
     unit = next((name for value, name in SCALES.items() if abs(value / scale - 1.0) < 1e-6), None)
     if unit:
@@ -144,6 +155,6 @@ def _finding(accel, gyro, evidence, ratio):
     return Finding("imu_axes", ERROR, cause, evidence, line, ratio)
 
 
-def _axis(variable, row):
+def _axis(variable: str, row: np.ndarray) -> str:
     k = int(np.argmax(np.abs(row)))
     return ("-" if row[k] < 0.0 else "") + f"{variable}.{'xyz'[k]}"

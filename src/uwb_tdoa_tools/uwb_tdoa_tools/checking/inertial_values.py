@@ -1,9 +1,17 @@
 """What the values of inertial samples tell by themselves, over a whole flight."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_ekf.streams import WARNING, Finding
 from uwb_tdoa_ekf.streams.inertial_rules import AXES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from uwb_tdoa_bias.foundation.flight import Flight
 
 HITS, MORE, NEXT = 20, 5.0, 5  # samples at one end, and times as many as have each of the values next to it; healthy 1
 # s, and times the least that the square of a step can be over that of the change in that time. Healthy 2.9 at least, but for a
@@ -12,8 +20,9 @@ FAR, EVEN = 0.02, 2.6
 FEWEST = 10  # samples within FAR, without which nothing is said
 
 
-def saturated(flight):
+def saturated(flight: Flight) -> Iterator[Finding]:
     """An axis with many samples at its largest or smallest value, far more than next to it. Takes a Flight, yields Findings."""
+    assert flight.imu is not None
     for name, column in zip(AXES, np.column_stack([flight.imu.gyro, flight.imu.accel]).T):
         values, counts = np.unique(column, return_counts=True)
         for values, counts in ((values, counts), (values[::-1], counts[::-1])):
@@ -24,7 +33,7 @@ def saturated(flight):
                 return
 
 
-def smooth(t, values):
+def smooth(t: np.ndarray, values: np.ndarray) -> bool:
     """Whether what a sensor reads, (n, 3) at t (n,) s, changes so evenly, on all axes, as only behind a low pass: the square of a
     step over that of the change in FAR is 1/k^2 at least, k steps being that long. False of a slow sensor, of which nobody can tell."""
     steps = round(FAR / max(np.median(np.diff(t)), 1e-6))

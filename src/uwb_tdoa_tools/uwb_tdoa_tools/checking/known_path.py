@@ -1,9 +1,17 @@
 """TDOAs of a flight beside what the geometry of its ground truth says, pair by pair."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet, Track, true_samples
 from uwb_tdoa_bias.foundation.geometry import tdoa
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.effects import LabelEffect
+    from uwb_tdoa_bias.foundation.flight import Flight
 
 AIRBORNE = 0.3  # m
 FEWEST = 40  # TDOAs of a pair in the air, of which something is said
@@ -13,8 +21,9 @@ class KnownPath:
     """d, true (n,) m, t (n,) s: the usable TDOAs and what they should be; samples : Samples; ids (N,); track : Track of the truth;
     start : s, stamp of the first TDOA; pairs {(a, b) ids: rows (k,)} of those in the air that are often heard."""
 
-    def __init__(self, flight):
+    def __init__(self, flight: Flight) -> None:
         """flight : Flight with ground truth."""
+        assert flight.truth is not None
         self._flight = flight
         self.samples, rows = true_samples(flight)
         self.t, self.d = self.samples.t, flight.tdoa.d[rows]
@@ -26,9 +35,9 @@ class KnownPath:
         parts = np.split(self.flown[order], np.flatnonzero(np.diff(key[order])) + 1) if len(order) else []
         self.pairs = {self._named(part[0]): part for part in parts if len(part) >= FEWEST}
 
-    def without(self, *effects):
+    def without(self, *effects: LabelEffect) -> KnownPath:
         """The same without some LabelEffects."""
         return KnownPath(EffectSet(effects).correct_streams(self._flight))
 
-    def _named(self, row):
+    def _named(self, row: int) -> tuple[int, int]:
         return int(self.ids[self.samples.a[row]]), int(self.ids[self.samples.b[row]])

@@ -1,6 +1,10 @@
 """What the messages of a bag say about themselves: frames, topics, anchors. A rule takes a Recording and yields
 Findings."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
@@ -10,10 +14,15 @@ from ..bags.placing import is_body
 from .recording import IMU
 from .tdoa_rules import furthest, same_place
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from ..bags.placing import Place
+    from .recording import Recording
+
 TURNED, SHIFTED = np.deg2rad(2.0), 0.02  # rad and m that a frame may be off the body frame
 
 
-def frames(recording):
+def frames(recording: Recording) -> Iterator[Finding]:
     """A frame that is not the body's: placed by /tf_static, as the nodes and the tools take it, or by nobody."""
     for topic, counts in recording.frames.items():
         for frame in sorted(counts):
@@ -21,7 +30,7 @@ def frames(recording):
                 yield from _frame(topic, frame, recording.places.get(frame))
 
 
-def _frame(topic, frame, place):
+def _frame(topic: str, frame: str, place: Place | None) -> Iterator[Finding]:
     if place is None:
         cause = f"{topic} is in the frame {frame}, and nothing says how that sits on {BODY_FRAME}"
         line = f"publish on /tf_static how {frame} sits on {BODY_FRAME}, or have the driver write frame_id {BODY_FRAME}"
@@ -38,7 +47,7 @@ def _frame(topic, frame, place):
     yield Finding("frame_turned", NOTE, cause, evidence, line, turn.magnitude())
 
 
-def senders(recording):
+def senders(recording: Recording) -> Iterator[Finding]:
     """Two frames on one topic: two tags, or two sensors."""
     for topic, counts in recording.frames.items():
         if len(counts) > 1:
@@ -54,7 +63,7 @@ def senders(recording):
             )
 
 
-def no_imu(recording):
+def no_imu(recording: Recording) -> Iterator[Finding]:
     """No inertial samples, or under another name."""
     if recording.imu is not None:
         return
@@ -75,7 +84,7 @@ def no_imu(recording):
         )
 
 
-def anchors(recording):
+def anchors(recording: Recording) -> Iterator[Finding]:
     """The anchors in the bag, which the nodes use, against the survey."""
     if recording.recorded is None or same_place(recording.anchors, recording.recorded):
         return
@@ -92,7 +101,7 @@ def anchors(recording):
     )
 
 
-def sorted_file(recording):
+def sorted_file(recording: Recording) -> Iterator[Finding]:
     """A file whose stamps fall: the reader has put them in order."""
     if recording.falls:
         yield Finding(

@@ -3,7 +3,10 @@
 Both sensors are compared over short cells; constant biases and what changes slowly are taken out first.
 """
 
+from __future__ import annotations
+
 from itertools import permutations, product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -14,6 +17,11 @@ from .delays import BLOCK, LONGEST, delays
 from .imu_rules import SCALES
 from .inertial_values import smooth
 from .time_rules import changing
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from .delays import Delays
 
 CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which one is averaged
 BEYOND = round(LONGEST / CELL)  # cells at either end that are there for what is late
@@ -40,8 +48,9 @@ class TrueMotion:
     """measured {"gyro", "accel": (n, 3)}, means over cells at t (n,) s in the air, or of all of a rover; block (n,), of BLOCK seconds; smooth {sensor: bool},
     whether it changes too evenly for a sensor that vibrates."""
 
-    def __init__(self, flight):
+    def __init__(self, flight: Flight) -> None:
         """flight : Flight with inertial samples and ground truth with attitudes."""
+        assert flight.imu is not None and flight.truth is not None
         imu, truth = flight.imu, flight.truth
         known = np.isfinite(truth.q).all(axis=1)
         self._t, first = np.unique(truth.t[known], return_index=True)
@@ -62,11 +71,11 @@ class TrueMotion:
             left = _slowly_left(self.measured[sensor] - self.at(self.true[sensor]), self.block)
             self._scale[sensor] = 1.4826 * np.median(np.abs(left), axis=0) + 1e-9
 
-    def __len__(self):
+    def __len__(self) -> int:
         """How many cells there are."""
         return len(self.t)
 
-    def with_attitude(self, name):
+    def with_attitude(self, name: str | None) -> dict[str, np.ndarray]:
         """{"gyro", "accel": (n + 2 BEYOND, 3)}, what the sensors should have measured at t and LONGEST before and after, with an
         attitude of ATTITUDES, or the one that is written."""
         order, signs = ATTITUDES[name] if name else ([0, 1, 2, 3], (1, 1, 1, 1))
@@ -77,57 +86,57 @@ class TrueMotion:
         force = (after - 2.0 * here + before) / HALF**2
         return {"gyro": gyro, "accel": turn(t).inv().apply(force + (0.0, 0.0, GRAVITY))}
 
-    def at(self, true, late=0):
+    def at(self, true: np.ndarray, late: int = 0) -> np.ndarray:
         """(n, 3): the values of `true` so many cells before."""
         return true[BEYOND - late : len(true) - BEYOND - late]
 
-    def power(self, sensor, true, change=None):
+    def power(self, sensor: str, true: np.ndarray, change: np.ndarray | None = None) -> float:
         """Mean clipped square of measured, turned by `change`, minus true (n + 2 BEYOND, 3), in units of its scatter as it is."""
         measured = self.measured[sensor] if change is None else self.measured[sensor] @ change.T
         left = _slowly_left(measured - self.at(true), self.block) / self._scale[sensor]
         return float(np.mean(np.clip(left, -LIMIT, LIMIT) ** 2))
 
-    def delays(self):
+    def delays(self) -> Delays:
         """Delays of the six axes together."""
         series, t = np.repeat(np.arange(6), len(self.t)), np.tile(self.t, 6)
 
-        def error(late):
+        def error(late: float) -> np.ndarray:
             parts = (self.measured[s] - self.at(self.true[s], round(late / CELL)) for s in SENSORS)
             return np.concatenate([part.T.reshape(-1) for part in parts])
 
         return delays(series, t, error)
 
 
-def _slowly_left(values, block):
+def _slowly_left(values: np.ndarray, block: np.ndarray) -> np.ndarray:
     """(n, 3) without their means over blocks."""
     count = np.maximum(np.bincount(block), 1)
     return values - np.stack([(np.bincount(block, column) / count)[block] for column in values.T], axis=1)
 
 
-def _integral(t, values):
+def _integral(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """(m, 3): integral of samples over t (m,)."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None]
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
-def _at(t, values, when):
+def _at(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(when, t, column) for column in values.T], axis=1)
 
 
-def _mean(t, values, when):
+def _mean(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
     """(n, 3): means over HALF to both sides."""
     total = _integral(t, values)
     return (_at(t, total, when + HALF) - _at(t, total, when - HALF)) / (2.0 * HALF)
 
 
-def _triangle(t, values, when):
+def _triangle(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
     """(n, 3): means with a triangular weight, HALF to both sides, which is what a second difference of places is of."""
     total = _integral(t, _integral(t, values - values.mean(axis=0)))
     second = _at(t, total, when + HALF) - 2.0 * _at(t, total, when) + _at(t, total, when - HALF)
     return second / HALF**2 + values.mean(axis=0)
 
 
-def axes(motion):
+def axes(motion: TrueMotion) -> Iterator[Finding]:
     """Axes that are exchanged or mirrored, a gyroscope in another unit, or a truth whose attitude is another one."""
     base = {sensor: motion.power(sensor, motion.true[sensor]) for sensor in SENSORS}
     best = {sensor: _best_arrangement(motion, sensor) for sensor in SENSORS}
@@ -140,40 +149,40 @@ def axes(motion):
         yield Finding("truth_attitude", ERROR, cause, evidence, "write body to world, right-handed, x y z w", power["gyro"])
         return
     for sensor in wrong:
-        power, change = best[sensor]
-        evidence = f"{100 * (1 - power / base[sensor]):.0f} % less mean square difference to the ground truth"
-        yield _of_axes(sensor, change, evidence, power)
+        left, change = best[sensor]
+        evidence = f"{100 * (1 - left / base[sensor]):.0f} % less mean square difference to the ground truth"
+        yield _of_axes(sensor, change, evidence, left)
 
 
-def _explains(motion, sensor, base, power, change):
+def _explains(motion: TrueMotion, sensor: str, base: float, power: float, change: np.ndarray) -> bool:
     """Whether a change of the axes explains much of what is left without; one that makes values small, more than no values would."""
     if _scale(change) < 0.9:
         base = min(base, motion.power(sensor, motion.true[sensor], np.zeros((3, 3))))
     return power < AXES[sensor] * base
 
 
-def _scale(change):
+def _scale(change: np.ndarray) -> float:
     return abs(np.linalg.det(change)) ** (1.0 / 3.0)
 
 
-def _best_arrangement(motion, sensor):
+def _best_arrangement(motion: TrueMotion, sensor: str) -> tuple[float, np.ndarray]:
     """(power that is left, (3, 3) matrix) of what explains most."""
     return min(((motion.power(sensor, motion.true[sensor], change), change) for change in _arrangements(sensor)), key=lambda x: x[0])
 
 
-def _arrangements(sensor):
+def _arrangements(sensor: str) -> list[np.ndarray]:
     """[(3, 3) matrix that undoes it] of what may be wrong with the axes of a sensor."""
     changes = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
     changes += [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)] if sensor == "gyro" else []
     return changes[1:]  # the first is as it is
 
 
-def _with_attitude(motion, name):
+def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:
     true = motion.with_attitude(name)
     return {sensor: motion.power(sensor, true[sensor]) for sensor in SENSORS}
 
 
-def _of_axes(sensor, change, evidence, power):
+def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Finding:
     scale = _scale(change)
     if abs(scale - 1.0) > 0.1:
         cause = f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the turns of the ground truth"
@@ -187,7 +196,7 @@ def _of_axes(sensor, change, evidence, power):
     return Finding(f"{sensor}_axes", ERROR, cause, evidence, "put the driver right: x forward, y left, z up", power)
 
 
-def filtered(motion):
+def filtered(motion: TrueMotion) -> Iterator[Finding]:
     """A low pass of first order in a sensor: its output is late and too small. The truth is noisy, and fits better behind any low
     pass: one that runs backwards tells by how much."""
     for sensor in SENSORS:
@@ -202,7 +211,7 @@ def filtered(motion):
             yield Finding("imu_filtered", ERROR, cause, evidence, "set the low pass of the sensor to 20 Hz or more", slowness)
 
 
-def _slowed(values, tau):
+def _slowed(values: np.ndarray, tau: float) -> np.ndarray:
     """Through a low pass of first order, of time constant tau, s."""
     from scipy.signal import lfilter  # takes a second to import
 
@@ -210,6 +219,6 @@ def _slowed(values, tau):
     return lfilter([share], [1.0, share - 1.0], values - values[0], axis=0) + values[0]
 
 
-def stamps(motion):
+def stamps(motion: TrueMotion) -> Iterator[Finding]:
     """Stamps that drift or jump."""
     yield from changing("imu", "inertial samples", motion.delays())

@@ -1,5 +1,9 @@
 """What is wrong with the numbers of a flight, before anybody asks which physics explains them."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_ekf.streams import NOTE, StreamRules, most_severe_first
@@ -7,8 +11,12 @@ from uwb_tdoa_ekf.streams import NOTE, StreamRules, most_severe_first
 from . import coverage, inertial_values
 from .against_truth import against_truth
 
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.streams import Finding
 
-def numbers(flight):
+
+def numbers(flight: Flight) -> list[Finding]:
     """[Finding] of a Flight, most severe first: of its streams by themselves, and against its ground truth if it has one. What several
     rules name by the same name is told once."""
     streams, imu, of = StreamRules(flight.anchors), flight.imu, flight.tdoa

@@ -3,12 +3,22 @@
 Limits are shares, or what is left of an error. The healthy values beside them are the extremes of the pairs of 37 measured recordings.
 """
 
+from __future__ import annotations
+
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.streams import ERROR, Finding
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from numpy.typing import ArrayLike
+    from .known_path import KnownPath
+
+    Fault = tuple[str, str, str, float]  # what the pair does, evidence, remedy, and the number that decided
 
 # Of the median error that is left with the other sign, or with the ids exchanged: healthy 2.1 and 0.68 at least.
 CONTRARY = 0.4
@@ -21,9 +31,9 @@ MOST = 0.5  # share of the pairs with the same fault, from which on it is one of
 EXCHANGES = 4  # pairs of anchors that are exchanged one after the other
 
 
-def values(path):
+def values(path: KnownPath) -> Iterator[Finding]:
     """Pairs with the other sign, rounded, interpolated, repeated, clipped or frozen; all of them alike count as one finding."""
-    found = {}
+    found: dict[str, dict[tuple[int, int], Fault]] = {}
     for pair, rows in path.pairs.items():
         for rule in OF_PAIR:
             said = rule(path.d[rows], path.true[rows], path.t[rows] - path.start)
@@ -40,27 +50,29 @@ def values(path):
             yield Finding(f"pair_{name}", ERROR, f"the TDOA of the pair ({pair[0]}, {pair[1]}) {what}", evidence, remedy, value)
 
 
-def contrary(path):
+def contrary(path: KnownPath) -> list[tuple[int, int]]:
     """[(a, b)] of the pairs whose sign is the other one."""
     return [pair for pair, rows in path.pairs.items() if _sign(path.d[rows], path.true[rows], None) is not None]
 
 
-def _sign(d, true, t):
+def _sign(d: np.ndarray, true: np.ndarray, t: np.ndarray | None) -> Fault | None:
     same, other = (float(np.median(np.abs(sign * d - true))) for sign in (1.0, -1.0))
     if np.std(true) > MOVED and other < CONTRARY * same:
         return "has the wrong sign", f"median error {same:.2f} m, with the other sign {other:.2f} m", "distance_difference *= -1.0", other
+    return None
 
 
-def _rounded(d, true, t):
+def _rounded(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
     values = np.unique(d)
     if len(values) < 2 or len(values) > 0.5 * len(d):
         return None
     grid = float(np.diff(values).min())
     if grid > GRID and (np.abs(d / grid - np.round(d / grid)) < ON_GRID / grid).all():
         return f"is rounded to {grid:.3g} m", f"{len(values)} values, all multiples of it", "publish it as measured", grid
+    return None
 
 
-def _interpolated(d, true, t):
+def _interpolated(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
     """On the line between its neighbours, over packets or over time."""
     step = np.median(np.abs(np.diff(d)))
     moving = (d[1:-1] != d[:-2]) | (d[2:] != d[1:-1])
@@ -72,9 +84,10 @@ def _interpolated(d, true, t):
     if share > BETWEEN:
         evidence = f"{100 * share:.0f} % are on the line between their neighbours"
         return "is interpolated", evidence, "publish only what was measured", share
+    return None
 
 
-def _repeated(d, true, t):
+def _repeated(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
     """Beside the longest run, which may stand still, and the ends, which may be clipped."""
     first, length = _runs(d)
     length = length[(d[first] > d.min()) & (d[first] < d.max())]
@@ -83,9 +96,10 @@ def _repeated(d, true, t):
     share = float((length.sum() - len(length) - (length.max() - 1)) / max(length.sum() - length.max(), 1))
     if share > REPEATED:
         return "is published more than once", f"{100 * share:.0f} % equal the one before", "publish a TDOA when there is a new one", share
+    return None
 
 
-def _clipped(d, true, t):
+def _clipped(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
     """Many at one end; if they are all together, there where the geometry is beyond it, or it stands still."""
     for end, outward in ((d.max(), 1.0), (d.min(), -1.0)):
         at = d == end
@@ -93,9 +107,10 @@ def _clipped(d, true, t):
         if at.sum() > AT_END * len(d) and at.sum() >= HITS and not (together and np.median(outward * (true[at] - end)) < 0.0):
             evidence = f"{100 * at.mean():.0f} % have this value"
             return f"is clipped at {end:.2f} m", evidence, "widen the limit of the driver", float(end)
+    return None
 
 
-def _frozen(d, true, t):
+def _frozen(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
     first, length = _runs(d)
     k = int(np.argmax(length))
     rows = slice(first[k], first[k] + length[k])
@@ -103,9 +118,10 @@ def _frozen(d, true, t):
         evidence = f"{length[k]} times {d[first[k]]:.3f} m while it changes by {np.ptp(true[rows]):.2f} m"
         what = f"stands still from {t[rows][0]:.1f} to {t[rows][-1]:.1f} s"
         return what, evidence, "publish a TDOA when there is a new one", float(t[rows][0])
+    return None
 
 
-def _runs(d):
+def _runs(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(first, length) of the runs of equal values: (k,) each."""
     edges = np.flatnonzero(np.concatenate([[True], np.diff(d) != 0.0, [True]]))
     return edges[:-1], np.diff(edges)
@@ -114,7 +130,7 @@ def _runs(d):
 OF_PAIR = _sign, _rounded, _interpolated, _repeated, _clipped, _frozen
 
 
-def ids(path):
+def ids(path: KnownPath) -> Iterator[Finding]:
     """Anchors that are called by the names of others."""
     table, before, after = renamed(path)
     if table:
@@ -124,9 +140,11 @@ def ids(path):
         yield Finding("ids_exchanged", ERROR, f"the ids of anchors are exchanged: what is called {names}", evidence, line, after)
 
 
-def renamed(path):
+def renamed(path: KnownPath) -> tuple[dict[int, int], float, float]:
     """({id as received: id of that anchor}, median error m of the TDOAs of these anchors as they are, and then)."""
-    rows, table, errors = np.arange(len(path.ids)), {}, None
+    rows = np.arange(len(path.ids))
+    table: dict[int, int] = {}
+    errors: tuple[float, ...] = (0.0, 0.0)
     for _ in range(EXCHANGES):
         best = None
         for one, two in combinations(range(len(rows)), 2):
@@ -141,10 +159,11 @@ def renamed(path):
         changed = np.flatnonzero(rows != np.arange(len(rows)))
         table = {int(path.ids[row]): int(path.ids[rows[row]]) for row in changed}
         errors = _median_errors(path, changed, np.arange(len(rows)), rows)
-    return table, *(errors or (0.0, 0.0))
+    before, after = errors
+    return table, before, after
 
 
-def _median_errors(path, anchors, *tables):
+def _median_errors(path: KnownPath, anchors: ArrayLike, *tables: np.ndarray) -> tuple[float, ...]:
     """Median |error| m of the TDOAs in the air with some anchors (rows), under each table of the rows of the anchors."""
     samples, flown = path.samples, path.flown
     a, b = samples.a[flown], samples.b[flown]

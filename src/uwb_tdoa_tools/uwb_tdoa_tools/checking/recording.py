@@ -1,9 +1,12 @@
 """What `check` judges: the streams of a recording as they came, in the order in which they arrived."""
 
+from __future__ import annotations
+
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 import tempfile
+from typing import Any, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -18,6 +21,17 @@ from ..bags.files import open_bag, readable, remarks_of
 from ..bags.message_types import check_type
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.foundation.sensors.sensor import Sensor, Stream
+    from ..bags.files import BagReader
+    from ..bags.placing import Place
+    from ..readers.inputs import Reading
+    from .wiring import End
+
+Made = TypeVar("Made")
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
 HEARD = (TDOA, IMU, "uwb/anchors", *(of.topics[0][0] for of in SENSORS.values()), "uwb/tdoa_corrected", "odometry", "uwb/residual")
@@ -46,25 +60,27 @@ class Recording:
     imu: Imu | None
     tdoa_arrival: np.ndarray
     imu_arrival: np.ndarray
-    frames: dict = field(default_factory=dict)
-    places: dict = field(default_factory=dict)
-    topics: dict = field(default_factory=dict)
+    frames: dict[str, dict[str, int]] = field(default_factory=dict)
+    places: dict[str, Place] = field(default_factory=dict)
+    topics: dict[str, str] = field(default_factory=dict)
     recorded: Anchors | None = None
     falls: int = 0
-    remarks: tuple = ()
-    ends: tuple = ()
-    sensors: dict = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    ends: tuple[End, ...] = ()
+    sensors: dict[str, Stream] = field(default_factory=dict)
 
 
-def read_recording(reading, path, survey=None):
+def read_recording(reading: Reading, path: str | Path, survey: str | Path | None = None) -> Recording:
     """Recording of a log, a CSV file or a bag, as a Reading says; survey : path of a survey, or None. Raises
     InputError."""
     if is_bag(path):
         return _read_bag(reading, Path(path), survey)
-    return of_flight(reading.read((path, survey)))
+    return of_flight(reading.read((Path(path), survey)))
 
 
-def read_live(reading, seconds, survey=None, say=print):
+def read_live(
+    reading: Reading, seconds: float, survey: str | Path | None = None, say: Callable[[str], object] = print
+) -> Recording:
     """Recording of live topics, named as a Reading says, for so many seconds. say(sentence) : told what happens. Raises
     InputError."""
     from ..live.listen import listen  # needs ROS
@@ -79,20 +95,20 @@ def read_live(reading, seconds, survey=None, say=print):
             raise InputError(str(error).replace(str(bag), "live topics")) from error
     recording = replace(recording, topics=topics, ends=tuple(ends))
     if "/clock" in topics:  # simulated time: the arrivals are of another
-        unknown = (np.full_like(arrival, np.nan) for arrival in (recording.tdoa_arrival, recording.imu_arrival))
-        recording = replace(recording, **dict(zip(("tdoa_arrival", "imu_arrival"), unknown)))
+        tdoa, imu = (np.full_like(arrival, np.nan) for arrival in (recording.tdoa_arrival, recording.imu_arrival))
+        recording = replace(recording, tdoa_arrival=tdoa, imu_arrival=imu)
     return recording
 
 
-def of_flight(flight):
+def of_flight(flight: Flight) -> Recording:
     """Recording of a Flight. When its messages arrived is not known."""
-    unknown = (np.full(len(stream) if stream is not None else 0, np.nan) for stream in (flight.tdoa, flight.imu))
+    tdoa, imu = (np.full(len(stream) if stream is not None else 0, np.nan) for stream in (flight.tdoa, flight.imu))
     falls = sum(flight.meta.get("reordered", {}).values())
     sensors = {name: stream for name in SENSORS if (stream := getattr(flight, name)) is not None}
-    return Recording(flight.name, flight.anchors, flight.tdoa, flight.imu, *unknown, falls=falls, sensors=sensors)
+    return Recording(flight.name, flight.anchors, flight.tdoa, flight.imu, tdoa, imu, falls=falls, sensors=sensors)
 
 
-def _read_bag(reading, path, survey):
+def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Recording:
     name_of = Names(reading.namespace, reading.topics)
     with open_bag(path, reading.salvage) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
@@ -134,35 +150,36 @@ class _Stream:
     stamps: np.ndarray
     arrival: np.ndarray
     rows: np.ndarray
-    frames: Counter
+    frames: Counter[str]
 
 
-def _stream(path, reader, topic, kind, row):
+def _stream(path: Path, reader: BagReader, topic: str, kind: str, row: Callable[[Any], tuple[float, ...]]) -> _Stream:
     """Messages of one topic in the order of the bag. A bag whose times are the stamps themselves tells no arrivals."""
     connections = [c for c in reader.connections if c.topic == topic]
     for connection in connections:
         if connection.msgtype != kind:
             raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {kind} is needed there.")
         check_type(path, connection)
-    arrivals, rows, frames = [], [], Counter()
+    arrived, rows = [], []
+    frames: Counter[str] = Counter()
     for _, received, message in readable(path, reader, connections):
-        arrivals.append(received)
+        arrived.append(received)
         rows.append(row(message))
         frames[message.header.frame_id] += 1
-    stamps, arrivals = np.array([r[0] for r in rows], dtype=np.int64), np.array(arrivals, dtype=np.int64)
+    stamps, arrivals = np.array([r[0] for r in rows], dtype=np.int64), np.array(arrived, dtype=np.int64)
     table = np.array([r[1:] for r in rows], dtype=float)
     known = bool((stamps != arrivals).any())
     return _Stream(stamps / 1e9, arrivals / 1e9 if known else np.full(len(rows), np.nan), table, frames)
 
 
-def _stream_of(path, reader, topic, sensor):
+def _stream_of(path: Path, reader: BagReader, topic: str, sensor: Sensor) -> Stream:
     """Stream of a Sensor."""
     row, make, _ = bag_messages.of_sensor(sensor)
     found = _stream(path, reader, topic, sensor.message, row)
     return make(found.stamps, found.rows.reshape(len(found.stamps), sum(sensor.fields.values())))
 
 
-def _last(path, reader, topic, make):
+def _last(path: Path, reader: BagReader, topic: str, make: Callable[[Any], Made]) -> Made | None:
     """make(the last message of a topic), or None."""
     found = None
     connections = [c for c in reader.connections if c.topic == topic]

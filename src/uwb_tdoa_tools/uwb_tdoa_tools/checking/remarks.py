@@ -1,5 +1,9 @@
 """What every tool that estimates says of a flight before it does: a survey that cannot be right."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -9,10 +13,14 @@ from .check import different_surveys
 from .recording import of_flight
 from .tdoa_rules import gained, survey_fit
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 SHORTEST = 10.0  # s; of shorter flights nothing is said
 
 
-def survey_remarks(flight):
+def survey_remarks(flight: Flight) -> Iterator[str]:
     """Sentences about the survey of a Flight: anchors that it lacks, and positions that cannot be right, by what moving
     the anchors explains (see SurveyFit). Raises InputError where no TDOA is between two anchors that it has."""
     tdoa, anchors = flight.tdoa, flight.anchors
@@ -31,11 +39,11 @@ def survey_remarks(flight):
         yield "the survey does not fit the TDOAs: of another room, or anchors have been moved; `check` says more."
 
 
-def _listed(ids):
+def _listed(ids: Iterable[int]) -> str:
     return ", ".join(map(str, ids))
 
 
-def remarks_on(flights):
+def remarks_on(flights: Sequence[Flight]) -> Iterator[str]:
     """Sentences on the surveys of Flights, each by itself and beside one another."""
     for flight in flights:
         yield from (f"{flight.name}: {remark}" for remark in survey_remarks(flight))

@@ -1,14 +1,22 @@
 """What `check` says: text for people, a dict for machines."""
 
+from __future__ import annotations
+
 from dataclasses import asdict
+from typing import Any, TYPE_CHECKING
 
 from .. import command_lines
 from ..scoring.metrics import as_json
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from uwb_tdoa_ekf.streams import Finding
+    from .check import Report
+
 SYMBOL = {"error": "ERROR", "warning": "warning", "note": "note"}
 
 
-def text(report):
+def text(report: Report) -> str:
     """Lines about one Report: the verdict first, then the findings, most severe first."""
     facts = ", ".join(f"{name} {value}" if name in ("TDOAs", "IMU") else value for name, value in report.facts.items())
     out = [f"{report.recording}: {verdict(report.findings)}  ({facts})"]
@@ -18,7 +26,7 @@ def text(report):
     return "\n".join(out)
 
 
-def verdict(findings):
+def verdict(findings: Sequence[Finding]) -> str:
     """In a few words."""
     counts = {severity: sum(f.severity == severity for f in findings) for severity in SYMBOL}
     if not counts["error"] and not counts["warning"]:
@@ -26,7 +34,7 @@ def verdict(findings):
     return ", ".join(f"{count} {severity}{'s' * (count > 1)}" for severity, count in counts.items() if count)
 
 
-def lines(finding):
+def lines(finding: Finding) -> Iterator[str]:
     """Lines of text about one Finding."""
     yield f"  {SYMBOL[finding.severity]}: {finding.cause}"
     yield f"      seen:   {finding.evidence}"
@@ -36,7 +44,7 @@ def lines(finding):
         yield f"              {line}"
 
 
-def as_dict(reports, together):
+def as_dict(reports: Iterable[Report], together: Iterable[Finding]) -> dict[str, Any]:
     """For JSON: {"recordings": [{"recording", "facts", "findings", "ends"}], "together": [findings about several
     recordings]}; ends : who publishes and hears live topics."""
     return {
@@ -53,5 +61,5 @@ def as_dict(reports, together):
     }
 
 
-def _finding(finding):
+def _finding(finding: Finding) -> dict[str, Any]:
     return as_json(asdict(finding))

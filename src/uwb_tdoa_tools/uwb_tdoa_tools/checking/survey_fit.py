@@ -4,6 +4,10 @@ Systematic errors move the anchors by some decimetres too; only what moving them
 survey.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_ekf.core import workspace
@@ -11,6 +15,11 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
 from uwb_tdoa_ekf.core.startup import locate
 from uwb_tdoa_ekf.streams.explain import SCALE
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
 
 WINDOWS, LENGTH, FEWEST = 40, 0.5, 30  # windows over the recording, s each, and TDOAs that one must have
 PRIOR = 0.5  # m, by which an anchor may be off the survey; of no anchor in particular is more believed
@@ -24,7 +33,7 @@ SPREAD = 0.3  # m of `spread`; measured flights 0.50 at least, also with ids swa
 class SurveyFit:
     """Windows of TDOAs, located with the anchors as surveyed."""
 
-    def __init__(self, t, a, b, d, positions):
+    def __init__(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray) -> None:
         """t (n,) s, rising; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
         self.positions = positions
         self._windows, self._start = [], []
@@ -41,28 +50,28 @@ class SurveyFit:
             self._start.append(x[0])
         self.before = self._loss(self._start, positions)
 
-    def __len__(self):
+    def __len__(self) -> int:
         """Windows that tell something."""
         return len(self._windows)
 
     @property
-    def places(self):
+    def places(self) -> np.ndarray:
         """(k, 3) m: where the tag was located in the windows."""
         return np.array([x[:3] for x in self._start]).reshape(-1, 3)
 
-    def solve(self, free=None):
+    def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
         """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows; None for all)
         moved."""
         moved = np.ones(len(self.positions), dtype=bool) if free is None else np.isin(range(len(self.positions)), free)
-        free = np.flatnonzero(np.repeat(moved, 3))
+        columns = np.flatnonzero(np.repeat(moved, 3))  # of the coordinates that are free
         anchors, start = self.positions.copy(), [x.copy() for x in self._start]
         for _ in range(SWEEPS):
-            H = np.eye(len(free)) / PRIOR**2
-            g = (self.positions - anchors).reshape(-1)[free] / PRIOR**2
+            H = np.eye(len(columns)) / PRIOR**2
+            g = (self.positions - anchors).reshape(-1)[columns] / PRIOR**2
             eliminated = []
             for x, window in zip(start, self._windows):
                 by_tag, by_anchors, residual = _linearised(x, window, anchors)
-                by_anchors = by_anchors[:, free]
+                by_anchors = by_anchors[:, columns]
                 weight = min(1.0, TOGETHER / len(residual)) / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
                 left = by_tag * weight[:, None]
                 A = left.T @ by_tag + np.diag([TAG**-2] * 3 + [SPEED**-2] * 3)
@@ -74,18 +83,18 @@ class SurveyFit:
                 eliminated.append(solved)
             step = np.linalg.solve(H, g)
             step *= min(1.0, STEP / max(np.abs(step).max(), 1e-9))
-            anchors.reshape(-1)[free] += step
+            anchors.reshape(-1)[columns] += step
             for x, solved in zip(start, eliminated):
                 x += np.clip(solved[:, -1] - solved[:, :-1] @ step, -2.0, 2.0)
         return self._loss(start, anchors), anchors
 
-    def _loss(self, states, anchors):
+    def _loss(self, states: list[np.ndarray], anchors: np.ndarray) -> float:
         """Mean Geman-McClure loss over the windows."""
         squares = (_residual(x, window, anchors)[0] ** 2 for x, window in zip(states, self._windows))
         return float(np.mean([np.mean(square / (square + SCALE**2)) for square in squares])) if states else np.nan
 
 
-def displacement(surveyed, fitted):
+def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """(N,) m, how far each anchor has moved, after the best rotation and shift of all of them (Kabsch, Acta Cryst. A
     32, 1976)."""
     one, two = surveyed - surveyed.mean(axis=0), fitted - fitted.mean(axis=0)
@@ -94,7 +103,7 @@ def displacement(surveyed, fitted):
     return np.linalg.norm(two @ turn - one, axis=1)
 
 
-def spread(places):
+def spread(places: np.ndarray) -> float:
     """m by which places of a tag (k, 3) are off the straight line that fits them best (second largest standard
     deviation): a tag that stands, or moves along one line, does not tell one anchor from its mirror image."""
     if not len(places):
@@ -102,7 +111,9 @@ def spread(places):
     return float(np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places)))
 
 
-def _residual(x, window, anchors):
+def _residual(
+    x: np.ndarray, window: Window, anchors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(residuals (n,) m, unit vectors (n, 3) from a, and from b, to the tag, time (n,) before the end, s)."""
     t, a, b, d = window
     before = t - t[-1]
@@ -112,7 +123,7 @@ def _residual(x, window, anchors):
     return d - (rb - ra), from_a / ra[:, None], from_b / rb[:, None], before
 
 
-def _linearised(x, window, anchors):
+def _linearised(x: np.ndarray, window: Window, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Jacobians of the TDOAs by position and velocity (n, 6) and by the anchors (n, 3 N), and the residuals (n,)."""
     residual, from_a, from_b, before = _residual(x, window, anchors)
     by_position = from_b - from_a

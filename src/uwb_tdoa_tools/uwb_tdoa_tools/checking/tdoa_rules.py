@@ -4,8 +4,11 @@ recording says whether more of it is explained then.
 A rule takes a Case and yields Trials: the case with one mistake undone, and the Finding if that was it.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +19,13 @@ from uwb_tdoa_ekf.streams import ERROR, Finding
 from .case import LONG, SHORT, Case
 from uwb_tdoa_ekf.streams.explain import SCALE, compare
 from .survey_fit import SPREAD, SurveyFit, spread
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Tdoas
+
+    Survey = tuple[str, Anchors]  # its name, and what it says
 
 RATIO, DEVIATIONS = 0.93, 2.5  # of what stays unexplained; healthy recordings: 1.02 at least for anything that is tried
 UNITS = {  # m in one
@@ -40,16 +50,16 @@ class Trial:
     the TDOAs that it changes."""
 
     case: Case
-    finding: object
+    finding: Callable[[float, float], Finding]
     share: float = 1.0
 
 
-def in_metres(case):
+def in_metres(case: Case) -> bool:
     """Whether the TDOAs scatter as metres do. (In nanoseconds those of a quiet radio do, too.)"""
     return NOISE[0] <= successive(case.tdoa) <= NOISE[1]
 
 
-def units(case):
+def units(case: Case) -> Iterator[tuple[Finding, Case]]:
     """In metres? The noise of the radio is known, and that a motion explains most of it. Yields (Finding, Case)."""
     noise = successive(case.tdoa)
     if not noise > 0.0 or (in_metres(case) and case.part(LONG).unexplained().mean < WELL):
@@ -65,7 +75,7 @@ def units(case):
     yield Finding("tdoa_unit", ERROR, f"TDOAs are in {name}, not in metres", evidence, line, scale), trial
 
 
-def successive(tdoa):
+def successive(tdoa: Tdoas) -> float:
     """Median difference of successive TDOAs of a pair, in the unit of the file."""
     order = np.lexsort((tdoa.t, tdoa.b, tdoa.a))
     a, b, t, d = tdoa.a[order], tdoa.b[order], tdoa.t[order], tdoa.d[order]
@@ -73,13 +83,13 @@ def successive(tdoa):
     return float(np.median(np.abs(np.diff(d))[follows])) if follows.any() else 0.0
 
 
-def sign(case):
+def sign(case: Case) -> Iterator[Trial]:
     """All signs the other way."""
     line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
     yield Trial(case.with_tdoa(d=-case.tdoa.d), _says("tdoa_sign", "the sign of all TDOAs is wrong", line))
 
 
-def survey(case, others):
+def survey(case: Case, others: Sequence[Survey]) -> Iterator[Trial]:
     """Another survey. others : [(name, Anchors)]. Those of one installation, of different days, count as one."""
     while others:
         (name, anchors), *rest = others
@@ -92,20 +102,20 @@ def survey(case, others):
         yield Trial(replace(case, anchors=anchors), _says("survey_other", cause, f"--survey {name}"))
 
 
-def same_place(one, other):
+def same_place(one: Anchors, other: Anchors) -> bool:
     """True if two Anchors have the same ids at the same places."""
     rows = other.index(one.ids)
-    return len(one) == len(other) and (rows >= 0).all() and furthest(one, other) < SAME
+    return len(one) == len(other) and bool((rows >= 0).all()) and furthest(one, other) < SAME
 
 
-def furthest(one, other):
+def furthest(one: Anchors, other: Anchors) -> float:
     """m between the two places of an id that two Anchors have furthest apart; infinite if they have none in common."""
     rows = other.index(one.ids)
     off = np.linalg.norm(one.positions - other.positions[rows], axis=1)[rows >= 0]
     return float(off.max()) if len(off) else np.inf
 
 
-def renumbered(case):
+def renumbered(case: Case) -> Iterator[Trial]:
     """Ids that the survey does not have: the same anchors in the same order, with other numbers?"""
     heard, known = np.unique(np.r_[case.tdoa.a, case.tdoa.b]), np.sort(case.anchors.ids)
     if len(heard) != len(known) or np.isin(heard, known).all():
@@ -118,12 +128,13 @@ def renumbered(case):
     yield Trial(_relabelled(case, table), _says("ids_renumbered", cause, line))
 
 
-def swapped(case):
+def swapped(case: Case) -> Iterator[Trial]:
     """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more is explained.
     Not along a line: in a room that is symmetrical about it, anchors differ by their systematic errors alone."""
     if spread(survey_fit(case).places) < SPREAD:
         return
-    table, trial, brief = {}, case, case.part(SHORT)
+    table: dict[int, int] = {}
+    trial, brief = case, case.part(SHORT)
     ids = np.intersect1d(case.anchors.ids, np.r_[case.tdoa.a, case.tdoa.b]).tolist()
     for _ in range(len(ids) - 1):
         base = brief.unexplained()
@@ -149,7 +160,7 @@ def swapped(case):
     )
 
 
-def contrary(case):
+def contrary(case: Case) -> Iterator[Trial]:
     """Single pairs with the other sign: a filter that hardly believes them knows. Or all pairs that name the larger id
     first."""
     tdoa = case.tdoa
@@ -173,7 +184,7 @@ def contrary(case):
     yield Trial(trial, _says("pair_sign", f"the sign of the pairs {names} is wrong", line), flip.mean())
 
 
-def _contrary(case, pairs):
+def _contrary(case: Case, pairs: np.ndarray) -> list[tuple[int, int]]:
     """The pairs, [(a, b)], most of whose TDOAs are nearer to the negative of what the filter predicts."""
     tdoa, run = case.tdoa, run_offline(case.flight(), FilterConfig(use_imu=False)).residuals
     predicted = tdoa.d - run.innovation
@@ -187,11 +198,11 @@ def _contrary(case, pairs):
     return wrong
 
 
-def _flipped(case, rows):
+def _flipped(case: Case, rows: np.ndarray) -> Case:
     return case.with_tdoa(d=np.where(rows, -case.tdoa.d, case.tdoa.d))
 
 
-def moved(case):
+def moved(case: Case) -> Iterator[Trial]:
     """An anchor that is not where the survey has it: there, TDOAs are explained that no motion explains otherwise."""
     fit = survey_fit(case)
     gain = gained(fit)
@@ -211,14 +222,14 @@ def moved(case):
     yield Trial(replace(case, anchors=anchors), _says("anchor_moved", cause, line))
 
 
-def survey_fit(case):
+def survey_fit(case: Case) -> SurveyFit:
     """SurveyFit of the TDOAs between known anchors."""
     a, b = case.rows()
     known = (a >= 0) & (b >= 0) & (a != b)
     return SurveyFit(case.tdoa.t[known], a[known], b[known], case.tdoa.d[known], case.anchors.positions)
 
 
-def gained(fit):
+def gained(fit: SurveyFit) -> float | None:
     """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording."""
     if len(fit) < FEWEST:
         return None
@@ -226,7 +237,7 @@ def gained(fit):
     return gain if gain > GAIN else None
 
 
-def best(case, others=()):
+def best(case: Case, others: Sequence[Survey] = ()) -> tuple[Finding | None, Case]:
     """(Finding, Case with it undone), or (None, case): of all that can be tried, what explains the most, if it is
     certain, and more than systematic errors could: along a line, in a room that is symmetrical about it, swapped ids
     differ by these alone.
@@ -249,15 +260,15 @@ def best(case, others=()):
     return next(units(case), (None, case))
 
 
-def _says(rule, cause, line):
-    def finding(ratio, z):
+def _says(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]:
+    def finding(ratio: float, z: float) -> Finding:
         evidence = f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
         return Finding(rule, ERROR, cause, evidence, line, ratio)
 
     return finding
 
 
-def _relabelled(case, table):
+def _relabelled(case: Case, table: dict[int, int]) -> Case:
     """Ids replaced as the dict `table` says, all at once."""
     columns = {}
     for name, ids in (("a", case.tdoa.a), ("b", case.tdoa.b)):

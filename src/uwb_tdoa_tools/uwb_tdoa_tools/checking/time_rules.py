@@ -3,12 +3,21 @@
 Limits are shares of the power that is left with a fault undone; healthy: the least of 37 measured recordings.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.geometry import tdoa_jacobian
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
 from .delays import of_tdoas
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from .delays import Delays
+    from .known_path import KnownPath
 
 LATE, OF_ALL, DRIFTS, JUMPS = 0.53, 0.965, 0.99, 0.985  # healthy: a pair 0.557; all together 0.984, drifting 0.9953, jumping 0.993
 LEAST = 0.1  # s that count
@@ -17,7 +26,7 @@ LIMIT = 4.0  # standard deviations, robust, beyond which an error counts no more
 CLOCK = "stamp with one clock, when it is measured; tdoa_time_offset and truth_time_offset take out what is constant"
 
 
-def tdoas(path):
+def tdoas(path: KnownPath) -> Iterator[Finding]:
     """TDOAs that are late, of one pair or of all; whose stamps drift or jump; that come in another order."""
     of = of_tdoas(path)
     if of is None:
@@ -36,13 +45,13 @@ def tdoas(path):
     yield from _reordered(path)
 
 
-def _late(rule, who, ratio, delay):
+def _late(rule: str, who: str, ratio: float, delay: float) -> Finding:
     cause = f"{who} {abs(delay):.2f} s {'late' if delay > 0.0 else 'early'}"
     evidence = f"{100 * (1 - ratio):.0f} % less mean square error with the geometry of that time"
     return Finding(rule, ERROR, cause, evidence, "publish a TDOA when it is taken, stamped with that instant", delay)
 
 
-def changing(stream, name, of):
+def changing(stream: str, name: str, of: Delays) -> Iterator[Finding]:
     """Stamps of a stream, "tdoa" or "imu", that drift or jump, by its Delays."""
     (drift, by), (jump, step, _) = of.drift(), of.jump()
     jumps = jump < JUMPS and abs(step) >= LEAST
@@ -54,7 +63,7 @@ def changing(stream, name, of):
         yield Finding(f"{stream}_jump", ERROR, f"the stamps of the {name} jump against the ground truth", evidence, CLOCK, step)
 
 
-def _reordered(path):
+def _reordered(path: KnownPath) -> Iterator[Finding]:
     """Errors of successive TDOAs of a pair differ by what the tag moves in the time by which they are out of place."""
     samples, error = path.samples, path.d - path.true
     change = np.sum(tdoa_jacobian(samples.p, samples.position_a, samples.position_b) * samples.velocity, axis=1)

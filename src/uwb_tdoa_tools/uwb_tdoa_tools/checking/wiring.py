@@ -1,11 +1,18 @@
 """Who publishes and hears what, of live topics. A rule takes a Recording and yields Findings."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from .recording import Recording
 
 
 @dataclass(frozen=True)
@@ -21,23 +28,23 @@ class End:
     latched: bool
 
     @property
-    def qos(self):
+    def qos(self) -> str:
         """In words."""
         return f"{'reliable' if self.reliable else 'best effort'}, {'transient local' if self.latched else 'volatile'}"
 
-    def gets(self, publisher):
+    def gets(self, publisher: End) -> bool:
         """Whether a subscription gets what a publisher of its topic sends (DDS: it may not ask for more than is offered)."""
         return publisher.reliable >= self.reliable and publisher.latched >= self.latched
 
 
-def _by_topic(recording):
+def _by_topic(recording: Recording) -> Iterator[tuple[str, list[End], list[End]]]:
     """(topic, publishers, subscriptions) of each."""
     for topic in sorted({end.topic for end in recording.ends}):
         ends = [end for end in recording.ends if end.topic == topic]
         yield topic, [end for end in ends if end.publishes], [end for end in ends if not end.publishes]
 
 
-def kinds(recording):
+def kinds(recording: Recording) -> Iterator[Finding]:
     """Ends of one topic that speak of different types never meet."""
     for topic, publishers, subscriptions in _by_topic(recording):
         found = {end.kind for end in (*publishers, *subscriptions)}
@@ -47,7 +54,7 @@ def kinds(recording):
             yield Finding("type_other", ERROR, cause, evidence, line, float(len(found)))
 
 
-def unmatched(recording):
+def unmatched(recording: Recording) -> Iterator[Finding]:
     """A subscription that asks for more than a publisher offers gets nothing from it."""
     for topic, publishers, subscriptions in _by_topic(recording):
         deaf = {
@@ -61,13 +68,13 @@ def unmatched(recording):
             yield Finding("qos_unmatched", ERROR, cause, evidence, _stronger(publisher, end), np.nan)
 
 
-def _stronger(publisher, end):
+def _stronger(publisher: End, end: End) -> str:
     """What to write in the node that publishes."""
     policies = ["reliability=ReliabilityPolicy.RELIABLE"] * end.reliable + ["durability=DurabilityPolicy.TRANSIENT_LOCAL"] * end.latched
     return f"qos = QoSProfile(depth=100, {', '.join(policies)})  # in {publisher.node}, or ask for less in {end.node}"
 
 
-def several(recording):
+def several(recording: Recording) -> Iterator[Finding]:
     """Two that publish one stream."""
     for topic, publishers, _ in _by_topic(recording):
         if len(publishers) > 1 and not topic.startswith("/tf"):
@@ -78,7 +85,7 @@ def several(recording):
             )
 
 
-def anchors(recording):
+def anchors(recording: Recording) -> Iterator[Finding]:
     """Anchors that who comes later does not get, unless they are repeated."""
     for topic, publishers, _ in _by_topic(recording):
         for publisher in publishers:
