@@ -7,8 +7,11 @@ Stamps that are late by what the gyroscope and the accelerometer say are the fau
 tells, only the difference of two clocks is known, that of the ground truth and that of the TDOAs.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from itertools import permutations, product
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,6 +22,12 @@ from ..checking.delays import of_tdoas
 from ..checking.known_path import KnownPath
 from ..checking.motion_rules import FEWEST, TrueMotion
 from .metrics import ALIGN, judged_part, position_at
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.effects.samples import Poses
+    from uwb_tdoa_bias.foundation.flight import Flight, Truth
+    from ..checking.delays import Delays
 
 NONE, TIME, FRAME = ALIGN
 OVERLAP = 1.0  # s that ground truth and TDOAs must have in common
@@ -50,7 +59,7 @@ class Alignment:
     middle: np.ndarray
     or_turned: bool = False
 
-    def applied(self, truth, how):
+    def applied(self, truth: Truth, how: str) -> Truth:
         """The Truth with its clock put right ("time"), or its frame too ("frame"); "none" leaves it as it is."""
         if how == NONE:
             return truth
@@ -58,37 +67,37 @@ class Alignment:
         return truth if how == TIME else moved_frame(truth, self.turn @ self.axes, self.shift)
 
     @property
-    def yaw(self):
+    def yaw(self) -> float:
         """rad, by which the ground truth is turned against the estimate about the vertical."""
         return float(np.arctan2(self.turn[0, 1] - self.turn[1, 0], self.turn[0, 0] + self.turn[1, 1]))
 
     @property
-    def tilt(self):
+    def tilt(self) -> float:
         """rad, between the verticals of the two."""
         return float(np.arccos(np.clip(self.turn[2, 2], -1.0, 1.0)))
 
     @property
-    def moved(self):
+    def moved(self) -> np.ndarray:
         """(3,) m, by which the ground truth is beside the estimate in the middle of its path."""
         return self.middle - self.turn @ self.middle - self.shift
 
     @property
-    def other_axes(self):
+    def other_axes(self) -> bool:
         """Whether its axes are not those of the survey."""
         return not np.array_equal(self.axes, np.eye(3))
 
     @property
-    def other_frame(self):
+    def other_frame(self) -> bool:
         """Whether the frame is another one than what a filter errs by makes it seem."""
         return self.other_axes or any(self._stands_out)
 
     @property
-    def _stands_out(self):
+    def _stands_out(self) -> tuple[bool, bool, bool, bool]:
         """Whether yaw, tilt, level shift and height are more than a filter errs by: (bool, ...)."""
         x, y, z = np.abs(self.moved)
         return bool(abs(self.yaw) > YAW), bool(self.tilt > TILT), bool(np.hypot(x, y) > LEVEL), bool(z > HEIGHT)
 
-    def least(self):
+    def least(self) -> Alignment:
         """The Alignment with those parts alone of turn and shift that stand out, and what goes with a turn: the rest may be what the estimate
         errs by."""
         turned, tilted, level, height = self._stands_out
@@ -97,7 +106,7 @@ class Alignment:
         there = self.middle - self.moved * (level, level, height)
         return replace(self, turn=turn, shift=there - turn @ self.middle)
 
-    def as_dict(self):
+    def as_dict(self) -> dict[str, Any]:
         """For JSON: s, degrees, m."""
         return {
             "late": self.late,
@@ -108,7 +117,7 @@ class Alignment:
             "shift": self.moved.tolist(),
         }
 
-    def of_clock(self):
+    def of_clock(self) -> str | None:
         """Sentence on a clock that is off; None if it is not."""
         if not self.late:
             return None
@@ -121,7 +130,7 @@ class Alignment:
         apart_by = f"ground truth or TDOAs are {abs(self.late):.2f} s apart"
         return f"{apart_by} (the truth {by}, or the TDOAs the other way{turned}); no inertial sensor tells which"
 
-    def of_frame(self):
+    def of_frame(self) -> str | None:
         """Sentence on a frame that is another one; None if it is not."""
         if not self.other_frame:
             return None
@@ -129,14 +138,14 @@ class Alignment:
         parts.append(self.frame_in_words())
         return "the ground truth is in another frame than the survey: " + "; ".join(parts)
 
-    def frame_in_words(self):
+    def frame_in_words(self) -> str:
         """By how much the frames differ, as numbers."""
         x, y, z = self.moved
         turned = f"turned by {np.rad2deg(self.yaw):.1f} degrees about the vertical, tilted by {np.rad2deg(self.tilt):.1f}"
         return f"{turned}, shifted by ({x:.2f}, {y:.2f}, {z:.2f}) m"
 
 
-def need_truth(flight, one_clock=True):
+def need_truth(flight: Flight, one_clock: bool = True) -> None:
     """Raise InputError if the Flight has no ground truth, or, unless `one_clock` is False, one on another clock than its TDOAs."""
     if flight.truth is None or len(flight.truth) < 2:
         raise InputError(f"{flight.name}: it holds no ground truth to compare with.")
@@ -148,8 +157,9 @@ def need_truth(flight, one_clock=True):
         )
 
 
-def on_another_clock(flight):
+def on_another_clock(flight: Flight) -> bool:
     """Whether the ground truth of a Flight, at least two poses, has hardly an instant in common with its TDOAs."""
+    assert flight.truth is not None
     truth, tdoa = flight.truth.t, flight.tdoa.t
     if not len(tdoa):
         return False
@@ -157,18 +167,20 @@ def on_another_clock(flight):
     return bool(common < min(OVERLAP, 0.5 * (truth[-1] - truth[0]), 0.5 * (tdoa[-1] - tdoa[0])))
 
 
-def apart(path, other):
+def apart(path: np.ndarray, other: np.ndarray) -> float:
     """m, root of the median square distance of two paths (n, 3)."""
     return float(np.sqrt(np.median(np.sum((path - other) ** 2, axis=1)))) if len(path) else np.inf
 
 
-def alignment_of(flight, odometry):
+def alignment_of(flight: Flight, odometry: Poses) -> Alignment:
     """Alignment of the ground truth of a Flight beside an Odometry. Raises InputError where it is on another clock, and the
     paths do not tell on which."""
+    assert flight.truth is not None
     epoch = _epoch(flight, odometry) if on_another_clock(flight) else 0.0
-    flight = replace(flight, truth=_earlier(flight.truth, epoch))
-    axes = _other_axes(flight.truth, odometry)
-    flight = replace(flight, truth=moved_frame(flight.truth, axes, np.zeros(3)))
+    truth = _earlier(flight.truth, epoch)
+    axes = _other_axes(truth, odometry)
+    truth = moved_frame(truth, axes, np.zeros(3))
+    flight = replace(flight, truth=truth)
     late, told_by = _late(flight, exact=epoch != 0.0)
     behind = _behind(flight, late) if told_by == "inertial" else 0.0
     ratio = _turned_or_late(flight, odometry, late, behind)
@@ -176,16 +188,17 @@ def alignment_of(flight, odometry):
         late = 0.0
     if ratio < 1.0:
         behind = 0.0
-    true, estimated = paths(_earlier(flight.truth, late + behind), odometry)
+    true, estimated = paths(_earlier(truth, late + behind), odometry)
     turn, shift = rigid(true, estimated) if len(true) >= FEWEST else (np.eye(3), np.zeros(3))
     middle = true.mean(axis=0) if len(true) else np.zeros(3)
     or_turned = bool(late and told_by == "tdoa" and ratio < 1.0 + AS_WELL)
     return Alignment(epoch + late, told_by, axes, turn, shift, middle, or_turned)
 
 
-def _turned_or_late(flight, odometry, late, behind):
+def _turned_or_late(flight: Flight, odometry: Poses, late: float, behind: float) -> float:
     """What is left of the distance of the paths if the frame is turned, over what is left if ground truth and TDOAs are apart in time too:
     below 1 the turn is all of it. Infinite where they are not apart, or nobody can tell."""
+    assert flight.truth is not None
     if not (behind or late):
         return np.inf
     pairs = [paths(_earlier(flight.truth, by), odometry) for by in ((late, late + behind) if behind else (0.0, late))]
@@ -194,18 +207,18 @@ def _turned_or_late(flight, odometry, late, behind):
     return _left(*pairs[0]) / max(_left(*pairs[1]), 1e-9)
 
 
-def _earlier(truth, seconds):
+def _earlier(truth: Truth, seconds: float) -> Truth:
     """The Truth with stamps that much earlier."""
     return replace(truth, t=truth.t - seconds)
 
 
-def _left(path, other):
+def _left(path: np.ndarray, other: np.ndarray) -> float:
     """m, root mean square distance of two paths (n, 3) after one was laid onto the other."""
     turn, shift = rigid(path, other)
     return float(np.sqrt(np.mean(np.sum((path @ turn.T + shift - other) ** 2, axis=1))))
 
 
-def rigid(path, other):
+def rigid(path: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(rotation (3, 3), translation (3,) m) that bring a path (n, 3) m onto another one, robustly (Umeyama, Least-squares estimation
     of transformation parameters between two point patterns, IEEE PAMI 1991, without scale)."""
     weight = np.ones(len(path))
@@ -218,9 +231,10 @@ def rigid(path, other):
     return turn, there - turn @ here
 
 
-def _late(flight, exact):
+def _late(flight: Flight, exact: bool) -> tuple[float, str | None]:
     """(s, who tells) by which the ground truth of a Flight is late: by the inertial sensor if it tells, else against the TDOAs; (0, None)
     where nobody tells. exact : whether the least counts."""
+    assert flight.truth is not None
     found, teller = _inertial(flight), "inertial"
     if found is None:
         found, teller = of_tdoas(KnownPath(flight)), "tdoa"
@@ -234,18 +248,20 @@ def _late(flight, exact):
     return late - (again.exact() if again else 0.0), teller
 
 
-def _behind(flight, late):
+def _behind(flight: Flight, late: float) -> float:
     """s by which the ground truth of a Flight, with its own `late` taken out, is later than the TDOAs, and so than an estimate."""
+    assert flight.truth is not None
     found = of_tdoas(KnownPath(replace(flight, truth=_earlier(flight.truth, late))))
     return -found.exact() if found and _is_late(*found.constant()) else 0.0
 
 
-def _is_late(ratio, delay):
+def _is_late(ratio: float, delay: float) -> bool:
     return ratio < LATE and abs(delay) >= LEAST
 
 
-def _inertial(flight):
+def _inertial(flight: Flight) -> Delays | None:
     """Delays of the inertial samples of a Flight against its ground truth; None where they do not tell."""
+    assert flight.truth is not None
     if flight.imu is None or len(flight.imu) < 2 or np.isfinite(flight.truth.q).all(axis=1).sum() < 2:
         return None
     motion = TrueMotion(flight)
@@ -256,20 +272,20 @@ def _inertial(flight):
     return found if power.min() < CONTRAST * np.median(power) else None
 
 
-def _other_axes(truth, odometry):
+def _other_axes(truth: Truth, odometry: Poses) -> np.ndarray:
     """(3, 3) signed permutation after which the ground truth is much nearer to the estimate; the identity if there is none."""
     true, estimated = paths(truth, odometry)
     if len(true) < FEWEST:
         return np.eye(3)
 
-    def error(axes):
+    def error(axes: np.ndarray) -> float:
         return apart(true @ axes.T, estimated)
 
     best = min(ARRANGEMENTS, key=error)
     return best if error(best) < AXES * error(np.eye(3)) else np.eye(3)
 
 
-def paths(truth, odometry):
+def paths(truth: Truth, odometry: Poses) -> tuple[np.ndarray, np.ndarray]:
     """(true (n, 3), estimated (n, 3)) m at the same instants, while the tag moves."""
     if len(odometry.t) < 2:
         return np.empty((0, 3)), np.empty((0, 3))
@@ -279,20 +295,21 @@ def paths(truth, odometry):
     return position_at(t, truth), _at(t, odometry)
 
 
-def _at(t, path):
+def _at(t: np.ndarray, path: Poses) -> np.ndarray:
     return np.stack([np.interp(t, path.t, path.p[:, k]) for k in range(3)], axis=1)
 
 
-def _epoch(flight, odometry):
+def _epoch(flight: Flight, odometry: Poses) -> float:
     """s by which the stamps of a ground truth on another clock are late: where its path is nearest to that of the estimate, as it is, or
     else, about its middle, with other axes."""
+    assert flight.truth is not None
     truth = flight.truth
     if len(odometry.t) < 2:
         raise InputError(f"{flight.name}: the ground truth is on another clock than the TDOAs, and there is no estimate to find it by.")
     ours, theirs = (_at(np.arange(one.t[0], one.t[-1], EPOCH_STEP), one) for one in (odometry, truth))
     lags, size, told = np.arange(-len(theirs) + 1, len(ours)), np.sqrt(np.sum(ours.var(axis=0))), []
     for pair, arrangements in (((ours, theirs), (np.eye(3),)), ((ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)), ARRANGEMENTS)):
-        error = _apart_by_lag(*pair, lags, arrangements)
+        error = _apart_by_lag(pair[0], pair[1], lags, arrangements)
         best = int(np.argmin(error))
         others = np.min(error[np.abs(lags - lags[best]) > APART / EPOCH_STEP], initial=np.inf)
         if error[best] < FITS * size and others >= ALIKE * error[best]:
@@ -304,7 +321,9 @@ def _epoch(flight, odometry):
     )
 
 
-def _apart_by_lag(ours, theirs, lags, arrangements):
+def _apart_by_lag(
+    ours: np.ndarray, theirs: np.ndarray, lags: np.ndarray, arrangements: Sequence[np.ndarray]
+) -> np.ndarray:
     """m, root mean square distance of two paths (n, 3), (m, 3) m at each lag (k,) of the second, with the best of some arrangements (3, 3) of its
     axes; infinite where they have too little in common."""
     common = np.minimum(lags + len(theirs), len(ours)) - np.maximum(lags, 0)
@@ -316,12 +335,12 @@ def _apart_by_lag(ours, theirs, lags, arrangements):
     return error
 
 
-def _over(ours, theirs):
+def _over(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     """Sums of products over what both have in common, with theirs moved by each lag."""
     return np.correlate(ours, theirs, mode="full")
 
 
-def moved_frame(truth, axes, shift):
+def moved_frame(truth: Truth, axes: np.ndarray, shift: np.ndarray) -> Truth:
     """The Truth in a frame whose axes are (3, 3) others, then shifted by (3,) m. Attitudes stay where it is mirrored: whatever they
     are, turns of the body are the same."""
     p, known = truth.p @ axes.T + shift, np.isfinite(truth.q).all(axis=1)
@@ -331,7 +350,7 @@ def moved_frame(truth, axes, shift):
     return replace(truth, p=p, q=q)
 
 
-def _axes_in_words(axes):
+def _axes_in_words(axes: np.ndarray) -> str:
     """Which axis of the survey each axis of the ground truth is: "x, y, -z"."""
     words = []
     for column in axes.T:

@@ -1,8 +1,14 @@
 """How much of a correction flights left out of its making bear out, and what gain can be expected of it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    Errors = dict[str, dict[float | None, float]]  # {flight: {share, None for no correction: 3D RMSE of the filter, m}}
 
 SHARES = 0.0, 0.5, 0.75, 1.0
 
@@ -13,14 +19,14 @@ class BorneOut:
     filter, m}}, under None without any correction."""
 
     share: float
-    errors: dict
+    errors: Errors
 
     @property
-    def gains(self):
+    def gains(self) -> np.ndarray:
         """(n,): by how much the error of each flight gets smaller with the share, relative to that without correction."""
         return np.array([1.0 - of[self.share] / of[None] for of in self.errors.values()])
 
-    def as_text(self):
+    def as_text(self) -> str:
         """One sentence."""
         gains = self.gains
         return (
@@ -28,14 +34,14 @@ class BorneOut:
             f"(of {len(gains)} flights, each left out; the worst {gains.min():+.0%}), with {self.share:g} of what is predicted taken out"
         )
 
-    def as_dict(self):
+    def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         gains = self.gains
         errors = {name: {str(share): error for share, error in of.items()} for name, of in self.errors.items()}
         return {"share": self.share, "gain": gains.mean(), "spread": _spread(gains), "worst": gains.min(), "left_out": errors}
 
 
-def choose(errors):
+def choose(errors: Errors) -> float:
     """The share whose error, relative to that without correction, is smallest a standard deviation above its mean over the
     flights left out. errors : as of BorneOut.
 
@@ -46,5 +52,5 @@ def choose(errors):
     return min(ratios, key=lambda share: ratios[share].mean() + _spread(ratios[share]))
 
 
-def _spread(gains):
+def _spread(gains: np.ndarray) -> float:
     return float(gains.std(ddof=1)) if len(gains) > 1 else 0.0

@@ -1,18 +1,30 @@
 """The filter run over a flight, and judged."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ..localizing.estimate import Estimator
 from .alignment import need_truth
 from .metrics import Score
 
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.effects.effect_set import EffectSet
+    from uwb_tdoa_bias.foundation.flight import Flight, Truth
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from uwb_tdoa_ekf.offline import Run
 
-def evaluate(flight, config=None, effects=None, network=None):
+
+def evaluate(
+    flight: Flight, config: FilterConfig | None = None, effects: EffectSet | None = None, network: Network | None = None
+) -> tuple[Score, Run]:
     """Run the filter over a Flight with ground truth. Returns (Score, Run). Raises InputError if there is no truth."""
     return score_of(flight, Estimator(config, effects, network))
 
 
-def score_of(flight, estimator):
+def score_of(flight: Flight, estimator: Estimator) -> tuple[Score, Run]:
     """(Score, Run) of a Flight with ground truth, by an Estimator. Raises InputError if there is no truth, or one on
     another clock."""
     need_truth(flight)
@@ -20,6 +32,9 @@ def score_of(flight, estimator):
     return Score(flight.name, run.odometry, judging_truth(flight, estimator.effects), run.residuals, flight.tdoa.t), run
 
 
-def judging_truth(flight, effects=None):
-    """The Truth to compare estimates with: that of the Flight, without what the EffectSet says is wrong with it."""
-    return effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth
+def judging_truth(flight: Flight, effects: EffectSet | None = None) -> Truth:
+    """The Truth to compare estimates with: that of the Flight, which has one, without what the EffectSet says is wrong
+    with it."""
+    truth = effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth
+    assert truth is not None
+    return truth

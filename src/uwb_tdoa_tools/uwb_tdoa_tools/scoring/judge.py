@@ -1,8 +1,11 @@
 """Recordings judged one by one, with a picture and trajectories for others."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
 import sys
+from typing import Any, TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -19,6 +22,14 @@ from .alignment import ALIGN, NONE, alignment_of, need_truth
 from .evaluation import judging_truth
 from .metrics import Pool, Result, Score
 from .tum import write_tum
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.estimator import Odometry, Residuals
+    from ..bags.bag import RecordedOdometry
+    from ..readers.inputs import Recording
+    from .alignment import Alignment
 
 
 @dataclass(frozen=True)
@@ -39,17 +50,21 @@ class Judge:
     rerun: Path | None = None
     align: str = NONE
 
-    def __call__(self, recording):
+    def __call__(self, recording: Recording) -> Result:
         flight = self.reading.read(recording)
         need_truth(flight, self.align == NONE)
         tell(flight.name, () if self.odometry else survey_remarks(flight))
+        odometry: Odometry | RecordedOdometry
+        residuals: Residuals | None
         if self.odometry:
-            odometry, residuals = read_odometry(self.odometry, *self._where), None
-            tell(self.odometry, odometry.remarks)
+            recorded = read_odometry(self.odometry, *self._where)
+            odometry, residuals = recorded, None
+            tell(self.odometry, recorded.remarks)
         else:
             run = self.estimator(flight)
             odometry, residuals = run.odometry, run.residuals
             flight = replace(flight, truth=judging_truth(flight, self.estimator.effects))
+        assert flight.truth is not None  # need_truth
         found = alignment_of(flight, odometry)
         tell(flight.name, self._of_truth(flight, found))
         truths = {how: found.applied(flight.truth, how) for how in ALIGN}
@@ -69,7 +84,7 @@ class Judge:
         aligned = {**found.as_dict(), "align": self.align, "words": found.frame_in_words()}
         return replace(score.result(), aligned=aligned | {f"rmse_3d_{how}": one.row()["rmse_3d"] for how, one in scores.items()})
 
-    def _of_truth(self, flight, found):
+    def _of_truth(self, flight: Flight, found: Alignment) -> Iterator[str]:
         """Sentences on the ground truth of a Flight, by its Alignment and by itself."""
         for how, words in (("time", found.of_clock()), ("frame", found.of_frame())):
             if words:
@@ -77,16 +92,19 @@ class Judge:
         for finding in of_truth(flight):
             yield f"{finding.cause}: {finding.evidence}; {finding.remedy}."
 
-    def late_tdoas(self):
+    def late_tdoas(self) -> int:
         """How many TDOAs were late for the odometry that is judged."""
         return late_tdoas(self.odometry, *self._where) if self.odometry else 0
 
     @property
-    def _where(self):
+    def _where(self) -> tuple[str, bool, dict[str, str]]:
         return self.reading.namespace, self.reading.salvage, self.reading.topics
 
 
-def results(judge, recordings, path, asked, jobs=None, dask=None):
+def results(
+    judge: Judge, recordings: Sequence[Recording], path: str | Path | None, asked: dict[str, Any],
+    jobs: int | None = None, dask: str | None = None,
+) -> Iterator[Result]:  # fmt: skip
     """Generator of the Result of each of some recordings, in turn; those that are in the file `path` are not made again.
 
     path : of a ResultsFile, or None to keep none; asked : all that results depend on besides the recording, see there; jobs,
@@ -107,7 +125,7 @@ def results(judge, recordings, path, asked, jobs=None, dask=None):
             yield done.read(key, _sound)
 
 
-def _sound(content):
+def _sound(content: dict[str, Any]) -> Result:
     """The Result of what a file holds, of which all figures can be made."""
     result, pool = Result.from_dict(content), Pool()
     pool.add(result)

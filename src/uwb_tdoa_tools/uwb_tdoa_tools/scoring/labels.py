@@ -1,11 +1,18 @@
 """Labels of anchors in pictures."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
 
 TOGETHER = 0.35  # m; anchors that are nearer to each other in a picture have one label
 
 
-def labels(ids, places):
+def labels(ids: Sequence[int], places: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """Yield (label, (2,) m) of ids at places (n, 2) m; those that would cover each other have one."""
     left = list(range(len(ids)))
     while left:

@@ -1,18 +1,36 @@
 """How far an estimate is from ground truth, and whether its covariance is honest."""
 
+from __future__ import annotations
+
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
+from typing import Any, Protocol, TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.effects.samples import Poses
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 
 from .by_phase import EVERYTHING, Judged, Together
 from .distribution import Distribution
 from .phases import AIRBORNE, TITLES, in_the_air, motion, phases
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from uwb_tdoa_bias.foundation.flight import Truth
+    from uwb_tdoa_ekf.estimator import Residuals
+    from .by_phase import Spans
+
+
+class Estimate(Poses, Protocol):
+    """Poses, and how far to trust them: covariance (n, k, k), its first three rows and columns of the position, m^2."""
+
+    @property
+    def covariance(self) -> np.ndarray: ...
+
 
 ALIGN = "none", "time", "frame"  # what of a ground truth is moved before it judges
 LOST = 1.0  # m; a larger error is no estimate
@@ -24,7 +42,7 @@ FIGURES = 3  # version of what a Result holds
 READY = 100  # TDOAs that a filter may take to begin with
 
 
-def airborne(truth):
+def airborne(truth: Truth) -> tuple[float, float]:
     """(first, last) stamp of the truth, s, with z above 0.3 m. Raises InputError if it never is."""
     found = in_the_air(truth)
     if found is None:
@@ -32,31 +50,32 @@ def airborne(truth):
     return found
 
 
-def judged_part(truth):
+def judged_part(truth: Truth) -> tuple[str, float, float]:
     """(name, first, last) of the phase that the figures of a whole run are of: in the air; moving, where that never is; or all, where
     the tag does not move at all."""
     found = {"in_the_air": in_the_air(truth), "moving": motion(truth), "whole": (truth.t[0], truth.t[-1])}
-    name = next(name for name, span in found.items() if span)
-    return name, *found[name]
+    name, (first, last) = next((name, span) for name, span in found.items() if span)
+    return name, first, last
 
 
-def position_at(t, truth):
+def position_at(t: np.ndarray, truth: Poses) -> np.ndarray:
     """True positions at stamps t (n,), s: (n, 3) m, linear in between."""
     return np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
 
 
-def position_errors(odometry, truth, first, last):
+def position_errors(
+    odometry: Estimate, truth: Truth, first: float, last: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors from `first` to `last`, s, the truth interpolated to the stamps of the estimate, except in holes of it.
 
     Returns (t (n,) s, error (n, 3) m, covariance (n, 3, 3) m^2 of the position).
     """
     chosen = (odometry.t >= first) & (odometry.t <= last) & ~_in_holes(odometry.t, truth.t)
     t = odometry.t[chosen]
-    covariance = getattr(odometry, "covariance", getattr(odometry, "pose_covariance", None))
-    return t, odometry.p[chosen] - position_at(t, truth), covariance[chosen, :3, :3]
+    return t, odometry.p[chosen] - position_at(t, truth), odometry.covariance[chosen, :3, :3]
 
 
-def _in_holes(t, known):
+def _in_holes(t: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Which stamps t (n,) s lie in holes between the stamps `known` (m,), s, of the truth: (n,) bool."""
     if len(known) < 2:
         return np.zeros(len(t), bool)
@@ -64,25 +83,25 @@ def _in_holes(t, known):
     return _holes(known)[k] & (t > known[k]) & (t < known[k + 1])
 
 
-def _holes(known):
+def _holes(known: np.ndarray) -> np.ndarray:
     """After which of the stamps `known` (m,), s, of a truth is a hole: (m - 1,) bool."""
     apart = np.diff(known)
     return apart > max(HOLE, SPARSE * np.median(apart)) if len(apart) else np.zeros(0, bool)
 
 
-def _known_spans(known):
+def _known_spans(known: np.ndarray) -> np.ndarray:
     """(k, 2) s: from where to where the stamps `known` (m,), s, of a truth have no holes."""
     last = np.append(_holes(known), True)
     return np.column_stack([known[np.append(True, last[:-1])], known[last]])
 
 
-def _inside(part, spans):
+def _inside(part: Any, spans: Spans) -> Any:
     """What of a Truth or an Odometry is stamped within spans ((first, last), ...), s."""
     inside = np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0)
     return replace(part, **{name: values[inside] for name, values in vars(part).items()})
 
 
-def nees(error, covariance):
+def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Normalised estimation error squared, e' P^-1 e: (n,), expected 3 for an honest 3D covariance (Bar-Shalom et al.,
     Estimation with Applications to Tracking and Navigation, sec. 5.4)."""
     out = np.full(len(error), np.nan)
@@ -92,13 +111,13 @@ def nees(error, covariance):
     return out
 
 
-def nis(residuals):
+def nis(residuals: Residuals) -> np.ndarray:
     """Normalised innovation squared of every TDOA that reached the filter: (n,), expected 1."""
     reached = (residuals.verdict == USED) | (residuals.verdict == REJECTED)
     return residuals.innovation[reached] ** 2 / residuals.variance[reached]
 
 
-def summary(errors, normalised, innovations):
+def summary(errors: np.ndarray, normalised: np.ndarray, innovations: np.ndarray) -> dict[str, Any]:
     """The figures of one run, or of several pooled: errors (n, 3) m, NEES (n,), NIS (k,). A dict of floats."""
     distance = np.linalg.norm(errors, axis=1)
     finite = np.isfinite(distance)
@@ -112,7 +131,7 @@ def summary(errors, normalised, innovations):
     return out
 
 
-def coverage(error, covariance, sigmas=3.0):
+def coverage(error: np.ndarray, covariance: np.ndarray, sigmas: float = 3.0) -> np.ndarray:
     """Share of errors within `sigmas` predicted standard deviations, per axis: (3,); honest and Gaussian: 0.997."""
     std = np.sqrt(np.einsum("nii->ni", covariance))
     return np.mean(np.abs(error) <= sigmas * std, axis=0) if len(error) else np.full(3, np.nan)
@@ -125,7 +144,10 @@ class Score:
     first, last : s, of that part.
     """
 
-    def __init__(self, name, odometry, truth, residuals=None, heard=None, spans=None, reach=EVERYTHING):
+    def __init__(
+        self, name: str, odometry: Estimate, truth: Truth, residuals: Residuals | None = None,
+        heard: np.ndarray | None = None, spans: Spans | None = None, reach: Spans = EVERYTHING,
+    ) -> None:  # fmt: skip
         """name : of the flight; odometry : Odometry; truth : Truth; residuals : Residuals or None; heard : (n,) s, stamps of the
         TDOAs, or None; spans : ((first, last), ...) s, what of the part counts, None for all; reach : the same of the phases."""
         self.name, self._whole, self._heard, self._reach = name, (odometry, truth), heard, reach
@@ -138,17 +160,17 @@ class Score:
         self.nis = nis(residuals) if residuals is not None else np.empty(0)
 
     @cached_property
-    def judged(self):
+    def judged(self) -> Judged:
         """Judged: the errors of all of the recording."""
         odometry, truth = self._whole
         t, error, covariance = position_errors(odometry, truth, truth.t[0], truth.t[-1])
         return Judged(t, error, covariance, nees(error, covariance), odometry.t, _known_spans(truth.t))
 
-    def phases(self):
+    def phases(self) -> dict[str, dict[str, Any]]:
         """The figures of each phase of this run: {name: dict of `Judged.figures`}."""
         return {name: self.judged.figures(*span, self._reach) for name, span in phases(self._whole[1]).items()}
 
-    def row(self):
+    def row(self) -> dict[str, Any]:
         """The figures of this run, of its part: a dict. "late_start": nothing but that has made it a diverged run; "ready_delay": s
         from the 100th TDOA to the first estimate, below 0 if that came before."""
         out = {"flight": self.name, "part": self.part, **summary(self.error, self.nees, self.nis)}
@@ -159,14 +181,14 @@ class Score:
         out["ready_delay"] = self._ready_delay()
         return {**out, **_named(coverage(self.error, self.covariance))}
 
-    def _ready_delay(self):
+    def _ready_delay(self) -> float:
         """s from the 100th TDOA to the first estimate; NaN where nobody knows the TDOAs, or there are fewer, inf without an estimate."""
         stamps = self._whole[0].t
         if self._heard is None or len(self._heard) < READY:
             return math.nan
         return float(stamps[0] - np.sort(self._heard)[READY - 1]) if len(stamps) else math.inf
 
-    def result(self):
+    def result(self) -> Result:
         """Result: this run as the figures of many need it."""
         distance, count = np.linalg.norm(self.error, axis=1), len(self.t)
         sums = {f"square_{axis}": float(np.sum(self.error[:, k] ** 2)) for k, axis in enumerate("xyz")}
@@ -183,26 +205,26 @@ class Result:
     over its samples}; distributions : {quantity: Distribution}; phases : Score.phases; aligned : where its ground truth is beside the
     estimate, as of `Alignment.as_dict`, and its 3D RMSE with each of ALIGN, m; {} where nobody looked."""
 
-    row: dict
-    sums: dict
-    distributions: dict
-    phases: dict
-    aligned: dict = field(default_factory=dict)
+    row: dict[str, Any]
+    sums: dict[str, float]
+    distributions: dict[str, Distribution]
+    phases: dict[str, dict[str, Any]]
+    aligned: dict[str, Any] = field(default_factory=dict)
 
-    def as_dict(self):
+    def as_dict(self) -> dict[str, Any]:
         """For JSON, without loss."""
         parts = {name: part.as_list() for name, part in self.distributions.items()}
         of_phases = {name: _as_texts(figures) for name, figures in self.phases.items()}
         return {"row": _as_texts(self.row), "sums": _as_texts(self.sums), "distributions": parts, "phases": of_phases, "aligned": as_json(self.aligned)}
 
     @classmethod
-    def from_dict(cls, content):
+    def from_dict(cls, content: dict[str, Any]) -> Result:
         """Of what `as_dict` gives."""
         parts = {name: Distribution.from_list(numbers) for name, numbers in content["distributions"].items()}
         of_phases = {name: _from_texts(figures) for name, figures in content["phases"].items()}
         return cls(_from_texts(content["row"]), _from_texts(content["sums"]), parts, of_phases, content["aligned"])
 
-    def as_json(self):
+    def as_json(self) -> dict[str, Any]:
         """All figures of the run, as JSON takes them."""
         return as_json({**self.row, "phases": self.phases, "aligned": self.aligned})
 
@@ -210,12 +232,16 @@ class Result:
 class Pool:
     """The figures of all samples of several runs together, one run after the other."""
 
-    def __init__(self):
-        self._sums, self._distributions, self._runs, self._total, self._largest = Counter(), {}, 0, 0.0, 0.0
-        self._row = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
-        self._ready, self._phases, self._aligned = math.nan, {}, Counter()
+    def __init__(self) -> None:
+        self._sums: dict[str, Any] = Counter()  # of numbers, not all of them whole
+        self._distributions: dict[str, Distribution] = {}
+        self._runs, self._total, self._largest = 0, 0.0, 0.0
+        self._row: dict[str, Any] = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
+        self._ready = math.nan
+        self._phases: dict[str, Together] = {}
+        self._aligned: dict[str, Any] = Counter()
 
-    def add(self, result):
+    def add(self, result: Result) -> None:
         """Count a Result."""
         row, known = result.row, self._distributions
         self._runs += 1
@@ -234,19 +260,19 @@ class Pool:
             self._phases.setdefault(name, Together()).add(figures)
 
     @property
-    def aligned(self):
+    def aligned(self) -> dict[str, float]:
         """{one of ALIGN: mean 3D RMSE of the runs, m, with that of their ground truth moved}; NaN where it is of another clock."""
         return {how: total / self._runs for how, total in self._aligned.items()}
 
-    def phases(self):
+    def phases(self) -> dict[str, dict[str, Any]]:
         """{name of a phase: dict of `Together.figures`}, of those that any of the runs has."""
         return {name: self._phases[name].figures() for name in TITLES if name in self._phases}
 
-    def figures(self):
+    def figures(self) -> dict[str, Any]:
         """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE, phases. Medians are right to 1 %. Of one run at least."""
         distance, count = self._distributions["distance"], self._distributions["distance"].count
         shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
-        out = {"flight": f"{self._runs} pooled"}
+        out: dict[str, Any] = {"flight": f"{self._runs} pooled"}
         out |= {f"rmse_{name}": math.sqrt(shares[f"square_{name}"]) for name in ("x", "y", "z", "3d")}
         out |= {"median_3d": distance.median, "max_3d": distance.largest if count else math.nan}
         out["frac_gt_1m"] = shares["lost"] if count else 1.0
@@ -258,7 +284,7 @@ class Pool:
         return {**out, "phases": self.phases()}
 
 
-def pooled(scores):
+def pooled(scores: Iterable[Score]) -> dict[str, Any]:
     """The figures of all samples of several Scores together, see Pool: a dict."""
     pool = Pool()
     for score in scores:
@@ -266,30 +292,30 @@ def pooled(scores):
     return pool.figures()
 
 
-def as_json(row):
+def as_json(row: Any) -> Any:
     """JSON has no NaN and no infinity: null; of dicts in it, too."""
     if isinstance(row, dict):
         return {key: as_json(value) for key, value in row.items()}
     return None if isinstance(row, float) and not math.isfinite(row) else row
 
 
-def _as_texts(numbers):
+def _as_texts(numbers: dict[str, Any]) -> dict[str, Any]:
     """Floats as texts: JSON has no NaN."""
     return {key: repr(value) if isinstance(value, float) else value for key, value in numbers.items()}
 
 
-def _from_texts(numbers):
+def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
     """Of what `_as_texts` gives; those that were texts before stay."""
     return {key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value for key, value in numbers.items()}
 
 
-def _named(shares):
+def _named(shares: np.ndarray) -> dict[str, float]:
     return {f"coverage_3sigma_{axis}": float(share) for axis, share in zip("xyz", shares)}
 
 
-def _rms(values):
+def _rms(values: np.ndarray) -> float:
     return _or_nan(lambda v: np.sqrt(np.mean(v**2)), values)
 
 
-def _or_nan(function, values):
+def _or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
     return float(function(values)) if len(values) else float("nan")

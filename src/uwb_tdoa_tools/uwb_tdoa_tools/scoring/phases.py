@@ -19,7 +19,16 @@ from its place; one that gets there within a second began, or ended, in motion, 
 that a recording does not have is not told; one that never moves is `at_rest_before` all the time.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Truth
+
+    Span = tuple[float, float]  # from when to when, s
 
 AIRBORNE = 0.3  # m of z
 RISE = 0.07  # m above its height at rest: away from the floor
@@ -42,18 +51,18 @@ TITLES = {
 NEAR_THE_FLOOR = "at_rest_before", "first_3_s", "last_3_s", "at_rest_after"  # told of each run where several are
 
 
-def in_the_air(truth):
+def in_the_air(truth: Truth) -> Span | None:
     """(first, last) stamp of a Truth, s, with z above 0.3 m; None if there is none."""
     above = np.flatnonzero(truth.p[:, 2] > AIRBORNE)
     return (float(truth.t[above[0]]), float(truth.t[above[-1]])) if len(above) else None
 
 
-def motion(truth):
+def motion(truth: Truth) -> Span | None:
     """(departure, arrival) of a Truth, s, its first and last stamp where it begins or ends in motion; None if it never moves."""
     t, p = truth.t, truth.p
     flies = in_the_air(truth) is not None
 
-    def away(place):
+    def away(place: np.ndarray) -> tuple[np.ndarray, float]:
         """(which poses are away from it; s that they must stay there for a rest)."""
         if flies and place[2] <= AIRBORNE:
             return np.flatnonzero(p[:, 2] - place[2] > RISE), 0.0
@@ -68,12 +77,12 @@ def motion(truth):
     return float(departure), float(max(departure, arrival))
 
 
-def phases(truth):
+def phases(truth: Truth) -> dict[str, Span]:
     """{name: (begin, end) s} of a Truth, in the order of TITLES, those alone that it has."""
     begin, end = float(truth.t[0]), float(truth.t[-1])
     moving, flown = motion(truth), in_the_air(truth)
     if moving is None:
-        found = {"at_rest_before": (begin, end), "in_the_air": flown}
+        found: dict[str, Span | None] = {"at_rest_before": (begin, end), "in_the_air": flown}
     else:
         departure, arrival = moving
         found = {
@@ -88,4 +97,4 @@ def phases(truth):
         if flown is None or departure + ENDS < flown[0] or flown[1] < arrival - ENDS:
             found["moving"] = moving
     found["whole"] = begin, end
-    return {name: found[name] for name in TITLES if found.get(name) and found[name][1] > found[name][0]}
+    return {name: span for name in TITLES if (span := found.get(name)) and span[1] > span[0]}

@@ -1,5 +1,9 @@
 """Pictures. Importing this chooses a drawing backend that needs no screen."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import matplotlib
 
 matplotlib.use("Agg")
@@ -9,13 +13,18 @@ import numpy as np  # noqa: E402
 from .metrics import position_at  # noqa: E402
 from .phases import TITLES  # noqa: E402
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from uwb_tdoa_bias.foundation.flight import Flight, Truth
+    from .metrics import Estimate, Score
 
 SHADES = {  # of phases that follow one another
     "at_rest_earlier": "0.9", "at_rest_before": "tab:gray", "first_3_s": "tab:green", "last_3_s": "tab:orange", "at_rest_after": "tab:gray",
 }  # fmt: skip
 
 
-def plot_error(score, odometry, truth, path, title=None):
+def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path, title: str | None = None) -> None:
     """Error per axis with its 3-sigma band over all of the recording, its phases shaded, and the path from above and from the side,
     to an image file."""
     figure, axes = plt.subplots(3, 2, figsize=(13, 8), width_ratios=(3, 2), layout="constrained")
@@ -49,8 +58,9 @@ def plot_error(score, odometry, truth, path, title=None):
     plt.close(figure)
 
 
-def plot_comparison(flight, scores, path):
+def plot_comparison(flight: Flight, scores: Sequence[Score], path: str | Path) -> None:
     """3D error of several Scores of one Flight over time, and the paths they tell from above; to an image file."""
+    assert flight.truth is not None
     figure, (over_time, above) = plt.subplots(1, 2, figsize=(13, 5), width_ratios=(3, 2), layout="constrained")
     flown = (flight.truth.t >= scores[0].first) & (flight.truth.t <= scores[0].last)
     above.plot(*flight.truth.p[flown, :2].T, "k", lw=1.2, label="ground truth")

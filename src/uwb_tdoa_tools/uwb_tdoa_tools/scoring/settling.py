@@ -4,7 +4,10 @@ Whatever a ground truth has wrong, clock or frame, is its own: it is moved, whic
 nothing of that goes into effects, which nodes take.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EffectSet
 
@@ -13,30 +16,40 @@ from ..localizing.estimate import Estimator
 from ..readers.inputs import tell
 from .alignment import FRAME, NONE, TIME, alignment_of, apart, need_truth, on_another_clock, paths
 
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from .alignment import Alignment
+
 AS_WELL = 1.5  # times the distance that another frame leaves, which wrong ids and signs may leave to explain as much
 
 
-def settled(flight, effects=None, config=None, align=NONE):
+def settled(
+    flight: Flight, effects: EffectSet | None = None, config: FilterConfig | None = None, align: str = NONE
+) -> tuple[Flight, tuple[str, ...]]:
     """(Flight, sentences): its ground truth on the clock and in the frame of its TDOAs, where it was plainly not, and what was found.
 
     flight : Flight with ground truth; effects : EffectSet that is in the model, or None; config : FilterConfig; align : of ALIGN: with
     "none" a ground truth on another clock is refused. Raises InputError.
     """
     need_truth(flight, align == NONE)
+    assert flight.truth is not None
     effects = effects or EffectSet()
     found = _alignment(flight, effects, config)
     said = [f"{words}: it is moved to judge by, and nothing of that goes to the nodes" for words in (found.of_clock(), found.of_frame()) if words]
     return replace(flight, truth=found.least().applied(flight.truth, FRAME if found.other_frame else TIME)), tuple(said)
 
 
-def told(flight, effects=None, config=None, align=NONE):
+def told(
+    flight: Flight, effects: EffectSet | None = None, config: FilterConfig | None = None, align: str = NONE
+) -> Flight:
     """The Flight of `settled`; what was found is told on stderr. Can be handed to other processes."""
     flight, said = settled(flight, effects, config, align)
     tell(flight.name, (f"{sentence}." for sentence in said))
     return flight
 
 
-def on_one_clock(flight, align=NONE):
+def on_one_clock(flight: Flight, align: str = NONE) -> Flight:
     """The Flight with its ground truth, if it has one, on the clock of the TDOAs. align : of ALIGN: with "none" one on another clock is
     refused. Raises InputError."""
     if flight.truth is None or len(flight.truth) < 2 or not on_another_clock(flight):
@@ -47,9 +60,10 @@ def on_one_clock(flight, align=NONE):
     return replace(flight, truth=found.applied(flight.truth, TIME))
 
 
-def _alignment(flight, effects, config):
+def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) -> Alignment:
     """Alignment of a Flight, or, where wrong ids and signs explain another frame as well, the one without these."""
     straight, odometry = effects.correct_streams(flight), Estimator(config, effects)(flight).odometry
+    assert straight.truth is not None
     found = alignment_of(straight, odometry)
     repair = EffectSet(repairs(replace(straight, truth=found.applied(straight.truth, TIME)))) if found.other_frame else EffectSet()
     if not len(repair):
