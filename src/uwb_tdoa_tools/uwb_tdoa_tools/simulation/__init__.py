@@ -4,6 +4,10 @@
     flight = simulate(SimulationConfig(trajectory="circle", protocol="tdoa3", seed=3))
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
@@ -13,10 +17,13 @@ from .config import SimulationConfig
 from .imu import NO_IMU_ERRORS, ImuErrors
 from .trajectories import Trajectory
 
+if TYPE_CHECKING:
+    from .trajectories import Flyable
+
 __all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
 
 
-def simulate(config, trajectory=None):
+def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Flight:
     """Fly `config`, a SimulationConfig, and return the Flight. Raises InputError where it does not fit together.
 
     trajectory : what has motion(t) and motors(t) of a Trajectory, to fly instead of the config's own.
@@ -27,18 +34,19 @@ def simulate(config, trajectory=None):
     meta : source, format, protocol, config, and under "parameters" the constants that the errors were made with.
     """
     filled, room = config.complete()
-    trajectory = trajectory or Trajectory(filled, room, filled.random("trajectory"))
+    assert filled.anchors is not None
+    flown: Flyable = trajectory or Trajectory(filled, room, filled.random("trajectory"))
     t_imu = np.arange(1, int(filled.duration * filled.imu_rate) + 1) / filled.imu_rate
-    samples, gyro_bias, accel_bias = imu.measure(t_imu, trajectory, filled.imu_errors, filled.random)
+    samples, gyro_bias, accel_bias = imu.measure(t_imu, flown, filled.imu_errors, filled.random)
     t_truth = np.arange(1, int(filled.duration * filled.truth_rate) + 1) / filled.truth_rate
-    motion = trajectory.motion(t_truth)
-    tdoa, tdoa_truth, parameters = ranging.measure(filled, room, trajectory)
+    motion = flown.motion(t_truth)
+    tdoa, tdoa_truth, parameters = ranging.measure(filled, room, flown)
 
     newest = np.maximum(np.searchsorted(t_imu, t_truth + 1e-9) - 1, 0)
     state = {"t": t_truth}
     for name, values in (("v", motion.v), ("gyro_bias_", gyro_bias[newest]), ("accel_bias_", accel_bias[newest])):
         state.update({name + axis: values[:, k] for k, axis in enumerate("xyz")})
-    parameters |= {name: getattr(trajectory, name, None) for name in ("take_off", "landing")}
+    parameters |= {name: getattr(flown, name, None) for name in ("take_off", "landing")}
     room_name = config.constellation if config.anchors is None else "anchors"
     return Flight(
         name=f"sim-{config.trajectory}-{config.protocol}-{room_name}-{config.seed}",
@@ -54,5 +62,5 @@ def simulate(config, trajectory=None):
             "config": filled.as_dict(),
             "parameters": parameters,
         },
-        **aids.measure(filled, room, trajectory),
+        **aids.measure(filled, room, flown),
     )

@@ -1,12 +1,22 @@
 """What the SENSORS beside inertia and TDOAs say: what is true, and white noise."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.sensors import Stream
+    from .config import SimulationConfig
+    from .room import Room
+    from .trajectories import Flyable
 
-def measure(config, room, trajectory):
+
+def measure(config: SimulationConfig, room: Room, trajectory: Flyable) -> dict[str, Stream]:
     """{name: Stream} of those that the SimulationConfig, from complete(), has a noise for."""
     out = {}
     for name, sensor in SENSORS.items():

@@ -1,6 +1,9 @@
 """What a simulated flight is: one frozen dataclass."""
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass, field, make_dataclass, replace
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -14,12 +17,17 @@ from .room import room_of
 from .schedule import PROTOCOLS
 from .trajectories import TRAJECTORIES
 
+if TYPE_CHECKING:
+    from .room import Room
+
 MOST_HEARD = 64  # anchors that a tag hears at once
 YAW_PROFILES = ("fixed", "along_track", "rotating")
 
 
 NOISES = tuple(f"{name}_noise" for name in SENSORS)
-_Noises = make_dataclass("_Noises", [(name, float | None, None) for name in NOISES], frozen=True)
+_Noises: Any = make_dataclass(  # the names of its attributes are those of SENSORS
+    "_Noises", [(name, float | None, None) for name in NOISES], frozen=True
+)
 
 
 @dataclass(frozen=True)
@@ -78,7 +86,7 @@ class SimulationConfig(_Noises):
     trajectory: str = "sines"
     duration: float = 60.0
     speed: float = 1.0
-    place: tuple | None = None
+    place: tuple[float, float] | None = None
     height: float | None = None
     radius: float | None = None
     yaw: str = "fixed"
@@ -92,16 +100,16 @@ class SimulationConfig(_Noises):
     protocol: str = "tdoa2"
     radio_reach: float | None = None
     noise_std: float = 0.06
-    anchor_noise_std: tuple | None = None
+    anchor_noise_std: tuple[float, ...] | None = None
     shared_noise: bool = False
     bias: bool = True
     anchor_delay_std: float = 0.05
     tag_unit: int = 0
-    tag_lever_arm: tuple = (0.0, 0.0, 0.0)
+    tag_lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     multipath: bool = True
     outlier_probability: float = 0.01
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, choices in (("trajectory", TRAJECTORIES), ("yaw", YAW_PROFILES), ("protocol", PROTOCOLS)):
             if getattr(self, name) not in choices:
                 raise InputError(f"{name}: {getattr(self, name)!r} is not known; choose {', '.join(choices)}.")
@@ -133,7 +141,7 @@ class SimulationConfig(_Noises):
             if value is not None and not (np.shape(value) == (length,) and np.isfinite(value).all()):
                 raise InputError(f"{name}: {value!r} is not {length} finite numbers of metres.")
 
-    def complete(self):
+    def complete(self) -> tuple[SimulationConfig, Room]:
         """(config, Room): this config with anchors, place, height, radius and anchor_noise_std filled in."""
         anchors = self.anchors if self.anchors is not None else constellation(self.constellation)
         if len(anchors) < 2:
@@ -147,15 +155,16 @@ class SimulationConfig(_Noises):
             raise InputError(
                 f"anchors: anchor {lost} has no orientation, on which its bias depends; add it or switch bias off."
             )
-        std = self.anchor_noise_std
-        std = np.full(len(anchors), self.noise_std / np.sqrt(2.0)) if std is None else np.asarray(std, dtype=float)
+        given = self.anchor_noise_std
+        std = np.full(len(anchors), self.noise_std / np.sqrt(2.0)) if given is None else np.asarray(given, dtype=float)
         if std.shape != (len(anchors),) or not (np.isfinite(std).all() and (std >= 0.0).all()):
             raise InputError(
                 f"anchor_noise_std: {self.anchor_noise_std!r} is not {len(anchors)} numbers of at least 0, in metres."
             )
         room = room_of(anchors)
         low, high = room.flyable
-        place = tuple(float(v) for v in (room.centre[:2] if self.place is None else self.place))
+        x, y = room.centre[:2] if self.place is None else self.place
+        place = float(x), float(y)
         reach = min(np.min(high[:2] - place), np.min(np.asarray(place) - low[:2]))
         filled = replace(
             self,
@@ -167,11 +176,11 @@ class SimulationConfig(_Noises):
         )
         return filled, room
 
-    def random(self, part):
+    def random(self, part: str) -> np.random.Generator:
         """The numpy Generator of the named part of the simulation."""
         return np.random.default_rng([self.seed, *part.encode()])
 
-    def as_dict(self):
+    def as_dict(self) -> dict[str, Any]:
         """Plain numbers, strings and lists, for Flight.meta and JSON; the anchors by their ids."""
         content = asdict(replace(self, anchors=None))
         content["anchors"] = None if self.anchors is None else self.anchors.ids.tolist()

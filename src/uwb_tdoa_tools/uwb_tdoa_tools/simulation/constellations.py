@@ -1,6 +1,9 @@
 """Named anchor constellations for simulated flights, and seeded random ones."""
 
+from __future__ import annotations
+
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -8,10 +11,13 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 LOW = 0.18  # m, height of an anchor on its stand on the floor
 
 
-def facing(positions, target, level=True, inverted=None):
+def facing(positions: ArrayLike, target: ArrayLike, level: bool = True, inverted: ArrayLike | None = None) -> Anchors:
     """Anchors whose front (antenna x) faces a point.
 
     positions (N, 3) and target (3,), metres. level: turn about the vertical only, so that the antenna axis (z) stays
@@ -32,7 +38,7 @@ def facing(positions, target, level=True, inverted=None):
     return Anchors(np.arange(len(positions)), positions, Rotation.from_matrix(axes).as_quat())
 
 
-def corners(x=7.0, y=8.0, z=3.0, level=True):
+def corners(x: float = 7.0, y: float = 8.0, z: float = 3.0, level: bool = True) -> Anchors:
     """A low and a high anchor in each corner of x by y by z metres, in the order of the Toronto surveys: neighbours in
     the TDOA2 ring lie far apart, 4 stand on the floor and 4 hang upside down under the ceiling."""
     a, b = 0.5 * x, 0.5 * y
@@ -42,7 +48,7 @@ def corners(x=7.0, y=8.0, z=3.0, level=True):
     return facing(positions, (0.0, 0.0, 0.5 * z), level, np.array(positions)[:, 2] > 0.5 * z)
 
 
-def wall_middles():
+def wall_middles() -> Anchors:
     """Four low ones at the middles of the walls, four high ones in the corners, 7 x 8 x 3 m."""
     positions = [
         (-3.5, 0, LOW), (3.5, 4, 3), (0, -4, LOW), (-3.5, 4, 3), (3.5, 0, LOW), (-3.5, -4, 3), (0, 4, LOW), (3.5, -4, 3)
@@ -50,28 +56,28 @@ def wall_middles():
     return facing(positions, (0.0, 0.0, 1.5), inverted=np.array(positions)[:, 2] > 1.5)
 
 
-def staircase():
+def staircase() -> Anchors:
     """Eight around the walls of 7 x 8 x 3 m, each higher than the one before, all upright."""
     x = [-3.5, 0.0, 3.5, 3.5, 3.5, 0.0, -3.5, -3.5]
     y = [-4.0, -4.0, -4.0, 0.0, 4.0, 4.0, 4.0, 0.0]
     return facing(np.column_stack([x, y, np.linspace(LOW, 3.0, 8)[[0, 4, 1, 5, 2, 6, 3, 7]]]), (0.0, 0.0, 1.5))
 
 
-def pillars():
+def pillars() -> Anchors:
     """Three heights on each of four pillars that stand inside 7 x 8 x 3 m: 12 anchors."""
     feet = [(-2.8, -2.6), (2.5, -3.2), (2.9, 2.7), (-2.4, 3.3)]
     positions = [(x, y, z) for z in (0.3, 1.6, 2.9) for x, y in feet]
     return facing(positions, (0.0, 0.0, 1.5), inverted=np.array(positions)[:, 2] > 2.0)
 
 
-def six():
+def six() -> Anchors:
     """Six anchors, three low and three high, on two opposite triangles in 6 x 6 x 2.8 m."""
     angle = np.deg2rad([90, 270, 210, 30, 330, 150])
     z = np.array([LOW, 2.8, LOW, 2.8, LOW, 2.8])
     return facing(np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), z]), (0.0, 0.0, 1.4), inverted=z > 1)
 
 
-def hall():
+def hall() -> Anchors:
     """Sixteen along the walls of a hall of 14 x 20 x 5 m, low and high in turn."""
     rim = [(-7, -10), (-7, -5), (-7, 0), (-7, 5), (-7, 10), (-3.5, 10), (0, 10), (3.5, 10)]
     rim += [(-x, -y) for x, y in rim]
@@ -79,18 +85,18 @@ def hall():
     return facing(np.column_stack([rim, z]), (0.0, 0.0, 2.5), inverted=z > 1)
 
 
-def planar():
+def planar() -> Anchors:
     """Four at the corners of 4 x 4 m, 0.2 m high, facing the centre: Grasso et al. (Sensors 2022), section 2.1."""
     return facing([(-2, -2, 0.2), (2, -2, 0.2), (2, 2, 0.2), (-2, 2, 0.2)], (0.0, 0.0, 0.2))
 
 
-def pair():
+def pair() -> Anchors:
     """Two anchors 4.5 m apart at 1.25 m, facing each other, with the default hovering place half-way between them: the
     bench of Zhao et al. (RA-L 2021), figure 4."""
     return facing([(-2.25, 0, 1.25), (2.25, 0, 1.25)], (0.0, 0.0, 1.25))
 
 
-def random(seed, count=8):
+def random(seed: int, count: int = 8) -> Anchors:
     """Seeded: `count` anchors (4 to 64) on the walls of a seeded room of 5 - 9 x 5 - 9 x 2.5 - 3.5 m, low ones and high
     ones in turn, at least 0.5 m apart, facing the centre to within some 20 degrees."""
     if not 4 <= count <= 64:
@@ -126,7 +132,7 @@ CONSTELLATIONS = {
 }
 
 
-def constellation(name):
+def constellation(name: str) -> Anchors:
     """Anchors of a named constellation, or of `random-SEED` or `random-SEED-COUNT`; raises InputError."""
     if name in CONSTELLATIONS:
         return CONSTELLATIONS[name]()

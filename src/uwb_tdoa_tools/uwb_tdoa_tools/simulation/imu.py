@@ -1,11 +1,18 @@
 """The inertial sensor: exact specific force and body rates, and the errors that are added to them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from .trajectories import Flyable
 
 
 @dataclass(frozen=True)
@@ -34,7 +41,7 @@ class ImuErrors:
     accel_bias: float = 5e-2
     vibration: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"imu_errors: {name}: {value!r} is not a finite number of at least 0.")
@@ -43,7 +50,9 @@ class ImuErrors:
 NO_IMU_ERRORS = ImuErrors(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def measure(t, trajectory, errors, random):
+def measure(
+    t: np.ndarray, trajectory: Flyable, errors: ImuErrors, random: Callable[[str], np.random.Generator]
+) -> tuple[Imu, np.ndarray, np.ndarray]:
     """What the sensor reports at the stamps t, (n,) s, equally spaced.
 
     random(part) gives the numpy Generator of a part. Returns (Imu, gyro bias (n, 3) rad/s, accel bias (n, 3) m/s^2).
@@ -52,7 +61,7 @@ def measure(t, trajectory, errors, random):
     n, dt = len(t), t[1] - t[0]
     motion = trajectory.motion(t)
 
-    def bias_of(part, initial, walk):
+    def bias_of(part: str, initial: float, walk: float) -> np.ndarray:
         rng = random(part)
         start = initial * rng.standard_normal(3)
         steps = walk * np.sqrt(dt) * rng.standard_normal((n, 3))

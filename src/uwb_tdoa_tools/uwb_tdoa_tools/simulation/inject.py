@@ -1,6 +1,9 @@
 """Declared effects put into flights."""
 
+from __future__ import annotations
+
 import re
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -9,12 +12,20 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.bag import check_output, write_bag
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from uwb_tdoa_bias.effects.base import Effect
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from ..readers.inputs import Reading
+
 _ANCHORS = re.compile(r"(\d+)(?:-(\d+))?(?:\..+)?")  # of which a parameter is: 3, 3-5, 3.x
 
 
-def parse_effect(name, values):
+def parse_effect(name: str, values: Sequence[str]) -> Effect:
     """The Effect `name` with `values`, a list of texts "KEY=NUMBER", "KEY:NUMBER" or "NUMBER". Raises InputError."""
-    kind, parameters = EFFECTS[name], {}
+    kind = EFFECTS[name]
+    parameters: dict[str, Any] = {}  # texts, of which the Effect makes numbers
     for text in ",".join(values).split(","):
         key, found, number = text.replace(":", "=").strip().rpartition("=")
         key = key.strip() if found else kind.example
@@ -24,7 +35,10 @@ def parse_effect(name, values):
     return kind(parameters, source="injected")
 
 
-def inject(effect, recording, reading, out, seed=0, storage="mcap", force=False):
+def inject(
+    effect: Effect, recording: str | Path, reading: Reading, out: str | Path, seed: int = 0, storage: str = "mcap",
+    force: bool = False,
+) -> str:  # fmt: skip
     """Write the flight that would have been recorded with an Effect as a bag. Returns the name of the flight.
 
     recording, reading : a path, and a Reading to read it; seed : of effects that are random. Raises InputError.
@@ -36,7 +50,7 @@ def inject(effect, recording, reading, out, seed=0, storage="mcap", force=False)
     return flight.name
 
 
-def _check_anchors(effect, flight):
+def _check_anchors(effect: Effect, flight: Flight) -> None:
     """Raise InputError if the Effect has a parameter of an anchor that the Flight does not have."""
     for key in effect.values if "tdoa" in effect.channels else ():
         named = _ANCHORS.fullmatch(key)
@@ -48,7 +62,7 @@ def _check_anchors(effect, flight):
                 )
 
 
-def catalogue():
+def catalogue() -> str:
     """All effects with a parameter, the unit and the physics of each: text."""
     lines = [f"{name:20s} e.g. {e.example}=NUMBER ({e.unit}): {e.physics}" for name, e in EFFECTS.items()]
     return "\n".join(lines)

@@ -1,20 +1,29 @@
 """Pictures of simulated flights."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+if TYPE_CHECKING:
+    from pathlib import Path
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 SUFFIXES = (".png", ".pdf", ".svg")
 
 
-def check_image(path):
+def check_image(path: Path | None) -> None:
     """Raises InputError for a path that is no image file; None is none."""
     if path is not None and path.suffix.lower() not in SUFFIXES:
         raise InputError(f"plot: {path} is no image file; choose one of {', '.join(SUFFIXES)}.")
 
 
-def plot(flight, path):
+def plot(flight: Flight, path: str | Path) -> None:
     """Draw path and anchors from above, height, and the bias and full error of the TDOAs, to an image file."""
+    assert flight.truth is not None
     from matplotlib.figure import Figure  # takes a second to import
 
     parts, truth, tdoa = flight.extra["tdoa_truth"], flight.truth, flight.tdoa

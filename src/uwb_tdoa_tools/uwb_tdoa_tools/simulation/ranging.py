@@ -1,5 +1,9 @@
 """The TDOA measurements: geometry, and the errors of the two arrival times that each is made of."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -11,6 +15,12 @@ from uwb_tdoa_bias.foundation.radio import FLAT_MOUNT, RadioLink, arrival_bias
 
 from .schedule import make_schedule, within_reach
 
+if TYPE_CHECKING:
+    from .config import SimulationConfig
+    from .room import Room
+    from .schedule import Schedule
+    from .trajectories import Flyable
+
 UNIT_GAIN_SPREAD = 0.7  # dB, tag to tag
 UNIT_MOUNT_SPREAD = np.deg2rad(2.0)  # rad, tag to tag
 MULTIPATH_HEIGHT = (0.1, 0.4)  # m, full strength below the first, none above the second
@@ -21,7 +31,7 @@ MULTIPATH_TIME = 0.5  # s, correlation time
 OUTLIER_KINDS = ((0.6, 0.4, 0.6), (0.3, 3.0, 5.0), (0.1, 20.0, 250.0))
 
 
-def tag_link(unit):
+def tag_link(unit: int) -> RadioLink:
     """The RadioLink of specimen `unit` of the tag: 0 is nominal, others differ a little in gain and mounting."""
     if unit == 0:
         return RadioLink()
@@ -32,7 +42,9 @@ def tag_link(unit):
     return RadioLink(tag_antenna=Antenna(gain_offset=gain), tag_mount=mount)
 
 
-def measure(config, room, trajectory):
+def measure(
+    config: SimulationConfig, room: Room, trajectory: Flyable
+) -> tuple[Tdoas, dict[str, np.ndarray], dict[str, Any]]:
     """All TDOAs of a flight: (Tdoas, truth, parameters). config as from SimulationConfig.complete().
 
     d_ab = (rho_b + e_b) - (rho_a + e_a) + outlier, where e, the error of one arrival, is bias + multipath + noise. Both
@@ -40,6 +52,7 @@ def measure(config, room, trajectory):
     truth : dict of "t" and the (n,) parts of each d besides the geometry: "bias", "multipath", "noise", "outlier", m.
     parameters : the constants that the errors were made with.
     """
+    assert config.anchors is not None  # complete
     anchors, random = config.anchors, config.random
     schedule = make_schedule(config.protocol, len(anchors), config.duration, random("schedule"))
     if config.radio_reach is not None:
@@ -81,7 +94,7 @@ def measure(config, room, trajectory):
     return Tdoas(t, anchors.ids[a], anchors.ids[b], d), truth, parameters
 
 
-def tdoa_noise(schedule, anchor_std, shared, rng):
+def tdoa_noise(schedule: Schedule, anchor_std: np.ndarray, shared: bool, rng: np.random.Generator) -> np.ndarray:
     """White noise of every measurement, (n,) m. shared: the difference of the noises of its two receptions, so that two
     TDOAs with the reception of anchor j in common have the covariance -std_j^2 (Grasso et al. 2022, eqs. 4 - 5)."""
     if shared:
@@ -90,7 +103,7 @@ def tdoa_noise(schedule, anchor_std, shared, rng):
     return np.hypot(anchor_std[schedule.a], anchor_std[schedule.b]) * rng.standard_normal(len(schedule.t))
 
 
-def outliers(n, probability, rng):
+def outliers(n: int, probability: float, rng: np.random.Generator) -> np.ndarray:
     """(n,) m, zero but for the given share."""
     share, smallest, largest = np.array(OUTLIER_KINDS).T
     hit = rng.random(n) < probability
@@ -99,7 +112,9 @@ def outliers(n, probability, rng):
     return np.where(hit, np.copysign(size, rng.uniform(-1.0, 1.0, n)), 0.0)
 
 
-def floor_multipath(t, height, duration, n_anchors, rng):
+def floor_multipath(
+    t: np.ndarray, height: np.ndarray, duration: float, n_anchors: int, rng: np.random.Generator
+) -> np.ndarray:
     """Delay of every anchor's signal by reflection near the floor, (n, n_anchors) m, never negative.
 
     t : (n,) s in 0 ... duration; height : (n,) m of the tag above the floor. Own model: the positive part of a Gaussian

@@ -1,8 +1,14 @@
 """The room a flight takes place in: what the anchors span, and the part of it that is comfortable to fly in."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
 CLEARANCE = 0.8  # m from the walls
 FLOOR_CLEARANCE = 0.6  # m from floor and ceiling
@@ -17,18 +23,18 @@ class Room:
     upper: np.ndarray
 
     @property
-    def centre(self):
+    def centre(self) -> np.ndarray:
         """(3,) metres."""
         return 0.5 * (self.lower + self.upper)
 
     @property
-    def flyable(self):
+    def flyable(self) -> tuple[np.ndarray, np.ndarray]:
         """The box that paths are sized to by default, (lower, upper), each (3,) metres: the room less a clearance."""
         margin = np.minimum([CLEARANCE, CLEARANCE, FLOOR_CLEARANCE], 0.25 * (self.upper - self.lower))
         return self.lower + margin, self.upper - margin
 
 
-def room_of(anchors):
+def room_of(anchors: Anchors) -> Room:
     """The room that Anchors stand in: the box around them, at least 4 x 4 x 2.5 m, floor at 0 or the lowest anchor."""
     lowest, highest = anchors.positions.min(axis=0), anchors.positions.max(axis=0)
     middle, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 2.0)

@@ -1,5 +1,7 @@
 """Who is heard when: the TDOA2 and TDOA3 schedules of the Loco Positioning System."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +35,9 @@ class Schedule:
     sender: np.ndarray
 
 
-def make_schedule(protocol, n_anchors, duration, rng, rate=None):
+def make_schedule(
+    protocol: str, n_anchors: int, duration: float, rng: np.random.Generator, rate: float | None = None
+) -> Schedule:
     """The Schedule of `protocol` ("tdoa2" or "tdoa3") over 0 ... duration, s, for n_anchors (at least 2) anchors. rate : TDOAs per
     second, which losses (tdoa2) or waits (tdoa3) are for; default: what these give."""
     if protocol == "tdoa2":
@@ -41,7 +45,9 @@ def make_schedule(protocol, n_anchors, duration, rng, rate=None):
     return _tdoa3(n_anchors, duration, rng, TDOA3_MEAN_WAIT if rate is None else max(1.0 / rate - TDOA3_DEAD_TIME, 0.0))
 
 
-def within_reach(schedule, p, positions, reach, protocol, rng):
+def within_reach(
+    schedule: Schedule, p: np.ndarray, positions: np.ndarray, reach: float, protocol: str, rng: np.random.Generator
+) -> Schedule:
     """The Schedule among anchors of which the tag hears those that are within reach, m; p (n, 3) m, of the tag at each measurement;
     positions (N, 3) m, of the anchors. Where it hears fewer than two there is nothing.
 
@@ -49,9 +55,10 @@ def within_reach(schedule, p, positions, reach, protocol, rng):
     TDOA3: any two of those that are heard.
     """
     rows, pairs, numbers = [], [], []  # of measurements, (a, b) and their receptions
-    senders, latest = [], {}  # row of the anchor of each reception, and the latest of each anchor
+    senders: list[int] = []  # row of the anchor of each reception
+    latest: dict[int, int] = {}  # the latest reception of each anchor
 
-    def receive(anchor):
+    def receive(anchor: int) -> None:
         latest[anchor] = len(senders)
         senders.append(anchor)
 
@@ -74,11 +81,12 @@ def within_reach(schedule, p, positions, reach, protocol, rng):
         rows.append(row)
         pairs.append((a, b))
         numbers.append((of_a, latest[b]))
-    (a, b), (heard_a, heard_b) = (np.array(each, int).reshape(-1, 2).T for each in (pairs, numbers))
-    return replace(schedule, t=schedule.t[rows], a=a, b=b, heard_a=heard_a, heard_b=heard_b, sender=np.array(senders, int))
+    (rows_a, rows_b), (heard_a, heard_b) = (np.array(each, int).reshape(-1, 2).T for each in (pairs, numbers))
+    sender = np.array(senders, int)
+    return replace(schedule, t=schedule.t[rows], a=rows_a, b=rows_b, heard_a=heard_a, heard_b=heard_b, sender=sender)
 
 
-def _tdoa2(n_anchors, duration, rng, loss):
+def _tdoa2(n_anchors: int, duration: float, rng: np.random.Generator, loss: float) -> Schedule:
     """A ring: anchors send in turn, and every packet is compared with the one of the slot before."""
     n = max(int(duration / SLOT), 2)
     sender = np.arange(n) % n_anchors
@@ -89,13 +97,13 @@ def _tdoa2(n_anchors, duration, rng, loss):
     return Schedule(t[k], sender[k - 1], sender[k], k - 1, k, sender)
 
 
-def _tdoa3(n_anchors, duration, rng, wait):
+def _tdoa3(n_anchors: int, duration: float, rng: np.random.Generator, wait: float) -> Schedule:
     """Any order: a packet of a random anchor is compared with the newest packet of a random other one."""
     n = int(1.3 * duration / (TDOA3_DEAD_TIME + wait)) + 50
     t = np.cumsum(TDOA3_DEAD_TIME + rng.exponential(wait, n))
     b = rng.integers(0, n_anchors, n)
     a = (b + rng.integers(1, n_anchors, n)) % n_anchors
-    n = np.searchsorted(t, duration)
+    n = int(np.searchsorted(t, duration))
     t, a, b = t[:n], a[:n], b[:n]
     sender = np.concatenate([np.arange(n_anchors), b])  # everyone was heard once before the first measurement
     heard_b = n_anchors + np.arange(n)

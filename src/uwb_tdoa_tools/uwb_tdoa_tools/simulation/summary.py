@@ -1,16 +1,23 @@
 """What a simulated flight holds, and what can be simulated, in words and figures."""
 
+from __future__ import annotations
+
 import inspect
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from .constellations import CONSTELLATIONS, constellation
 from .trajectories import TRAJECTORIES
 
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Flight
 
-def summary(flight):
+
+def summary(flight: Flight) -> dict[str, Any]:
     """Plain values for JSON: name, counts, sizes of the parts of the TDOA errors (m), configuration, true
     parameters."""
+    assert flight.imu is not None and flight.truth is not None
     parts = flight.extra["tdoa_truth"]
     return {
         "flight": flight.name,
@@ -24,11 +31,12 @@ def summary(flight):
     }
 
 
-def catalogue():
+def catalogue() -> str:
     """All trajectories and constellations with a line on each, text."""
     lines = ["trajectories:"]
     for name, family in TRAJECTORIES.items():
-        text = "Stay at the place, the yaw rotating." if name == "spin" else inspect.getdoc(family).splitlines()[0]
+        described = (inspect.getdoc(family) or name).splitlines()[0]
+        text = "Stay at the place, the yaw rotating." if name == "spin" else described
         lines.append(f"  {name:<14} {text}")
     lines.append("constellations:")
     for name in CONSTELLATIONS:

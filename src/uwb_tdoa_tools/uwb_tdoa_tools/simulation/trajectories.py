@@ -4,7 +4,10 @@ A family gives positions over "path time" s, which runs with the clock at cruise
 up, slowing down and landing, and fits one spline through it all, whose derivatives are then exact.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Protocol, TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -14,6 +17,12 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .room import REST_HEIGHT
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from numpy.typing import ArrayLike
+    from .config import SimulationConfig
+    from .room import Room
 
 GRAVITY = 9.81  # m/s^2
 DRAG = 0.2  # 1/s, rotor drag per mass: without it the lateral accelerometers would never feel anything
@@ -28,8 +37,9 @@ STEP = Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])  # 0 to 1 with four
 _RAMP = STEP.integ()
 
 
-def circle(s, config, room, rng):
+def circle(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
     """A level circle around the place, radius and speed as configured."""
+    assert config.radius is not None and config.place is not None and config.height is not None  # complete
     angle = config.speed * s / config.radius
     return np.column_stack(
         [
@@ -40,8 +50,9 @@ def circle(s, config, room, rng):
     )
 
 
-def rising_circle(s, config, room, rng):
+def rising_circle(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
     """The circle with a height that rises and falls in a sine, up to 0.6 m, 0.7 times per turn."""
+    assert config.height is not None and config.radius is not None  # complete
     p = circle(s, config, room, rng)
     low, high = room.flyable
     swing = np.clip(min(high[2] - config.height, config.height - low[2]), 0.0, 0.6)
@@ -49,7 +60,7 @@ def rising_circle(s, config, room, rng):
     return p
 
 
-def sines(s, config, room, rng):
+def sines(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Products of two sines per axis, of seeded amplitude, period and phase, through the flyable room.
 
     Source: the training trajectories of Zhao et al. (RA-L 2021), section V-B. `speed` is the root mean square here.
@@ -59,7 +70,7 @@ def sines(s, config, room, rng):
     rate = 2.0 * np.pi / rng.uniform([[8.0], [13.0]], [[13.0], [24.0]], (2, 3))
     phase = rng.uniform(0.0, 2.0 * np.pi, (2, 3))
 
-    def position(u):
+    def position(u: np.ndarray) -> np.ndarray:
         return 0.5 * (low + high) + reach * np.prod(np.sin(rate * u[:, None, None] + phase), axis=1)
 
     u = np.linspace(0.0, 240.0, 4801)
@@ -67,23 +78,25 @@ def sines(s, config, room, rng):
     return position(s * config.speed / np.sqrt(np.mean(np.sum(pace**2, axis=1))))
 
 
-def square(s, config, room, rng):
+def square(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
     """A level square around the place, its edges `radius` away from it, at constant speed, with rounded corners."""
+    assert config.radius is not None  # complete
     return _laps(s, config, [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], config.radius)
 
 
-def line_x(s, config, room, rng):
+def line_x(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Back and forth along x through the place, `radius` to each side, at constant speed, with smooth turns."""
     return _laps(s, config, [[-1, 0], [1, 0], [-1, 0]], 0.0)
 
 
-def line_y(s, config, room, rng):
+def line_y(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
     """The same along y."""
     return _laps(s, config, [[0, -1], [0, 1], [0, -1]], 0.0)
 
 
-def _laps(s, config, corners, ahead):
+def _laps(s: np.ndarray, config: SimulationConfig, corners: Sequence[Sequence[float]], ahead: float) -> np.ndarray:
     """Round the corners, (n, 2) in units of the radius and as far apart each, level, `ahead` m further at the start."""
+    assert config.radius is not None and config.place is not None and config.height is not None  # complete
     edge, n = 2.0 * config.radius, len(corners) - 1
     dt = 0.01
     s_fine = np.arange(-CORNER_TIME, s[-1] + CORNER_TIME + dt, dt)
@@ -94,8 +107,9 @@ def _laps(s, config, corners, ahead):
     return np.column_stack([rounded + config.place, np.full(len(s), config.height)])
 
 
-def hover(s, config, room, rng):
+def hover(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
     """Stay at the place."""
+    assert config.place is not None and config.height is not None  # complete
     return np.tile([*config.place, config.height], (len(s), 1))
 
 
@@ -127,6 +141,16 @@ class Motion:
     specific_force: np.ndarray
 
 
+class Flyable(Protocol):
+    """What `simulate` flies."""
+
+    def motion(self, t: np.ndarray) -> Motion:
+        """The Motion at stamps t, (n,) s."""
+
+    def motors(self, t: np.ndarray) -> np.ndarray:
+        """Whether the motors turn at stamps t: (n,) bool."""
+
+
 class Trajectory:
     """One flight over 0 ... config.duration: position and yaw as splines, attitude and rates from them.
 
@@ -135,7 +159,8 @@ class Trajectory:
     take_off, landing : s, when it leaves the floor and is back on it; None when it starts and ends in the air.
     """
 
-    def __init__(self, config, room, rng):
+    def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        assert config.height is not None  # complete
         self.take_off = self.landing = None
         start, end, clamp = 0.0, config.duration, None
         if not config.start_in_air:
@@ -178,7 +203,7 @@ class Trajectory:
                 f"more than {MAX_ACCELERATION:g}; fly slower or wider."
             )
 
-    def motion(self, t):
+    def motion(self, t: ArrayLike) -> Motion:
         """The Motion at the stamps t, (n,) s; before take-off and after landing it rests exactly.
 
         The thrust, along body z, carries weight, acceleration and rotor drag (differential flatness of a quadrotor,
@@ -210,22 +235,22 @@ class Trajectory:
         q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[:, None]  # no sign flips
         return Motion(p, v, a, q, body_rates, np.einsum("nij,ni->nj", axes, a + gravity))
 
-    def motors(self, t):
+    def motors(self, t: ArrayLike) -> np.ndarray:
         """Whether the motors turn at the stamps t: (n,) bool."""
         t = np.asarray(t)
         return (t >= self._start - SPIN_UP) & (t <= self._end + SPIN_UP) if self._clamped else np.ones(len(t), bool)
 
 
-def _path_time(tau, rise, air):
+def _path_time(tau: np.ndarray, rise: float, air: float) -> np.ndarray:
     """Path time after tau seconds in the air: still during rise and descent, with the clock in between, smoothly."""
 
-    def since(x):  # integral of the smooth step, in units of SPEED_UP
+    def since(x: np.ndarray) -> np.ndarray:  # integral of the smooth step, in units of SPEED_UP
         return _RAMP(np.clip(x, 0.0, 1.0)) + np.maximum(x - 1.0, 0.0)
 
     return SPEED_UP * (since((tau - rise) / SPEED_UP) - since((tau - (air - rise - SPEED_UP)) / SPEED_UP))
 
 
-def _yaw(s, p, config):
+def _yaw(s: np.ndarray, p: np.ndarray, config: SimulationConfig) -> np.ndarray:
     """Yaw at every knot, rad: "fixed", "along_track" or "rotating", from config.yaw_angle on."""
     if config.trajectory == "spin" or config.yaw == "rotating":
         return config.yaw_angle + config.yaw_rate * s
@@ -241,7 +266,7 @@ def _yaw(s, p, config):
     return config.yaw_angle + _smoothed(course[:, None], int(HEADING_TIME / KNOT) | 1)[:, 0]
 
 
-def _smoothed(values, width):
+def _smoothed(values: np.ndarray, width: int) -> np.ndarray:
     """Columns of (n, k) values averaged with a raised-cosine window of `width` samples; the ends go on as constants."""
     window = np.hanning(width + 2)[1:-1]
     window /= window.sum()
