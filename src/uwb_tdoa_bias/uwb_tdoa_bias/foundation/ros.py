@@ -65,7 +65,7 @@ OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH
 Report = tuple[bytes, str, dict[str, Any]]  # level of a DiagnosticStatus, text, values
 
 
-def publish_stream(node: StreamNode, kind: type, topic: str) -> Publisher:
+def publish_stream(node: Node, kind: type, topic: str) -> Publisher:
     """Publisher of a stream; QoS by parameter: qos_overrides.<topic>.publisher.reliability and .depth."""
     return node.create_publisher(kind, topic, copy(OUTPUT_QOS), qos_overriding_options=OVERRIDES)
 

@@ -1,6 +1,9 @@
 """us per prediction, per robust update, and per height, pressure or velocity in the compiled core."""
 
+from __future__ import annotations
+
 import time
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +15,11 @@ from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, YAWS, Measurements, new_m
 from .figures import Figure
 from .flights import make_flight
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.memory import Memory
+
 ANCHORS = (4, 8, 16, 32, 64)
 BEFORE, MEASURED = 3.0, 4.0  # s of a flight: until it is measured, and measured
 RARELY = 1e-3  # Hz of odometry: the core alone is measured
@@ -21,7 +29,7 @@ NOISES = {"height": 0.01, "pressure": 0.1, "velocity": 0.05}  # m, m, m/s
 SECTION = "compiled core, one core"
 
 
-def measure(progress, quick=False):
+def measure(progress: Callable[[str], object], quick: bool = False) -> Iterator[Figure]:
     """Generator of Figures. progress(text) is told what comes next.
 
     Each pair of figures comes from the same stretch of a flight, run from the same state: with its inertial samples
@@ -42,17 +50,20 @@ def measure(progress, quick=False):
         yield Figure.of(SECTION, f"one {aid}", "us", per_aid(aid, repeats), OF_AID)
 
 
-def _pair(name, anchors, robust, hypotheses, repeats, target=None):
+def _pair(
+    name: str, anchors: int, robust: str, hypotheses: int, repeats: int, target: float | None = None
+) -> Iterator[Figure]:
     prediction, update = per_event(anchors, robust, hypotheses, repeats)
     yield Figure.of(SECTION, f"prediction, {name}", "us", prediction)
     yield Figure.of(SECTION, f"robust update, {name}", "us", update)
     yield Figure.of(SECTION, f"both, {name}", "us", prediction + update, target)
 
 
-def per_event(anchors, robust, hypotheses, repeats):
+def per_event(anchors: int, robust: str, hypotheses: int, repeats: int) -> tuple[np.ndarray, np.ndarray]:
     """us per prediction and per update, two (repeats,) arrays, while 1 or YAWS yaws are followed."""
     # A tag that hovers tells nothing about its yaw.
-    path = {"trajectory": "hover" if hypotheses > 1 else "sines", "start_in_air": True, "multipath": False}
+    trajectory = "hover" if hypotheses > 1 else "sines"
+    path: dict[str, Any] = {"trajectory": trajectory, "start_in_air": True, "multipath": False}
     flight = make_flight(BEFORE + MEASURED, anchors, **path)
     config = FilterConfig(
         robust=robust, initial_yaw_std=FilterConfig.initial_yaw_std if hypotheses > 1 else 0.5, odometry_rate=RARELY
@@ -69,11 +80,10 @@ def per_event(anchors, robust, hypotheses, repeats):
     return 1e6 * seconds[:, 0] / core.samples, 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.tdoas
 
 
-def per_aid(aid, repeats):
+def per_aid(aid: str, repeats: int) -> np.ndarray:
     """us per height, pressure or velocity beside 1 kHz IMU and 400 Hz TDOA: (repeats,)."""
-    flight = make_flight(
-        BEFORE + MEASURED, start_in_air=True, multipath=False, **{f"{aid}_noise": NOISES[aid]}
-    )
+    noise: dict[str, Any] = {f"{aid}_noise": NOISES[aid]}
+    flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False, **noise)
     core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
     core.run(BEFORE, core.memory)
     if not core.memory.record.running:
@@ -85,8 +95,10 @@ def per_aid(aid, repeats):
 class Core:
     """engine.feed on a stretch of a flight, again and again from the same Memory."""
 
-    def __init__(self, flight, config):
-        self.memory, self.last, self._tuning = new_memory(flight.anchors.positions), None, config.tuning()
+    def __init__(self, flight: Flight, config: FilterConfig) -> None:
+        assert flight.imu is not None
+        self.memory = self.last = new_memory(flight.anchors.positions)
+        self._tuning = config.tuning()
         imu, tdoa = flight.imu, flight.tdoa
         self._imu = structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
         # no prediction of their own: at the stamp of the inertial sample before
@@ -97,7 +109,7 @@ class Core:
         self._aids["t"] = imu.t[np.maximum(np.searchsorted(imu.t, self._aids["t"], side="right") - 1, 0)]
         self._begin = imu.t[0]
 
-    def run(self, until, memory):
+    def run(self, until: float, memory: Memory) -> None:
         """Feed the flight's first seconds; what is measured is the rest."""
         streams = self._imu, self._tdoa, self._aids
         ends = [int(np.searchsorted(stream["t"], self._begin + until)) for stream in streams]
@@ -105,14 +117,14 @@ class Core:
         self._imu, self._tdoa, self._aids = (stream[end:] for stream, end in zip(streams, ends))
         self.samples, self.tdoas, self.aids = len(self._imu), len(self._tdoa), len(self._aids)
 
-    def timed(self, tdoa, aids=False):
+    def timed(self, tdoa: bool, aids: bool = False) -> float:
         """s that the rest takes, with or without its TDOAs, and its heights, pressures and velocities."""
         self.last = self.memory.copy()
         return self._feed(
             self.last, self._imu, self._tdoa if tdoa else self._tdoa[:0], self._aids if aids else self._aids[:0]
         )
 
-    def _feed(self, memory, *measured):
+    def _feed(self, memory: Memory, *measured: np.ndarray) -> float:
         began = time.perf_counter()
         feed(memory, self._tuning, Measurements(*measured))
         return time.perf_counter() - began

@@ -1,8 +1,15 @@
 """Measured figures, and how they are told: a table, and JSON."""
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from numpy.typing import ArrayLike
 
 HEADER = ("", "median", "quartiles", "unit", "target")
 
@@ -24,22 +31,22 @@ class Figure:
     target: float | None = None
 
     @classmethod
-    def of(cls, section, name, unit, values, target=None):
+    def of(cls, section: str, name: str, unit: str, values: ArrayLike, target: float | None = None) -> Figure:
         """From repeated measurements, a number or (n,) of them; NaN where there is none."""
-        values = np.atleast_1d(np.asarray(values, dtype=float))
-        values = values[np.isfinite(values)]
-        low, median, high = np.percentile(values, [25, 50, 75]) if len(values) else (np.nan,) * 3
-        return cls(section, name, unit, float(median), float(low), float(high), len(values), target)
+        numbers = np.atleast_1d(np.asarray(values, dtype=float))
+        numbers = numbers[np.isfinite(numbers)]
+        low, median, high = np.percentile(numbers, [25, 50, 75]) if len(numbers) else (np.nan,) * 3
+        return cls(section, name, unit, float(median), float(low), float(high), len(numbers), target)
 
     @property
-    def met(self):
+    def met(self) -> bool | None:
         """Whether the median meets the target; None if there is none."""
         if self.target is None:
             return None
         return bool(self.median <= self.target)
 
 
-def table(figures):
+def table(figures: Iterable[Figure]) -> list[str]:
     """Lines of text, with a title above each section."""
     rows = [(f, _cells(f)) for f in figures]
     wide = [max(len(cells[k]) for _, cells in [*rows, (None, HEADER)]) for k in range(len(HEADER))]
@@ -52,13 +59,13 @@ def table(figures):
     return lines
 
 
-def as_json(figures):
+def as_json(figures: Iterable[Figure]) -> list[dict[str, Any]]:
     """List of dicts; JSON has no NaN: null."""
     rows = [asdict(figure) | {"met": figure.met} for figure in figures]
     return [{key: None if value != value else value for key, value in row.items()} for row in rows]
 
 
-def _cells(figure):
+def _cells(figure: Figure) -> tuple[str, ...]:
     target = ""
     if figure.target is not None:
         target = f"<= {_number(figure.target)}{'' if figure.met else ' MISSED'}"
@@ -66,11 +73,11 @@ def _cells(figure):
     return f"  {figure.name}", _number(figure.median), spread, figure.unit, target
 
 
-def _number(value):
+def _number(value: float) -> str:
     return f"{value:.0f}" if value == round(value) or abs(value) >= 1000.0 else f"{value:.3g}"
 
 
-def _line(cells, wide):
+def _line(cells: Sequence[str], wide: Sequence[int]) -> str:
     name, median, spread, unit, target = (
         cell.rjust(width) if k in (1, 2) else cell.ljust(width) for k, (cell, width) in enumerate(zip(cells, wide))
     )

@@ -1,6 +1,9 @@
 """The flights that are measured with: simulated, 1 kHz IMU and 400 Hz TDOA."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -8,11 +11,14 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ..simulation import SimulationConfig, simulate
 
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 SHORTEST = 16.0  # s that the simulation needs to take off and land
 TDOA_RATE = 400.0  # Hz
 
 
-def make_flight(seconds, anchors=8, tdoa_rate=TDOA_RATE, **more):
+def make_flight(seconds: float, anchors: int = 8, tdoa_rate: float = TDOA_RATE, **more: Any) -> Flight:
     """A Flight of at least `seconds` among so many anchors; tdoa_rate : Hz; more : of SimulationConfig. Its first `seconds`
     count."""
     room = "corners" if anchors == 8 else f"random-1-{anchors}"
@@ -20,20 +26,22 @@ def make_flight(seconds, anchors=8, tdoa_rate=TDOA_RATE, **more):
     return first(thinned(flight, tdoa_rate), seconds)
 
 
-def thinned(flight, rate):
+def thinned(flight: Flight, rate: float) -> Flight:
     """The flight with `rate` of its TDOAs, Hz, evenly left out."""
+    assert flight.imu is not None
     duration = flight.imu.t[-1] - flight.imu.t[0]
     kept = np.linspace(0, len(flight.tdoa) - 1, min(len(flight.tdoa), round(rate * duration))).astype(int)
     return replace(flight, tdoa=_rows(flight.tdoa, kept))
 
 
-def first(flight, seconds):
+def first(flight: Flight, seconds: float) -> Flight:
     """Its first seconds."""
+    assert flight.imu is not None
     end = flight.imu.t[0] + seconds
     streams = {name: getattr(flight, name) for name in ("tdoa", "imu", "truth", *AIDS)}
     kept = {name: _rows(stream, stream.t < end) for name, stream in streams.items() if stream is not None}
     return replace(flight, **kept)
 
 
-def _rows(stream, chosen):
+def _rows(stream: Any, chosen: np.ndarray) -> Any:
     return type(stream)(**{name: values[chosen] for name, values in vars(stream).items()})

@@ -1,11 +1,14 @@
 """How fast nodes answer the rest of the graph, parameters, poses that are told, a clock that stops, while messages flow."""
 
+from __future__ import annotations
+
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 import re
 import subprocess
 import sys
 import time
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import rclpy
@@ -17,6 +20,13 @@ from ..live.processes import LiveError
 from .figures import Figure
 from .nodes import PACKAGES, READY_LIMIT, ready_at, surroundings
 from .usage import cpu_seconds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+    from numpy.typing import ArrayLike
+    from rclpy.node import Node
+    from ..live.processes import Processes
 
 CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, busy loops beside
     (0.0, 0.0, False, 0), (0.0, 0.0, True, 0), (40.0, 0.0, True, 0), (200.0, 0.0, True, 0), (1000.0, 0.0, True, 0),
@@ -35,14 +45,14 @@ class Answers:
     """answers, poses : s that each get_parameters, each initialpose took, SILENCE without an answer; periods : s between reports;
     pause : s until a clock that stopped was told, None without one; cpu : share of one core."""
 
-    answers: list = field(default_factory=list)
-    poses: list = field(default_factory=list)
-    periods: list = field(default_factory=list)
-    pause: float = None
+    answers: list[float] = field(default_factory=list)
+    poses: list[float] = field(default_factory=list)
+    periods: np.ndarray = field(default_factory=lambda: np.empty(0))
+    pause: float | None = None
     cpu: float = np.nan
 
 
-def measure(progress, folder, quick=False):
+def measure(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
     """Generator of Figures. progress(text); folder : for the output of the nodes."""
     seconds = 6.0 if quick else 20.0
     for clock, tf, streams, busy in [CASES[0], CASES[3], CASES[-1]] if quick else CASES:
@@ -51,7 +61,7 @@ def measure(progress, folder, quick=False):
         yield from figures(section, ask(folder, seconds, clock, tf, streams, busy), streams)
 
 
-def describe(clock, tf, streams, busy):
+def describe(clock: float, tf: float, streams: bool, busy: int) -> str:
     """Title of a case."""
     parts = [f"/clock at {clock:g} Hz"] if clock else []
     parts += [f"/tf at {tf:g} Hz"] if tf else []
@@ -60,9 +70,9 @@ def describe(clock, tf, streams, busy):
     return f"the rest of the graph, {NODE}: {', '.join(parts) or 'nothing flows'}"
 
 
-def figures(section, found, streams):
+def figures(section: str, found: Answers, streams: bool) -> Iterator[Figure]:
     """Figures of Answers."""
-    def of(name, unit, values):
+    def of(name: str, unit: str, values: ArrayLike) -> Figure:
         return Figure.of(section, name, unit, values, TARGETS.get(name))
 
     yield of("get_parameters p50", "s", np.percentile(found.answers, 50, method="nearest"))
@@ -76,7 +86,10 @@ def figures(section, found, streams):
     yield Figure.of(section, f"CPU, {NODE}", "% of a core", 100.0 * found.cpu, target)
 
 
-def ask(folder, seconds, clock=0.0, tf=0.0, streams=True, busy=0, arguments=()):
+def ask(
+    folder: Path, seconds: float, clock: float = 0.0, tf: float = 0.0, streams: bool = True, busy: int = 0,
+    arguments: Sequence[str] = (),
+) -> Answers:  # fmt: skip
     """Answers of an ekf_node, for so long. clock, tf : Hz, 0.0 for none; streams : whether a tag flies, through a bias_node; busy :
     loops that take all of a core; arguments : more of the ekf_node."""
     with ExitStack() as stack:
@@ -98,24 +111,24 @@ def ask(folder, seconds, clock=0.0, tf=0.0, streams=True, busy=0, arguments=()):
 
 
 class _Asking:
-    def __init__(self, node, processes, log):
+    def __init__(self, node: Node, processes: Processes, log: Path) -> None:
         self._node, self._processes, self._log = node, processes, log
-        self._reports = []  # (arrival, text)
+        self._reports: list[tuple[float, str]] = []  # (arrival, text)
         self._client = node.create_client(GetParameters, f"/{NODE}/get_parameters")
         self._poses = node.create_publisher(PoseWithCovarianceStamped, "/initialpose", 10)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_report, 10)
 
-    def _on_report(self, message):
+    def _on_report(self, message: DiagnosticArray) -> None:
         self._reports += [(time.monotonic(), each.message) for each in message.status if each.name.strip("/") == NODE]
 
-    def ask(self, seconds, clock):
+    def ask(self, seconds: float, clock: subprocess.Popen[bytes] | None) -> Answers:
         """clock : Popen of what publishes it, or None."""
         out, began = Answers(), time.monotonic()
         _wait(self._node, SILENCE, lambda: len(self._reports) > 2 or time.monotonic() > began + SILENCE - 1.0)
         _wait(self._node, SILENCE, self._client.service_is_ready)
         _wait(self._node, SILENCE, self._poses.get_subscription_count)
         before, began = cpu_seconds(self._processes.pid(NODE)), time.monotonic()
-        _wait(self._node, UNASKED + 1.0, lambda: time.monotonic() > began + UNASKED)
+        _wait(self._node, UNASKED + 1.0, _later_than(began + UNASKED))
         out.cpu = (cpu_seconds(self._processes.pid(NODE)) - before) / (time.monotonic() - began)
         began, self._reports = time.monotonic(), []
         while time.monotonic() < began + seconds:
@@ -124,7 +137,7 @@ class _Asking:
                 out.poses.append(self._tell(len(out.poses)))
             if out.answers[-1] == SILENCE:
                 break
-            _wait(self._node, 1.0, lambda until=time.monotonic() + 0.05: time.monotonic() > until)
+            _wait(self._node, 1.0, _later_than(time.monotonic() + 0.05))
         took = time.monotonic() - began
         arrivals = [began, *(arrival for arrival, _ in self._reports), began + took]
         out.periods = np.diff(arrivals[1:-1]) if len(arrivals) > 3 else np.array([took])
@@ -132,32 +145,33 @@ class _Asking:
             out.pause = self._pause(clock)
         return out
 
-    def _call(self):
+    def _call(self) -> float:
         began, future = time.monotonic(), self._client.call_async(GetParameters.Request(names=["tdoa_std"]))
         while not future.done() and time.monotonic() < began + SILENCE:
             rclpy.spin_once(self._node, timeout_sec=0.01)
         return time.monotonic() - began if future.done() else SILENCE
 
-    def _tell(self, number):
+    def _tell(self, number: int) -> float:
         """s until the node has said, by the time of its log, that it does not take a pose in a frame of this number."""
         message, frame, began = PoseWithCovarianceStamped(), f"nowhere_{number}", time.time()
         message.header.frame_id = frame
         self._poses.publish(message)
-        found = []
+        found: list[str] = []
 
-        def said():
+        def said() -> bool:
             found[:] = re.findall(r"\[([0-9.]+)\] .*initialpose: not taken: .*", self._log.read_text(errors="replace"))[number:]
-            return found or time.time() > began + SILENCE
+            return bool(found) or time.time() > began + SILENCE
 
         _wait(self._node, SILENCE + 1.0, said)
         return float(found[0]) - began if found else SILENCE
 
-    def _pause(self, clock):
+    def _pause(self, clock: subprocess.Popen[bytes]) -> float:
         _end(clock)
         stopped = time.monotonic()
 
-        def told():
-            return [a for a, text in self._reports if a > stopped and "paused" in text] or time.monotonic() > stopped + SILENCE
+        def told() -> bool:
+            paused = any(a > stopped and "paused" in text for a, text in self._reports)
+            return paused or time.monotonic() > stopped + SILENCE
 
         _wait(self._node, SILENCE + 1.0, told)
         arrivals = [a for a, text in self._reports if a > stopped and "paused" in text]
@@ -165,15 +179,16 @@ class _Asking:
 
 
 @contextmanager
-def _load(what, number):
+def _load(what: str, number: float) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "uwb_tdoa_tools.benchmark.load", what, f"{number:g}"]
     with _process(command, stdout=subprocess.PIPE, cwd="/") as process:  # -m looks for modules in the folder where it starts
+        assert process.stdout is not None  # it is a pipe
         process.stdout.readline()  # it begins
         yield process
 
 
 @contextmanager
-def _process(command, **options):
+def _process(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)
     try:
         yield process
@@ -181,13 +196,18 @@ def _process(command, **options):
         _end(process)
 
 
-def _end(process):
+def _end(process: subprocess.Popen[bytes]) -> None:
     if process.poll() is None:
         process.kill()
     process.wait()
 
 
-def _wait(node, limit, condition):
+def _later_than(t: float) -> Callable[[], bool]:
+    """Whether it is later than t, s, by time.monotonic()."""
+    return lambda: time.monotonic() > t
+
+
+def _wait(node: Node, limit: float, condition: Callable[[], object]) -> None:
     until = time.monotonic() + limit
     while not condition():
         if time.monotonic() > until:

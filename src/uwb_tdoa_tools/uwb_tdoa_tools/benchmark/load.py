@@ -5,8 +5,11 @@ python -m uwb_tdoa_tools.benchmark.load tf 500
 python -m uwb_tdoa_tools.benchmark.load streams 30
 """
 
+from __future__ import annotations
+
 import sys
 import time
+from typing import Any, TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
@@ -18,10 +21,15 @@ from ..live.session import session
 from .flights import make_flight
 from .source import Source
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from rclpy.node import Node
+    from ..live.session import Stop
+
 WHEELS = "odom", "base_link"  # of the transform on /tf
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> None:
     """Publish `what` at so many Hz (clock, tf), or streams of a flight of so many seconds over and over, until interrupted.
     Says an empty line when it begins."""
     what, number = sys.argv[1:] if argv is None else argv
@@ -35,7 +43,7 @@ def main(argv=None):
             publish(node, stop, float(number), *{"clock": (Clock, "/clock", of_clock), "tf": (TFMessage, "/tf", of_tf)}[what])
 
 
-def publish(node, stop, rate, kind, topic, of):
+def publish(node: Node, stop: Stop, rate: float, kind: type, topic: str, of: Callable[[Time], Any]) -> None:
     """Publish of(Time of now) at `rate` Hz."""
     publisher, due = node.create_publisher(kind, topic, QoSProfile(depth=100)), time.monotonic()
     while not stop:
@@ -44,12 +52,12 @@ def publish(node, stop, rate, kind, topic, of):
         time.sleep(max(due - time.monotonic(), 0.0))
 
 
-def of_clock(now):
+def of_clock(now: Time) -> Clock:
     """Clock at a Time."""
     return Clock(clock=now)
 
 
-def of_tf(now):
+def of_tf(now: Time) -> TFMessage:
     """TFMessage with where the wheels say that the robot is, at a Time."""
     parent, child = WHEELS
     transform = TransformStamped(child_frame_id=child)
@@ -57,7 +65,7 @@ def of_tf(now):
     return TFMessage(transforms=[transform])
 
 
-def stop_if(stop):
+def stop_if(stop: Stop) -> None:
     """Raise KeyboardInterrupt once asked to end."""
     if stop:
         raise KeyboardInterrupt

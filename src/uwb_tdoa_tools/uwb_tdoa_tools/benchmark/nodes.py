@@ -1,5 +1,7 @@
 """The nodes live, in real time: CPU, memory, latency, losses, time to ready; for one tag and for several."""
 
+from __future__ import annotations
+
 import json
 import os
 import re
@@ -7,6 +9,7 @@ import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +20,14 @@ from .figures import Figure
 from .flights import make_flight
 from .source import Source, latencies
 from .usage import cpu_seconds, memory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+    from rclpy.node import Node
+    from uwb_tdoa_bias.foundation.flight import Flight
+
+    Starts = dict[str, tuple[str, Sequence[str]]]  # {title: (executable, arguments)}
 
 PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf", "localization_node": "uwb_tdoa_ekf"}
 NODES = "bias_node", "ekf_node"
@@ -35,17 +46,17 @@ class Measured:
     latency : one (n,) array of ms per block; lost, late : messages; source_late : (k,) ms, each message of the source;
     source_cpu : share of one core in each block."""
 
-    ready: dict = field(default_factory=dict)
-    memory: dict = field(default_factory=dict)
-    cpu: dict = field(default_factory=dict)
-    latency: list = field(default_factory=list)
-    lost: dict = field(default_factory=dict)
+    ready: dict[str, float] = field(default_factory=dict)
+    memory: dict[str, int] = field(default_factory=dict)
+    cpu: dict[str, np.ndarray] = field(default_factory=dict)
+    latency: list[np.ndarray] = field(default_factory=list)
+    lost: dict[str, int] = field(default_factory=dict)
     late: int = 0
     source_late: np.ndarray = field(default_factory=lambda: np.empty(0))
-    source_cpu: list = field(default_factory=list)
+    source_cpu: np.ndarray = field(default_factory=lambda: np.empty(0))
 
 
-def measure(progress, folder, quick=False):
+def measure(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
     """Generator of Figures for one tag. progress(text); folder : for the output of the nodes."""
     progress("nodes, first start")
     first, ready, seconds = start(folder), [], 6.0 if quick else 30.0
@@ -68,7 +79,7 @@ def measure(progress, folder, quick=False):
         yield from _figures(f"{SECTION}, 64 anchors", fly(make_flight(seconds, 64), folder, [""], pairs([""])))
 
 
-def measure_tags(progress, folder, quick=False):
+def measure_tags(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
     """Generator of Figures for several tags that all hear the same streams, in a localization_node for each core."""
     seconds, cores = 10.0 if quick else 20.0, len(os.sched_getaffinity(0))
     progress("tags, first start")
@@ -82,18 +93,18 @@ def measure_tags(progress, folder, quick=False):
         yield from _figures(section, fly(flight, folder, spaces, starts), None, TARGET_LATENCY_OF_FLEET)
 
 
-def start(folder):
+def start(folder: Path) -> dict[str, float]:
     """{node: s from its start until it says that it is ready}, one after the other."""
     with surroundings(folder) as (node, processes):
         return {name: _start(processes, node, name, name, []) for name in NODES}
 
 
-def pairs(namespaces):
+def pairs(namespaces: Sequence[str]) -> Starts:
     """A bias_node and an ekf_node for each namespace: {title: (executable, arguments)}."""
     return {_title(space, name): (name, _arguments(space, name)) for space in namespaces for name in NODES}
 
 
-def pool(namespaces, processes):
+def pool(namespaces: Sequence[str], processes: int) -> Starts:
     """So many localization_nodes, which share the namespaces: {title: (executable, arguments)}."""
     name, shared = "localization_node", [part for topic in SHARED for part in ("-r", f"{topic}:=/{topic}")]
     if namespaces == [""]:
@@ -103,7 +114,7 @@ def pool(namespaces, processes):
     return {f"{k + 1}/{name}": (name, ["--ros-args", *arguments, *shared]) for k, arguments in enumerate(own)}
 
 
-def fly(flight, folder, namespaces, starts):
+def fly(flight: Flight, folder: Path, namespaces: Sequence[str], starts: Starts) -> Measured:
     """Measured of a flight in real time through the nodes of each namespace ("" or "/name"); starts : of `pairs` or `pool`."""
     out = Measured()
     with surroundings(folder) as (node, processes):
@@ -115,14 +126,19 @@ def fly(flight, folder, namespaces, starts):
         wait(MATCH_LIMIT, "all to find each other", processes, node, matched)
         samples = []
 
-        def sample():
+        def sample() -> None:
             used = {title: cpu_seconds(processes.pid(title)) for title in out.ready}
             samples.append((time.time_ns(), used, time.process_time()))
 
         sent, stamps, late = source.play(flight, BLOCK, sample)
         out.memory = {title: memory(processes.pid(title)) for title in out.ready}
         diagnostics.forget()
-        wait(SETTLE_LIMIT, "the nodes to finish", processes, node, lambda: source.take() or diagnostics.is_settled())
+
+        def settled() -> bool:
+            source.take()
+            return diagnostics.is_settled()
+
+        wait(SETTLE_LIMIT, "the nodes to finish", processes, node, settled)
         for title in out.ready:
             processes.stop(title)
     times = np.array([t for t, _, _ in samples])
@@ -137,7 +153,7 @@ def fly(flight, folder, namespaces, starts):
 
 
 @contextmanager
-def surroundings(folder):
+def surroundings(folder: str | Path) -> Iterator[tuple[Node, Processes]]:
     """(node of ours, Processes) in a domain of their own, whose logs ready_at understands."""
     form = "[{severity}] [{time}] [{name}]: {message}"
     logs = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": form, "RCUTILS_COLORIZED_OUTPUT": "0"}
@@ -145,7 +161,7 @@ def surroundings(folder):
         yield node, processes
 
 
-def _arguments(space, name):
+def _arguments(space: str, name: str) -> list[str]:
     if not space:
         return []
     remaps = [f"__ns:={space}", *(f"{topic}:=/{topic}" for topic in SHARED)]
@@ -153,13 +169,13 @@ def _arguments(space, name):
     return ["--ros-args", *(part for remap in remaps for part in ("-r", remap)), *own]
 
 
-def _start(processes, node, title, name, arguments):
+def _start(processes: Processes, node: Node, title: str, name: str, arguments: Sequence[str]) -> float:
     """Start an executable and wait until it is ready; returns the s that took, by the clock of its log."""
     began = time.time()
     processes.start(PACKAGES[name], name, *arguments, title=title)
-    said = []
+    said: list[str] = []
 
-    def is_ready():
+    def is_ready() -> list[str]:
         said[:] = ready_at(name, processes.file(title).read_text(errors="replace"))
         return said
 
@@ -167,16 +183,16 @@ def _start(processes, node, title, name, arguments):
     return float(said[0]) - began
 
 
-def ready_at(name, log):
+def ready_at(name: str, log: str) -> list[str]:
     """When an executable said in its log that it is ready: [s since 1970, as text]."""
     return re.findall(rf"^\[INFO\] \[([0-9.]+)\] \[\S*{name}\S*\]: ready", log, re.MULTILINE)
 
 
-def _title(space, name):
+def _title(space: str, name: str) -> str:
     return f"{space}/{name}".strip("/")
 
 
-def _matched(node, source, diagnostics, titles):
+def _matched(node: Node, source: Source, diagnostics: Diagnostics, titles: Sequence[str]) -> bool:
     """Whether every node hears what it needs, and we hear every odometry."""
     wanted = {"bias_node": ("uwb/tdoa", "odometry"), "ekf_node": ("imu/data", "uwb/tdoa_corrected")}
     return (
@@ -191,7 +207,7 @@ def _matched(node, source, diagnostics, titles):
     )
 
 
-def _count(out, flight, namespaces, diagnostics, source):
+def _count(out: Measured, flight: Flight, namespaces: Sequence[str], diagnostics: Diagnostics, source: Source) -> None:
     """Fill in what was lost between the processes, and what came too late to be used."""
     out.lost = dict.fromkeys(("TDOAs", "IMU samples", "odometry"), 0)
     for space, received in zip(namespaces, source.received):
@@ -203,7 +219,9 @@ def _count(out, flight, namespaces, diagnostics, source):
         out.late += became["late"] + became["imu_late"]
 
 
-def _figures(section, measured, target_cpu=None, target_latency=None):
+def _figures(
+    section: str, measured: Measured, target_cpu: float | None = None, target_latency: float | None = None
+) -> Iterator[Figure]:
     """Figures of a Measured. CPU and latency: medians and quartiles of blocks; memory: of nodes."""
     for name in PACKAGES:
         titles = [title for title in measured.cpu if title.endswith(name)]
@@ -226,5 +244,5 @@ def _figures(section, measured, target_cpu=None, target_latency=None):
     yield Figure.of(section, "this process: p99 of how late it published", "ms", late)
 
 
-def _known(values):
+def _known(values: np.ndarray) -> np.ndarray:
     return values[np.isfinite(values)]

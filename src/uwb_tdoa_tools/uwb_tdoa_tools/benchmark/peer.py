@@ -17,11 +17,14 @@ rows a and b of `anchors` (count, 3), m. The filter starts at p, m, with the att
 There p is NaN at the start if nobody told it where it is, and what is told is so to 0.1 m; q is level, and its yaw so to 0.1 rad.
 """
 
+from __future__ import annotations
+
 import ctypes
 from pathlib import Path
 import shutil
 from tempfile import TemporaryDirectory
 import time
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -32,6 +35,11 @@ from .core import BEFORE, MEASURED, RARELY, Core
 from .figures import Figure
 from .flights import make_flight
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from numpy.typing import ArrayLike
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 VERSION = 1
 EVENT = np.dtype([("t", float), ("gyro", float, 3), ("accel", float, 3), ("d", float), ("a", np.int32), ("b", np.int32)])
 SYMBOLS = ("version", "start", "run", "position")
@@ -41,7 +49,7 @@ REPEATS = 41
 class Peer:
     """The library at a path. name : of its file. Raises InputError if it cannot be loaded, or is not what this module says."""
 
-    def __init__(self, path, own=False):
+    def __init__(self, path: str | Path, own: bool = False) -> None:
         """own : load a copy, whose static variables are as they are when a program starts, whatever was done with the library before."""
         self.name = Path(path).name
         try:
@@ -49,7 +57,7 @@ class Peer:
                 library = ctypes.CDLL(shutil.copy(path, folder) if own else str(Path(path).absolute()))
         except OSError as error:
             raise InputError(f"--peer: {path} cannot be loaded as a shared library ({error}); build it anew on this machine.") from error
-        functions = {name: getattr(library, f"tdoa_peer_{name}", None) for name in SYMBOLS}
+        functions: dict[str, Any] = {name: getattr(library, f"tdoa_peer_{name}", None) for name in SYMBOLS}
         missing = [f"tdoa_peer_{name}" for name, function in functions.items() if function is None]
         if missing:
             raise InputError(f"--peer: {path} does not export {missing[0]}; add it as docs/speed.md shows.")
@@ -60,38 +68,40 @@ class Peer:
         if version != VERSION:
             raise InputError(f"--peer: {path} is of version {version} of the interface, this is {VERSION}; build it for that.")
 
-    def start(self, anchors, p, q):
+    def start(self, anchors: np.ndarray, p: ArrayLike, q: ArrayLike) -> None:
         """Begin anew at p (3,) m, q (4,) x y z w, among anchors (n, 3) m."""
         self._anchors = np.ascontiguousarray(anchors, dtype=float)  # for as long as it may look at them
         self._start(_pointer(self._anchors), ctypes.c_int32(len(anchors)), _pointer(np.array(p, float)), _pointer(np.array(q, float)))
 
-    def run(self, events):
+    def run(self, events: np.ndarray) -> float:
         """s that events (n,) of EVENT take."""
         data, count = _pointer(events), ctypes.c_int32(len(events))
         began = time.perf_counter()
         self._run(data, count)
         return time.perf_counter() - began
 
-    def position(self):
+    def position(self) -> np.ndarray:
         """(3,) m."""
         out = np.full(3, np.nan)
         self._position(_pointer(out))
         return out
 
-    def state(self):
+    def state(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(p (3,) m, v (3,) m/s, world, q (4,) x y z w). Raises InputError if the library does not tell."""
         if self._state is None:
             raise InputError(f"--peer: {self.name} does not export tdoa_peer_state; add it as docs/speed.md shows.")
-        out = [np.full(n, np.nan) for n in (3, 3, 4)]
-        self._state(*map(_pointer, out))
-        return out
+        p, v, q = np.full(3, np.nan), np.full(3, np.nan), np.full(4, np.nan)
+        self._state(*map(_pointer, (p, v, q)))
+        return p, v, q
 
 
-def events_of(flight, begin, end):
+def events_of(flight: Flight, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
     """(inertial samples, the same and TDOAs) of a Flight from begin to end, s: two arrays of EVENT in order of their stamps, each
     TDOA at that of the sample before, as `Core` measures ours."""
+    assert flight.imu is not None
     imu, tdoa = flight.imu, flight.tdoa
-    samples, ranges = np.zeros(len(imu), EVENT), np.zeros(len(tdoa), EVENT)
+    samples: np.ndarray = np.zeros(len(imu), EVENT)
+    ranges: np.ndarray = np.zeros(len(tdoa), EVENT)
     samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
     ranges["t"] = imu.t[np.maximum(np.searchsorted(imu.t, tdoa.t, side="right") - 1, 0)]
     ranges["a"], ranges["b"], ranges["d"] = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b), tdoa.d
@@ -100,18 +110,19 @@ def events_of(flight, begin, end):
     return samples, both[np.argsort(both["t"], kind="stable")]
 
 
-def measure(progress, peer, quick=False):
+def measure(progress: Callable[[str], object], peer: Peer, quick: bool = False) -> Iterator[Figure]:
     """Generator of Figures: ours and those of a Peer, run in turn. progress(text)."""
     repeats = 9 if quick else REPEATS
     progress("peer")
     flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False)
+    assert flight.imu is not None and flight.truth is not None
     core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
     core.run(BEFORE, core.memory)
     begin, end, truth = flight.imu.t[0] + BEFORE, flight.imu.t[-1], flight.truth
     samples, both = events_of(flight, begin, np.inf)
     first = int(np.searchsorted(truth.t, begin))
 
-    def timed(events):
+    def timed(events: np.ndarray) -> float:
         peer.start(flight.anchors.positions, truth.p[first], truth.q[first])
         return peer.run(events)
 
@@ -126,11 +137,11 @@ def measure(progress, peer, quick=False):
     yield Figure.of(section, "the other's position at the end, off by", "m", off)
 
 
-def _per_event(seconds, samples, tdoas):
+def _per_event(seconds: np.ndarray, samples: int, tdoas: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """us per prediction, update, and both, (repeats,) each. seconds : (repeats, 2), without TDOAs and with."""
     prediction, update = 1e6 * seconds[:, 0] / samples, 1e6 * (seconds[:, 1] - seconds[:, 0]) / tdoas
     return prediction, update, prediction + update
 
 
-def _pointer(array):
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)

@@ -1,5 +1,9 @@
 """The highest rate of a replay at which nothing is lost."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..bags.bag import read_odometry, write_bag
@@ -8,13 +12,17 @@ from ..live.run import accounts, run_live
 from .figures import Figure
 from .flights import make_flight
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
 RATES = (4.0, 10.0, 16.0, 32.0, 64.0)
 KEPT_UP = 0.8  # of the rate that was asked for; a run that is slower than that has found the limit
 NEEDED = 10.0
 SECTION = "replay of a bag through both nodes, reliable links, odometry recorded"
 
 
-def measure(progress, folder, quick=False):
+def measure(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
     """Generator of Figures; folder : for bags and the output of the processes. progress(text)."""
     flight = make_flight(8.0 if quick else 45.0)
     bag, highest = folder / "flight.bag", 0.0
@@ -36,7 +44,7 @@ def measure(progress, folder, quick=False):
     yield Figure.of(SECTION, "highest without loss", "s of flight/s", highest)
 
 
-def speed(recorded):
+def speed(recorded: str | Path) -> float:
     """s of flight per s of which a bag with odometry was recorded."""
     with open_bag(recorded) as reader:
         arrived = [stamp for _, stamp, _ in messages(recorded, reader, list(reader.connections))]

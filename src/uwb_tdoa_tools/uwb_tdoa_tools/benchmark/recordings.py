@@ -1,6 +1,9 @@
 """s that a whole recording takes without ROS: filter, correction, smoother."""
 
+from __future__ import annotations
+
 import time
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +16,12 @@ from uwb_tdoa_ekf.smoother import smooth
 from .figures import Figure
 from .flights import make_flight
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.foundation.flight import Flight
+
 SECONDS = 45.0
 TARGET, TARGET_CORRECTED = 0.1, 0.2  # s for such a flight, without and with corrections
 ANCHORS = (4, 16, 32, 64)
@@ -20,7 +29,9 @@ CORRECTION_TARGET = 12.0  # us, of one TDOA alone
 BATCHES = (1, 4, 16)  # TDOAs that arrive together
 
 
-def measure(progress, quick=False, model=None):
+def measure(
+    progress: Callable[[str], object], quick: bool = False, model: str | Path | None = None
+) -> Iterator[Figure]:
     """Generator of Figures; model : path of an ONNX network, default the one shipped. progress(text)."""
     repeats = 2 if quick else 7
     flight = make_flight(SECONDS)
@@ -29,6 +40,7 @@ def measure(progress, quick=False, model=None):
     name = "first call: compiled, or compiled code read from numba's cache"
     yield Figure.of(section, name, "s", _seconds(run_offline, flight))
     network = load_network(model or SHIPPED)
+    assert network is not None  # as a name is given
     effects = EffectSet((
         AnchorDelay(flight.meta["parameters"]["anchor_delays"]), TagLeverArm({"x": 0.01, "y": 0.0, "z": 0.05}),
     ))  # fmt: skip
@@ -62,14 +74,15 @@ def measure(progress, quick=False, model=None):
         )
 
 
-def _per_prediction(flight, network, repeats):
+def _per_prediction(flight: Flight, network: Network, repeats: int) -> np.ndarray:
     """us per TDOA of a Flight that the network alone takes, one at a time: (repeats,)."""
+    assert flight.truth is not None
     truth, tdoa = flight.truth, flight.tdoa
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
     rows = [slice(k, k + 1) for k in range(400)]
     alone = [samples_at(tdoa.t[k], a[k], b[k], truth, flight.anchors, motion=False) for k in rows]
 
-    def predict():
+    def predict() -> None:
         for samples in alone:
             network.predict(samples)
 
@@ -77,14 +90,15 @@ def _per_prediction(flight, network, repeats):
     return np.array([_seconds(predict) for _ in range(repeats)]) * 1e6 / len(alone)
 
 
-def _per_tdoa(flight, corrector, batch, repeats):
+def _per_tdoa(flight: Flight, corrector: Corrector, batch: int, repeats: int) -> np.ndarray:
     """us per TDOA of a Flight, corrected in batches of `batch`: (repeats,)."""
+    assert flight.truth is not None
     truth, tdoa = flight.truth, flight.tdoa
     corrector.add_pose(truth.t, truth.p, truth.q)
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
     parts = [slice(k, k + batch) for k in range(0, 400 * batch, batch) if k + batch <= len(tdoa)]
 
-    def correct():
+    def correct() -> None:
         for part in parts:
             corrector.correct(tdoa.t[part], a[part], b[part], tdoa.d[part])
 
@@ -92,7 +106,7 @@ def _per_tdoa(flight, corrector, batch, repeats):
     return np.array([_seconds(correct) for _ in range(repeats)]) * 1e6 / (len(parts) * batch)
 
 
-def _seconds(function, *arguments):
+def _seconds(function: Callable[..., object], *arguments: Any) -> float:
     began = time.perf_counter()
     function(*arguments)
     return time.perf_counter() - began

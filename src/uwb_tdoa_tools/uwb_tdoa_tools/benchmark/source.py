@@ -1,8 +1,11 @@
 """The surroundings of the nodes: publishes a flight in real time and takes the odometry that comes back."""
 
+from __future__ import annotations
+
 from functools import partial
 import struct
 import time
+from typing import TYPE_CHECKING
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -12,6 +15,12 @@ from sensor_msgs.msg import Imu
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from rclpy.node import Node
+    from rclpy.publisher import Publisher
+    from uwb_tdoa_bias.foundation.flight import Flight
 
 HEADER_STAMP = struct.Struct("<iI")  # of a little-endian CDR message that begins with a header, after 4 bytes
 AHEAD = 0.5  # s from the call to the first message
@@ -25,24 +34,27 @@ class Source:
     arrival of an odometry is when the middleware of this process had it.
     """
 
-    def __init__(self, node, namespaces):
+    def __init__(self, node: Node, namespaces: Sequence[str]) -> None:
         self.publishers = {
             kind: ros.publish_stream(node, kind, topic) for kind, topic in ((Imu, "/imu/data"), (Tdoa, "/uwb/tdoa"))
         }
         self._anchors = node.create_publisher(AnchorArray, "/uwb/anchors", ANCHORS_QOS)
-        self.received = [[] for _ in namespaces]  # (arrival, stamp), ns
+        self.received: list[list[tuple[int, int]]] = [[] for _ in namespaces]  # (arrival, stamp), ns
         self.subscriptions = [  # whose callbacks only run while somebody waits, before and after `play`
             node.create_subscription(Odometry, f"{space}/odometry", partial(_keep, received), ros.OUTPUT_QOS, raw=True)
             for space, received in zip(namespaces, self.received)
         ]
 
-    def play(self, flight, block, on_block, rounds=1):
+    def play(
+        self, flight: Flight, block: float, on_block: Callable[[], object], rounds: int = 1
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Publish a Flight as fast as it was flown, so many times, one after the other. on_block(): called first, after every
         `block` s, and at the end.
 
         Returns (sent, stamps, late): of each TDOA when it was published and its stamp, (n,) ns since 1970; s by which
         each message was late.
         """
+        assert flight.imu is not None
         self._anchors.publish(anchors_to_message(flight.anchors))
         start = time.time_ns() // 10**9 + 1  # stamps are of now, too
         events = self._events(flight, start - flight.imu.t[0])
@@ -65,7 +77,7 @@ class Source:
         on_block()
         return np.array(sent), np.array(stamps), np.array(late)
 
-    def take(self):
+    def take(self) -> None:
         """Keep what has arrived."""
         for subscription, received in zip(self.subscriptions, self.received):
             with subscription.handle:
@@ -73,8 +85,9 @@ class Source:
                     data, information = taken
                     _keep(received, data, information["received_timestamp"])
 
-    def _events(self, flight, epoch):
+    def _events(self, flight: Flight, epoch: float) -> list[tuple[float, int, Publisher, bytes]]:
         """(due s, stamp ns of a TDOA or 0, publisher, bytes) in the order in which they are due."""
+        assert flight.imu is not None
         imu, tdoa, events = flight.imu, flight.tdoa, []
         message, publisher = Imu(), self.publishers[Imu]
         for t, (gx, gy, gz), (fx, fy, fz) in zip(imu.t.tolist(), imu.gyro.tolist(), imu.accel.tolist()):
@@ -90,19 +103,19 @@ class Source:
         return sorted(events, key=lambda event: event[0])
 
 
-def _keep(received, data, arrival=None):
+def _keep(received: list[tuple[int, int]], data: bytes, arrival: int | None = None) -> None:
     second, nanosecond = HEADER_STAMP.unpack_from(data, 4)
     received.append((arrival or time.time_ns(), second * 10**9 + nanosecond))
 
 
-def later(data, ns):
+def later(data: bytes, ns: int) -> bytes:
     """A message as bytes, stamped so much later."""
     second, nanosecond = HEADER_STAMP.unpack_from(data, 4)
     second, nanosecond = divmod(second * 10**9 + nanosecond + ns, 10**9)
     return data[:4] + HEADER_STAMP.pack(second, nanosecond) + data[4 + HEADER_STAMP.size :]
 
 
-def latencies(sent, stamps, arrivals, of):
+def latencies(sent: np.ndarray, stamps: np.ndarray, arrivals: np.ndarray, of: np.ndarray) -> np.ndarray:
     """s from the publication of each TDOA to the arrival of the first odometry whose stamp is not older: (n,), NaN for
     those that were published before there was any odometry, or that none contains.
 
@@ -117,7 +130,7 @@ def latencies(sent, stamps, arrivals, of):
     return out
 
 
-def _stamp(seconds):
+def _stamp(seconds: float) -> tuple[Time, int]:
     """(Time, ns) of seconds since 1970, to the microsecond: a float holds no more."""
     ns = round(seconds * 1e6) * 1000
     second, nanosecond = divmod(ns, 10**9)

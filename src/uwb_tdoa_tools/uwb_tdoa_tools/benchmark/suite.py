@@ -1,8 +1,12 @@
 """All parts of the benchmark in one run, and the machine they ran on."""
 
+from __future__ import annotations
+
+from functools import partial
 import os
 from pathlib import Path
 import platform
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
@@ -10,10 +14,17 @@ from tqdm import tqdm
 from . import core, graph, nodes, peer, rates, recordings
 from .usage import used_by_all, used_by_others
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from .figures import Figure
+
 PARTS = ("core", "offline", "nodes", "tags", "replay", "graph")
 
 
-def measure(parts, folder, quick=False, model=None, other=None):
+def measure(
+    parts: Sequence[str], folder: Path, quick: bool = False, model: str | Path | None = None,
+    other: peer.Peer | None = None,
+) -> tuple[dict[str, Any], list[Figure]]:  # fmt: skip
     """Measure some of PARTS. Returns (machine, list of Figure).
 
     folder : for bags and the output of the nodes; quick : fewer repetitions and cases; model : ONNX file for "offline",
@@ -24,23 +35,24 @@ def measure(parts, folder, quick=False, model=None, other=None):
     before, figures = used_by_all(), []
     with tqdm(bar_format="{desc}: {n} figures, {elapsed}", disable=None, leave=False) as progress:
         say = progress.set_description
-        measurements = {  # recordings first: their first call is to be the first of this process
+        # recordings first: their first call is to be the first of this process
+        measurements: dict[str, Callable[[], Iterator[Figure]]] = {
             "offline": lambda: recordings.measure(say, quick, model),
             "core": lambda: core.measure(say, quick),
-            "peer": lambda: peer.measure(say, other, quick),
+            **({"peer": partial(peer.measure, say, other, quick)} if other is not None else {}),
             "nodes": lambda: nodes.measure(say, folder, quick),
             "tags": lambda: nodes.measure_tags(say, folder, quick),
             "graph": lambda: graph.measure(say, folder, quick),
             "replay": lambda: rates.measure(say, folder, quick),
         }
         for part, measurement in measurements.items():
-            for figure in measurement() if part in (*parts, "peer" if other else None) else ():
+            for figure in measurement() if part in (*parts, "peer") else ():
                 figures.append(figure)
                 progress.update()
     return _machine() | used_by_others(before), figures
 
 
-def _machine():
+def _machine() -> dict[str, Any]:
     names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
     return {
         "cpu": names[0].partition(":")[2].strip() if names else platform.machine(),
