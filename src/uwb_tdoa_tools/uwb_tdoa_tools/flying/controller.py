@@ -5,6 +5,10 @@ Position and velocity to a wanted acceleration, that to thrust and attitude (geo
 of the gyroscope. Between estimates the attitude turns as the gyroscope says. Compiled, without ROS.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from dataclasses import asdict, dataclass, fields
 import math
 
@@ -13,6 +17,9 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Vehicle
+
+if TYPE_CHECKING:
+    from .vehicle import Record
 
 FELT = 0.1  # s over which the accelerometer tells what carries the vehicle
 
@@ -46,7 +53,7 @@ NUMBERS = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
 class Controller:
     """thrust : N, wanted of all rotors together; lift : N, what they have come to, as felt over FELT; rates : (3,) rad/s, wanted; integral : (3,) m/s^2, world."""
 
-    def __init__(self, gains=None, vehicle=None):
+    def __init__(self, gains: Gains | None = None, vehicle: Vehicle | None = None) -> None:
         """gains : Gains; vehicle : Vehicle, as far as the controller knows it."""
         self.gains, self.vehicle = gains or Gains(), vehicle or Vehicle()
         self.numbers = np.array([tuple(asdict(self.gains).values())], NUMBERS)[0]
@@ -54,24 +61,27 @@ class Controller:
         self.rates, self.integral = np.zeros(3), np.zeros(3)
         self.thrust = self.lift = 0.0
 
-    def fly(self, p, v, q, wanted, yaw, dt):
+    def fly(self, p: np.ndarray, v: np.ndarray, q: np.ndarray, wanted: np.ndarray, yaw: float, dt: float) -> None:
         """Set thrust and rates. p (3,) m, v (3,) m/s, q (4,) x y z w: the estimate; wanted (3, 3): position, velocity and
         acceleration, NaN in the position where only the velocity counts; yaw : rad; dt : s since the last call."""
         self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * FELT)) * (self.thrust - self.lift)
         self.thrust = outer(p, v, q, wanted, yaw, dt, self.weight, self.numbers, self.integral, self.rates)
 
-    def support(self, force):
+    def support(self, force: float) -> float:
         """Share of the weight that something else than the rotors carries. force : m/s^2, specific, along the body's z, as felt."""
         return force / GRAVITY - self.lift / (self.weight * (1.0 + self.integral[2] / GRAVITY))
 
-    def stop(self):
+    def stop(self) -> None:
         """Rotors off."""
         self.thrust = self.lift = 0.0
         self.rates[:] = self.integral[:] = 0.0
 
 
 @compiled
-def outer(p, v, q, wanted, yaw, dt, weight, gains, integral, rates):
+def outer(
+    p: np.ndarray, v: np.ndarray, q: np.ndarray, wanted: np.ndarray, yaw: float, dt: float, weight: float,
+    gains: Record, integral: np.ndarray, rates: np.ndarray,
+) -> float:  # fmt: skip
     """See Controller.fly. integral (3,) and rates (3,) are written to. Returns the thrust, N."""
     a, error = np.empty(3), np.empty(3)
     far = 0.0
@@ -116,7 +126,10 @@ def outer(p, v, q, wanted, yaw, dt, weight, gains, integral, rates):
 
 
 @compiled
-def inner(thrust, rates, gyro, before, dt, gains, vehicle, speeds):
+def inner(
+    thrust: float, rates: np.ndarray, gyro: np.ndarray, before: np.ndarray, dt: float, gains: Record, vehicle: Record,
+    speeds: np.ndarray,
+) -> None:  # fmt: skip
     """From thrust, N, and rates (3,) rad/s, both wanted, to rotor speeds (4,) rad/s. gyro, before : (3,) rad/s, felt now and dt s ago;
     gains, vehicle : numbers of both."""
     if thrust <= 0.0:
@@ -135,7 +148,7 @@ def inner(thrust, rates, gyro, before, dt, gains, vehicle, speeds):
 
 
 @compiled
-def turned(q, rate, dt):
+def turned(q: np.ndarray, rate: np.ndarray, dt: float) -> None:
     """Turn the attitude q (4,) x y z w by a body rate (3,) rad/s for dt, s, in place."""
     angle = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2) * dt
     share = 0.5 * dt if angle < 1e-9 else math.sin(0.5 * angle) / angle * dt

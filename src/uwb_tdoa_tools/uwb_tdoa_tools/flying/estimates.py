@@ -1,6 +1,9 @@
 """Who tells the controller where it is: our filter, as the nodes run it, or somebody else's, built as a shared library."""
 
+from __future__ import annotations
+
 import math
+from typing import Protocol, TYPE_CHECKING
 
 import numpy as np
 
@@ -11,31 +14,74 @@ from uwb_tdoa_ekf.offline import poses_of
 
 from ..benchmark.peer import EVENT, Peer
 
-NOTHING = Odometry(np.empty(0), *(np.empty((0, n)) for n in (3, 3, 4, 3, 3)), np.empty((0, 9, 9)), np.empty((0, 3, 3)))
+if TYPE_CHECKING:
+    from pathlib import Path
+    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_ekf.core.config import FilterConfig
+    from .mission import Pose
+    from .simulator import Measured
+
+NOTHING = Odometry(
+    np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 4)), np.empty((0, 3)), np.empty((0, 3)),
+    np.empty((0, 9, 9)), np.empty((0, 3, 3)),
+)  # fmt: skip
+
+
+class Source(Protocol):
+    """Who tells where a vehicle is. why : what keeps it from being flown by, in words, "" for nothing."""
+
+    @property
+    def why(self) -> str: ...
+
+    def tell(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
+        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
+
+    def take(self, measured: Measured) -> None:
+        """Take what arrived."""
+
+    @property
+    def pose(self) -> Pose | None:
+        """The newest estimate."""
+
+    @property
+    def deviation(self) -> float:
+        """Largest standard deviation of a coordinate of it, m; inf without one."""
+
+    @property
+    def odometry(self) -> Odometry:
+        """All that came out."""
 
 
 class OurFilter:
-    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs."""
+    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs: a Source."""
 
-    def __init__(self, anchors, config, effects=None, network=None):
+    why = ""
+
+    def __init__(
+        self, anchors: Anchors, config: FilterConfig, effects: EffectSet | None = None, network: Network | None = None
+    ) -> None:
         """anchors : Anchors; config : FilterConfig; effects : EffectSet, and network : Network, to correct what was measured with, or None."""
         effects = effects or EffectSet()
         self._anchors, self._corrector = anchors, Corrector(anchors, effects, network)
-        self._labels, self._of_imu, self._of_aids = (kind(effects.effects) for kind in (LabelCorrector, ImuCorrector, AidCorrector))
+        self._labels, self._of_imu = LabelCorrector(effects.effects), ImuCorrector(effects.effects)
+        self._of_aids = AidCorrector(effects.effects)
         self._offset = effects.stamp_offset
         self._estimator = Estimator(anchors, config, functions=effects.sensor_functions, floor=effects.on_floor(anchors))
-        self._parts, self._newest = [NOTHING], None
+        self._parts = [NOTHING]
+        self._newest: Odometry | None = None
 
-    def tell(self, t, p, std, yaw):
-        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN where nobody knows."""
+    def tell(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
+        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
         self._estimator.tell_pose(t, p, std**2 * np.eye(3), yaw, std)
 
-    def take(self, measured):
+    def take(self, measured: Measured) -> None:
         """Take what arrived: Measured."""
         imu, tdoa = measured.imu, measured.tdoa
         if len(imu):
-            samples = imu.t - self._offset("imu"), imu.gyro, imu.accel
-            self._estimator.add_imu(samples[0], *(samples[1:] if self._of_imu.idle else self._of_imu.correct(*samples)))
+            t, gyro, accel = imu.t - self._offset("imu"), imu.gyro, imu.accel
+            gyro, accel = (gyro, accel) if self._of_imu.idle else self._of_imu.correct(t, gyro, accel)
+            self._estimator.add_imu(t, gyro, accel)
         if len(tdoa):
             t, (a, b, d) = tdoa.t - self._offset("tdoa"), self._labels.correct(tdoa.a, tdoa.b, tdoa.d)
             known = self._corrector.correct(t, self._anchors.index(a), self._anchors.index(b), d)
@@ -51,14 +97,14 @@ class OurFilter:
                 self._corrector.add_pose(*poses_of(odometry))
 
     @property
-    def pose(self):
+    def pose(self) -> Pose | None:
         """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
         if self._newest is None:
             return None
         return self._newest.t[-1], self._newest.p[-1], self._newest.v[-1], self._newest.q[-1]
 
     @property
-    def deviation(self):
+    def deviation(self) -> float:
         """Largest standard deviation of a coordinate of the newest estimate, m; inf without one."""
         if self._newest is None:
             return math.inf
@@ -66,7 +112,7 @@ class OurFilter:
         return math.sqrt(max(P[0, 0], P[1, 1], P[2, 2]))
 
     @property
-    def odometry(self):
+    def odometry(self) -> Odometry:
         """Odometry, all that came out."""
         return Odometry(*(np.concatenate([getattr(part, name) for part in self._parts]) for name in vars(NOTHING)))
 
@@ -75,15 +121,17 @@ class TheirFilter:
     """A Peer behind the same calls. It is told place and yaw at the start, knows no effects, and says nothing of its covariance."""
 
     deviation = 0.0  # m; nobody knows
+    why = ""
 
-    def __init__(self, library, anchors, yaw, place=None):
+    def __init__(self, library: str | Path, anchors: Anchors, yaw: float, place: np.ndarray | None = None) -> None:
         """library : path; anchors : Anchors; yaw : rad; place : (3,) m, or None. Raises InputError."""
         self._peer, self._anchors = Peer(library, own=True), anchors
         q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
         self._peer.start(anchors.positions, np.full(3, np.nan) if place is None else place, q)
-        self._states, self._newest = [], None
+        self._states: list[Pose] = []
+        self._newest: Pose | None = None
 
-    def take(self, measured):
+    def take(self, measured: Measured) -> None:
         """Take what arrived: Measured, of which other sensors are passed over."""
         imu, tdoa = measured.imu, measured.tdoa
         samples, ranges = np.zeros(len(imu), EVENT), np.zeros(len(tdoa), EVENT)
@@ -93,17 +141,17 @@ class TheirFilter:
         events = np.concatenate([samples, ranges])
         if len(events):
             self._peer.run(events[np.argsort(events["t"], kind="stable")])
-            self._states.append((events["t"].max(), *self._peer.state()))
+            self._states.append((float(events["t"].max()), *self._peer.state()))
             if all(np.isfinite(part).all() for part in self._states[-1]):
                 self._newest = self._states[-1]
 
     @property
-    def pose(self):
+    def pose(self) -> Pose | None:
         """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate that is one, or None."""
         return self._newest
 
     @property
-    def odometry(self):
+    def odometry(self) -> Odometry:
         """Odometry, all that came out; covariances NaN."""
         if not self._states:
             return NOTHING

@@ -1,8 +1,11 @@
 """Many flights, on all cores, with what they came to kept on the way."""
 
+from __future__ import annotations
+
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 from .. import parallel
 from ..bags.bag import write_bag
@@ -12,13 +15,24 @@ from .report import summary, text
 from .trial import fly
 from .verdict import judge
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from contextlib import AbstractContextManager
+    from .plots import Drawn
+    from .trial import Task
 
-def kept(path, asked):
+    Verdicts = ResultsFile | dict[str, dict[str, Any]]  # {seed: verdict}
+
+
+def kept(path: str | Path | None, asked: dict[str, Any]) -> AbstractContextManager[Verdicts]:
     """Context of a ResultsFile, or of a dict where path is None. asked : as of ResultsFile. Raises InputError."""
     return nullcontext({}) if path is None else ResultsFile(path, asked)
 
 
-def flown(tasks, done, record=None, draw=False, jobs=None, dask=None):
+def flown(
+    tasks: Sequence[Task], done: Verdicts, record: str | Path | None = None, draw: bool = False,
+    jobs: int | None = None, dask: str | None = None,
+) -> Iterator[tuple[dict[str, Any], Drawn | None]]:  # fmt: skip
     """Generator of (verdict, Drawn or None), of Tasks in turn; those that are in `done`, by their seeds, are not flown again.
 
     record : folder for a bag of each, or None; draw : give what is drawn; jobs, dask : as of `parallel.over`.
@@ -33,13 +47,13 @@ def flown(tasks, done, record=None, draw=False, jobs=None, dask=None):
     next(made, None)  # to its end, so that its processes are kept
 
 
-def _sound(verdict):
+def _sound(verdict: dict[str, Any]) -> dict[str, Any]:
     """A verdict that a file holds, of which a summary can be made."""
     text(summary([verdict]))
     return verdict
 
 
-def judged(record, draw, task):
+def judged(record: str | Path | None, draw: bool, task: Task) -> tuple[dict[str, Any], Drawn | None]:
     """(verdict, Drawn or None) of a Task that is flown; record, draw : as of `flown`."""
     one = fly(task)
     verdict = judge(one)

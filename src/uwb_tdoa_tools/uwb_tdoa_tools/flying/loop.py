@@ -1,5 +1,9 @@
 """From one estimate to the next: gyroscope, rates, rotors, body, and what the sensors of the vehicle felt meanwhile. Compiled."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import math
 
 import numpy as np
@@ -9,13 +13,20 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from .controller import inner
 from .vehicle import STATE, STEP, specific_force, step
 
+if TYPE_CHECKING:
+    from .vehicle import Record
+
 IMU_RATE = 400.0  # Hz
 STEPS = round(1.0 / (IMU_RATE * STEP))  # of the integration, per sample
 TURNING = 50.0  # rad/s of a rotor, above which it shakes the vehicle
 
 
 @compiled
-def interval(state, gyro, thrust, rates, gains, known, vehicle, wind, errors, shaking, truth, samples, contact):
+def interval(
+    state: np.ndarray, gyro: np.ndarray, thrust: float, rates: np.ndarray, gains: Record, known: Record,
+    vehicle: Record, wind: np.ndarray, errors: np.ndarray, shaking: np.ndarray, truth: np.ndarray, samples: np.ndarray,
+    contact: np.ndarray,
+) -> None:  # fmt: skip
     """Fly n samples of the inertial sensor long.
 
     state (17,) and gyro (2, 3) rad/s, as felt last and before that, are updated; thrust : N, rates (3,) rad/s, wanted; gains, known : of the controller;
@@ -46,7 +57,7 @@ def interval(state, gyro, thrust, rates, gains, known, vehicle, wind, errors, sh
 
 
 @compiled
-def poses_at(t, times, states, p, q):
+def poses_at(t: np.ndarray, times: np.ndarray, states: np.ndarray, p: np.ndarray, q: np.ndarray) -> None:
     """Positions p (n, 3) and attitudes q (n, 4) at t (n,) s, between states (m, 17) at times (m,) s; written to."""
     j = 0
     for i in range(len(t)):

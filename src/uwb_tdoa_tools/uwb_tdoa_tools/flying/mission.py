@@ -1,9 +1,16 @@
 """Wait, take off, fly, land: decided by nothing but the estimate, its deviation, and what the accelerometer feels."""
 
+from __future__ import annotations
+
+from typing import Protocol, TYPE_CHECKING
+
 from dataclasses import dataclass
 import math
 
 import numpy as np
+
+if TYPE_CHECKING:
+    Pose = tuple[float, np.ndarray, np.ndarray, np.ndarray]  # t s, p (3,) m, v (3,) m/s, world, q (4,) x y z w
 
 WAITING, FLYING, LOST, DONE, REFUSED = "waiting", "flying", "lost", "done", "refused"
 
@@ -26,6 +33,29 @@ class Rules:
     longest_sink: float = 10.0
 
 
+class Way(Protocol):
+    """What is to be flown from where a vehicle stands, by s since its rotors started."""
+
+    duration: float  # s, until it begins to sink
+
+    @property
+    def end(self) -> np.ndarray:
+        """(2,) m, where it is to land."""
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Position, velocity and acceleration wanted, (n, 3, 3), m and s, at t (n,) s."""
+
+    def turned(self, t: float) -> float:
+        """rad by which it is to be turned at t, s."""
+
+
+class Route(Protocol):
+    """What is to be flown, wherever it begins."""
+
+    def along(self, place: np.ndarray, ground: float) -> Way:
+        """The Way from `place` (2,) m; ground : m, height at which the body stands."""
+
+
 PULL = 0.15  # m, most by which the height that is wanted while it comes down is below the estimated height
 USUAL = 2.0  # s over which it learns what support it feels in the air, where there is none: its accelerometer has an offset
 
@@ -35,23 +65,29 @@ class Mission:
     its estimate first said that it was lost, or None: then it stops, sinks, and goes on with its path only if it is told where it is while
     it is still in the air; yaw : rad, wanted now."""
 
-    def __init__(self, path, place, ground, rules=None, begin=0.0):
+    def __init__(
+        self, path: Route, place: np.ndarray, ground: float, rules: Rules | None = None, begin: float = 0.0
+    ) -> None:
         """path : Circles, or what else has `along`; place (2,) m; ground : m, of the body's origin; begin : s, when it was switched on."""
         self.ground, self.rules, self.begin = ground, rules or Rules(), begin
-        self._path, self._clock = path.along(place, ground), []  # (s, s since the start of the path) of each call
-        self.state, self.started, self.ended, self.lost = WAITING, None, None, None
+        self._path = path.along(place, ground)
+        self._clock: list[tuple[float, float]] = []  # (s, s since the start of the path) of each call
+        self.state = WAITING
+        self.started: float | None = None
+        self.ended: float | None = None
+        self.lost: float | None = None
         self.yaw = self._first_yaw = 0.0
         self._usual = 0.0  # support, of the weight
-        self._descent = None  # (s, m) where it began to come down on whatever is there
+        self._descent: tuple[float, float] | None = None  # (s, m) where it began to come down on whatever is there
 
-    def decide(self, t, pose, deviation, support):
+    def decide(self, t: float, pose: Pose | None, deviation: float, support: float) -> np.ndarray | None:
         """What the controller is to do at t, s: (3, 3) position, velocity, acceleration, NaN where it does not matter; None for rotors
         off. pose : as of an estimate, or None; deviation : m; support : of the weight, that something else than the rotors carries, as
         felt."""
         rules = self.rules
         good = pose is not None and t - pose[0] <= rules.stale
         if self.state == WAITING and t >= self.begin + rules.rest:
-            if good and deviation <= rules.arm:
+            if pose is not None and good and deviation <= rules.arm:
                 self.state, self.started, self._last, self._sinking = FLYING, t, t, t
                 self._first_yaw = yaw_of(pose[3])
             elif t >= self.begin + rules.rest + rules.patience:
@@ -74,6 +110,7 @@ class Mission:
             self.state, self.ended = DONE, t
             return None
         if self.state != LOST:
+            assert pose is not None  # or it would be lost
             self._sinking = t if along < self._path.duration else self._sinking
             self.yaw = self._first_yaw + self._path.turned(along)
             wanted = self._path.at(np.array([along]))[0]
@@ -82,7 +119,7 @@ class Mission:
         wanted[0], wanted[1, 2] = math.nan, -rules.sink
         return wanted
 
-    def _descend(self, t, wanted, height):
+    def _descend(self, t: float, wanted: np.ndarray, height: float) -> np.ndarray:
         """Wanted, with a height, m, that falls at half of the wanted velocity, where the estimated height does not fall as fast: an
         estimated velocity that is wrong by a constant does not keep it in the air."""
         begun, first = self._descent = self._descent or (t, height)
@@ -90,21 +127,21 @@ class Mission:
         return wanted
 
     @property
-    def place(self):
+    def place(self) -> np.ndarray:
         """(2,) m, where it is to land."""
         return self._path.end
 
     @property
-    def along(self):
+    def along(self) -> float:
         """s since the start of the path."""
         return self._clock[-1][1] if self._clock else 0.0
 
-    def wanted(self, t):
+    def wanted(self, t: np.ndarray) -> np.ndarray:
         """Of the path, (n, 3, 3), at t (n,) s."""
         return self._path.at(np.interp(t, *np.transpose(self._clock)))
 
 
-def yaw_of(q):
+def yaw_of(q: np.ndarray) -> float:
     """rad, of q (4,) x y z w."""
     x, y, z, w = q
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

@@ -1,7 +1,10 @@
 """A filter that is reached over topics, behind the calls that a flight needs: what is measured goes out, odometry and status come in."""
 
+from __future__ import annotations
+
 import math
 from types import SimpleNamespace
+from typing import Any, TYPE_CHECKING
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry as OdometryMessage
@@ -24,11 +27,21 @@ from ..bags.messages import BODY_FRAME
 from .estimates import NOTHING
 from .vehicle import ATTITUDE, POSITION
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from builtin_interfaces.msg import Time
+    from uwb_tdoa_bias.foundation.ros_wire import Template
+    from .mission import Pose
+    from .pace import Lockstep, RealTime
+    from .simulator import Measured
+    from .world import World
+
 FARTHEST, FASTEST = 1e3, 100.0  # m, m/s; what is beyond is no odometry of a hall
 CLOSEST = 0.5e-3  # s between odometries that are kept: anybody may publish one for each nanosecond
 LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
 MARKER_SIZE = 0.12  # m
-STREAMS = {  # {stream: (topic, class of its messages, {field: values} of its part)}
+# {stream: (topic, class of its messages, {field: values} of its part)}
+STREAMS: dict[str, tuple[str, type, Callable[[Any], dict[str, Any]]]] = {
     "imu": ("imu/data", Imu, lambda imu: {"angular_velocity": imu.gyro, "linear_acceleration": imu.accel}),
     "tdoa": (
         "uwb/tdoa", Tdoa, lambda of: {"anchor_a": of.a, "anchor_b": of.b, "distance_difference": of.d, "variance": of.variance}
@@ -41,12 +54,14 @@ class OverTopics:
     """See `estimates.OurFilter`. deviation : m, as there; inf unless the filter says that it is running; status : EstimatorStatus, the
     newest, or None."""
 
-    def __init__(self, node, world, pace, clock):
+    def __init__(self, node: ros.StreamNode, world: World, pace: RealTime | Lockstep, clock: bool) -> None:
         """node : ros.StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count stamps
         from 0, not from now."""
         self._node, self._pace, self._anchors = node, pace, world.anchors
         self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock
-        self._now, self._told, self.status = 0.0, (), None
+        self._now = 0.0
+        self._told: tuple[float, np.ndarray, float, float] | None = None
+        self.status: EstimatorStatus | None = None
         self._outputs = {name: _Output(node, *STREAMS[name]) for name in ("imu", "tdoa", *world.aids)}
         self._truth = _Output(node, *STREAMS["truth"], frame=self._anchors.frame)
         self._clock = node.create_publisher(Clock, "/clock", 10) if clock else None
@@ -62,33 +77,35 @@ class OverTopics:
         ):
             self._latched = node.create_publisher(type(content), topic, qos)
             self._latched.publish(content)
-        self._rows = []  # (t s, p, v, q, covariance (3, 3)) of each odometry
+        # (t s, p, v, q, covariance (3, 3)) of each odometry
+        self._rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def heard(self):
+    def heard(self) -> bool:
         """Whether somebody listens to what is measured, and says what comes of it."""
         ends = [output.subscribers for output in (self._outputs["imu"], self._outputs["tdoa"])]
         return all(ends) and bool(self._odometry.get_publisher_count())
 
-    def wait_for_anchors(self):
+    def wait_for_anchors(self) -> None:
         """Wait until those who listen have the anchors, and hear everything else, too."""
         self._latched.wait_for_all_acked(Duration(seconds=LATCHED_LIMIT))
 
-    def tell(self, t, p, std, yaw):
+    def tell(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         """See OurFilter; is said before what is measured first."""
         self._told = t, p, std, yaw
 
-    def take(self, measured):
+    def take(self, measured: Measured) -> None:
         """Publish Measured."""
         if self._begin is None:
             self._begin = self._node.get_clock().now().nanoseconds
         if self._told:
             self._pose.publish(self._pose_of(*self._told))
-            self._told = ()
+            self._told = None
         self._measured = measured
-        for name, part in {"imu": measured.imu, "tdoa": measured.tdoa, **measured.aids}.items():
+        parts: dict[str, Any] = {"imu": measured.imu, "tdoa": measured.tdoa, **measured.aids}
+        for name, part in parts.items():
             self._outputs[name].publish(*self._parts(part.t), part)
 
-    def turned(self, t, state):
+    def turned(self, t: float, state: np.ndarray) -> None:
         """Publish what is true at t, s, up to which everything was published: state (17,), as of `vehicle`; and on /clock the time."""
         self._now = t
         self._truth.publish(*self._parts(np.array([t])), SimpleNamespace(pose=np.concatenate([state[POSITION], state[ATTITUDE]])[None]))
@@ -96,7 +113,7 @@ class OverTopics:
             self._clock.publish(Clock(clock=self._stamp(t)))
         self._pace.sent(t, self._measured)
 
-    def listen(self):
+    def listen(self) -> None:
         """Take the odometry that has come."""
         for frame, rows, _ in self._odometry.fetch(self._wire):
             if self._begin is None:  # nothing was measured yet: whose odometry is that?
@@ -106,7 +123,7 @@ class OverTopics:
             for k in np.flatnonzero(usable & (t <= self._now)):
                 self._hear(t[k], rows["pose"][k], rows["twist"][k])
 
-    def _hear(self, t, pose, twist):
+    def _hear(self, t: float, pose: np.ndarray, twist: np.ndarray) -> None:
         p, q, covariance = pose[:3].copy(), pose[3:7].copy(), pose[7:].reshape(6, 6)[:3, :3].copy()
         length = np.linalg.norm(q)
         sound = length > 0.5 and (np.diag(covariance) >= 0.0).all()
@@ -117,7 +134,7 @@ class OverTopics:
         self._rows.append((float(t), p, Rotation.from_quat(q).apply(twist[:3]), q, covariance))
         self._pace.heard(float(t))
 
-    def _pose_of(self, t, p, std, yaw):
+    def _pose_of(self, t: float, p: np.ndarray, std: float, yaw: float) -> PoseWithCovarianceStamped:
         """PoseWithCovarianceStamped, see `tell`; a variance of 0 says that nobody knows."""
         message, known = PoseWithCovarianceStamped(), not math.isnan(yaw)
         message.header.stamp, message.header.frame_id = self._stamp(t), self._anchors.frame
@@ -127,30 +144,30 @@ class OverTopics:
         message.pose.covariance = np.diag([*[std**2] * 3, 0.0, 0.0, std**2 if known else 0.0]).ravel()
         return message
 
-    def _on_status(self, message):
+    def _on_status(self, message: EstimatorStatus) -> None:
         self.status = message
 
     @property
-    def pose(self):
+    def pose(self) -> Pose | None:
         """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
         return self._rows[-1][:4] if self._rows else None
 
     @property
-    def deviation(self):
+    def deviation(self) -> float:
         """Largest standard deviation of a coordinate of the newest estimate, m; inf without one, or where the filter says that it is lost."""
         if not self._rows or self.status is None or self.status.status != EstimatorStatus.STATUS_RUNNING:
             return math.inf
         return math.sqrt(np.diag(self._rows[-1][4]).max())
 
     @property
-    def why(self):
+    def why(self) -> str:
         """What keeps it from being flown by, in words, "" if nothing is said."""
         if self.status is None:
             return "nothing came on status: start ekf_node"
         return self.status.why if self.status.status != EstimatorStatus.STATUS_RUNNING else ""
 
     @property
-    def odometry(self):
+    def odometry(self) -> Odometry:
         """Odometry, all that came; of its covariance only that of the position, the rest 0."""
         if not self._rows:
             return NOTHING
@@ -159,11 +176,12 @@ class OverTopics:
         whole[:, :3, :3] = covariance
         return Odometry(t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), whole, np.zeros((len(t), 3, 3)))
 
-    def _parts(self, t):
+    def _parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Seconds and nanoseconds of the stamps, (n,) each, of t (n,) s."""
+        assert self._begin is not None
         return np.divmod(self._begin + np.rint(t * 1e9).astype(np.int64), 10**9)
 
-    def _stamp(self, t):
+    def _stamp(self, t: float) -> Time:
         second, nanosecond = self._parts(np.array([t]))
         return ros.Time(sec=int(second[0]), nanosec=int(nanosecond[0]))
 
@@ -171,15 +189,19 @@ class OverTopics:
 class _Output:
     """A stream of which only some fields are not 0. subscribers : how many hear it."""
 
-    def __init__(self, node, topic, kind, content, frame=BODY_FRAME):
-        self._content, self._kind, self._frame, self._template = content, kind, frame, None
+    def __init__(
+        self, node: ros.StreamNode, topic: str, kind: type, content: Callable[[Any], dict[str, np.ndarray]],
+        frame: str = BODY_FRAME,
+    ) -> None:  # fmt: skip
+        self._content, self._kind, self._frame = content, kind, frame
+        self._template: Template | None = None
         self._output = StreamOutput(node, kind, topic)
 
     @property
-    def subscribers(self):
+    def subscribers(self) -> int:
         return self._output.publisher.get_subscription_count()
 
-    def publish(self, seconds, nanoseconds, part):
+    def publish(self, seconds: np.ndarray, nanoseconds: np.ndarray, part: Any) -> None:
         """Publish the rows of a part of a stream, with stamps of these seconds and nanoseconds (n,) each."""
         content = self._content(part)
         if self._template is None:

@@ -1,5 +1,7 @@
 """What is to be flown: a path from a place on the ground and back to it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,11 +33,11 @@ class Circles:
     swing: float = 0.0
 
     @property
-    def duration(self):
+    def duration(self) -> float:
         """s, from the rotors' start to where the slow sinking begins."""
         return self.rise + self.turns * self.turn_time + self.fall
 
-    def along(self, place, ground):
+    def along(self, place: np.ndarray, ground: float) -> Reference:
         """The Reference from `place` (2,) m, where the circle is entered at its point nearest to +x; ground : m, height at which the body
         stands."""
         knots = np.arange(0.0, self.duration + KNOT, KNOT)
@@ -67,11 +69,11 @@ class Sines:
     radius = 0.0  # m: it begins in the middle
 
     @property
-    def duration(self):
+    def duration(self) -> float:
         """As of Circles."""
         return self.rise + self.seconds + self.fall
 
-    def along(self, place, ground):
+    def along(self, place: np.ndarray, ground: float) -> Reference:
         """The Reference, as of Circles."""
         knots = np.arange(0.0, self.duration + KNOT, KNOT)
         up = _cruise(knots / self.rise, CLIMB)
@@ -87,7 +89,7 @@ class Reference:
     """Position, velocity and acceleration, (n, 3, 3), m and s, wanted since the rotors started; at its end it sinks, and no height is wanted.
     duration : s until then; end (2,) m, where."""
 
-    def __init__(self, p, turning=0.0):
+    def __init__(self, p: np.ndarray, turning: float = 0.0) -> None:
         """p : (m, 3) m, each KNOT s, from the start on; turning : rad/s."""
         knots = KNOT * np.arange(len(p))
         spline = make_interp_spline(knots, p, k=5)
@@ -95,17 +97,17 @@ class Reference:
         self._turning = turning
         self._grid = np.stack([spline(fine), spline.derivative(1)(fine), spline.derivative(2)(fine)], axis=1)
 
-    def at(self, t):
+    def at(self, t: np.ndarray) -> np.ndarray:
         """At t (n,) s; (n, 3, 3)."""
         out = self._grid[np.clip(np.rint(t / FINE).astype(int), 0, len(self._grid) - 1)]
         return sinking(out, t > self.duration)
 
-    def turned(self, t):
+    def turned(self, t: float) -> float:
         """rad by which it is to be turned t s after the start."""
         return self._turning * t
 
 
-def sinking(wanted, after):
+def sinking(wanted: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Of what is wanted, (n, 3, 3), have it sink where `after`, (n,) bool."""
     wanted[after, 0, 2] = np.nan  # as fast as that, from wherever it is: the ground is where it is felt
     wanted[after, 1:] = 0.0
@@ -113,13 +115,13 @@ def sinking(wanted, after):
     return wanted
 
 
-def _smooth(x):
+def _smooth(x: np.ndarray) -> np.ndarray:
     """0 to 1 with three derivatives zero at both ends."""
     x = np.clip(x, 0.0, 1.0)
     return x**4 * (35.0 - 84.0 * x + 70.0 * x**2 - 20.0 * x**3)
 
 
-def _cruise(x, ramp):
+def _cruise(x: np.ndarray, ramp: float) -> np.ndarray:
     """0 to 1 over x in 0 ... 1, at one speed but for smooth ramps of that length at both ends."""
     fine = np.linspace(0.0, 1.0, 4001)
     speed = _smooth(fine / ramp) * _smooth((1.0 - fine) / ramp)

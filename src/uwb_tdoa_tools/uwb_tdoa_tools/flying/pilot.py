@@ -1,27 +1,36 @@
 """Does what is asked for piece by piece, with the vehicle of a Trial: take off, go to, land. Refuses, with why, what it cannot do."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .commanded import Commanded
 from .mission import FLYING, LOST, yaw_of
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .mission import Mission
+    from .trial import Trial
+
 
 class Pilot:
     """Of a Trial, whose source also says `why` it is not to be flown by. Seconds, metres and rad; raises InputError."""
 
-    def __init__(self, trial):
+    def __init__(self, trial: Trial) -> None:
         """trial : Trial."""
-        self._trial, self._path = trial, None
+        self._trial = trial
+        self._path: Commanded | None = None
 
     @property
-    def _mission(self):
+    def _mission(self) -> Mission | None:
         """The mission in the air, or None."""
         last = self._trial.missions[-1:]
         return last[0] if last and last[0].state in (FLYING, LOST) else None
 
-    def take_off(self, group_mask, height, seconds):
+    def take_off(self, group_mask: int, height: float, seconds: float) -> None:
         """Take off from where it stands, if it knows where that is."""
         _check(group_mask)
         if self._mission is not None:
@@ -37,24 +46,26 @@ class Pilot:
         self._path = path
         self._trial.begin(path, replace(rules, rest=0.0, patience=0.0))
 
-    def go_to(self, group_mask, relative, goal, yaw, seconds):
+    def go_to(self, group_mask: int, relative: bool, goal: Sequence[float], yaw: float, seconds: float) -> None:
         """Go to goal (3,) m."""
-        self._in_air(group_mask)
-        self._path.go_to(self._mission.along, relative, goal, yaw, seconds)
+        mission, path = self._in_air(group_mask)
+        path.go_to(mission.along, relative, goal, yaw, seconds)
 
-    def land(self, group_mask, height, seconds):
+    def land(self, group_mask: int, height: float, seconds: float) -> None:
         """Land where it is, on what is `height` m high."""
-        self._in_air(group_mask)
-        self._path.land(self._mission.along, height, seconds)
+        mission, path = self._in_air(group_mask)
+        path.land(mission.along, height, seconds)
 
-    def _in_air(self, group_mask):
+    def _in_air(self, group_mask: int) -> tuple[Mission, Commanded]:
         _check(group_mask)
-        if self._mission is None:
+        mission, path = self._mission, self._path
+        if mission is None or path is None:
             raise InputError("it does not fly; take off first.")
-        if self._mission.state == LOST:
+        if mission.state == LOST:
             raise InputError("its estimate is lost: it sinks to the ground.")
+        return mission, path
 
 
-def _check(group_mask):
+def _check(group_mask: int) -> None:
     if group_mask:
         raise InputError(f"group_mask: {group_mask} is a group that it is not in; give 0.")

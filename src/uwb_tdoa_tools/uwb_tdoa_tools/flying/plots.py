@@ -1,10 +1,19 @@
 """Pictures of flights: one map of all, and of one of them the errors with three sigma."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from ..scoring.metrics import position_at
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .trial import Flown
 
 SPACING = 0.05  # s
 
@@ -20,11 +29,12 @@ class Drawn:
     stamps: np.ndarray
     error: np.ndarray
     sigma: np.ndarray
-    verdict: dict
+    verdict: dict[str, Any]
 
 
-def drawn(flown, verdict):
+def drawn(flown: Flown, verdict: dict[str, Any]) -> Drawn:
     """Drawn, of a Flown."""
+    assert flown.flight.truth is not None
     truth, odometry = flown.flight.truth, flown.odometry
     every = max(1, round(SPACING / (truth.t[1] - truth.t[0])))
     t, p = truth.t[::every], truth.p[::every]
@@ -32,14 +42,16 @@ def drawn(flown, verdict):
     for mission in (mission for mission in flown.missions if mission.started is not None):
         inside = (t >= mission.started) & (t <= (mission.ended or np.inf))
         wanted[inside] = mission.wanted(t[inside])[:, 0]
-    rows = np.unique(np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING))) if len(odometry) else []
+    rows: np.ndarray = np.empty(0, int)
+    if len(odometry):
+        rows = np.unique(np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING)))
     stamps = odometry.t[rows]
     error = odometry.p[rows] - position_at(stamps, truth)
     sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[rows, :3, :3]))
     return Drawn(t, p, wanted, stamps, error, sigma, verdict)
 
 
-def plot(flights, anchors, path):
+def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
     """Draw [Drawn] among Anchors to an image file: a map and the heights of all, and the errors of the worst."""
     from matplotlib.figure import Figure  # takes a second to import
 
@@ -68,5 +80,5 @@ def plot(flights, anchors, path):
     figure.savefig(path, dpi=120)
 
 
-def _badness(one):
+def _badness(one: Drawn) -> tuple[bool, float]:
     return not one.verdict["landed"], one.verdict["tracking"] or 0.0

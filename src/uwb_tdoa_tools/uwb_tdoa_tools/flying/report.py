@@ -1,16 +1,22 @@
 """What many flights came to, in words and for JSON."""
 
+from __future__ import annotations
+
 from collections import Counter
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from .verdict import PHASES
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
 DISHONEST = 3.0  # standard deviations of a coordinate
 MEDIANS = "tracking", "estimation", "place", "touchdown"
 
 
-def summary(verdicts):
+def summary(verdicts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """dict for JSON, of verdicts as of `judge`: counts, medians and largest of the figures, per phase too."""
     out = {"flights": len(verdicts), "landed": sum(one["landed"] for one in verdicts)}
     out["why"] = dict(Counter(one["why"] for one in verdicts if one["why"]).most_common())
@@ -27,14 +33,14 @@ def summary(verdicts):
     return out
 
 
-def _spread(values):
+def _spread(values: Iterable[float | None]) -> dict[str, float] | None:
     known = [value for value in values if value is not None]
     if not known:
         return None
     return {"median": float(np.median(known)), "least": float(min(known)), "most": float(max(known))}
 
 
-def text(summed):
+def text(summed: dict[str, Any]) -> str:
     """Lines of a summary."""
     lines = [f"{summed['landed']} of {summed['flights']} landed; {summed['safe']} without a crash"]
     lines += [f"  {count} {why}" for why, count in summed["why"].items()]
@@ -56,7 +62,7 @@ def text(summed):
     return "\n".join(lines)
 
 
-def sentence(verdict):
+def sentence(verdict: dict[str, Any]) -> str:
     """One of them in words."""
     if not verdict["landed"]:
         return f"not landed: {verdict['why']}"
@@ -64,5 +70,5 @@ def sentence(verdict):
     return f"landed {figures}, in the air {verdict['tracking']:.2f} m off the path"
 
 
-def _range(spread):
+def _range(spread: dict[str, float] | None) -> str:
     return "-" if spread is None else f"{spread['median']:.2f} ({spread['least']:.2f} - {spread['most']:.2f})"

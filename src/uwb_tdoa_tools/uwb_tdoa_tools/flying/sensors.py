@@ -1,10 +1,14 @@
 """What radio, inertial sensor and the others of one flight say: all that does not depend on the path is drawn beforehand, by seed."""
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EFFECTS, Samples
+from uwb_tdoa_bias.effects import Samples
+from uwb_tdoa_bias.effects.floor_multipath import FloorMultipath
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.radio import arrival_bias
 from uwb_tdoa_bias.foundation.sensors.pressure import SITE, pressure_at
@@ -15,7 +19,9 @@ from ..simulation.ranging import outliers, tag_link, tdoa_noise
 from ..simulation.schedule import make_schedule
 from .loop import IMU_RATE
 
-FloorMultipath = EFFECTS["floor_multipath"]
+if TYPE_CHECKING:
+    from .world import World
+
 NEAR_FLOOR = 0.5  # m, above which the floor does nothing
 LOW = 1.0  # m, below which an anchor is one of the low ones
 GUST_TIME = 1.0  # s, correlation time of gusts
@@ -25,7 +31,7 @@ ALTITUDE_STD, VELOCITY_STD = 0.08, 0.05  # m and m/s, noise of a barometer and o
 NEVER = np.inf, np.inf
 
 
-def random(seed, part):
+def random(seed: int, part: str) -> np.random.Generator:
     """The numpy Generator of the named part of flight `seed`."""
     return np.random.default_rng([seed, *part.encode()])
 
@@ -34,7 +40,7 @@ class Radio:
     """The TDOAs of one flight. t (n,) s; a, b (n,) rows of the anchors; silent : (begin, end) s, in which none is heard; changed : s, from
     which on anchor `other` is silent or late."""
 
-    def __init__(self, world, seed, duration):
+    def __init__(self, world: World, seed: int, duration: float) -> None:
         """world : World; duration : s."""
         anchors = world.anchors
         self.positions, n = anchors.positions, len(anchors)
@@ -54,12 +60,12 @@ class Radio:
         self._way = _walk(world, duration, random(seed, "person")) if world.person else np.empty((0, 2))
         self._blocked = random(seed, "blocked").uniform(*BLOCKED, (int(duration / BLOCK_TIME) + 1, n))
 
-    def happens(self, silent, changed):
+    def happens(self, silent: float, changed: float) -> None:
         """Say when its world's silence begins, and from when on its world's change holds, s."""
         self.silent = (silent, silent + self._world.silence[1]) if self._world.silence else NEVER
         self.changed = changed
 
-    def measured(self, rows, p, q):
+    def measured(self, rows: slice, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         """d (k,) m, NaN where nothing was heard, of the TDOAs in a slice of rows, taken by a tag at p (k, 3) m with q (k, 4)."""
         t, a, b, d = self.t[rows], self.a[rows], self.b[rows], np.empty(len(p))
         _measure(p, a, b, self.positions, self.constants, d)
@@ -84,7 +90,7 @@ class Radio:
         d[(t >= self.silent[0]) & (t < self.silent[1])] = np.nan
         return d
 
-    def _near_floor(self, rows, p):
+    def _near_floor(self, rows: slice, p: np.ndarray) -> np.ndarray:
         """What the floor adds, (k,) m: an anchor is late or not, as often as FloorMultipath says."""
         t, a, b = self.t[rows], self.a[rows], self.b[rows]
         samples, both = Samples(t, a, b, p, np.full((len(p), 4), np.nan), self._anchors), np.concatenate([a, b])
@@ -94,40 +100,43 @@ class Radio:
 
 
 @compiled
-def _measure(p, a, b, positions, constants, out):
+def _measure(
+    p: np.ndarray, a: np.ndarray, b: np.ndarray, positions: np.ndarray, constants: np.ndarray, out: np.ndarray
+) -> None:
     """Geometry and what is late at each of two anchors, (k,) m. constants (n, 3): see Radio."""
     for i in range(len(p)):
         out[i] = _heard(p[i], positions[b[i]], constants[b[i]]) - _heard(p[i], positions[a[i]], constants[a[i]])
 
 
 @compiled
-def _heard(p, anchor, late):
+def _heard(p: np.ndarray, anchor: np.ndarray, late: np.ndarray) -> float:
     x, y, z = p[0] - anchor[0], p[1] - anchor[1], p[2] - anchor[2]
     return math.sqrt(x * x + y * y + z * z) + late[0] + late[1] * math.sin(2.0 * math.atan2(y, x) + late[2])
 
 
-def _outliers(world, n, rng):
+def _outliers(world: World, n: int, rng: np.random.Generator) -> np.ndarray:
     """(n,) m, zero but for the given share."""
     if not world.outlier_size:
         return outliers(n, world.outlier_share, rng)
     return np.where(rng.random(n) < world.outlier_share, rng.uniform(-world.outlier_size, world.outlier_size, n), 0.0)
 
 
-def _walk(world, duration, rng):
+def _walk(world: World, duration: float, rng: np.random.Generator) -> np.ndarray:
     """Where somebody is who walks from one place at a wall to the next: (n, 2) m, at each sample of the inertial sensor."""
-    half, places, stamps = 0.5 * np.array(world.size[:2]), [], [0.0]
+    half, stamps = 0.5 * np.array(world.size[:2]), [0.0]
+    places: list[np.ndarray] = []
     while stamps[-1] <= duration:
         place = rng.uniform(-half, half)
         wall = rng.integers(2)
         place[wall] = math.copysign(half[wall], rng.standard_normal())
         if places:
-            stamps.append(stamps[-1] + np.linalg.norm(place - places[-1]) / PERSON[2])
+            stamps.append(stamps[-1] + float(np.linalg.norm(place - places[-1])) / PERSON[2])
         places.append(place)
     t = np.arange(int(duration * IMU_RATE) + 2) / IMU_RATE
     return np.stack([np.interp(t, stamps, column) for column in np.transpose(places)], axis=1)
 
 
-def _passes(p, anchor, person):
+def _passes(p: np.ndarray, anchor: np.ndarray, person: np.ndarray) -> np.ndarray:
     """Whether the ways from p (k, 3) to anchors (k, 3) lead through a person at (k, 2), all m: (k,) bool."""
     way = anchor - p
     share = np.sum((person - p[:, :2]) * way[:, :2], axis=1) / np.maximum(np.sum(way[:, :2] ** 2, axis=1), 1e-9)
@@ -138,7 +147,7 @@ def _passes(p, anchor, person):
 class Inertial:
     """Errors of the inertial sensor at each of its samples: errors (n, 6) rad/s and m/s^2; shaking (n, 3) m/s^2, of turning rotors."""
 
-    def __init__(self, world, seed, duration):
+    def __init__(self, world: World, seed: int, duration: float) -> None:
         of, n, dt = world.imu, int(duration * IMU_RATE) + 1, 1.0 / IMU_RATE
         self.errors = np.empty((n, 6))
         for columns, name, start, walk, noise in (
@@ -158,7 +167,7 @@ class Inertial:
         self.shaking = np.array(world.vibration) * (self.shaking + world.rectified * np.sign(rng.standard_normal(3)))
 
 
-def gusts(world, seed, duration):
+def gusts(world: World, seed: int, duration: float) -> np.ndarray:
     """Wind at each sample of the inertial sensor, (n, 3) m/s: exponentially correlated."""
     from scipy.signal import lfilter  # takes a second to import
 
@@ -174,40 +183,54 @@ class Aid:
 
     rate, width = RATE, 1  # Hz; numbers per measurement
 
-    def __init__(self, world, seed, duration):
+    def __init__(self, world: World, seed: int, duration: float) -> None:
         self.world, rate = world, self.rate_in(world)
         self.t = np.arange(0.5, duration * rate) / rate
         self.noise = random(seed, type(self).__name__).standard_normal((len(self.t), self.width))
 
-    def rate_in(self, world):
+    def rate_in(self, world: World) -> float:
         """Hz."""
         return self.rate
 
-    def measured(self, rows, p, q, v, height):
+    def measured(
+        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
         """Columns of the measurements in a slice of rows, of a body at p (k, 3) m, q (k, 4), with v (k, 3) m/s in its own frame, `height`
         (k,) m above what is below it: tuple."""
         raise NotImplementedError
 
 
 class RangeFinder(Aid):
-    def rate_in(self, world):
+    """The distance to what is below, along the body's -z, m; inf where it sees nothing."""
+
+    def rate_in(self, world: World) -> float:
         return world.height_rate
 
-    def measured(self, rows, p, q, v, height):
+    def measured(
+        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
         up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
         seen = height / np.maximum(up, 1e-3) + self.world.height_noise * self.noise[rows, 0]
         return (np.where((up > 0.0) & (seen <= self.world.height_range), np.maximum(seen, 0.0), np.inf),)
 
 
 class Barometer(Aid):
-    def measured(self, rows, p, q, v, height):
+    """The pressure of the air, Pa."""
+
+    def measured(
+        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
         return (pressure_at(SITE + p[:, 2] + ALTITUDE_STD * self.noise[rows, 0]),)
 
 
 class Speedometer(Aid):
+    """The velocity in the body frame, m/s, and its standard deviation."""
+
     width = 3
 
-    def measured(self, rows, p, q, v, height):
+    def measured(
+        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
         return v + VELOCITY_STD * self.noise[rows], np.full(v.shape, max(VELOCITY_STD, LEAST_STD))
 
 

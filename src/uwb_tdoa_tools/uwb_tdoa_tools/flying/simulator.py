@@ -1,6 +1,9 @@
 """A vehicle in a world, turn by turn: what it does, and what its sensors say of that."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,6 +14,12 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from .loop import IMU_RATE, interval, poses_at
 from .sensors import AIDS, Inertial, Radio, gusts, random
 from .vehicle import ATTITUDE, GRAVITY, POSITION, STATE, VELOCITY, Vehicle, ground_at
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.sensors.sensor import Stream
+    from .controller import Controller
+    from .sensors import Aid
+    from .world import World
 
 TICK = 4  # samples of the inertial sensor, from one turn of the controller to the next
 DT = TICK / IMU_RATE  # s
@@ -27,14 +36,14 @@ class Measured:
 
     imu: Imu
     tdoa: Tdoas
-    aids: dict
+    aids: dict[str, Stream]
 
 
 class Simulator:
     """One vehicle for so many seconds. state (17,), as of `vehicle`; vehicle : the true Vehicle; believed : the one that its controller is
     told; times (n,) s, states (n, 17), contact (n,) number of feet on the ground: at each sample of the inertial sensor, up to `done`."""
 
-    def __init__(self, world, seed, duration, radius=0.0):
+    def __init__(self, world: World, seed: int, duration: float, radius: float = 0.0) -> None:
         """world : World; duration : s; radius : m, of the circle whose point nearest to +x it starts from."""
         self.world, rng = world, random(seed, "place")
         middle, yaw = rng.uniform(-STARTS, STARTS, 2), rng.uniform(-np.pi, np.pi)
@@ -51,25 +60,27 @@ class Simulator:
         n = len(self._wind)
         self.times, self.states, self.contact = np.arange(n) / IMU_RATE, np.empty((n, STATE)), np.zeros(n)
         self.samples = np.zeros((n, 6))
-        self.done, self.states[0], self._gyro, self._hands = 0, self.state, np.zeros((2, 3)), None
-        self._heard, self._first = dict.fromkeys(("tdoa", *world.aids), 0), None
+        self.done, self.states[0], self._gyro = 0, self.state, np.zeros((2, 3))
+        self._hands: tuple[np.ndarray, float, float, np.ndarray] | None = None  # state and s at first, s at last, way
+        self._heard = dict.fromkeys(("tdoa", *world.aids), 0)
+        self._first: tuple[Tdoas, np.ndarray] | None = None  # what was heard first, and the state then
 
     @property
-    def now(self):
+    def now(self) -> float:
         """s"""
         return self.times[self.done]
 
     @property
-    def over(self):
+    def over(self) -> bool:
         """True when there is no time left."""
         return self.done + TICK >= len(self.times)
 
     @property
-    def ground(self):
+    def ground(self) -> float:
         """Height of what is below it, m."""
         return ground_at(self._numbers, self.state[0], self.state[1])
 
-    def advance(self, controller):
+    def advance(self, controller: Controller) -> Measured:
         """Fly one turn by what a Controller wants, or be carried on by hands. Returns Measured."""
         k = self.done
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
@@ -91,13 +102,14 @@ class Simulator:
         aids = {name: self._felt(name, sensor, lately) for name, sensor in self._aids.items()}
         return self._disturbed(Measured(imu, tdoa, aids))
 
-    def lift(self, by, seconds):
+    def lift(self, by: np.ndarray, seconds: float) -> None:
         """Be carried by (2,) m, lifted and put down, within so many s, from now on."""
         begin, end = self.state.copy(), self.now + seconds
         way = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, LIFTED], [*by, LIFTED], [*by, 0.0]])
         self._hands = begin, self.now, end, way
 
-    def _be_carried(self, rows):
+    def _be_carried(self, rows: slice) -> None:
+        assert self._hands is not None
         begin, since, until, way = self._hands
         t, h = self.times[rows], 0.5 / IMU_RATE
         at = [begin[POSITION] + _along(way, (t + shift - since) / (until - since)) for shift in (-2.0 * h, 0.0, 2.0 * h)]
@@ -114,7 +126,7 @@ class Simulator:
             self._hands = None
             self.state[VELOCITY] = 0.0
 
-    def _poses(self, stream, t, lately):
+    def _poses(self, stream: str, t: np.ndarray, lately: slice) -> tuple[slice, np.ndarray, np.ndarray]:
         """(slice, p (k, 3) m, q (k, 4)): what of a stream with stamps t (n,) s is new, and the poses then."""
         first = self._heard[stream]
         new = slice(first, int(np.searchsorted(t, self.now, side="right")))
@@ -123,13 +135,13 @@ class Simulator:
         self._heard[stream] = new.stop
         return new, p, q
 
-    def _felt(self, name, sensor, lately):
+    def _felt(self, name: str, sensor: Aid, lately: slice) -> Stream:
         new, p, q = self._poses(name, sensor.t, lately)
         v = np.broadcast_to(self.state[VELOCITY], p.shape)
         inside = Rotation.from_quat(q).inv().apply(v) if len(q) else v
         return SENSORS[name].stream(sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground))
 
-    def _disturbed(self, measured):
+    def _disturbed(self, measured: Measured) -> Measured:
         """Measured, with the world's effects in it, put there as `inject` does."""
         if not len(self.world.effects) or not len(measured.tdoa):
             return measured
@@ -140,14 +152,16 @@ class Simulator:
         recent = slice(max(self.done - RECENT, 0), self.done + 1)
         states, t = np.concatenate([at[None], self.states[recent]]), np.concatenate([first.t[:1] - 1e-3, self.times[recent]])
         truth = Truth(t, states[:, POSITION], states[:, ATTITUDE])
-        flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **measured.aids)
+        aids: dict[str, Any] = measured.aids
+        flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **aids)
         for effect in self.world.effects.effects:
             flight = effect.inject(flight, self._rng)
+        assert flight.imu is not None  # as no effect takes it away
         tdoa = Tdoas(*(column[1:] for column in vars(flight.tdoa).values()))
         return replace(measured, tdoa=tdoa, imu=flight.imu, aids={name: getattr(flight, name) for name in measured.aids})
 
 
-def _along(way, share):
+def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:
     """(n, 3) m, along places (m, 3), smoothly from each to the next, at shares (n,) of the whole time."""
     part = np.clip(share, 0.0, 1.0) * (len(way) - 1)
     k = np.minimum(part.astype(int), len(way) - 2)

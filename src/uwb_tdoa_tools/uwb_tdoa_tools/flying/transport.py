@@ -1,5 +1,9 @@
 """The way from the sensors to the estimate: it takes time, the same for all streams and more for some messages."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
 from .simulator import Measured
@@ -8,20 +12,21 @@ from .simulator import Measured
 class Transport:
     """Holds what was measured until it arrives; within a stream nothing overtakes."""
 
-    def __init__(self, latency, jitter, rng):
+    def __init__(self, latency: float, jitter: float, rng: np.random.Generator) -> None:
         """latency : s, of everything; jitter : s, mean of what comes on top; rng : numpy Generator."""
         self._latency, self._jitter, self._rng = latency, jitter, rng
-        self._waiting = {}  # by stream: [what waits, when it arrives (n,) s, the last arrival]
+        # by stream: (what waits, when it arrives (n,) s, the last arrival)
+        self._waiting: dict[str, tuple[Any, np.ndarray, float]] = {}
 
-    def arrived(self, measured, now):
+    def arrived(self, measured: Measured, now: float) -> Measured:
         """Measured that has arrived by `now`, s, after one more Measured was sent."""
         if not self._latency and not self._jitter:
             return measured
-        parts = {"imu": measured.imu, "tdoa": measured.tdoa, **measured.aids}
+        parts: dict[str, Any] = {"imu": measured.imu, "tdoa": measured.tdoa, **measured.aids}
         parts = {stream: self._due(stream, part, now) for stream, part in parts.items()}
         return Measured(parts.pop("imu"), parts.pop("tdoa"), parts)
 
-    def _due(self, stream, part, now):
+    def _due(self, stream: str, part: Any, now: float) -> Any:
         held, arrival, last = self._waiting.get(stream, (None, np.empty(0), 0.0))
         delay = self._latency + self._rng.exponential(self._jitter, len(part)) if self._jitter else np.full(len(part), self._latency)
         came = np.maximum.accumulate(np.maximum(part.t + delay, last))
@@ -32,5 +37,5 @@ class Transport:
         return _rows(part, slice(0, due))
 
 
-def _rows(part, rows):
+def _rows(part: Any, rows: slice) -> Any:
     return type(part)(*(column[rows] for column in vars(part).values()))

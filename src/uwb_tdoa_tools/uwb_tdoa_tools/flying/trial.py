@@ -1,7 +1,10 @@
 """One flight in lockstep: the same task gives the same flight, whatever the computer does beside it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 import math
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +24,12 @@ from .simulator import DT, Simulator
 from .transport import Transport
 from .vehicle import ATTITUDE, POSITION
 from .world import World
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .estimates import Source
+    from .mission import Route
+    from .simulator import Measured
 
 REST_AFTER = 3.0  # s of the recording after the rotors have stopped
 PAUSE, CARRIED, CARRY_TIME = 60.0, 2.0, 6.0  # s at rest between two flights, m and s by which it is carried then
@@ -60,7 +69,7 @@ class Flown:
     states: np.ndarray
     contact: np.ndarray
     odometry: Odometry
-    missions: list
+    missions: list[Mission]
     crash: str
 
 
@@ -68,7 +77,7 @@ class Trial:
     """A Task under way. simulator : Simulator; source : who tells where it is; missions : [Mission], the last one under way; crash : as of
     Flown."""
 
-    def __init__(self, task, source=None, lasts=None):
+    def __init__(self, task: Task, source: Source | None = None, lasts: float | None = None) -> None:
         """source : something like OurFilter, default: what the Task says; lasts : s, default: as long as it can take."""
         world, seed, rules = task.world, task.seed, task.rules
         longest = rules.rest + rules.patience + task.path.duration + rules.longest_sink + REST_AFTER
@@ -78,64 +87,68 @@ class Trial:
         told = random(seed, "told")
         place, off = self.simulator.state[POSITION] + TOLD_STD * told.standard_normal(3), TOLD_STD * told.standard_normal()
         yaw = self.simulator.yaw + off
-        self.source = source or _filter_of(task, place, yaw)
-        if task.told == "place" and task.peer is None:
+        self.source: Source | TheirFilter = source or _filter_of(task, place, yaw)
+        if task.told == "place" and not isinstance(self.source, TheirFilter):
             self.source.tell(TOLD_AT, place, TOLD_STD, yaw if task.yaw == "known" else math.nan)
         self.controller = Controller(task.gains, self.simulator.believed)
         self.transport = Transport(world.latency, world.jitter, random(seed, "transport"))
-        self.missions, self.crash, self._arrived = [], "", []
+        self.missions: list[Mission] = []
+        self.crash = ""
+        self._arrived: list[Measured] = []
 
-    def fly(self):
+    def fly(self) -> None:
         """One mission from where it stands, until it has rested for a while after it, or has come to an end."""
         self.begin()
         while not self.over:
             self.turn()
 
-    def begin(self, path=None, rules=None):
+    def begin(self, path: Route | None = None, rules: Rules | None = None) -> None:
         """Begin a mission from where it stands; path, rules : default: those of the Task."""
         state, task = self.simulator.state, self.task
         self.missions.append(Mission(path or task.path, state[:2].copy(), state[2], rules or task.rules, self.simulator.now))
         self._moment = _moment(task.world.silence, task.path, task.rules, self._rng)
 
     @property
-    def over(self):
+    def over(self) -> bool:
         """True when the mission under way has come to an end, or nothing more can come."""
         mission = self.missions[-1]
-        rested = mission.state == DONE and self.simulator.now > mission.ended + REST_AFTER
+        rested = mission.state == DONE and mission.ended is not None and self.simulator.now > mission.ended + REST_AFTER
         return bool(rested or mission.state == REFUSED or self.crash or self.simulator.over)
 
-    def turn(self):
+    def turn(self) -> None:
         """One turn of the controller, as the mission under way decides; rotors off without one."""
         wanted = self._decide(self.missions[-1]) if self.missions else None
         if wanted is None:
             self.controller.stop()
         else:
-            p, v, q, yaw = *self.source.pose[1:], self.missions[-1].yaw
-            self.controller.fly(p, v, self._turned_since(q, self.source.pose[0]), wanted, yaw, DT)
+            pose = self.source.pose
+            assert pose is not None  # as the mission has begun by it
+            since, p, v, q = pose
+            self.controller.fly(p, v, self._turned_since(q, since), wanted, self.missions[-1].yaw, DT)
         self._turn()
 
-    def _decide(self, mission):
+    def _decide(self, mission: Mission) -> np.ndarray | None:
         """What a Mission wants now."""
         simulator, k = self.simulator, self.simulator.done
         started = mission.begin + mission.rules.rest if mission.started is None else mission.started
         simulator.radio.happens(started + self._moment, started + 0.5 * self.task.path.duration)
-        force = np.mean(simulator.samples[max(k - int(FELT * IMU_RATE), 0) : k + 1, 5])
+        force = float(np.mean(simulator.samples[max(k - int(FELT * IMU_RATE), 0) : k + 1, 5]))
         return mission.decide(simulator.now, self.source.pose, self.source.deviation, self.controller.support(force))
 
-    def rest(self, seconds):
+    def rest(self, seconds: float) -> None:
         """Stand, or be carried, with rotors off."""
         self.controller.stop()
         end = self.simulator.now + seconds
         while self.simulator.now < end and not (self.simulator.over or self.crash):
             self._turn()
 
-    def _turn(self):
+    def _turn(self) -> None:
         measured = self.transport.arrived(self.simulator.advance(self.controller), self.simulator.now)
         self._arrived.append(measured)
         self.source.take(measured)
         self.crash = _crash(self.simulator, self.task.world)
 
-    def _turned_since(self, attitude, since):
+    def _turned_since(self, attitude: np.ndarray, since: float) -> np.ndarray:
         """An attitude (4,) of `since`, s, turned by the rates that were felt until now."""
         times, samples, k, attitude = self.simulator.times, self.simulator.samples, self.simulator.done, attitude.copy()
         for j in range(max(int(np.searchsorted(times[: k + 1], since, side="right")), 1), k + 1):
@@ -143,7 +156,7 @@ class Trial:
         return attitude
 
     @property
-    def flown(self):
+    def flown(self) -> Flown:
         """Flown."""
         simulator, world = self.simulator, self.task.world
         end = simulator.done + 1
@@ -156,7 +169,7 @@ class Trial:
         return Flown(self.task, flight, states, simulator.contact[:end], self.source.odometry, self.missions, self.crash)
 
 
-def fly(task):
+def fly(task: Task) -> Flown:
     """Flown, of a Task."""
     trial = Trial(task)
     trial.fly()
@@ -169,7 +182,7 @@ def fly(task):
     return trial.flown
 
 
-def _filter_of(task, place, yaw):
+def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OurFilter | TheirFilter:
     """Who tells where it is, of a Task; place (3,) m and yaw, rad: what is told at the start, if it is."""
     anchors = task.world.anchors
     if task.peer is not None:
@@ -178,7 +191,7 @@ def _filter_of(task, place, yaw):
     return OurFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
 
 
-def _moment(silence, path, rules, rng):
+def _moment(silence: tuple[str, float] | None, path: Circles, rules: Rules, rng: np.random.Generator) -> float:
     """s since the rotors started, at which a silence begins; inf without one."""
     anywhere = rng.uniform(-0.5 * rules.rest, path.duration)
     if silence is None:
@@ -188,7 +201,7 @@ def _moment(silence, path, rules, rng):
     }[silence[0]]  # fmt: skip
 
 
-def _crash(simulator, world):
+def _crash(simulator: Simulator, world: World) -> str:
     """What ends a flight in the state of a Simulator, in words, or ""."""
     state = simulator.state
     x, y, z = state[POSITION]
@@ -202,6 +215,6 @@ def _crash(simulator, world):
     return ""
 
 
-def _joined(parts):
+def _joined(parts: Sequence[Any]) -> Any:
     """One stream of its parts."""
     return type(parts[0])(*map(np.concatenate, zip(*(vars(part).values() for part in parts))))

@@ -6,13 +6,18 @@ first-order motors; ground effect of each rotor after Cheeseman and Bennett (ARC
 Coulomb friction. Frames: world z up, body x forward, y left, z up; quaternions x y z w, body to world.
 """
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass, fields
 import math
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import rotate
+
+Record = Any  # row of a structured array, whose fields compiled code reads as attributes: Python has no type for it
 
 GRAVITY = 9.81  # m/s^2
 STEP = 0.625e-3  # s, of the integration (midpoint)
@@ -58,16 +63,16 @@ class Vehicle:
     table_y: float = 0.0
     table_radius: float = 0.0
 
-    def numbers(self):
+    def numbers(self) -> Record:
         """The record, of NUMBERS, that compiled code takes."""
         return np.array([tuple(asdict(self).values())], NUMBERS)[0]
 
     @property
-    def most_thrust(self):
+    def most_thrust(self) -> float:
         """N, of all rotors together."""
         return ROTORS * self.thrust * self.top_speed**2
 
-    def at_rest(self, x, y, yaw):
+    def at_rest(self, x: float, y: float, yaw: float) -> np.ndarray:
         """A state (17,): standing on what is below (x, y), m, with its rotors still."""
         state = np.zeros(STATE)
         sag = self.mass * GRAVITY / (ROTORS * self.stiffness)
@@ -80,7 +85,7 @@ NUMBERS = np.dtype([(field.name, float) for field in fields(Vehicle)], align=Tru
 
 
 @compiled
-def ground_at(numbers, x, y):
+def ground_at(numbers: Record, x: float, y: float) -> float:
     """Height of what is below (x, y), m."""
     if numbers.table_radius > 0.0 and math.hypot(x - numbers.table_x, y - numbers.table_y) <= numbers.table_radius:
         return numbers.floor + numbers.table
@@ -88,7 +93,9 @@ def ground_at(numbers, x, y):
 
 
 @compiled
-def step(state, speeds, wind, dt, numbers, scratch):
+def step(
+    state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, dt: float, numbers: Record, scratch: np.ndarray
+) -> int:
     """Advance `state` (17,) by dt, s, with the commanded rotor `speeds` (4,) rad/s in a `wind` (3,) m/s, world.
 
     numbers : of a Vehicle; scratch : (2, 17), is written to. Returns the number of feet on the ground.
@@ -106,7 +113,7 @@ def step(state, speeds, wind, dt, numbers, scratch):
 
 
 @compiled
-def _derivative(state, speeds, wind, numbers, out):
+def _derivative(state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, numbers: Record, out: np.ndarray) -> int:
     """Time derivative of a state, to `out` (17,). Returns the number of feet on the ground."""
     q, w = state[6:10], state[10:13]
     # columns of the rotation matrix are the body's axes in the world
@@ -175,7 +182,7 @@ def _derivative(state, speeds, wind, numbers, out):
 
 
 @compiled
-def specific_force(before, after, dt, out):
+def specific_force(before: np.ndarray, after: np.ndarray, dt: float, out: np.ndarray) -> None:
     """Mean specific force (3,) m/s^2, in the body frame of the state `after`, over the dt s from the state `before`: to `out`."""
     back = np.empty(4)
     back[0], back[1], back[2], back[3] = -after[6], -after[7], -after[8], after[9]

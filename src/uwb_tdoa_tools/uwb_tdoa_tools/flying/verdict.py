@@ -1,6 +1,9 @@
 """What became of a flight, by ground truth alone."""
 
+from __future__ import annotations
+
 import math
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +15,10 @@ from .mission import DONE, REFUSED
 from .trial import REST_AFTER
 from .vehicle import POSITION, VELOCITY
 
+if TYPE_CHECKING:
+    from .mission import Mission
+    from .trial import Flown
+
 AIR = 0.3  # m above the ground, from which on it is in the air
 UPRIGHT = math.radians(30.0)
 NEAR, SLOW = 0.3, 0.6  # m from the wanted place and m/s at touchdown, of a flight that has landed
@@ -21,7 +28,7 @@ SPACING = 0.02  # s between the estimates that are judged
 PHASES = "before", "lift_off", "air", "landing", "after"
 
 
-def judge(flown):
+def judge(flown: Flown) -> dict[str, Any]:
     """dict for JSON, of a Flown: the verdict and its figures; None where there is nothing to say. Of several flights the last one's; what
     kept an earlier one from landing counts for all.
 
@@ -42,8 +49,9 @@ def judge(flown):
     return {"seed": flown.task.seed, "landed": not why, **verdicts[-1], "why": why}
 
 
-def _judge(flown, mission, end):
+def _judge(flown: Flown, mission: Mission, end: float) -> dict[str, Any]:
     """Figures of one Mission, until `end`, s."""
+    assert flown.flight.truth is not None
     truth = flown.flight.truth
     inside = slice(*np.searchsorted(truth.t, (mission.begin, end)))
     truth = Truth(truth.t[inside], truth.p[inside], truth.q[inside])
@@ -54,9 +62,12 @@ def _judge(flown, mission, end):
     tilt = np.arccos(np.clip(1.0 - 2.0 * (states[:, 6] ** 2 + states[:, 7] ** 2), -1.0, 1.0))
     aloft = np.flatnonzero(height > AIR)
     took_off = bool(len(aloft))
-    first, last = (aloft[0], aloft[-1]) if took_off else (None, None)
-    tracking, touchdown = None, None
+    first: int | None = None
+    last: int | None = None
+    tracking: float | None = None
+    touchdown: float | None = None
     if took_off:
+        first, last = int(aloft[0]), int(aloft[-1])
         touched = last + np.flatnonzero(contact[last:] > 0)
         if len(touched):
             speeds = np.linalg.norm(states[last : touched[-1] + 1, VELOCITY], axis=1)
@@ -86,13 +97,13 @@ def _judge(flown, mission, end):
     return figures
 
 
-def _between(odometry, begin, end):
+def _between(odometry: Odometry, begin: float, end: float) -> Odometry:
     """The part of an Odometry."""
     inside = slice(*np.searchsorted(odometry.t, (begin, end)))
     return Odometry(*(column[inside] for column in vars(odometry).values()))
 
 
-def _why(crash, mission, figures):
+def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:
     """What kept it from having landed, in words, "" for nothing."""
     if mission.state == REFUSED:
         return "refused to arm"
@@ -109,7 +120,7 @@ def _why(crash, mission, figures):
     return "landed elsewhere" if figures["place"] >= NEAR else ""
 
 
-def _armed(odometry, truth, mission):
+def _armed(odometry: Odometry, truth: Truth, mission: Mission) -> dict[str, float | None]:
     """How far the estimate was off when the rotors started."""
     started = mission.started
     if started is None:
@@ -120,7 +131,9 @@ def _armed(odometry, truth, mission):
     return {"armed_off": float(np.linalg.norm(error)), "armed_deviations": deviations if math.isfinite(deviations) else None}
 
 
-def _estimation(odometry, truth, mission, first, last):
+def _estimation(
+    odometry: Odometry, truth: Truth, mission: Mission, first: int | None, last: int | None
+) -> dict[str, Any]:
     """Figures of the estimate, per phase, and when it was lost."""
     if not len(odometry):
         return {"lost": None, "estimation": None, "phases": {}}
@@ -145,7 +158,7 @@ def _estimation(odometry, truth, mission, first, last):
     return {"lost": float(t[far[0]]) if len(far) else None, "estimation": air and air["rmse"], "phases": phases}
 
 
-def _figures(distance, normalised):
+def _figures(distance: np.ndarray, normalised: np.ndarray) -> dict[str, float | None]:
     usable = normalised[np.isfinite(normalised)]
     return {
         "rmse": _rms(distance),
@@ -154,5 +167,5 @@ def _figures(distance, normalised):
     }
 
 
-def _rms(values):
+def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))

@@ -1,7 +1,10 @@
 """What the vehicle flies in: radio, inertial sensor and air, each as wrong as asked for."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 import math
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +15,9 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..simulation.constellations import corners
 from ..simulation.imu import ImuErrors
 from ..simulation.inject import parse_effect
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
 
 MOMENTS = "rest", "lift-off", "circle", "landing", "anywhere"  # in a flight; on a circle of no radius it hovers
 CHANGES = "silent", "late"
@@ -56,12 +62,12 @@ class World:
         height_rate, height_noise, and height_range, beyond which the range finder sees nothing
     """
 
-    size: tuple = (6.4, 6.2, 3.0)
+    size: tuple[float, float, float] = (6.4, 6.2, 3.0)
     layout: Anchors | None = None
     low_first: bool = False
     floor_effect: bool = True
-    floor_delay: tuple = (3.0, 3.9)
-    floor_height: tuple = (0.06, 0.2)
+    floor_delay: tuple[float, float] = (3.0, 3.9)
+    floor_height: tuple[float, float] = (0.06, 0.2)
     protocol: str = "tdoa2"
     rate: float = 360.0
     noise: float = 0.08
@@ -71,7 +77,7 @@ class World:
     delay: float = 0.1
     bearing_bias: float = 0.12
     antennas: bool = False
-    silence: tuple | None = None
+    silence: tuple[str, float] | None = None
     person: bool = False
     change: str = ""
     lateness: float = 0.3
@@ -79,13 +85,13 @@ class World:
     latency: float = 0.0
     jitter: float = 0.0
     imu: ImuErrors = field(default_factory=ImuErrors)
-    vibration: tuple = (0.6, 0.6, 0.6)
+    vibration: tuple[float, float, float] = (0.6, 0.6, 0.6)
     vibration_band: float = 0.0
     rectified: float = 0.0
-    mass: tuple = (0.027, 0.033)
+    mass: tuple[float, float] = (0.027, 0.033)
     gust: float = 0.0
     table: float = 0.0
-    aids: tuple = ()
+    aids: tuple[str, ...] = ()
     height_rate: float = 20.0
     height_noise: float = 0.01
     height_range: float = 4.0
@@ -124,10 +130,13 @@ WORLDS = {
 }
 
 
-def world_of(name, floor_effect=None, aids=(), silence=None, injected=(), installation=None):
+def world_of(
+    name: str, floor_effect: bool | None = None, aids: Iterable[str] = (), silence: str | None = None,
+    injected: Iterable[Sequence[str]] = (), installation: int | None = None,
+) -> World:  # fmt: skip
     """The World `name`, with what options change: floor_effect bool or None; installation int or None; aids, names; silence "MOMENT:S" or None; injected [[effect,
     "KEY=NUMBER", ...]]. Raises InputError."""
-    changed = {"aids": tuple(dict.fromkeys(aids)), "installation": installation}
+    changed: dict[str, Any] = {"aids": tuple(dict.fromkeys(aids)), "installation": installation}
     if floor_effect is not None:
         changed["floor_effect"] = floor_effect
     if silence is not None:
@@ -140,7 +149,7 @@ def world_of(name, floor_effect=None, aids=(), silence=None, injected=(), instal
     return replace(WORLDS[name], effects=EffectSet(tuple(effects)), **changed)
 
 
-def _moment(text):
+def _moment(text: str) -> tuple[str, float]:
     """(moment, s) of "MOMENT:S"."""
     moment, _, seconds = text.partition(":")
     try:
