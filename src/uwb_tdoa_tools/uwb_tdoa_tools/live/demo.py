@@ -1,7 +1,10 @@
 """A flight through both nodes over topics, beside the same filter without ROS."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN, load_network
@@ -22,6 +25,11 @@ from ..localizing.rerun_file import write_rerun
 from ..scoring.metrics import Score, airborne
 from .run import accounts, run_live
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from ..bags.bag import RecordedOdometry
+    from ..readers.inputs import Reading
+
 SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # told nothing, as the nodes are
 
 
@@ -31,26 +39,27 @@ class Case:
     that was simulated, in words."""
 
     flight: Flight
-    effects_file: Path | None
+    effects_file: str | Path | None
     model: str | None
     became: str = ""
 
-    def corrector(self):
+    def corrector(self) -> Corrector | None:
         """Corrector of the flight, or None if nothing corrects it. Raises InputError."""
         if not (self.effects_file or self.model):
             return None
         effects = EffectSet.from_yaml(self.effects_file) if self.effects_file else EffectSet()
         return Corrector(self.flight.anchors, effects, load_network(self.model))
 
-    def correction(self):
+    def correction(self) -> str:
         """What corrects the flight, from where and why, in words."""
-        if not (self.effects_file or self.model):
+        corrector = self.corrector()
+        if corrector is None:
             return "nothing: neither --effects nor --model is given, and what other flights needed may harm this one"
         sources = [f"the network shipped: {UNPROVEN}" if path == SHIPPED else str(path) for path in (self.effects_file, self.model) if path]
-        return f"{self.corrector().model} ({', '.join(sources)})"
+        return f"{corrector.model} ({', '.join(sources)})"
 
 
-def simulated(folder, effects_file=None, model=None):
+def simulated(folder: str | Path, effects_file: str | Path | None = None, model: str | None = None) -> Case:
     """Case of a flight by nothing but its estimate, among anchors that are late; corrected, if nothing else is given, with their
     true delays as a calibration would find them: an effects.yaml in the folder. Raises InputError."""
     if not (effects_file or model):
@@ -63,7 +72,9 @@ def simulated(folder, effects_file=None, model=None):
     return Case(flown.flight, effects_file, model, sentence(judge(flown)))
 
 
-def measured(path, reading, effects_file=None, model=None):
+def measured(
+    path: str | Path, reading: Reading, effects_file: str | Path | None = None, model: str | None = None
+) -> Case:
     """Case of a recording, read by a Reading, corrected with what is given and nothing else. Raises InputError."""
     flight = reading.one(path)
     if flight.truth is None:
@@ -75,26 +86,27 @@ def measured(path, reading, effects_file=None, model=None):
 @dataclass(frozen=True)
 class Flown:
     """became : {what became of the messages: count}, see `accounts`; scores : [Score], of the filter without correction, of the nodes, and of
-    the filter with correction; or, if nothing corrects, of the nodes and of the filter; nodes : Odometry; without_ros : Run of the filter
-    with what the nodes correct with; raw : Odometry of the filter without correction, or None if nothing corrects."""
+    the filter with correction; or, if nothing corrects, of the nodes and of the filter; nodes : RecordedOdometry;
+    without_ros : Run of the filter with what the nodes correct with; raw : Odometry of the filter without correction, or None if nothing corrects."""
 
-    became: dict
-    scores: list
-    nodes: Odometry
+    became: dict[str, int]
+    scores: list[Score]
+    nodes: RecordedOdometry
     without_ros: Run
     raw: Odometry | None
 
-    def show(self, path, flight, sentences):
+    def show(self, path: Path, flight: Flight, sentences: Sequence[str]) -> None:
         """Write a file for Rerun: what the nodes said, and sentences."""
-        write_rerun(path, flight, self.nodes, self.without_ros.residuals, sentences, flight.truth, self.raw)
+        write_rerun(path, flight, self.nodes, self.without_ros.residuals, list(sentences), flight.truth, self.raw)
 
 
-def fly(case, folder, rate=1.0, say=print):
+def fly(case: Case, folder: Path, rate: float = 1.0, say: Callable[[str], object] = print) -> Flown:
     """Write the flight of a Case as a bag, play it to both nodes, and run the filter without ROS beside them: Flown.
 
     The bags and the output of the nodes go to the folder. Raises InputError, LiveError. say(text) : told what happens.
     """
     flight, bag, correction = case.flight, folder / "flight.bag", case.corrector()
+    assert flight.truth is not None
     write_bag(flight, bag, force=True)
     model = SHIPPED if case.model == SHIPPED else _absolute(case.model)
     bias, ekf = {"effects_file": _absolute(case.effects_file), "model_file": model}, {"use_imu": flight.imu is not None}
@@ -109,13 +121,13 @@ def fly(case, folder, rate=1.0, say=print):
     return Flown(accounts(live.bias, live.ekf, flight), scores, nodes, without_ros, before)
 
 
-def next_steps(recording, survey=None):
+def next_steps(recording: str | Path, survey: str | Path | None = None) -> list[str]:
     """[command line] to copy after the demo: check a recording, localize it, calibrate the tag by it."""
     words = [recording, *(("--survey", survey) if survey else ())]
     lines = [("check",), ("localize", "--out", "localized/"), ("calibrate", "--out", "calibrated/")]
     return [command_lines.tool(name, *words, *more) for name, *more in lines]
 
 
-def _absolute(path):
+def _absolute(path: str | Path | None) -> str:
     """For a node, which runs elsewhere; "" for none."""
     return str(Path(path).resolve()) if path else ""

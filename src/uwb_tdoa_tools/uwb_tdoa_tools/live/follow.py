@@ -1,15 +1,23 @@
 """Let what is played keep in step with what comes of it."""
 
+from __future__ import annotations
+
 from collections import deque
 import math
 import struct
 import time
+from typing import Any, TYPE_CHECKING
 
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .session import READER_DEPTH, message_class, subscription_qos
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from rclpy.subscription import Subscription
+    from .session import Stop
 
 LEAD = 2_000_000_000  # ns of stamps that may be played ahead
 STEP = 80_000_000  # ns: a TDOA that is older than the newest by more has come out of the filter, or is waited for
@@ -33,7 +41,7 @@ class Follower:
     Where somebody also publishes uwb/residual, one message for each TDOA, TDOAs are followed too (`note_tdoa`).
     """
 
-    def __init__(self, node, topic, lag=LAG):
+    def __init__(self, node: Node, topic: str, lag: float = LAG) -> None:
         """lag : s, of ekf_node. Raises InputError if nobody publishes the topic, or its messages have no header."""
         topic = node.resolve_topic_name(topic)
         types = dict(node.get_topic_names_and_types()).get(topic)
@@ -43,19 +51,21 @@ class Follower:
             raise InputError(f"--follow: messages on {topic} are {types[0]}: not installed, or without a header.")
         qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)  # taken, never spun
-        self._newest = self._looked = self._started = None
+        self._newest: int | None = None  # ns, as those that follow
+        self._looked: int | None = None
+        self._started: int | None = None
         self._silent = False
         self._tdoas = _Tdoas(node, round(1e9 * AID_SHARE * lag))
 
-    def note_tdoa(self, stamp):
+    def note_tdoa(self, stamp: int) -> None:
         """A TDOA with this stamp, ns, has been played."""
         self._tdoas.note(stamp)
 
-    def note_aid(self, topic, stamp):
+    def note_aid(self, topic: str, stamp: int) -> None:
         """What one of the SENSORS measured, with this stamp, ns, has been played, for the filter."""
         self._tdoas.note_aid(topic, stamp)
 
-    def wait(self, stamp, stop):
+    def wait(self, stamp: int, stop: Stop) -> float:
         """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to be played, and
         until every TDOA has come out of the filter that is older by STEP than what it goes to by now: the newest, or less while it
         waits for an aid.
@@ -64,7 +74,7 @@ class Follower:
         """
         return self._tdoas.wait(self._is_starting(stamp), stop) + self._wait_for_stamps(stamp, stop)
 
-    def _is_starting(self, stamp):
+    def _is_starting(self, stamp: int) -> bool:
         """Whether bias_node may not know yet that there are poses, for what is stamped so, ns."""
         if self._started is not None and stamp < self._started - LEAD:  # a recording that starts again
             self._started = None
@@ -72,7 +82,7 @@ class Follower:
             self._hear()
         return self._started is None or stamp < self._started + START
 
-    def _hear(self):
+    def _hear(self) -> bool:
         """Whether the topic has said something."""
         taken = _taken(self._subscription)
         if taken:
@@ -80,7 +90,7 @@ class Follower:
             self._started = self._newest if self._started is None else self._started
         return bool(taken)
 
-    def _wait_for_stamps(self, stamp, stop):
+    def _wait_for_stamps(self, stamp: int, stop: Stop) -> float:
         self._newest = stamp if self._newest is None else self._newest
         self._looked = stamp if self._looked is None else self._looked
         in_step = self._silent or stamp - self._newest <= LEAD
@@ -101,7 +111,7 @@ class Follower:
 class _Tdoas:
     """How far the TDOAs that were played have come out of the filter, in the order of their stamps."""
 
-    def __init__(self, node, aid_wait):
+    def __init__(self, node: Node, aid_wait: int) -> None:
         self._subscription, self._aid_wait = None, aid_wait
         publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(RESIDUAL))
         cls = message_class(publishers[0].topic_type) if publishers else None
@@ -111,14 +121,16 @@ class _Tdoas:
             self._subscription = node.create_subscription(cls, RESIDUAL, lambda _: None, qos, raw=True)
         self._start_over()
 
-    def _start_over(self):
-        self._begin = self._newest = None  # ns: none up to here is waited for; newest stamp that was played
+    def _start_over(self) -> None:
+        self._begin = -math.inf  # ns: none up to here is waited for
+        self._newest: int | None = None  # ns, newest stamp that was played
         self._out, self._silent = -math.inf, False  # ns, newest stamp that has come out
-        self._first, self._shift = deque(), 0  # stamps that were played first; by how much those that come out are less
-        self._aids = {}  # {topic: ns, newest stamp that was played}
+        self._first: deque[int] = deque()  # stamps that were played first
+        self._shift = 0  # by how much those that come out are less
+        self._aids: dict[str, int] = {}  # {topic: ns, newest stamp that was played}
         self._learned, self._behind = 0, False  # whether START_STEP is too little, because the recorded IMU is behind its TDOAs
 
-    def note(self, stamp):
+    def note(self, stamp: int) -> None:
         if self._newest is not None and stamp < self._newest - LEAD:  # a recording that starts again
             self._start_over()
         if self._newest is None:
@@ -127,10 +139,10 @@ class _Tdoas:
         if self._learned < LEARNED:
             self._first.append(stamp)
 
-    def note_aid(self, topic, stamp):
+    def note_aid(self, topic: str, stamp: int) -> None:
         self._aids[topic] = stamp
 
-    def wait(self, starting, stop):
+    def wait(self, starting: bool, stop: Stop) -> float:
         if self._subscription is None or self._newest is None:
             return 0.0
         step = START_STEP if starting and not self._behind else STEP
@@ -148,12 +160,13 @@ class _Tdoas:
             time.sleep(POLL_PERIOD)
         return time.monotonic() - began
 
-    def _is_in_step(self, step):
+    def _is_in_step(self, step: int) -> bool:
+        assert self._newest is not None
         aids = [stamp for stamp in self._aids.values() if stamp > self._newest - AID_SILENT]
         reach = max(min((self._newest, *aids)), self._newest - self._aid_wait)  # how far the filter goes
         return reach - step <= max(self._begin, self._out + self._shift)
 
-    def _learn(self, stamps):
+    def _learn(self, stamps: list[int]) -> None:
         """Note stamps that have come out. An effect may have shifted them: the first ones tell by how much."""
         self._out = max(self._out, *stamps)
         for stamp in stamps[: len(self._first)]:
@@ -162,7 +175,7 @@ class _Tdoas:
                 self._learned += 1
 
 
-def _taken(subscription):
+def _taken(subscription: Subscription) -> list[bytes]:
     """Take what has come: list of bytes."""
     found = []
     with subscription.handle:
@@ -171,12 +184,12 @@ def _taken(subscription):
     return found
 
 
-def is_stamped(cls):
+def is_stamped(cls: Any) -> bool:
     """Whether messages of a class, or None, begin with a header."""
     return cls is not None and next(iter(cls.get_fields_and_field_types().values()), None) == "std_msgs/Header"
 
 
-def stamp_of(data):
+def stamp_of(data: bytes) -> int:
     """Stamp, ns, of a message that begins with a header, from its serialised bytes (CDR)."""
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return seconds * 10**9 + nanoseconds

@@ -1,6 +1,9 @@
 """Whether both nodes can keep up with a replay that follows them, and whether they have."""
 
+from __future__ import annotations
+
 import time
+from typing import TYPE_CHECKING
 
 import rclpy
 from rclpy.parameter_client import AsyncParameterClient
@@ -10,6 +13,12 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .follow import AID_SHARE, LAG, STEP
 from .processes import Diagnostics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from rclpy.node import Node
+    from .player import Player
+    from .session import Stop
 
 SPIN = 0.05  # s
 ANSWER_LIMIT = 10.0  # s for a node's parameters
@@ -33,7 +42,7 @@ class Nodes:
 
     lag = LAG
 
-    def __init__(self, node):
+    def __init__(self, node: Node) -> None:
         """Raises InputError if their parameters do not allow to wait for what is on its way, or if one says nothing on
         /diagnostics."""
         self._node, self._diagnostics = node, Diagnostics(node)
@@ -50,7 +59,7 @@ class Nodes:
                     f"--follow: {self._names[name]} says nothing on /diagnostics for {SETTLE_LIMIT:g} s; start it again."
                 )
 
-    def wrong(self, player, stop):
+    def wrong(self, player: Player, stop: Stop) -> dict[str, int]:
         """{what went wrong since: how often}, once the diagnostics have settled or `stop` is true. player : Player, who
         knows what was played."""
         after = self._counts(lambda _: stop or self._diagnostics.is_settled())
@@ -67,7 +76,7 @@ class Nodes:
                 wrong[f"{what} lost"] = max(lost, wrong.get(f"{what} lost", 0))
         return {what: count for what, count in wrong.items() if count > 0}
 
-    def _counts(self, is_enough):
+    def _counts(self, is_enough: Callable[[Diagnostics], object]) -> dict[str, dict[str, int]]:
         """{node: {key: count}} when each has said something and is_enough(diagnostics)."""
         until = time.monotonic() + SETTLE_LIMIT
         self._diagnostics.forget()
@@ -81,7 +90,7 @@ class Nodes:
             name: {key: int(text) for key, text in values.items() if text.isdigit()} for name, values in newest.items()
         }
 
-    def _check_patience(self):
+    def _check_patience(self) -> None:
         """What may wait in the filter, for aids too, < hold < lag, or one of the nodes goes on without what is still on its way."""
         hold, self.lag = (self._parameter(name, parameter) for name, parameter in PATIENCE.items())
         least = 1e-9 * STEP + AID_SHARE * self.lag
@@ -91,7 +100,7 @@ class Nodes:
                 f"{least:g} s < hold < lag."
             )
 
-    def _wait_for_names(self):
+    def _wait_for_names(self) -> None:
         """Return when the node of every publisher and subscription is known: DDS tells that later than that they are."""
         node, until = self._node, time.monotonic() + ANSWER_LIMIT
         while time.monotonic() < until:
@@ -101,7 +110,7 @@ class Nodes:
                 return
             time.sleep(SPIN)
 
-    def _parameter(self, name, parameter):
+    def _parameter(self, name: str, parameter: str) -> float:
         client = AsyncParameterClient(self._node, self._names[name])
         future = client.get_parameters([parameter]) if client.wait_for_services(ANSWER_LIMIT) else None
         if future is not None:

@@ -1,7 +1,10 @@
 """Listening to live topics for a while: what came, as a bag, and who publishes and hears what."""
 
+from __future__ import annotations
+
 from functools import partial
 import time
+from typing import TYPE_CHECKING
 
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
@@ -12,10 +15,18 @@ from ..checking.wiring import End
 from .record import DISCOVERY_PERIOD, POLL_PERIOD, Recorder
 from .session import session
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+    from rclpy.node import Node
+    from .session import Stop
+
 FIRST_LIMIT = 20.0  # s until there must be a message on the first topic
 
 
-def listen(topics, bag, seconds, say=print):
+def listen(
+    topics: Sequence[str], bag: str | Path, seconds: float, say: Callable[[str], object] = print
+) -> tuple[dict[str, str], list[End]]:
     """Record topics to a new bag, from the first message on the first of them on for `seconds`, or until SIGINT.
 
     topics : absolute names. Returns ({topic: type} of all that there are, [End] of topics, who is not us).
@@ -36,7 +47,7 @@ def listen(topics, bag, seconds, say=print):
     return kinds, ends
 
 
-def _take(recorder, stop, seconds, enough=lambda: False):
+def _take(recorder: Recorder, stop: Stop, seconds: float, enough: Callable[[], object] = lambda: False) -> None:
     until, look_again = time.monotonic() + seconds, 0.0
     while not stop and not enough() and time.monotonic() < until:
         if time.monotonic() >= look_again:
@@ -46,7 +57,7 @@ def _take(recorder, stop, seconds, enough=lambda: False):
         time.sleep(POLL_PERIOD)
 
 
-def _ends(node, topic):
+def _ends(node: Node, topic: str) -> Iterator[End]:
     for publishes, infos in (
         (True, node.get_publishers_info_by_topic(topic)), (False, node.get_subscriptions_info_by_topic(topic)),
     ):  # fmt: skip
@@ -58,7 +69,7 @@ def _ends(node, topic):
             )  # fmt: skip
 
 
-def _elsewhere(topic, kinds):
+def _elsewhere(topic: str, kinds: dict[str, str]) -> str:
     """What to do about a topic that nobody publishes."""
     others = sorted(name for name, kind in kinds.items() if kind == "uwb_tdoa_msgs/msg/Tdoa" and name != topic)
     if others:

@@ -1,8 +1,11 @@
 """Publishing recorded messages in the time between their stamps."""
 
+from __future__ import annotations
+
 from collections import Counter
 from dataclasses import dataclass, field
 import time
+from typing import TYPE_CHECKING
 
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -13,6 +16,14 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .follow import is_stamped, stamp_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from rclpy.node import Node
+    from rclpy.publisher import Publisher
+    from rosbags.interfaces import Connection
+    from .follow import Follower
+    from .session import Stop
 
 RCLError = rclpy_implementation.RCLError
 LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all that follows, instead of a burst that a subscription cannot take
@@ -30,25 +41,30 @@ class Played:
     the topic that is followed.
     """
 
-    counts: Counter = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)
     behind: float = 0.0
     stretched: float = 0.0
     waited: float = 0.0
 
 
-def is_latched(publisher):
+def is_latched(publisher: Publisher) -> bool:
     """Whether who subscribes late gets the last messages too."""
     return publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 
-def is_tdoa(publisher):
+def is_tdoa(publisher: Publisher) -> bool:
     """Whether it publishes raw TDOAs."""
-    return publisher.msg_type.__name__ == "Tdoa"
+    return _kind(publisher) == "Tdoa"
 
 
-def is_aid(publisher):
+def is_aid(publisher: Publisher) -> bool:
     """Whether it publishes what one of the SENSORS measures, for ekf_node."""
     return publisher.topic_name.endswith(tuple(f"/{topic}" for sensor in SENSORS.values() for topic, _ in sensor.topics))
+
+
+def _kind(publisher: Publisher) -> str:
+    """Name of the class of its messages."""
+    return publisher.msg_type.__name__  # type: ignore[attr-defined]  # rclpy says of the class that it is a message
 
 
 class Player:
@@ -57,23 +73,27 @@ class Player:
     stop : true once the process was asked to end; follower : Follower or None; played : Played.
     """
 
-    def __init__(self, node, publishers, rate, clock_rate, stop):
-        self.played, self.follower = Played(), None
+    def __init__(
+        self, node: Node, publishers: dict[str, Publisher], rate: float, clock_rate: float | None, stop: Stop
+    ) -> None:
+        self.played = Played()
+        self.follower: Follower | None = None
         self._publishers, self._rate, self._stop = publishers, rate, stop
         self._clock = node.create_publisher(Clock, "/clock", QoSProfile(depth=10)) if clock_rate else None
-        self._clock_period = 1.0 / clock_rate if clock_rate else None
+        self._clock_period = 1.0 / clock_rate if clock_rate else 0.0
         self._stamped = {topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)}
         self._tdoas = {topic for topic, publisher in publishers.items() if is_tdoa(publisher)}
         self._aids = {topic for topic, publisher in publishers.items() if is_aid(publisher)}
         self._latched = [publisher for publisher in publishers.values() if is_latched(publisher)]
-        self._start = self._began = self._next_tick = None
+        self._start: int | None = None  # ns, stamp of the first message
+        self._began = self._next_tick = 0.0
 
-    def count(self, what):
+    def count(self, what: str) -> int:
         """How many "TDOAs" or "IMU samples" have been played."""
         kind = {"TDOAs": "Tdoa", "IMU samples": "Imu"}[what]
-        return sum(n for topic, n in self.played.counts.items() if self._publishers[topic].msg_type.__name__ == kind)
+        return sum(n for topic, n in self.played.counts.items() if _kind(self._publishers[topic]) == kind)
 
-    def play(self, recorded):
+    def play(self, recorded: Iterable[tuple[Connection, int, bytes]]) -> None:
         """Publish an iterable of (connection, stamp ns, bytes), from the beginning."""
         self._start = None
         for connection, stamp, data in recorded:
@@ -98,7 +118,7 @@ class Player:
                 elif self.follower is not None and topic in self._aids and publisher.get_subscription_count():
                     self.follower.note_aid(topic, stamp_of(data))
 
-    def _wait_for_latched(self):
+    def _wait_for_latched(self) -> float:
         """Wait, before the first message of a stream, until what is latched (the anchors) has been acknowledged.
         Returns the s that took.
 
@@ -113,7 +133,7 @@ class Player:
         self._latched = []
         return time.perf_counter() - began
 
-    def _sleep_until(self, due):
+    def _sleep_until(self, due: float) -> float:
         """Sleep, and publish the clock meanwhile. Returns the s by which it is later than due."""
         while True:
             now = time.perf_counter()
@@ -125,19 +145,20 @@ class Player:
             wake = due if self._clock is None else min(due, self._next_tick)
             time.sleep(min(max(wake - now, 0.0), LONGEST_SLEEP))
 
-    def _tick(self, now):
+    def _tick(self, now: float) -> None:
+        assert self._clock is not None and self._start is not None
         nanoseconds = self._start + int((now - self._began) * 1e9 * self._rate)
         message = Clock()
         message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 10**9)
         self._clock.publish(message)
 
-    def _count_delay(self, behind):
+    def _count_delay(self, behind: float) -> None:
         self.played.behind = max(self.played.behind, behind)
         if behind > LARGEST_CATCH_UP:
             self._began += behind - LARGEST_CATCH_UP
             self.played.stretched += behind - LARGEST_CATCH_UP
 
-    def _publish(self, publisher, data):
+    def _publish(self, publisher: Publisher, data: bytes) -> bool:
         """Publish, after waiting until reliable subscriptions have acknowledged what the history is full of. Returns
         False if stopped while it waited."""
         until = time.monotonic() + ACKNOWLEDGE_LIMIT

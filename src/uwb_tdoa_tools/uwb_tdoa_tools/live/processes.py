@@ -1,5 +1,7 @@
 """Executables of our packages as processes in a ROS domain of their own, and what they say on /diagnostics."""
 
+from __future__ import annotations
+
 import os
 import re
 import signal
@@ -7,6 +9,7 @@ import subprocess
 import time
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import rclpy
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
@@ -14,6 +17,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from domain_coordinator import domain_id
 
 from uwb_tdoa_bias.foundation.errors import Failure
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from rclpy.node import Node
+    from .session import Stop
 
 STOP_LIMIT = 10.0  # s
 LOOK = 5.0  # s between two looks at what the processes do, and between two lines about it
@@ -27,7 +35,7 @@ class LiveError(Failure):
 
 
 @contextmanager
-def variables(values):
+def variables(values: dict[str, str]) -> Iterator[None]:
     """Environment variables, for the block and what it starts."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
@@ -42,14 +50,17 @@ def variables(values):
 
 
 @contextmanager
-def own_domain():
+def own_domain() -> Iterator[None]:
     """A ROS domain that nobody else has, on this machine only, for the block and what it starts."""
     with domain_id() as number:
         with variables({"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}):
             yield
 
 
-def wait(limit, what, processes, node, condition, say=lambda text: None, goes_on=lambda: None):
+def wait(
+    limit: float | None, what: str, processes: Processes, node: Node, condition: Callable[[], object],
+    say: Callable[[str], object] = lambda text: None, goes_on: Callable[[], object] = lambda: None,
+) -> None:  # fmt: skip
     """Serve the node until condition(). Raises LiveError if a process has ended that should not, or after `limit` s in which nothing
     went on: what goes_on() gives stayed the same, and no process that is still starting worked, as a node that compiles does.
 
@@ -77,11 +88,12 @@ def wait(limit, what, processes, node, condition, say=lambda text: None, goes_on
 class Diagnostics:
     """The newest status of each node on /diagnostics, and whether it still changes."""
 
-    def __init__(self, node):
-        self._newest, self._repeated = {}, {}
+    def __init__(self, node: Node) -> None:
+        self._newest: dict[str, dict[str, str]] = {}
+        self._repeated: dict[str, int] = {}
         self._subscription = node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
 
-    def _take(self, message):
+    def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:
             name = status.name.strip("/")
             values = {pair.key: pair.value for pair in status.values}
@@ -90,11 +102,11 @@ class Diagnostics:
             self._repeated[name] = self._repeated.get(name, 0) + 1 if same else 0
             self._newest[name] = values
 
-    def newest(self, name):
+    def newest(self, name: str) -> dict[str, str]:
         """{key: text}; empty before the first status."""
         return self._newest.get(name, {})
 
-    def forget(self):
+    def forget(self) -> None:
         """Count anew how often a status repeats, from what is said from here on. What still waits to be read is older: of a node
         that was not spun it would seem settled before anything happened."""
         handle = self._subscription.handle
@@ -103,34 +115,38 @@ class Diagnostics:
                 pass
         self._repeated.clear()
 
-    def counts(self):
+    def counts(self) -> dict[str, dict[str, str]]:
         """Everything that the nodes counted, for comparison with what they had counted before."""
         return {name: _counts(values) for name, values in self._newest.items()}
 
-    def is_settled(self):
+    def is_settled(self) -> bool:
         """Whether each node has said the same counts twice in a row: nothing is on its way any more."""
         return len(self._repeated) == len(self._newest) and all(self._repeated.values())
 
 
-def _counts(values):
+def _counts(values: dict[str, str]) -> dict[str, str]:
     return {key: value for key, value in values.items() if value.isdigit()}
 
 
 class Processes:
     """Executables of our packages, each in a process group of its own, output in a file. Ends what it started."""
 
-    def __init__(self, folder, stop):
+    def __init__(self, folder: str | Path, stop: Stop) -> None:
         self.folder = Path(folder)
-        self._stop, self._running, self._may_end = stop, {}, {}
+        self._stop = stop
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._may_end: dict[str, Sequence[int]] = {}
 
-    def __enter__(self):
+    def __enter__(self) -> Processes:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         for title in list(self._running)[::-1]:
             self._end(title)
 
-    def start(self, package, name, *arguments, title=None, may_end_with=()):
+    def start(
+        self, package: str, name: str, *arguments: object, title: str | None = None, may_end_with: Sequence[int] = ()
+    ) -> subprocess.Popen[bytes]:
         """The Popen of the executable; title : to tell it from others, default its name, output in `file(title)`;
         may_end_with : exit codes with which it is no failure that it ends."""
         try:
@@ -146,15 +162,15 @@ class Processes:
         self._may_end[title] = may_end_with
         return self._running[title]
 
-    def pid(self, title):
+    def pid(self, title: str) -> int:
         """Process id of a running executable."""
         return self._running[title].pid
 
-    def file(self, title):
+    def file(self, title: str) -> Path:
         """Where the output of a process goes."""
         return self.folder / f"{title.replace('/', '.')}.log"
 
-    def check(self):
+    def check(self) -> None:
         """Raise LiveError if a process ended that should not have, KeyboardInterrupt if we are asked to end."""
         if self._stop:
             raise KeyboardInterrupt
@@ -163,22 +179,22 @@ class Processes:
             if code is not None and code not in self._may_end[title]:
                 raise self._failure(title, code)
 
-    def worked(self):
+    def worked(self) -> dict[str, float]:
         """{title: s that its threads have run, or waited for a core} of those that are starting: they have not said that they are ready."""
         return {title: _worked(process.pid) for title, process in self._running.items() if not READY.search(self._said(title))}
 
-    def doing(self):
+    def doing(self) -> str:
         """What each that is starting said last, in words; of all if none is."""
         titles = [title for title in self._running if not READY.search(self._said(title))] or list(self._running)
         return "; ".join(f"{title}: {_bare(self._said(title)) or 'starting'}" for title in titles)
 
-    def stop(self, title):
+    def stop(self, title: str) -> None:
         """Interrupt a process and wait for it; raises LiveError if it does not end well."""
         code = self._end(title)
         if code != 0:
             raise self._failure(title, code)
 
-    def _end(self, title):
+    def _end(self, title: str) -> int:
         process = self._running.pop(title)
         for number, patience in ((signal.SIGINT, STOP_LIMIT), (signal.SIGKILL, None)):
             if process.poll() is None:
@@ -189,23 +205,23 @@ class Processes:
                     continue
         return process.returncode
 
-    def _said(self, title):
+    def _said(self, title: str) -> str:
         """The end of its output."""
         with open(self.file(title), "rb") as log:
             log.seek(max(0, os.fstat(log.fileno()).st_size - TAIL))
             return log.read().decode(errors="replace").strip()
 
-    def _failure(self, title, code):
+    def _failure(self, title: str, code: int) -> LiveError:
         last = " ".join(self._said(title).splitlines()[-1:])
         return LiveError(f"{title} ended with code {code} ({last}); all of its output is in {self.file(title)}.")
 
 
-def _bare(said):
+def _bare(said: str) -> str:
     """The last line of a log, without level, time and name."""
     return re.sub(r"^(\[[^]]*\] ?)+: ", "", (said.splitlines() or [""])[-1])
 
 
-def _worked(pid):
+def _worked(pid: int) -> float:
     """s that the threads of a process have run or were ready to run: on a loaded machine that of one that works is still about all."""
     total = 0
     for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):

@@ -1,7 +1,10 @@
 """Recording topics to a bag."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 import time
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -10,6 +13,16 @@ from uwb_tdoa_bias.foundation.errors import Failure, InputError
 from ..bags.files import new_bag
 from ..bags.message_types import add_type, typestore
 from .session import message_class, recorded_qos, session, subscription_qos
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+    from rclpy.node import Node
+    from rclpy.qos import QoSProfile
+    from rclpy.subscription import Subscription
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag2 import Writer
+    from .session import Stop
 
 REMEDY = "build and source the workspace that has it, and name the package with --package"
 DISCOVERY_PERIOD = 0.1  # s between two looks for new topics
@@ -21,12 +34,15 @@ class Recorded:
     """counts : {topic: messages}; missing : topics, asked for by name, that brought none; error : what ended the
     recording, or None."""
 
-    counts: dict
-    missing: list
+    counts: dict[str, int]
+    missing: list[str]
     error: Exception | None
 
 
-def record(topics, output, storage="mcap", ros_arguments=(), say=print, packages=()):
+def record(
+    topics: Sequence[str], output: str | Path, storage: str = "mcap", ros_arguments: Sequence[str] = (),
+    say: Callable[[str], object] = print, packages: Sequence[str] = (),
+) -> Recorded:  # fmt: skip
     """Record topics, or all that are not hidden if the list is empty, until SIGINT or SIGTERM. Returns Recorded.
 
     output : path of the bag, which appears when the recording ends; say(sentence) : told what happens; packages : of message types,
@@ -49,7 +65,7 @@ def record(topics, output, storage="mcap", ros_arguments=(), say=print, packages
     return Recorded(recorder.counts, sorted(recorder.missing()), error)
 
 
-def _take_until(stop, recorder, progress):
+def _take_until(stop: Stop, recorder: Recorder, progress: tqdm) -> None:
     look_again = 0.0
     while not stop:
         if time.monotonic() >= look_again:
@@ -66,13 +82,17 @@ class Recorder:
     wanted : set of absolute topic names, or None for all; packages : see `record`. counts : {topic: messages recorded so far}.
     """
 
-    def __init__(self, node, writer, wanted, say, packages=()):
-        self.counts, self._packages = {}, packages
+    def __init__(
+        self, node: Node, writer: Writer, wanted: set[str] | None, say: Callable[[str], object],
+        packages: Sequence[str] = (),
+    ) -> None:  # fmt: skip
+        self.counts: dict[str, int] = {}
+        self._packages = packages
         self._node, self._writer, self._wanted, self._say = node, writer, wanted, say
-        self._pairs = []  # (subscription, connection)
-        self._refused = set()
+        self._pairs: list[tuple[Subscription, Connection]] = []
+        self._refused: set[str] = set()
 
-    def discover(self):
+    def discover(self) -> None:
         """Subscribe to wanted topics that have a publisher by now."""
         for topic, types in self._node.get_topic_names_and_types():
             if topic in self.counts or topic in self._refused or not self._is_wanted(topic):
@@ -82,7 +102,7 @@ class Recorder:
                 msgtype = next(filter(self._class, types), types[0])  # others may tell other types of it
                 self._subscribe(topic, msgtype, [each.qos_profile for each in publishers if each.topic_type == msgtype])
 
-    def take(self):
+    def take(self) -> int:
         """Move all messages that have arrived to the bag; returns how many."""
         taken = 0
         for subscription, connection in self._pairs:
@@ -95,19 +115,19 @@ class Recorder:
                     taken += 1
         return taken
 
-    def missing(self):
+    def missing(self) -> set[str]:
         """Topics that were asked for by name and brought nothing."""
         return {topic for topic in self._wanted or () if not self.counts.get(topic)}
 
-    def _is_wanted(self, topic):
+    def _is_wanted(self, topic: str) -> bool:
         if self._wanted is not None:
             return topic in self._wanted
         return not any(part.startswith("_") for part in topic.split("/"))
 
-    def _class(self, msgtype):
+    def _class(self, msgtype: str) -> type | None:
         return message_class(msgtype, self._packages)
 
-    def _subscribe(self, topic, msgtype, offered):
+    def _subscribe(self, topic: str, msgtype: str, offered: list[QoSProfile]) -> None:
         cls = self._class(msgtype)
         try:
             if cls is None:

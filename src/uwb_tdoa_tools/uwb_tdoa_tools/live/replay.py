@@ -1,9 +1,12 @@
 """Replaying a bag over topics: publishers as recorded, somebody to listen, and everything acknowledged."""
 
+from __future__ import annotations
+
 from contextlib import closing
 from dataclasses import dataclass, field
 import itertools
 import time
+from typing import TYPE_CHECKING
 
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy
@@ -16,6 +19,14 @@ from .followed_nodes import Nodes
 from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player, is_tdoa
 from .read_ahead import read_ahead
 from .session import message_class, publisher_qos, session
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
+    from rclpy.node import Node
+    from rclpy.publisher import Publisher
+    from ..bags.files import BagReader
+    from .session import Stop
 
 GLOBAL = ("/tf", "/tf_static", "/clock", "/diagnostics", "/rosout", "/parameter_events")  # in no robot's namespace
 SETTLE = 0.2  # s from the last match to the first message: a subscription learns of a match a little later than we do
@@ -36,10 +47,10 @@ class Options:
     loop: bool = False
     clock_rate: float | None = None
     wait: float = 10.0
-    wait_topics: tuple = ()
+    wait_topics: Sequence[str] = ()
     follow: str | None = None
-    ros_arguments: tuple = ()
-    packages: tuple = ()
+    ros_arguments: Sequence[str] = ()
+    packages: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -52,10 +63,10 @@ class Replayed:
     took: float = 0.0
     acknowledged: bool = True
     stopped_by: int | None = None
-    wrong: dict = field(default_factory=dict)
+    wrong: dict[str, int] = field(default_factory=dict)
 
 
-def replay(bag, options=Options(), say=print):
+def replay(bag: str | Path, options: Options = Options(), say: Callable[[str], object] = print) -> Replayed:
     """Replay a bag. Returns Replayed. Raises InputError. say(sentence) : told what happens."""
     with open_bag(bag) as reader, session("replay", list(options.ros_arguments)) as (node, stop):
         publishers = _publishers(node, bag, reader, say, options.packages)
@@ -66,7 +77,7 @@ def replay(bag, options=Options(), say=print):
         player = Player(node, publishers, options.rate, options.clock_rate, stop)
         _wait_for_listeners(node, publishers, options, stop, say)
         nodes = Nodes(node) if options.follow else None
-        player.follower = Follower(node, options.follow, nodes.lag) if options.follow else None
+        player.follower = Follower(node, options.follow, nodes.lag) if options.follow and nodes else None
         length = (reader.end_time - reader.start_time) / 1e9
         say(f"playing {count} messages, {length:.1f} s at rate {options.rate:g}")
         began = time.perf_counter()
@@ -81,18 +92,24 @@ def replay(bag, options=Options(), say=print):
         return Replayed(player.played, took, acknowledged, stop.signal, wrong)
 
 
-def _publishers(node, bag, reader, say, packages):
+def _publishers(
+    node: Node, bag: str | Path, reader: BagReader, say: Callable[[str], object], packages: Sequence[str]
+) -> dict[str, Publisher]:
     """{topic in the bag: publisher} of all topics whose type is installed, those that are latched last. What belongs to
     one robot is published in the namespace of the node (--ros-args -r __ns:=/tag1)."""
     made = []
     by_topic = itertools.groupby(sorted(reader.connections, key=lambda c: c.topic), key=lambda c: c.topic)
-    for topic, connections in by_topic:
-        connections = list(connections)
+    for topic, group in by_topic:
+        connections = list(group)
         cls = message_class(connections[0].msgtype, packages)
         if cls is None:
             say(f"leaving out {topic}: its type {connections[0].msgtype} is not installed, or of a package that is not known (--package)")
             continue
-        recorded = [qos for connection in connections for qos in connection.ext.offered_qos_profiles]
+        recorded = [
+            qos
+            for connection in connections
+            for qos in connection.ext.offered_qos_profiles  # type: ignore[union-attr]  # a bag of ROS 2
+        ]
         made.append((topic, cls, publisher_qos(recorded, sum(connection.msgcount for connection in connections))))
     if not made:
         raise InputError(f"{bag}: has no topic of an installed type; build and source the workspace first.")
@@ -103,7 +120,9 @@ def _publishers(node, bag, reader, say, packages):
     }
 
 
-def _wait_for_listeners(node, publishers, options, stop, say):
+def _wait_for_listeners(
+    node: Node, publishers: dict[str, Publisher], options: Options, stop: Stop, say: Callable[[str], object]
+) -> None:
     """Return when somebody subscribes to each wanted topic: those that options name, or else all of the bag, as far as
     they have any subscriber once nobody new has come for DISCOVERY s; and when somebody publishes what is followed.
     InputError if after `options.wait` s nobody subscribes to one that must have a subscriber, or to any."""
@@ -116,7 +135,8 @@ def _wait_for_listeners(node, publishers, options, stop, say):
     names = ", ".join(publishers[topic].topic_name for topic in wanted)
     say(f"waiting up to {options.wait:g} s for subscriptions to {names}")
     began = changed = time.monotonic()
-    missing, heard = wanted, ()
+    missing = wanted
+    heard: tuple[tuple[int, ...], ...] = ()
     while not stop:
         now = time.monotonic()
         counts = tuple(publishers[topic].get_subscription_count() for topic in wanted)
@@ -131,7 +151,7 @@ def _wait_for_listeners(node, publishers, options, stop, say):
         if (enough and followed and matched) or now > began + options.wait:
             break
         time.sleep(0.01)
-    names = [publishers[topic].topic_name for topic in missing]
+    without = [publishers[topic].topic_name for topic in missing]
     unheard = [publishers[topic].topic_name for topic in missing if topic in needed]
     if not stop and (unheard or len(missing) == len(wanted)):
         what = unheard[0] if unheard else "any topic of the bag"
@@ -140,11 +160,11 @@ def _wait_for_listeners(node, publishers, options, stop, say):
             "(--wait-matched)."
         )
     if missing:
-        say(f"nobody subscribes to {', '.join(names)}")
+        say(f"nobody subscribes to {', '.join(without)}")
     time.sleep(SETTLE)
 
 
-def _wait_acknowledged(publishers, stop):
+def _wait_acknowledged(publishers: Iterable[Publisher], stop: Stop) -> bool:
     """Whether every subscription has everything; waits at most ACKNOWLEDGE_LIMIT, in slices that see a signal."""
     until = time.monotonic() + ACKNOWLEDGE_LIMIT
     for publisher in publishers:

@@ -1,9 +1,12 @@
 """Run a bag through both nodes, as processes, over ROS topics, and record what they say."""
 
+from __future__ import annotations
+
 import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.estimator import VERDICTS
@@ -11,6 +14,11 @@ from uwb_tdoa_ekf.estimator import VERDICTS
 from ..bags.files import open_bag
 from .processes import Diagnostics, Processes, own_domain, wait
 from .session import session
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from rclpy.node import Node
+    from uwb_tdoa_bias.foundation.flight import Flight
 
 INPUTS = ("/uwb/anchors", "/uwb/tdoa", "/imu/data")
 # Who must have found whom before the first message: topic -> (publishers, subscriptions)
@@ -41,11 +49,14 @@ class LiveRun:
     """recorded : path of a bag with `odometry`; bias, ekf : {key: text}, the last diagnostics of each node."""
 
     recorded: Path
-    bias: dict
-    ekf: dict
+    bias: dict[str, str]
+    ekf: dict[str, str]
 
 
-def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, say=print):
+def run_live(
+    bag: str | Path, folder: str | Path, rate: float = 1.0, bias_parameters: dict[str, Any] | None = None,
+    ekf_parameters: dict[str, Any] | None = None, say: Callable[[str], object] = print,
+) -> LiveRun:  # fmt: skip
     """Start bias_node, ekf_node and record, wait until they have found each other, replay the bag, stop them.
 
     bag : path of a bag; folder : where the recorded bag (`recorded.bag`) and the output of the processes (`*.log`) go;
@@ -79,7 +90,7 @@ def run_live(bag, folder, rate=1.0, bias_parameters=None, ekf_parameters=None, s
     return LiveRun(recorded, diagnostics.newest("bias_node"), diagnostics.newest("ekf_node"))
 
 
-def accounts(bias, ekf, flight):
+def accounts(bias: dict[str, str], ekf: dict[str, str], flight: Flight) -> dict[str, int]:
     """What became of the messages of a Flight that was played, by the last diagnostics of bias_node and ekf_node.
 
     {verdict: TDOAs, "waiting", "lost": TDOAs, "imu_late", "imu_lost": samples}.
@@ -91,7 +102,7 @@ def accounts(bias, ekf, flight):
     return counts | {"imu_late": int(ekf["imu_late"]), "imu_lost": samples - int(ekf["IMU samples received"])}
 
 
-def _parameters(name, values):
+def _parameters(name: str, values: dict[str, Any] | None) -> list[str]:
     """Command-line arguments for a node's parameters; JSON is also YAML."""
     values = PATIENCE[name] | (values or {})
     for end in RELIABLE[name]:
@@ -99,15 +110,15 @@ def _parameters(name, values):
     return ["--ros-args", *(part for key, value in values.items() for part in ("-p", f"{key}:={json.dumps(value)}"))]
 
 
-def _played(diagnostics, total):
+def _played(diagnostics: Diagnostics, total: int) -> str:
     """How much of the TDOAs of the bag bias_node has, in words."""
     received = int(diagnostics.newest("bias_node").get("received", 0))
     return f"{100.0 * received / max(total, 1):.0f} % of the flight is through"
 
 
-def _is_ready(node, diagnostics):
+def _is_ready(node: Node, diagnostics: Diagnostics) -> bool:
     found = diagnostics.newest("ekf_node").get("publishers of uwb/tdoa_corrected", "0") != "0"
-    return found and diagnostics.newest("bias_node") and all(
+    return found and bool(diagnostics.newest("bias_node")) and all(
         node.count_publishers(topic) >= publishers and node.count_subscribers(topic) >= subscriptions
         for topic, (publishers, subscriptions) in MATCHED.items()
     )  # fmt: skip

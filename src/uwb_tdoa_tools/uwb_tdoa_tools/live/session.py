@@ -1,8 +1,11 @@
 """What replay and record share: their life as a ROS node, message classes by name, QoS to and from bags."""
 
+from __future__ import annotations
+
 import signal
 from contextlib import contextmanager
 from importlib import import_module
+from typing import Any, TYPE_CHECKING
 
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -12,12 +15,17 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from rclpy.duration import Duration
+    from rclpy.node import Node
+
 KNOWN = frozenset(  # packages of message types: those of ROS that robots speak, and ours
     """actionlib_msgs action_msgs builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs nav_msgs rcl_interfaces rosgraph_msgs
     sensor_msgs shape_msgs statistics_msgs std_msgs stereo_msgs tf2_msgs trajectory_msgs unique_identifier_msgs uwb_tdoa_msgs
     visualization_msgs""".split()
 )
-PACKAGE = {  # the option by which others are allowed
+PACKAGE: dict[str, Any] = {  # the option by which others are allowed
     "action": "append", "default": [], "metavar": "NAME",
     "help": "import message types of this package, too; those of ROS that robots speak, and ours, are known; may be repeated",
 }  # fmt: skip
@@ -27,22 +35,22 @@ READER_DEPTH = 10_000  # messages that a subscription holds until they are taken
 class Stop:
     """True once the process was asked to end, with the number of the signal that asked."""
 
-    def __init__(self):
-        self.signal = None
+    def __init__(self) -> None:
+        self.signal: int | None = None
 
-    def __bool__(self):
+    def __bool__(self) -> bool:
         return self.signal is not None
 
 
 @contextmanager
-def session(name, arguments):
+def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
     """(node, Stop) while the block lasts. SIGINT and SIGTERM only set Stop: the block ends in its own order.
 
     arguments : command line with the --ros-args that rclpy shall see. Raises InputError for what rclpy refuses.
     """
     stop = Stop()
 
-    def asked(number, _):
+    def asked(number: int, _: object) -> None:
         stop.signal = number
 
     # Set here even where SIGINT was ignored, as it is in a job that a shell script put in the background.
@@ -63,7 +71,7 @@ def session(name, arguments):
             signal.signal(number, handler)
 
 
-def message_class(msgtype, packages=()):
+def message_class(msgtype: str, packages: Sequence[str] = ()) -> type | None:
     """Class of a type like "pkg/msg/Name", or None if its package is not installed, or neither KNOWN nor one of `packages`: whoever
     publishes, or made a bag, names the type, and importing a package runs it."""
     package, _, name = msgtype.partition("/msg/")
@@ -75,7 +83,7 @@ def message_class(msgtype, packages=()):
         return None
 
 
-def publisher_qos(recorded, messages):
+def publisher_qos(recorded: Sequence[Qos], messages: int) -> QoSProfile:
     """QoSProfile to replay a topic with. recorded : rosbags Qos of each recorded publisher; messages : how many.
 
     Durability as recorded. Always reliable: that serves reliable and best-effort subscriptions alike. A stream keeps
@@ -92,7 +100,7 @@ def publisher_qos(recorded, messages):
     return QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 
 
-def subscription_qos(offered):
+def subscription_qos(offered: Sequence[QoSProfile]) -> QoSProfile:
     """QoSProfile that gets the most of all publishers of a topic. offered : their QoSProfiles."""
     reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
     latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
@@ -103,10 +111,10 @@ def subscription_qos(offered):
     )
 
 
-def recorded_qos(qos):
+def recorded_qos(qos: QoSProfile) -> Qos:
     """The rosbags Qos of a publisher's QoSProfile. (Both number the policies as rmw does.)"""
 
-    def time(duration):
+    def time(duration: Duration) -> QosTime:
         return QosTime(*divmod(duration.nanoseconds, 10**9))
 
     return Qos(
