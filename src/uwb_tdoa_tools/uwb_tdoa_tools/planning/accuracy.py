@@ -1,6 +1,9 @@
 """Bias and scatter of estimates over places, beside what the bound promises there."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +12,12 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
 from .precision import bound, information
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from .installation import Installation
+    from .maps import Grid
 
 FEW = 20  # estimates in a cell below which it tells nothing
 
@@ -24,14 +33,15 @@ class Samples:
     covariance: np.ndarray
 
 
-def fly(flight, aids=()):
+def fly(flight: Flight, aids: Iterable[str] = ()) -> Samples:
     """Samples of a Flight with ground truth, static or moving, from its TDOAs, IMU and `aids`, names of AIDS, alone. Raises
     InputError."""
+    assert flight.truth is not None
     score, _ = evaluate(flight.without(*(name for name in AIDS if name not in aids)))
     return Samples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
 
 
-def together(samples):
+def together(samples: Sequence[Samples]) -> Samples:
     """One Samples of several, their times moved apart."""
     apart = max(s.t[-1] for s in samples) + 10.0
     times = np.concatenate([s.t + k * apart for k, s in enumerate(samples)])
@@ -48,7 +58,7 @@ class AccuracyMap:
     bound of one round and the filter give at the same places.
     """
 
-    grid: object
+    grid: Grid
     count: np.ndarray
     bias: np.ndarray
     rmse: np.ndarray
@@ -56,12 +66,12 @@ class AccuracyMap:
     claimed: np.ndarray
 
     @property
-    def std(self):
+    def std(self) -> np.ndarray:
         """Scatter about the bias, (n, 3) m: eq. 22 of Grasso et al."""
         return np.sqrt(np.maximum(self.rmse**2 - self.bias**2, 0.0))
 
 
-def accuracy_map(samples, installation, grid):
+def accuracy_map(samples: Samples, installation: Installation, grid: Grid) -> AccuracyMap:
     """AccuracyMap of Samples. Estimates outside of the grid are left out."""
     variances = np.diagonal(promised(samples, installation), axis1=1, axis2=2)
     claimed = np.diagonal(samples.covariance, axis1=1, axis2=2)
@@ -71,7 +81,7 @@ def accuracy_map(samples, installation, grid):
     size = int(np.prod(grid.shape))
     count = np.bincount(index, minlength=size)
 
-    def mean(values):
+    def mean(values: np.ndarray) -> np.ndarray:
         sums = np.stack([np.bincount(index, column, size) for column in values[inside].T], axis=1)
         return np.where(count[:, None] >= FEW, sums / np.maximum(count, 1)[:, None], np.nan)
 
@@ -80,12 +90,12 @@ def accuracy_map(samples, installation, grid):
     )
 
 
-def promised(samples, installation):
+def promised(samples: Samples, installation: Installation) -> np.ndarray:
     """The bound of one round at the place of every sample: (n, 3, 3) m^2. Needs three dimensions."""
     return bound(information(samples.place, installation))
 
 
-def comparison(samples, installation):
+def comparison(samples: Samples, installation: Installation) -> dict[str, Any]:
     """Achieved and claimed errors against the bound, over all samples: a dict of m and ratios.
 
     rmse, bound, claimed : roots of the mean squares of the 3D error, of the bound of one round, and of what the filter

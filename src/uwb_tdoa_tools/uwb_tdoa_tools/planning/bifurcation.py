@@ -13,7 +13,10 @@ this is the polynomial of Compagnoni et al. (Inverse Problems 30, 2014, 035004) 
 A tag of known height among anchors of other heights only adds constants to the right-hand sides, and nothing to |q|.
 """
 
+from __future__ import annotations
+
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +25,10 @@ from uwb_tdoa_bias.foundation.geometry import ranges
 
 from .installation import principal_extents
 from .precision import weigh
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .installation import Installation
 
 FLAT_SUBSET = 0.05  # thickness over length; anchors so close to a line (plane) mirror every position in it
 MOST_SUBSETS = 2000
@@ -37,7 +44,7 @@ class Subsets:
     Of more than MOST_SUBSETS choices, only those of anchors that come close together in the round are taken.
     """
 
-    def __init__(self, anchors, dimensions):
+    def __init__(self, anchors: Anchors, dimensions: int) -> None:
         """anchors : Anchors; dimensions : k, 2 or 3. Raises InputError if all choices are flat."""
         self.anchors, self.dimensions = anchors, dimensions
         candidates = _choices(len(anchors), dimensions + 1)
@@ -57,7 +64,7 @@ class Subsets:
         self._q[q, :, self.rows[:, 1:]] = -inverse.swapaxes(1, 2)
         self._q[q[:, 0], :, self.rows[:, 0]] = inverse.sum(axis=2)
 
-    def discriminant(self, points):
+    def discriminant(self, points: np.ndarray) -> np.ndarray:
         """|q|^2 - 1 of every subset: (n, Q), negative where the position is the only one with its TDOAs.
 
         points : (n, 3) m.
@@ -72,11 +79,11 @@ class Subsets:
             at += len(chunk)
         return out
 
-    def ambiguous(self, points):
+    def ambiguous(self, points: np.ndarray) -> np.ndarray:
         """Share of the subsets with two positions: (n,), 0 where every pairing has one."""
         return np.mean(self.discriminant(points) > 0.0, axis=1)
 
-    def slopes(self, points, weights):
+    def slopes(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Derivatives of the sum of weights (n, Q) times the discriminants along the anchors' positions: (N, 3) 1/m.
 
         With A q = -D and u_j the direction from anchor j to the tag, d|q|^2 / dm_j = 2 c_j (q - u_j), where c_j is q
@@ -92,7 +99,7 @@ class Subsets:
             total -= np.einsum("nqj,njk->jk", share, unit[chunk])
         return total
 
-    def mirrors(self, points):
+    def mirrors(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The other positions with the same TDOAs: (row of the point (m,), subset (m,), position (m, 3) m).
 
         Only where there is one. The height stays, if known.
@@ -109,7 +116,7 @@ class Subsets:
         other = squared / ((np.einsum("mk,mk->m", q, q) - 1.0) * np.maximum(r, 1e-12))
         return row, subset, np.hstack([reference[:, :k] + p + q * other[:, None], points[row, k:]])
 
-    def separation(self, points, installation):
+    def separation(self, points: np.ndarray, installation: Installation) -> np.ndarray:
         """How clearly a whole round tells each point from its nearest mirrored position: (n,) standard deviations.
 
         inf where no pairing has one farther than FLIP. An estimator that weighs all TDOAs takes a mirrored position for
@@ -129,11 +136,11 @@ class Subsets:
         return clear
 
 
-def _distances(points, anchors):
+def _distances(points: np.ndarray, anchors: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - anchors, axis=-1)
 
 
-def _choices(n, k):
+def _choices(n: int, k: int) -> np.ndarray:
     """(Q, k) choices of k out of n, all within the shortest stretch of the ring that is needed to keep within
     MOST_SUBSETS."""
     every = np.array(list(combinations(range(min(n, 40)), k)))

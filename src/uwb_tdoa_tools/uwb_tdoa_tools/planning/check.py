@@ -1,17 +1,29 @@
 """The failure map against brute force: solve with the TDOAs of every pairing, from many starts."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from .bifurcation import Subsets
 from .maps import Grid
 from .multistart import same_place, solutions
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from .installation import Installation
+
+    Wrap = Callable[[Iterable[Any]], Iterable[Any]]  # gives the same items, and tells how many are done
+
 ACROSS = {2: 40, 3: 10}  # places along the longest side of a slice, of a volume, at most
 MOST_PAIRINGS = 8  # pairings that are solved, spread over all; each takes thousands of solutions
 _BATCH = 200
 
 
-def brute_force(installation, grid, progress=iter):
+def brute_force(
+    installation: Installation, grid: Grid, progress: Wrap = iter
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Solve all over a grid for the pairings of an Installation, from many starts.
 
     Returns (unique (n,) bool: every pairing solved gave one position; agrees (n,) bool: each as predicted; points (n,

@@ -1,5 +1,9 @@
 """Downhill to better anchors: the bound, its derivatives along what moves the anchors, and a descent along them."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING, TypeVar
+
 import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
@@ -14,6 +18,13 @@ from .goal import UNUSABLE
 from .pairing import PAIRINGS
 from .precision import bound, position_error, weigh
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from .goal import Goal
+    from .layout import Layout
+
+Told = TypeVar("Told")
+
 SOFT = 0.05  # of |q|^2 - 1, over which failure sets in where derivatives are needed
 EDGE = 0.05  # m over which the hull ends, likewise
 FAILED = 10.0  # of the objective, a logarithm
@@ -22,7 +33,7 @@ CLOSE = 1e-4  # of the objective: a step that gains less is the last
 _CHUNK = 1_000_000  # numbers in the largest array of one step
 
 
-def errors_and_slopes(goal, layout, x, points):
+def errors_and_slopes(goal: Goal, layout: Layout, x: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The bound at points (n, 3): (n,) m, and its derivatives along x: (n, len(x)).
 
     Only one column of the ranges and of the variances changes with one number of x, so each is computed once, and the
@@ -55,7 +66,7 @@ def errors_and_slopes(goal, layout, x, points):
     return errors, slopes
 
 
-def failing_and_slopes(goal, layout, x, points):
+def failing_and_slopes(goal: Goal, layout: Layout, x: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray]:
     """A smooth stand-in for the share of points (n, 3) that are not flyable, and its derivatives along x: (len(x),).
 
     Outside of the anchors' hull or, for the criterion "pairings", where one of them has two solutions. Raises InputError where that
@@ -65,6 +76,7 @@ def failing_and_slopes(goal, layout, x, points):
         good, along = _inside(anchors.positions, points, goal.installation.unknowns)
     except QhullError as error:
         raise InputError("anchors: they span no hull; take some of them out of the plane of the others.") from error
+    more: np.ndarray | float
     if goal.criterion == "pairings":
         subsets = Subsets(anchors, goal.installation.unknowns)
         excess = subsets.discriminant(points) / SOFT
@@ -80,7 +92,7 @@ def failing_and_slopes(goal, layout, x, points):
     return 1.0 - good.mean(), np.einsum("imk,ik->im", moved - here[:, None], along[-len(here) :]).ravel() / steps
 
 
-def _inside(positions, points, k):
+def _inside(positions: np.ndarray, points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """How far inside the hull points (n, 3) are, softly 0 ... 1: (n,), and its derivatives along the anchors' positions
     (N, 3): (n, N, 3) 1/m.
 
@@ -101,16 +113,18 @@ def _inside(positions, points, k):
     return inside, along
 
 
-def descend(goal, layout, points, x, sweeps):
+def descend(goal: Goal, layout: Layout, points: np.ndarray, x: np.ndarray, sweeps: int) -> np.ndarray:
     """x after at most `sweeps` steps of SLSQP (scipy.optimize) towards the goal at points (n, 3).
 
     The worst case is not smooth, but the smallest s that no point's log error exceeds is, with a constraint per point. Where the goal
     cannot be told there is no slope, and none is made up: such a step is taken back, being FAILED worse than any other; where SLSQP
     would go on from there, the best x so far is returned. A start there is shaken until the goal can be told, and returned if it never is.
     """
-    size, seen, best, (low, high) = len(x), {}, [np.inf, x], np.transpose(layout.bounds)
+    size, (low, high) = len(x), np.transpose(layout.bounds)
+    seen: dict[bytes, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}  # of the last x
+    best: list[Any] = [np.inf, x]
 
-    def at(x):
+    def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
         """(errors, slopes, failing, slopes of that) at x. Raises InputError where they cannot be told."""
         if not np.isfinite(x).all():
             raise InputError("layout: no numbers")  # SLSQP has been seen to ask for NaN
@@ -124,8 +138,8 @@ def descend(goal, layout, points, x, sweeps):
                 best[:] = value, x
         return seen[key]
 
-    def tried(function, otherwise):
-        def value(z):
+    def tried(function: Callable[[np.ndarray], Told], otherwise: Told) -> Callable[[np.ndarray], Told]:
+        def value(z: np.ndarray) -> Told:
             try:
                 return function(z)
             except InputError:
@@ -133,15 +147,15 @@ def descend(goal, layout, points, x, sweeps):
 
         return value
 
-    def mean(x):
+    def mean(x: np.ndarray) -> float:
         errors, _, failing, _ = at(x)
         return np.log(errors.mean() * (1.0 + failing))
 
-    def mean_slopes(x):
+    def mean_slopes(x: np.ndarray) -> np.ndarray:
         errors, slopes, failing, more = at(x)
         return slopes.mean(axis=0) / errors.mean() + more / (1.0 + failing)
 
-    def worst_slopes(z):
+    def worst_slopes(z: np.ndarray) -> np.ndarray:
         _, _, failing, slopes = at(z[:size])
         return np.append(slopes / (1.0 + failing), 1.0)
 
@@ -165,7 +179,7 @@ def descend(goal, layout, points, x, sweeps):
     return np.clip(found.x[:size], low, high)
 
 
-def _told_near(at, x, low, high):
+def _told_near(at: Callable[[np.ndarray], object], x: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """x, or an x near it where `at` can tell the goal; moved at random by more and more of what is allowed. Raises InputError."""
     rng = np.random.default_rng(0)
     for share in SHAKEN:

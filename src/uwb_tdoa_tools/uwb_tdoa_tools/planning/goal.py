@@ -1,6 +1,9 @@
 """What a layout of anchors is judged by."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +12,10 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .bifurcation import CLEAR, Subsets
 from .pairing import PAIRINGS
 from .precision import bound, information, position_error
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .installation import Installation
 
 OBJECTIVES = ("worst", "mean")
 UNUSABLE = 100.0  # m, what an infinite bound counts for, and a layout from which no position follows
@@ -24,22 +31,22 @@ class Goal:
     """
 
     points: np.ndarray
-    installation: object
+    installation: Installation
     pairing: str = "ring"
     objective: str = "worst"
     criterion: str = "pairings"
 
-    def installed(self, anchors):
+    def installed(self, anchors: Anchors) -> Installation:
         """The Installation with other Anchors. Raises InputError for anchors that locate nothing."""
         return replace(self.installation, anchors=anchors, pairing=PAIRINGS[self.pairing](len(anchors)))
 
-    def errors(self, anchors):
+    def errors(self, anchors: Anchors) -> np.ndarray:
         """Bound at the points, without the small second term of eq. 1: (n,) m. Raises InputError for useless
         anchors."""
         found = position_error(bound(information(self.points, self.installed(anchors), correction=False)))
         return np.minimum(found, UNUSABLE)
 
-    def judge(self, anchors):
+    def judge(self, anchors: Anchors) -> dict[str, float]:
         """{"worst", "mean": m, bound over the points; "failing": share of the points that are not flyable}."""
         errors, installation = self.errors(anchors), self.installed(anchors)
         subsets = Subsets(anchors, installation.unknowns)
@@ -50,7 +57,7 @@ class Goal:
         failing = 1.0 - np.mean(unique & installation.inside_hull(self.points))
         return {"worst": float(errors.max()), "mean": float(errors.mean()), "failing": float(failing)}
 
-    def score(self, anchors):
+    def score(self, anchors: Anchors) -> float:
         """What is minimised: the objective, m, twice that where the tag fails at all points."""
         try:
             found = self.judge(anchors)

@@ -1,6 +1,9 @@
 """A hall in which a tag hears the anchors within the radio's reach, not all: cells that hear the same anchors are charted together."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from matplotlib.colors import BoundaryNorm
@@ -14,6 +17,16 @@ from .bifurcation import CLEAR, Subsets
 from .maps import Chart
 from .precision import bound, dilution, information, position_error
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .goal import Goal
+    from .maps import Grid
+
+    # covariance (n, k, k) m^2, dop, hull, ambiguous and flyable, (n,) each, of a Chart
+    OfGroup = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
 MOST_HEARD = 10  # nearest anchors that a cell is judged by: more add little, and pairings grow with the fourth power
 AT_ONCE = 64  # groups of cells that a process takes at once
 ANCHOR_HEIGHT = 4.0  # m above the floor, of an anchor that is proposed
@@ -26,11 +39,11 @@ HEARD_COLOURS = [0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25]  # bounds of the colour
 class Hall:
     """goal : Goal, whose points are not used; anchors : Anchors; reach : m. Can be pickled."""
 
-    goal: object
-    anchors: object
+    goal: Goal
+    anchors: Anchors
     reach: float
 
-    def heard(self, points):
+    def heard(self, points: np.ndarray) -> list[np.ndarray]:
         """Rows of the anchors within reach of points (n, 3) m, the nearest first: list of (k,) arrays."""
         tree = cKDTree(self.anchors.positions)
         return [
@@ -38,11 +51,11 @@ class Hall:
             for p, rows in zip(points, tree.query_ball_point(points, self.reach))
         ]
 
-    def chart(self, grid, jobs=None, dask=None):
+    def chart(self, grid: Grid, jobs: int | None = None, dask: str | None = None) -> tuple[Chart, np.ndarray]:
         """(Chart, heard (n,) anchors at each cell) over a Grid. jobs, dask : as of `parallel.over`."""
         points = grid.points
         heard = self.heard(points)
-        groups = {}
+        groups: dict[tuple[int, ...], list[int]] = {}
         for cell, rows in enumerate(heard):
             groups.setdefault(tuple(sorted(rows[:MOST_HEARD].tolist())), []).append(cell)
         n, k, unknowns = len(points), self.goal.installation.dimensions, self.goal.installation.unknowns
@@ -56,14 +69,14 @@ class Hall:
             covariance[cells], dop[cells], hull[cells], ambiguous[cells], flyable[cells] = its, one, inside, share, good
         return Chart(grid, covariance, position_error(covariance), dop, hull, ambiguous, flyable), np.array([len(rows) for rows in heard])
 
-    def __call__(self, batch):
+    def __call__(self, batch: Sequence[tuple[Sequence[int], np.ndarray]]) -> list[OfGroup]:
         return [self.of_group(*item) for item in batch]
 
-    def of_group(self, rows, points):
+    def of_group(self, rows: Sequence[int], points: np.ndarray) -> OfGroup:
         """Covariance, dop, hull, ambiguous and flyable of a Chart at points (n, 3) m that hear the anchors in rows; hull : seen from above."""
         n = len(points)
         try:
-            installation = self.goal.installed(self.anchors.only(list(rows)))
+            installation = self.goal.installed(self.anchors.only(np.array(rows)))
             above, subsets = Delaunay(installation.anchors.positions[:, :2]), Subsets(installation.anchors, installation.unknowns)
         except (InputError, QhullError):  # in a plane: nothing tells its sides apart; or on a line
             k = self.goal.installation.dimensions
@@ -73,13 +86,14 @@ class Hall:
         covariance = bound(information(points, installation))
         return covariance, np.linalg.norm(dilution(points, installation), axis=1), inside, ambiguous, inside & unique
 
-    def addition(self, chart, floor):
+    def addition(self, chart: Chart, floor: float) -> dict[str, Any] | None:
         """{"position": (3,) m, "gain": share of the cells} of the best place for one more anchor, None where nearly all can be flown. floor : m."""
         holes = np.flatnonzero(~chart.flyable)
         if len(holes) < 0.02 * len(chart.flyable):
             return None
         points = chart.grid.points
-        tree, best = cKDTree(points[holes]), (0, None)
+        tree = cKDTree(points[holes])
+        best: tuple[float, list[float] | None] = (0, None)
         spread = holes[np.linspace(0, len(holes) - 1, min(len(holes), 50 * TRIED)).astype(int)]
         around = tree.query_ball_point(points[spread], 0.5 * self.reach, return_length=True)
         for cell in spread[np.argsort(-around, kind="stable")][:TRIED]:
@@ -89,22 +103,22 @@ class Hall:
             more = Hall(self.goal, _with(self.anchors, position), self.reach)
             gained = 0
             for rows, point in zip(more.heard(points[near]), points[near]):
-                rows = sorted(rows[:MOST_HEARD].tolist())
-                if len(rows) > self.goal.installation.unknowns:
-                    gained += int(more.of_group(rows, point[None])[4][0])
+                nearest = sorted(rows[:MOST_HEARD].tolist())
+                if len(nearest) > self.goal.installation.unknowns:
+                    gained += int(more.of_group(nearest, point[None])[4][0])
             share = len(tree.query_ball_point(position, self.reach)) / max(len(near), 1)
             best = max(best, (gained * share, position.tolist()), key=lambda one: one[0])
         return {"position": best[1], "gain": float(best[0] / len(chart.flyable))}
 
 
-def _with(anchors, position):
+def _with(anchors: Anchors, position: np.ndarray) -> Anchors:
     """Anchors with one more at a position (3,) m."""
     ids = np.append(anchors.ids, anchors.ids.max() + 1 if anchors.ids.max() < 65535 else np.setdiff1d(np.arange(65536), anchors.ids)[0])
     orientations = np.vstack([anchors.orientations, [np.nan] * 4])
     return type(anchors)(ids, np.vstack([anchors.positions, position]), orientations, anchors.frame)
 
 
-def summary(chart, heard):
+def summary(chart: Chart, heard: np.ndarray) -> dict[str, Any]:
     """Figures of a Chart and heard (n,): {"heard": {number: share of the cells}, "flyable_share", "bound_flyable": quantiles, m}."""
     numbers, counts = np.unique(heard, return_counts=True)
     errors = chart.error[chart.flyable]
@@ -118,7 +132,7 @@ def summary(chart, heard):
     }
 
 
-def say(about, addition):
+def say(about: dict[str, Any], addition: dict[str, Any] | None) -> None:
     """Print what `summary` and `Hall.addition` found."""
     print(f"{' x '.join(map(str, about['cells']))} cells of {about['step']:.3g} m")
     shares = {int(number): share for number, share in about["heard"].items()}
@@ -132,7 +146,7 @@ def say(about, addition):
         print(f"one more anchor would help most near ({at}): {100.0 * (about['flyable_share'] + addition['gain']):.1f} % of the cells")
 
 
-def plot(anchors, chart, heard, path):
+def plot(anchors: Anchors, chart: Chart, heard: np.ndarray, path: str | Path) -> None:
     """How many are heard, and how precise a round is where it can be flown; seen from above, of the middle layer."""
     x, y, z = chart.grid.axes
     k, wide = len(z) // 2, np.ptp(x) > 1.2 * np.ptp(y)

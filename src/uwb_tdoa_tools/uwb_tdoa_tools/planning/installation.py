@@ -1,6 +1,9 @@
 """What is planned with: anchors, their radio, which TDOAs they give, and whether height is known."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay
@@ -10,6 +13,9 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .noise import RadioNoise
 from .pairing import Pairing, ring
+
+if TYPE_CHECKING:
+    from .noise import FixedNoise
 
 SAME_PLACE = 0.01  # m; two anchors nearer than this are one
 FLAT = 0.01  # of the largest distance: anchors this close to one plane (line) cannot tell its two sides apart
@@ -30,13 +36,13 @@ class Installation:
     """
 
     anchors: Anchors
-    noise: object = field(default_factory=RadioNoise)
-    pairing: Pairing = None
+    noise: RadioNoise | FixedNoise = field(default_factory=RadioNoise)
+    pairing: Pairing = None  # type: ignore[assignment]  # __post_init__ puts a ring there
     link_std: float = 0.0
     dimensions: int = 3
     height_std: float = np.inf
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.height_std > 0.0 or (self.dimensions == 2 and self.height_std < np.inf):
             raise InputError(
                 f"height std: {self.height_std!r} m is not the standard deviation of a height sensor; give one above 0, "
@@ -49,31 +55,31 @@ class Installation:
             raise InputError(f"link noise: {self.link_std!r} m is not a standard deviation; give 0 or more, e.g. 0.05.")
 
     @property
-    def unknowns(self):
+    def unknowns(self) -> int:
         """Coordinates that TDOAs alone must tell: 2 where a height is known or measured, else 3."""
         return 2 if self.height_std < np.inf else self.dimensions
 
-    def with_height(self, information):
+    def with_height(self, information: np.ndarray) -> np.ndarray:
         """Information (n, k, k) 1/m^2 of TDOAs about the position, with that of the height sensor added."""
         if self.height_std < np.inf:
             information = information + np.diag([0.0, 0.0, self.height_std**-2])
         return information
 
-    def inside_hull(self, points):
+    def inside_hull(self, points: np.ndarray) -> np.ndarray:
         """Whether points (n, 3) are inside the convex hull of the anchors (seen from above if height is known or measured):
         (n,)."""
         k = self.unknowns
         hull = Delaunay(self.anchors.positions[:, :k])
         return hull.find_simplex(points[:, :k]) >= 0
 
-    def hull_outline(self):
+    def hull_outline(self) -> np.ndarray:
         """Corners of the hull seen from above, in order and closed: (k + 1, 2) m."""
         above = self.anchors.positions[:, :2]
         corners = ConvexHull(above).vertices
         return above[np.append(corners, corners[0])]
 
 
-def check_anchors(anchors, dimensions):
+def check_anchors(anchors: Anchors, dimensions: int) -> None:
     """Raise InputError, with what to do, for anchors from which no position follows."""
     what = {2: "a position at known height", 3: "a position in space"}[dimensions]
     if len(anchors) < dimensions + 1:
@@ -94,7 +100,7 @@ def check_anchors(anchors, dimensions):
         )
 
 
-def principal_extents(positions):
+def principal_extents(positions: np.ndarray) -> np.ndarray:
     """Extent of positions (..., N, k) along their principal axes, the longest first: (..., k) m."""
     centred = positions - positions.mean(axis=-2, keepdims=True)
     return np.ptp(centred @ np.linalg.svd(centred, full_matrices=False)[2].swapaxes(-1, -2), axis=-2)

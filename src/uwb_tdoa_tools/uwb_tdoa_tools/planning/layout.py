@@ -1,6 +1,9 @@
 """Better places and directions for the anchors."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -13,6 +16,10 @@ from ..simulation.constellations import facing
 from .descent import descend
 from .goal import UNUSABLE
 from .places import Places, spread
+
+if TYPE_CHECKING:
+    from .check import Wrap
+    from .goal import Goal
 
 ROUGH = 80  # points that the starts are judged at
 DRAWN = 16  # layouts drawn for every start; the best are taken
@@ -41,21 +48,21 @@ class Layout:
     turned: bool = True
 
     @property
-    def width(self):
+    def width(self) -> int:
         """Numbers per anchor."""
         return self.places.numbers + 3 * self.turned
 
     @property
-    def bounds(self):
+    def bounds(self) -> list[tuple[float, float]]:
         """(low, high) of every number of x."""
         return ([(0.0, length / _ARM) for length in self.places.lengths] + [(-np.pi, np.pi)] * 3 * self.turned) * self.count
 
-    def start(self, numbers):
+    def start(self, numbers: np.ndarray) -> np.ndarray:
         """x of place numbers (count, places.numbers), antennas not turned."""
         placed = np.reshape(numbers, (self.count, -1)) * self.places.lengths / _ARM
         return np.hstack([placed, np.zeros((self.count, 3 * self.turned))]).ravel()
 
-    def anchors(self, x):
+    def anchors(self, x: np.ndarray) -> Anchors:
         """Anchors of x, after the fixed ones."""
         positions, orientations = self._placed(np.reshape(x, (self.count, self.width)))
         if self.fixed is None:
@@ -67,7 +74,7 @@ class Layout:
             self.fixed.frame,
         )
 
-    def nudged(self, x):
+    def nudged(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The fixed anchors, the free ones, and these again after a small step of each of their numbers in turn:
         positions (F + (1 + width) count, 3) m, orientations likewise, steps (len(x),)."""
         rows = np.reshape(x, (self.count, self.width))
@@ -80,12 +87,12 @@ class Layout:
             orientations = np.vstack([self.fixed.orientations, orientations])
         return positions, orientations, steps.ravel()
 
-    def free(self, positions):
+    def free(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of the positions of `nudged`: the free anchors (count, 3) m, and after each step (count, width, 3) m."""
         moved = positions[-self.count * (1 + self.width) :].reshape(1 + self.width, self.count, 3)
         return moved[0], moved[1:].swapaxes(0, 1)
 
-    def columns(self):
+    def columns(self) -> np.ndarray:
         """Which rows of `nudged` make up each layout, first x, then x after the step of each number:
         (1 + len(x), N)."""
         fixed = 0 if self.fixed is None else len(self.fixed)
@@ -94,7 +101,7 @@ class Layout:
         chosen[1 + np.arange(len(anchor)), fixed + anchor] = fixed + self.count * (1 + number) + anchor
         return chosen
 
-    def _placed(self, rows):
+    def _placed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions (n, 3) m and orientations (n, 4) of rows (n, width)."""
         n = self.places.numbers
         new = facing(self.places.positions(rows[:, :n] * _ARM / self.places.lengths), self.target)
@@ -103,7 +110,10 @@ class Layout:
         return new.positions, (Rotation.from_rotvec(rows[:, n:]) * Rotation.from_quat(new.orientations)).as_quat()
 
 
-def optimise(goal, places, count, fixed=None, start=None, starts=16, seed=0, progress=iter):
+def optimise(
+    goal: Goal, places: Places, count: int, fixed: Anchors | None = None, start: np.ndarray | None = None,
+    starts: int = 16, seed: int = 0, progress: Wrap = iter,
+) -> Anchors:  # fmt: skip
     """Anchors at the `count` best places, turned in the best directions; after those of `fixed`, which stay.
 
     goal : Goal; places : Places; start : (count, 3) m, a layout to begin with besides the quasi-random ones;
@@ -128,19 +138,19 @@ def optimise(goal, places, count, fixed=None, start=None, starts=16, seed=0, pro
     return best
 
 
-def one_more(goal, anchors, places, count=400):
+def one_more(goal: Goal, anchors: Anchors, places: Places, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
     """What one more anchor would give at places all over: (positions (n, 3) m, scores (n,) m), facing the points."""
     layout = Layout(places, 1, anchors, goal.points.mean(axis=0), are_turned(anchors))
     numbers = places.grid(count)
     return places.positions(numbers), np.array([goal.score(layout.anchors(layout.start(x))) for x in numbers])
 
 
-def are_turned(anchors):
+def are_turned(anchors: Anchors) -> bool:
     """Whether the orientation of any of the Anchors is known: only then are directions part of a layout."""
     return bool(np.isfinite(anchors.orientations).all(axis=1).any())
 
 
-def with_one(anchors, position):
+def with_one(anchors: Anchors, position: np.ndarray) -> Anchors:
     """Anchors with one more, whose orientation is not known, at position (3,) m."""
     return Anchors(
         np.append(anchors.ids, _free_ids(anchors.ids, 1)),
@@ -150,7 +160,7 @@ def with_one(anchors, position):
     )
 
 
-def named(better, before):
+def named(better: Anchors, before: Anchors) -> Anchors:
     """Anchors of a layout with the ids that they have `before`: who is moved is moved as little as possible in all. New ids where there are
     more than before."""
     away = np.linalg.norm(better.positions[:, None] - before.positions, axis=2)
@@ -162,7 +172,7 @@ def named(better, before):
     return Anchors(ids[order], better.positions[order], better.orientations[order], before.frame)
 
 
-def rounded(better, before):
+def rounded(better: Anchors, before: Anchors) -> Anchors:
     """The same Anchors as somebody can put them up: to the centimetre and the degree; those that stay as they are `before` are not touched."""
     moved = _moved(better, before)
     positions, orientations = better.positions.copy(), better.orientations.copy()
@@ -174,7 +184,7 @@ def rounded(better, before):
     return Anchors(better.ids, positions, orientations, better.frame)
 
 
-def placed(better, before):
+def placed(better: Anchors, before: Anchors) -> list[dict[str, Any]]:
     """[{"id", "words"}] of the Anchors that are not where they are `before`: where to put them, and which way they face."""
     rows = before.index(better.ids)
     found = []
@@ -190,25 +200,25 @@ def placed(better, before):
     return found
 
 
-def _moved(better, before):
+def _moved(better: Anchors, before: Anchors) -> np.ndarray:
     """Which of the Anchors are new, or more than a millimetre from where they are `before`: (n,) bool."""
     rows = before.index(better.ids)
     return (rows < 0) | (np.linalg.norm(better.positions - before.positions[rows], axis=1) > 1e-3)
 
 
-def _free_ids(taken, count):
+def _free_ids(taken: np.ndarray, count: int) -> np.ndarray:
     """The `count` smallest ids that nobody has."""
     return np.setdiff1d(np.arange(count + taken.max() + 1), taken)[:count]
 
 
-def _some(goal, count, seed):
+def _some(goal: Goal, count: int, seed: int) -> np.ndarray:
     """Rows of some of the goal's points."""
     if goal.objective == "worst":
         return spread(goal.points, count)
     return np.random.default_rng(seed).permutation(len(goal.points))[:count]
 
 
-def _refined(goal, layout, x, rows):
+def _refined(goal: Goal, layout: Layout, x: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """x after descents at these rows of the goal's points and at those that turn out to be worse; or x itself."""
     best, score = x, goal.score(layout.anchors(x))
     for _ in range(EXCHANGES):

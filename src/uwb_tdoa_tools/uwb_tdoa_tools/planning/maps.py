@@ -1,6 +1,9 @@
 """Precision and failure over a slice or a volume."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +12,12 @@ from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 
 from .bifurcation import CLEAR, Subsets
 from .precision import bound, dilution, information, position_error
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from numpy.typing import ArrayLike
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .installation import Installation
 
 MOST_CELLS = 4_000_000
 FLYABLE = {  # criteria for what is flyable inside the hull
@@ -23,10 +32,10 @@ class Grid:
 
     lower: np.ndarray
     step: float
-    shape: tuple
+    shape: tuple[int, int, int]
 
     @classmethod
-    def box(cls, lower, upper, step):
+    def box(cls, lower: ArrayLike, upper: ArrayLike, step: float) -> Grid:
         """Cubes of `step` m that cover the box from lower (3,) to upper (3,), m. Raises InputError."""
         lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
         if not 0.0 < step < np.inf:
@@ -43,21 +52,21 @@ class Grid:
         return cls(0.5 * (lower + upper - step * shape), float(step), tuple(shape.astype(int).tolist()))
 
     @classmethod
-    def slice(cls, x, y, height, step):
+    def slice(cls, x: Sequence[float], y: Sequence[float], height: float, step: float) -> Grid:
         """One layer of cells, centred on `height`, m; x and y: (lower, upper), m."""
         return cls.box((x[0], y[0], height - 0.5 * step), (x[1], y[1], height + 0.5 * step), step)
 
     @property
-    def axes(self):
+    def axes(self) -> list[np.ndarray]:
         """Centres of the cells along x, y and z, m."""
         return [low + self.step * (np.arange(n) + 0.5) for low, n in zip(self.lower, self.shape)]
 
     @property
-    def points(self):
+    def points(self) -> np.ndarray:
         """Centres of the cells: (nx ny nz, 3) m, z running fastest."""
         return np.stack(np.meshgrid(*self.axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
-    def layer(self, values, k):
+    def layer(self, values: np.ndarray, k: int) -> np.ndarray:
         """The layer k of values (n, ...) of all cells, to draw: (ny, nx, ...)."""
         return values.reshape(*self.shape, *values.shape[1:])[:, :, k].swapaxes(0, 1)
 
@@ -83,11 +92,11 @@ class Chart:
     flyable: np.ndarray
 
     @property
-    def std(self):
+    def std(self) -> np.ndarray:
         """Bound along x, y (and z): (n, k) m."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
-    def volume(self, anchors, dimensions):
+    def volume(self, anchors: Anchors, dimensions: int) -> FlyableVolume:
         """The FlyableVolume of this chart, among Anchors."""
         return FlyableVolume(
             self.grid.lower,
@@ -101,7 +110,7 @@ class Chart:
         )
 
 
-def chart(installation, grid, criterion="pairings"):
+def chart(installation: Installation, grid: Grid, criterion: str = "pairings") -> Chart:
     """Chart of an Installation over a Grid. criterion : of FLYABLE."""
     points = grid.points
     covariance = bound(information(points, installation))
@@ -109,7 +118,9 @@ def chart(installation, grid, criterion="pairings"):
     return Chart(grid, covariance, position_error(covariance), dop, *flyable(installation, points, criterion))
 
 
-def flyable(installation, points, criterion):
+def flyable(
+    installation: Installation, points: np.ndarray, criterion: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """hull, ambiguous, flyable of a Chart, (n,) each, at points (n, 3) m."""
     subsets = Subsets(installation.anchors, installation.unknowns)
     hull, ambiguous = installation.inside_hull(points), subsets.ambiguous(points)

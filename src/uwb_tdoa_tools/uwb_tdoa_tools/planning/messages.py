@@ -1,11 +1,22 @@
 """Charts as standard ROS messages, for RViz and Foxglove: to a bag, or published."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from ..bags.bag import LATCHED_QOS
 from ..bags.files import new_bag
 from ..bags.messages import anchors_message
 from ..bags.message_types import typestore
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from rosbags.typesys.store import Typestore
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .maps import Chart, Grid
 
 TOPICS = {
     "plan/flyable": "nav_msgs/msg/OccupancyGrid",
@@ -17,7 +28,7 @@ _CUBES, _SPHERES, _TEXT = 6, 7, 9  # visualization_msgs/msg/Marker
 _IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 
-def messages(chart, anchors, stamp=0):
+def messages(chart: Chart, anchors: Anchors, stamp: int = 0) -> dict[str, Any]:
     """{topic: rosbags message} of TOPICS. stamp : ns.
 
     plan/flyable : one slice (the middle layer), 0 flyable, 50 ambiguous inside the hull, 100 outside
@@ -36,7 +47,7 @@ def messages(chart, anchors, stamp=0):
     }
 
 
-def write(found, path):
+def write(found: dict[str, Any], path: str | Path) -> None:
     """Write what `messages` gave as a bag (replaced if it is one), transient local, one message per topic."""
     store = typestore()
     with new_bag(path, force=True) as writer:
@@ -47,7 +58,7 @@ def write(found, path):
             writer.write(connection, 0, store.serialize_cdr(message, TOPICS[topic]))
 
 
-def publish(found):
+def publish(found: dict[str, Any]) -> None:
     """Publish what `messages` gave, transient local, until SIGINT or SIGTERM. Needs rclpy."""
     import rclpy
     from rclpy.serialization import deserialize_message
@@ -66,18 +77,18 @@ def publish(found):
             rclpy.spin_once(node, timeout_sec=0.2)
 
 
-def _header(store, frame, stamp):
+def _header(store: Typestore, frame: str, stamp: int) -> Any:
     return store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame)
 
 
-def _pose(store, p=(0.0, 0.0, 0.0)):
+def _pose(store: Typestore, p: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> Any:
     types = store.types
     return types["geometry_msgs/msg/Pose"](
         types["geometry_msgs/msg/Point"](*map(float, p)), types["geometry_msgs/msg/Quaternion"](*_IDENTITY)
     )
 
 
-def _occupancy(store, grid, values, k, frame, stamp):
+def _occupancy(store: Typestore, grid: Grid, values: np.ndarray, k: int, frame: str, stamp: int) -> Any:
     """Values (n,) of layer k as an OccupancyGrid at the height of the layer's middle."""
     types, (nx, ny, _) = store.types, grid.shape
     header = _header(store, frame, stamp)
@@ -87,7 +98,7 @@ def _occupancy(store, grid, values, k, frame, stamp):
     return types["nav_msgs/msg/OccupancyGrid"](header, info, data)
 
 
-def _markers(store, chart, anchors, stamp):
+def _markers(store: Typestore, chart: Chart, anchors: Anchors, stamp: int) -> Any:
     types, grid = store.types, chart.grid
     surface = _surface(chart.flyable.reshape(grid.shape)).ravel()
     error = chart.error[surface]
@@ -102,7 +113,11 @@ def _markers(store, chart, anchors, stamp):
     return types["visualization_msgs/msg/MarkerArray"](found)
 
 
-def _marker(store, frame, stamp, namespace, number, kind, size, points=(), colours=(), at=(0.0, 0.0, 0.0), text=""):
+def _marker(
+    store: Typestore, frame: str, stamp: int, namespace: str, number: int, kind: int, size: float,
+    points: Sequence[float] | np.ndarray = (), colours: Sequence[float] | np.ndarray = (),
+    at: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0), text: str = "",
+) -> Any:  # fmt: skip
     types = store.types
     colour, zero = types["std_msgs/msg/ColorRGBA"], types["builtin_interfaces/msg/Duration"](0, 0)
     nothing = types["sensor_msgs/msg/CompressedImage"](_header(store, "", 0), "", np.empty(0, np.uint8))
@@ -115,7 +130,7 @@ def _marker(store, frame, stamp, namespace, number, kind, size, points=(), colou
     )  # fmt: skip
 
 
-def _surface(cells):
+def _surface(cells: np.ndarray) -> np.ndarray:
     """Cells that are true and have a neighbour, or the edge of the grid, that is not."""
     padded = np.pad(cells, 1)
     inner = np.ones_like(cells)

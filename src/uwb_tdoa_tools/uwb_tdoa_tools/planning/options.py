@@ -1,7 +1,10 @@
 """What the options of plan ask for."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +18,11 @@ from .maps import Grid
 from .noise import FixedNoise, RadioNoise, antenna_from_yaml
 from .pairing import OF_PROTOCOL, PAIRINGS
 from .places import Places, lattice
+
+if TYPE_CHECKING:
+    from argparse import Namespace
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
 ACROSS = {"slice": 100, "volume": 50}  # cells along the longest side, unless --step says otherwise
 SEARCHED = 300  # cells of the flown volume whose corners are looked at while better anchors are searched
@@ -31,31 +39,33 @@ class Aim:
     count: int
 
 
-def installation_of(args, anchors):
+def installation_of(args: Namespace, anchors: Anchors) -> Installation:
     """Installation of Anchors and the options. With --radio-reach that of the first few, as each place has its own. Raises InputError."""
     if args.radio_reach is not None:
         anchors = _some(anchors, 3 if args.planar or "height" in args.aids else 4)
+    noise: RadioNoise | FixedNoise
     if args.noise is not None:
         noise = FixedNoise(args.noise)
     else:
         antenna = antenna_from_yaml(args.antenna) if args.antenna else Antenna()
         noise = RadioNoise(antenna, args.tx_power, args.temperature, args.voltage)
-    pairing = PAIRINGS[_pairing(args)](len(anchors)) if len(anchors) > 1 else None
+    # of a single anchor there is none, and Installation refuses it
+    pairing: Any = PAIRINGS[_pairing(args)](len(anchors)) if len(anchors) > 1 else None
     height_std = args.height_std if "height" in args.aids else np.inf
     return Installation(anchors, noise, pairing, args.link_noise, 2 if args.planar else 3, height_std)
 
 
-def _some(anchors, count):
+def _some(anchors: Anchors, count: int) -> Anchors:
     """So many Anchors that are not in one plane, if there are."""
     far = [0]
     while len(far) < min(count, len(anchors)):
         away = anchors.positions - anchors.positions[far[0]]
         basis = np.linalg.qr(away[far[1:]].T)[0] if len(far) > 1 else np.zeros((3, 0))
         far.append(int(np.argmax(np.linalg.norm(away - away @ basis @ basis.T, axis=1))))
-    return anchors.only(far)
+    return anchors.only(np.array(far))
 
 
-def room_for(args, anchors):
+def room_for(args: Namespace, anchors: Anchors) -> Room:
     """Room that --room gives, or that the anchors stand in. Raises InputError."""
     room = room_of(anchors)
     if args.room is None:
@@ -65,7 +75,7 @@ def room_for(args, anchors):
     return _box("room", args.room if len(args.room) == 6 else [*args.room, room.lower[2], room.upper[2]])
 
 
-def grid_of(args, room):
+def grid_of(args: Namespace, room: Room) -> Grid:
     """Grid of a slice or of the Room. Raises InputError."""
     size = room.upper - room.lower
     if args.volume and args.planar:
@@ -77,7 +87,7 @@ def grid_of(args, room):
     return Grid.slice((room.lower[0], room.upper[0]), (room.lower[1], room.upper[1]), height, step)
 
 
-def aim_of(args, installation, room, height):
+def aim_of(args: Namespace, installation: Installation, room: Room, height: float) -> Aim:
     """Aim of --improve. height : m, of the flown slice if the tag's height is known. Raises InputError."""
     count = len(installation.anchors) if args.count is None else args.count
     for name, value, least in (("count", count, installation.unknowns + 1), ("starts", args.starts, 1)):
@@ -88,32 +98,32 @@ def aim_of(args, installation, room, height):
     lower[k:] = upper[k:] = height
     step = max(0.1, (np.prod((upper - lower)[:k]) / SEARCHED) ** (1.0 / k))
 
-    def goal(step):
+    def goal(step: float) -> Goal:
         return Goal(lattice(lower, upper, step), installation, _pairing(args), args.objective, args.flyable)
 
     return Aim(goal(step), goal(0.4 * step), places_of(args, room), count)
 
 
-def goal_of(args, installation):
+def goal_of(args: Namespace, installation: Installation) -> Goal:
     """Goal of no points, whose `installed` gives the Installation of other Anchors."""
     return Goal(np.empty((0, 3)), installation, _pairing(args), criterion=args.flyable)
 
 
-def places_of(args, room):
+def places_of(args: Namespace, room: Room) -> Places:
     """Places that --places gives, or the walls of the Room. Raises InputError."""
     return Places.from_yaml(args.places) if args.places else Places.walls(room.lower, room.upper)
 
 
-def plain(args):
+def plain(args: Namespace) -> dict[str, Any]:
     """The options as JSON takes them."""
     return {name: str(value) if isinstance(value, Path) else value for name, value in vars(args).items()}
 
 
-def _pairing(args):
+def _pairing(args: Namespace) -> str:
     return args.covariance or OF_PROTOCOL[args.protocol]
 
 
-def _box(name, numbers):
+def _box(name: str, numbers: Sequence[float]) -> Room:
     lower, upper = np.array(numbers[0::2]), np.array(numbers[1::2])
     if not (upper > lower).all():
         raise InputError(f"{name}: {list(numbers)} is empty; give X0 X1 Y0 Y1 Z0 Z1, each pair rising.")

@@ -1,5 +1,7 @@
 """Which TDOAs one round of measurements holds, and how their errors hang together."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,14 +25,14 @@ class Pairing:
     times: float = 1.0
     ranges: bool = False
 
-    def incidence(self):
+    def incidence(self) -> np.ndarray:
         """(M, N) matrix of -1 at a and +1 at b; of ranges the identity."""
         rows = np.arange(len(self.a))
         matrix = np.zeros((len(rows), 1 + max(self.a.max(), self.b.max())))
         matrix[rows, self.a], matrix[rows, self.b] = -1.0, 1.0
         return matrix
 
-    def covariance(self, variance, link_std=0.0):
+    def covariance(self, variance: np.ndarray, link_std: float = 0.0) -> np.ndarray:
         """Covariance of the TDOAs: (n, M, M) m^2.
 
         variance : (n, N) m^2 of the receptions. link_std : m, error that every TDOA has of its own besides (the
@@ -45,23 +47,23 @@ class Pairing:
         return (variance[:, self.a] + variance[:, self.b])[:, :, None] * np.eye(len(self.a)) + own
 
 
-def ring(n, shared=True):
+def ring(n: int, shared: bool = True) -> Pairing:
     """TDOA2: every anchor with the next one, and the last with the first; N TDOAs."""
     return Pairing(np.arange(n), (np.arange(n) + 1) % n, shared)
 
 
-def common_reference(n):
+def common_reference(n: int) -> Pairing:
     """Every anchor with anchor 0; N - 1 TDOAs. The case of eq. A18."""
     return Pairing(np.zeros(n - 1, int), np.arange(1, n), True)
 
 
-def all_pairs(n):
+def all_pairs(n: int) -> Pairing:
     """TDOA3: any anchor with any other, each TDOA with an error of its own; weighted to N TDOAs a round."""
     a, b = np.triu_indices(n, 1)
     return Pairing(a, b, False, 2.0 / (n - 1))
 
 
-def every_range(n):
+def every_range(n: int) -> Pairing:
     """Two-way ranging: the distance to every anchor; N ranges."""
     return Pairing(np.arange(n), np.arange(n), False, ranges=True)
 

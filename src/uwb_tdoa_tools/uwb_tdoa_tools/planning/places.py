@@ -1,9 +1,18 @@
 """Where anchors may be, and points that fill a volume."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from numpy.typing import ArrayLike
 
 
 class Places:
@@ -12,7 +21,7 @@ class Places:
     Two numbers between 0 and 1 for a place on flat boxes, three where a box has volume: the first runs through all
     boxes along their longest sides, the others across."""
 
-    def __init__(self, boxes):
+    def __init__(self, boxes: ArrayLike) -> None:
         """boxes : (B, 6) lower x y z and upper x y z of each, m. Raises InputError."""
         boxes = np.asarray(boxes, dtype=float)
         if boxes.ndim != 2 or boxes.shape[1] != 6 or not len(boxes) or not np.isfinite(boxes).all():
@@ -29,7 +38,9 @@ class Places:
         self.lengths = np.append(self.ends[-1], across)  # m, of what each number runs through, at most
 
     @classmethod
-    def walls(cls, lower, upper, lowest=0.2, depth=0.0):
+    def walls(
+        cls, lower: Sequence[float] | np.ndarray, upper: Sequence[float] | np.ndarray, lowest: float = 0.2, depth: float = 0.0
+    ) -> Places:
         """The four walls of a room from `lowest` m above its floor to its ceiling, and what is within `depth` m of
         them."""
         (x0, y0, z0), (x1, y1, z1) = lower, upper
@@ -44,7 +55,7 @@ class Places:
         )
 
     @classmethod
-    def from_yaml(cls, path):
+    def from_yaml(cls, path: str | Path) -> Places:
         """Read `places: [[x0, y0, z0, x1, y1, z1], ...]`; raises InputError."""
         content = read_yaml(path)
         try:
@@ -56,7 +67,7 @@ class Places:
                 f"{path}: is no list of places ({error!r}); write 'places: [[x0, y0, z0, x1, y1, z1]]'."
             ) from error
 
-    def positions(self, numbers):
+    def positions(self, numbers: np.ndarray) -> np.ndarray:
         """(..., 3) m of (..., self.numbers) numbers between 0 and 1."""
         at = np.clip(numbers[..., 0], 0.0, 1.0) * self.ends[-1]
         box = np.minimum(np.searchsorted(self.ends, at), len(self.ends) - 1)
@@ -66,28 +77,28 @@ class Places:
             np.put_along_axis(share, self.order[box][..., k : k + 1], value[..., None], axis=-1)
         return self.lower[box] + share * self.size[box]
 
-    def grid(self, count):
+    def grid(self, count: int) -> np.ndarray:
         """Numbers of about `count` places all over: (n, self.numbers)."""
         side = max(2, round(count ** (0.8 / self.numbers)))
         along = max(2, count // side ** (self.numbers - 1))
         axes = [np.linspace(0.0, 1.0, along), *[np.linspace(0.0, 1.0, side)] * (self.numbers - 1)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.numbers)
 
-    def nearest(self, wanted):
+    def nearest(self, wanted: ArrayLike) -> np.ndarray:
         """Numbers (n, self.numbers), strictly between 0 and 1, of about the places nearest to `wanted` (n, 3), m."""
         numbers = 0.01 + 0.98 * self.grid(4000)
         away = np.linalg.norm(self.positions(numbers) - np.asarray(wanted)[:, None], axis=-1)
         return numbers[np.argmin(away, axis=1)]
 
 
-def lattice(lower, upper, step):
+def lattice(lower: Sequence[float] | np.ndarray, upper: Sequence[float] | np.ndarray, step: float) -> np.ndarray:
     """Points at most `step` apart that fill a box, its faces and corners included: (n, 3) m."""
     counts = [max(1, int(np.ceil((high - low) / step - 1e-9))) + 1 for low, high in zip(lower, upper)]
     axes = [np.unique(np.linspace(*ends)) for ends in zip(lower, upper, counts)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def spread(points, count):
+def spread(points: np.ndarray, count: int) -> np.ndarray:
     """Rows of `count` of the points (n, 3), m, far from each other: first the corners, then what lies between."""
     diagonals = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
     rows = list(np.unique(np.argmax(points @ diagonals.T, axis=0)))

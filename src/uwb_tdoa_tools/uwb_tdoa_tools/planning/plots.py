@@ -1,5 +1,9 @@
 """Pictures of charts: precision, failure, accuracy, layouts."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import ListedColormap
@@ -11,12 +15,22 @@ from ..scoring.plots import plt
 from .bifurcation import Subsets
 from .precision import NORMAL_99, ellipses
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .accuracy import AccuracyMap
+    from .installation import Installation
+    from .maps import Chart, Grid
+
 HULL, ENVELOPE, FLYABLE = "magenta", "tab:green", "#ffe680"
 _MOST_LAYERS = 3
-TITLE = {"fontsize": 9, "pad": 12.0}  # above anchors on the upper edge, and their labels
+TITLE: dict[str, Any] = {"fontsize": 9, "pad": 12.0}  # above anchors on the upper edge, and their labels
 
 
-def plot_precision(installation, chart, path):
+def plot_precision(installation: Installation, chart: Chart, path: str | Path) -> None:
     """The bound at 99 % (2.58 times the root mean square of its axes) with ellipses, and the dilution of precision."""
     layers = _layers(chart.grid)
     figure, axes = _panels(2 * len(layers), 2)
@@ -32,7 +46,7 @@ def plot_precision(installation, chart, path):
     _save(figure, "Precision of one round of TDOAs", path)
 
 
-def plot_failure(installation, chart, path):
+def plot_failure(installation: Installation, chart: Chart, path: str | Path) -> None:
     """Where pairings have two solutions: their share, each bifurcation curve, the envelope, hull and flyable area."""
     layers = _layers(chart.grid)
     figure, axes = _panels(2 * len(layers), 2)
@@ -55,7 +69,10 @@ def plot_failure(installation, chart, path):
     _save(figure, f"{title}\n{100.0 * chart.flyable.mean():.0f} % of {'the slice' if chart.grid.shape[2] == 1 else 'the room'} is flyable", path)
 
 
-def plot_flips(installation, points, unique, agrees, mirrors, path):
+def plot_flips(
+    installation: Installation, points: np.ndarray, unique: np.ndarray, agrees: np.ndarray,
+    mirrors: tuple[np.ndarray, np.ndarray], path: str | Path,
+) -> None:  # fmt: skip
     """Result of the brute-force check: points with one solution, with several, and where it contradicts the prediction.
 
     points (n, 3); unique, agrees (n,) bool; mirrors : (from (m, 2), to (m, 2)), flips to draw as arrows.
@@ -73,7 +90,7 @@ def plot_flips(installation, points, unique, agrees, mirrors, path):
     _save(figure, "Solved from many starts; arrows lead to the other solution", path)
 
 
-def plot_accuracy(installation, found, path):
+def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
     """Measured bias and RMSE beside the bound and what the filter claims, 3D, one colour scale; seen from above."""
     figure, axes = _panels(4, 2)
     columns = (
@@ -98,7 +115,10 @@ def plot_accuracy(installation, found, path):
     _save(figure, "Achieved, claimed and possible error at each place", path)
 
 
-def plot_layouts(charts, path, candidates=None):
+def plot_layouts(
+    charts: Sequence[tuple[str, Installation, Chart]], path: str | Path,
+    candidates: tuple[np.ndarray, np.ndarray] | None = None,
+) -> None:  # fmt: skip
     """Bound before and after, side by side at one scale. charts : [(title, Installation, Chart)].
 
     candidates : (positions (n, 3) m, scores (n,) m) of one more anchor, drawn from above and from the side, or None.
@@ -128,19 +148,22 @@ def plot_layouts(charts, path, candidates=None):
     _save(figure, "Before and after; hatched: not flyable" if hatched else "Before and after; all is flyable", path)
 
 
-def _layers(grid):
+def _layers(grid: Grid) -> list[int]:
     """Layers to draw: all, or three spread over the height."""
     n = grid.shape[2]
     return list(range(n)) if n <= _MOST_LAYERS else [round(share * (n - 1)) for share in (0.2, 0.5, 0.8)]
 
 
-def _panels(count, wide):
+def _panels(count: int, wide: int) -> tuple[Figure, np.ndarray]:
     high = -(-count // wide)
     figure, axes = plt.subplots(high, wide, figsize=(4.4 * wide + 0.8, 3.9 * high), squeeze=False, layout="constrained")
     return figure, axes
 
 
-def _field(ax, chart, judged, values, k, label, levels=True, scale=None):
+def _field(
+    ax: Axes, chart: Chart, judged: np.ndarray, values: np.ndarray, k: int, label: str, levels: bool = True,
+    scale: tuple[float, float] | None = None,
+) -> None:  # fmt: skip
     """Colours scaled to what lies inside the hull, or to `scale`; contour lines over them."""
     x, y, _ = chart.grid.axes
     inside = values[judged & np.isfinite(values)]
@@ -155,7 +178,7 @@ def _field(ax, chart, judged, values, k, label, levels=True, scale=None):
     ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.85)
 
 
-def _hatch(ax, chart, k):
+def _hatch(ax: Axes, chart: Chart, k: int) -> None:
     """Lines, on a lighter ground, over what is not flyable."""
     x, y, _ = chart.grid.axes
     edges = [np.append(axis - 0.5 * chart.grid.step, axis[-1] + 0.5 * chart.grid.step) for axis in (x, y)]
@@ -165,7 +188,7 @@ def _hatch(ax, chart, k):
         ax.contourf(x, y, blocked.filled(0).astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
 
 
-def _room(ax, installation, grid, k):
+def _room(ax: Axes, installation: Installation, grid: Grid, k: int | None) -> None:
     ax.plot(*installation.hull_outline().T, color=HULL, lw=1.2)
     _anchors(ax, installation.anchors)
     x, y, z = grid.axes
@@ -176,7 +199,7 @@ def _room(ax, installation, grid, k):
         ax.set_title(f"z = {z[k]:.2f} m", **TITLE)
 
 
-def _anchors(ax, anchors):
+def _anchors(ax: Axes, anchors: Anchors) -> None:
     p = anchors.positions
     ax.plot(p[:, 0], p[:, 1], "r^", ms=6, clip_on=False)
     turned = np.isfinite(anchors.orientations).all(axis=1)
@@ -184,10 +207,11 @@ def _anchors(ax, anchors):
         front = Rotation.from_quat(anchors.orientations[turned]).apply([1.0, 0.0, 0.0])
         ax.quiver(*p[turned, :2].T, *front[:, :2].T, color="r", width=0.005, scale=18)
     for names, at in labels(anchors.ids.tolist(), p[:, :2]):
-        ax.annotate(names, at, xytext=(3, 3), textcoords="offset points", fontsize=7, color="r")
+        place = float(at[0]), float(at[1])
+        ax.annotate(names, place, xytext=(3, 3), textcoords="offset points", fontsize=7, color="r")
 
 
-def _ellipses(ax, chart, k, across=9):
+def _ellipses(ax: Axes, chart: Chart, k: int, across: int = 9) -> int:
     """99 % ellipses of some cells inside the hull, enlarged so that they can be seen. Returns by how much."""
     every = max(1, max(chart.grid.shape[:2]) // across)
     rows = np.zeros(chart.grid.shape, bool)
@@ -207,7 +231,7 @@ def _ellipses(ax, chart, k, across=9):
     return enlarged
 
 
-def _save(figure, title, path):
+def _save(figure: Figure, title: str, path: str | Path) -> None:
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=80)
     plt.close(figure)

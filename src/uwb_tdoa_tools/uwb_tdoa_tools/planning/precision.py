@@ -1,6 +1,9 @@
 """How precise a position can be: Fisher information, the Cramer-Rao bound, dilution of precision and ellipses."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,11 +11,15 @@ from uwb_tdoa_bias.foundation.geometry import ranges
 
 from .noise import FixedNoise, variance_gradient
 
+if TYPE_CHECKING:
+    from .installation import Installation
+    from .pairing import Pairing
+
 NORMAL_99 = 2.58  # standard deviations of a normal variable that hold 99 %, as rounded in Grasso et al., sec. 2.2.3
 _CHUNK = 200_000  # numbers in the largest array of one step: what a processor cache holds
 
 
-def information(points, installation, correction=True):
+def information(points: np.ndarray, installation: Installation, correction: bool = True) -> np.ndarray:
     """Fisher information about the position from one round of TDOAs and, where the tag measures it, a height: (n, k, k)
     1/m^2, k the installation's dimensions.
 
@@ -26,7 +33,7 @@ def information(points, installation, correction=True):
     return installation.with_height(np.concatenate(parts))
 
 
-def _information(points, installation, correction):
+def _information(points: np.ndarray, installation: Installation, correction: bool) -> np.ndarray:
     anchors, k = installation.anchors, installation.dimensions
     unit = ranges(points[:, None, :], anchors.positions)[1]
     variance = installation.noise.variance(points, anchors)
@@ -37,7 +44,7 @@ def _information(points, installation, correction):
     return total
 
 
-def weigh(ranges, variance, pairing, link_std=0.0):
+def weigh(ranges: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: float = 0.0) -> np.ndarray:
     """Squared size, in standard deviations, of what changes (n, N, k) of the ranges do to the TDOAs of one round.
 
     variance : (n, N) m^2 of the receptions; link_std : m, as for Installation. Returns (n, k, k), V' F^-1 V with V
@@ -60,7 +67,7 @@ def weigh(ranges, variance, pairing, link_std=0.0):
     return _product(centred, w * centred)
 
 
-def _from_sizes(gradient, variance, installation):
+def _from_sizes(gradient: np.ndarray, variance: np.ndarray, installation: Installation) -> np.ndarray:
     """Second term of eq. 1, for the derivatives (n, N, k) of the variances.
 
     With F = D S D' + own, dF_i = D diag(g_i) D' and P = D' F^-1 D, half the trace is g_i' (P o P) g_j / 2.
@@ -81,17 +88,17 @@ def _from_sizes(gradient, variance, installation):
     return 0.5 * (_product(g, (1.0 - 2.0 * w / total) * g) + _product(mean, mean))
 
 
-def _inverse(variance, pairing, link_std):
+def _inverse(variance: np.ndarray, pairing: Pairing, link_std: float) -> np.ndarray:
     """D' F^-1 D: (n, N, N)."""
     d = pairing.incidence()
     return d.T @ np.linalg.inv(pairing.covariance(variance, link_std)) @ d
 
 
-def _product(left, right):
+def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     return left.swapaxes(1, 2) @ right
 
 
-def bound(information):
+def bound(information: np.ndarray) -> np.ndarray:
     """The Cramer-Rao bound: smallest covariance of an unbiased estimate, (n, k, k) m^2; inf where there is none."""
     finite = np.isfinite(information).all(axis=(1, 2))
     checked = np.where(finite[:, None, None], information, 0.0)
@@ -101,12 +108,12 @@ def bound(information):
     return np.where(lost[:, None, None], np.inf, covariance)
 
 
-def position_error(covariance):
+def position_error(covariance: np.ndarray) -> np.ndarray:
     """Root of the summed variances of x, y (and z): (n,) m."""
     return np.sqrt(np.trace(covariance, axis1=1, axis2=2))
 
 
-def dilution(points, installation):
+def dilution(points: np.ndarray, installation: Installation) -> np.ndarray:
     """Dilution of precision: (n, k), error along x, y (and z) over that of one reception, if all are alike; k the
     coordinates that TDOAs must tell.
 
@@ -117,7 +124,7 @@ def dilution(points, installation):
     return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
 
-def ellipses(covariance, share=0.99):
+def ellipses(covariance: np.ndarray, share: float = 0.99) -> tuple[np.ndarray, np.ndarray]:
     """Ellipses that hold `share` of the estimates in the xy plane: (semi-axes (n, 2) m, the longer first; angle (n,)
     rad of the longer one from x)."""
     values, vectors = np.linalg.eigh(covariance[:, :2, :2])

@@ -1,8 +1,17 @@
 """What plan says: figures for plan.json, and lines for the screen."""
 
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
 import numpy as np
 
 from .precision import NORMAL_99
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from ..simulation.room import Room
+    from .maps import Chart
 
 WORTH = 0.02  # of the room: less is not worth an anchor
 _COLUMNS = {
@@ -11,7 +20,7 @@ _COLUMNS = {
 }  # fmt: skip
 
 
-def summary(chart):
+def summary(chart: Chart) -> dict[str, Any]:
     """Figures of a Chart: sizes in m, m^2 or m^3, shares 0 to 1 of all its cells: of the room, or of a slice of it. None where no cell is
     inside the hull."""
     inside, step = chart.hull & np.isfinite(chart.error), chart.grid.step
@@ -32,13 +41,13 @@ def summary(chart):
     }
 
 
-def say_room(room, given):
+def say_room(room: Room, given: bool) -> None:
     """Print the Room, and whether it was given."""
     ends = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in zip("xyz", room.lower, room.upper))
     print(f"room: {ends} m" + ("" if given else ", what the anchors span; if yours is another: --room X0 X1 Y0 Y1 Z0 Z1"))
 
 
-def say_summary(about):
+def say_summary(about: dict[str, Any]) -> None:
     """Print what `summary` found."""
     print(f"{' x '.join(map(str, about['cells']))} cells of {about['step']:.3g} m")
     if about["bound_in_hull"] is None:
@@ -53,7 +62,7 @@ def say_summary(about):
         print(f"  {label:52s}" + "  ".join(f"{name} {value:.3f}" for name, value in values.items()))
 
 
-def say_flyable(about, addition, criterion):
+def say_flyable(about: dict[str, Any], addition: dict[str, Any] | None, criterion: str) -> None:
     """Print how much can be flown, and what one more anchor would give. addition : of `run.addition`, or None; criterion : of FLYABLE."""
     unit, whole = ("m^2", "this slice of your room") if about["cells"][2] == 1 else ("m^3", "your room")
     print(
@@ -69,12 +78,12 @@ def say_flyable(about, addition, criterion):
         print(f"one more anchor on the walls would not change that by {_percent(WORTH)}; {'; '.join(ways)}")
 
 
-def say_check(found):
+def say_check(found: dict[str, Any]) -> None:
     """Print what `run.check` found."""
     print(f"check: {found['places']} places, agreement with the brute-force solver {found['agreement']:.2%}")
 
 
-def say_flights(rows):
+def say_flights(rows: Sequence[dict[str, Any]]) -> None:
     """Print the rows of accuracy.comparison, each with its "flight"."""
     print("3D, root mean square, m; efficiency: variance of the bound of one round over that of the estimate")
     print(f"{'flight':20s}" + "".join(f"{label:>10s}" for label in _COLUMNS.values()))
@@ -82,7 +91,7 @@ def say_flights(rows):
         print(f"{row['flight']:20s}" + "".join(f"{row[name]:10.3f}" for name in _COLUMNS))
 
 
-def say_improvement(found):
+def say_improvement(found: dict[str, Any]) -> None:
     """Print before and after in the terms of `summary`, and what is judged where it flies."""
     print(f"{'':44s}  before   after")
     for name, label, factor, digits in (
@@ -98,11 +107,11 @@ def say_improvement(found):
         print(f"anchor {anchor['id']}: {anchor['words']}")
 
 
-def _percent(share):
+def _percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
-def _quantiles(values):
+def _quantiles(values: np.ndarray) -> dict[str, float] | None:
     if not len(values):
         return None
     return dict(zip(("best", "median", "95 %", "worst"), np.quantile(values, [0.0, 0.5, 0.95, 1.0]).tolist()))

@@ -1,7 +1,10 @@
 """The parts of plan: each writes its pictures to a folder and returns its figures, plain values."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import partial
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -14,11 +17,24 @@ from . import accuracy, hall, layout, messages, options, plots, report
 from .check import brute_force
 from .maps import Grid, chart, flyable
 
+if TYPE_CHECKING:
+    from argparse import Namespace
+    from collections.abc import Callable, Iterable
+    from pathlib import Path
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from ..readers.inputs import Recording
+    from ..simulation.room import Room
+    from .installation import Installation
+    from .maps import Chart
+    from .places import Places
+
 ENOUGH = 0.95  # of the room that can be flown: no anchor is proposed
 LOOKED_AT, TRIED = 600, 60  # cells of the room, and places, that are tried for one more anchor, about
 
 
-def plan_hall(args, anchors, installation, room, grid):
+def plan_hall(
+    args: Namespace, anchors: Anchors, installation: Installation, room: Room, grid: Grid
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """All of plan with --radio-reach: (figures, messages). args : the options; anchors : Anchors of the hall; installation : Installation of
     some of them; room : Room; grid : Grid. Raises InputError."""
     for name in ("check", "flights", "improve"):
@@ -30,7 +46,8 @@ def plan_hall(args, anchors, installation, room, grid):
     cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
     whole = hall.Hall(options.goal_of(args, installation), anchors, args.radio_reach)
     found, heard = whole.chart(grid, args.jobs, args.dask)
-    figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": hall.summary(found, heard)}
+    figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args)}
+    figures["map"] = hall.summary(found, heard)
     figures["addition"] = whole.addition(found, room.lower[2])
     hall.say(figures["map"], figures["addition"])
     hall.plot(anchors, found, heard, args.out / "hall.png")
@@ -40,7 +57,7 @@ def plan_hall(args, anchors, installation, room, grid):
     return figures, outgoing
 
 
-def end(args, figures, outgoing):
+def end(args: Namespace, figures: dict[str, Any], outgoing: dict[str, Any]) -> None:
     """Write the figures, say what was written, and publish the messages if that was asked for."""
     for path in (args.out / "plan.json", args.json):
         if path is not None:
@@ -51,7 +68,7 @@ def end(args, figures, outgoing):
         messages.publish(outgoing)
 
 
-def draw_map(found, installation, out):
+def draw_map(found: Chart, installation: Installation, out: Path) -> dict[str, Any]:
     """Pictures, flyable volume and bag of a Chart. Returns {topic: message}, see `messages.messages`."""
     plots.plot_precision(installation, found, out / "precision.png")
     plots.plot_failure(installation, found, out / "failure.png")
@@ -61,7 +78,7 @@ def draw_map(found, installation, out):
     return outgoing
 
 
-def check(installation, grid, out):
+def check(installation: Installation, grid: Grid, out: Path) -> dict[str, Any]:
     """The failure map against a solver that is started from many places."""
     with Progress("plan") as progress:
         unique, agrees, points, arrows = brute_force(installation, grid, partial(progress.over, what="solving"))
@@ -75,9 +92,9 @@ class Fly:
     accuracy.fly. Can be pickled. Raises InputError."""
 
     reading: Reading
-    aids: tuple = ()
+    aids: tuple[str, ...] = ()
 
-    def __call__(self, recording):
+    def __call__(self, recording: Recording) -> tuple[str, accuracy.Samples]:
         flight = self.reading.read(recording)
         for name in self.aids:
             if getattr(flight, name) is None:
@@ -85,7 +102,9 @@ class Fly:
         return flight.name, accuracy.fly(flight, self.aids)
 
 
-def judge_flights(flown, installation, room, step, out):
+def judge_flights(
+    flown: Iterable[tuple[str, accuracy.Samples]], installation: Installation, room: Room, step: float, out: Path
+) -> list[dict[str, Any]]:
     """Rows of `accuracy.comparison`, one for each of what a Fly gave, and one for all. step : m, of the picture."""
     samples, rows = [], []
     for name, one in flown:
@@ -98,7 +117,9 @@ def judge_flights(flown, installation, room, step, out):
     return rows
 
 
-def addition(found, anchors, installed, places, criterion):
+def addition(
+    found: Chart, anchors: Anchors, installed: Callable[[Anchors], Installation], places: Places, criterion: str
+) -> dict[str, Any] | None:
     """What the best of some places for one more anchor would add to what is flyable: {"position": (3,) m, "gain": share of the room}, to
     the centimetre; None where nearly all is flyable. found : Chart of Anchors; installed(anchors) : Installation of others; places : Places."""
     if found.flyable.mean() > ENOUGH:
@@ -119,21 +140,21 @@ def addition(found, anchors, installed, places, criterion):
     return {"position": best[1], "gain": float(best[0])}
 
 
-def _across(grid):
+def _across(grid: Grid) -> int:
     """Dimensions of a grid."""
     return 2 if grid.shape[2] == 1 else 3
 
 
-def improve(before, aim, how, starts, criterion, out):
+def improve(before: Chart, aim: options.Aim, how: str, starts: int, criterion: str, out: Path) -> dict[str, Any]:
     """Better places for the anchors, improved.yaml. before : Chart as it is; aim : options.Aim; how : "move" or "add";
     criterion : of what is flyable."""
     goal, places, installation, candidates = aim.goal, aim.places, aim.goal.installation, None
     anchors = installation.anchors
     with Progress("plan") as progress:
-        search = {"starts": starts, "progress": partial(progress.over, what="layouts")}
+        search: dict[str, Any] = {"starts": starts, "progress": partial(progress.over, what="layouts")}
         if how == "add":
             candidates = layout.one_more(goal, anchors, places)
-            start = candidates[0][[np.argmin(candidates[1])]]
+            start: np.ndarray | None = candidates[0][[np.argmin(candidates[1])]]
             better = layout.optimise(goal, places, 1, anchors, start, **search)
         else:
             start = anchors.positions if aim.count == len(anchors) else None
