@@ -9,6 +9,8 @@
         return made
 """
 
+from __future__ import annotations
+
 import argparse
 import errno
 import json
@@ -17,6 +19,7 @@ from pathlib import Path
 import sqlite3
 import sys
 import tempfile
+from typing import Any, TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -26,10 +29,13 @@ from uwb_tdoa_bias.foundation.version import written_by
 
 from . import command_lines
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
 FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up", errno.EFBIG: "the file may not become larger"}
 
 
-def parser(name, description, *examples):
+def parser(name: str, description: str, *examples: str) -> argparse.ArgumentParser:
     """An ArgumentParser that keeps line breaks, and ends its help with the given example command lines: those that begin with the name, as
     they run where the user is."""
     started = command_lines.started(name).removesuffix(name)
@@ -42,7 +48,10 @@ def parser(name, description, *examples):
     return made
 
 
-def run(command, parser, argv=None, ros=False):
+def run(
+    command: Callable[[argparse.Namespace], int | None], parser: argparse.ArgumentParser,
+    argv: Sequence[str] | None = None, ros: bool = False,
+) -> int:  # fmt: skip
     """Parse argv (default: sys.argv[1:]), call command(args), and return the exit code of the process.
 
     0 or what command returned; 1 for a Failure; 2 for bad usage, an InputError or a file that cannot be used, each told
@@ -58,7 +67,7 @@ def run(command, parser, argv=None, ros=False):
         sys.stdout.flush()
         return code
     except SystemExit as stop:  # argparse has said it already: usage and error, or the help
-        return stop.code or 0
+        return stop.code or 0  # type: ignore[return-value]  # argparse ends with a number
     except InputError as error:
         return _fail(parser.prog, error, 2)
     except Failure as failure:
@@ -71,19 +80,19 @@ def run(command, parser, argv=None, ros=False):
     except (OSError, sqlite3.OperationalError) as error:
         if full := _full(error):
             return _fail(parser.prog, f"{full}: what was being written is not whole; make room, or write elsewhere.", 2)
-        if getattr(error, "filename", None) is None:
+        if not isinstance(error, OSError) or error.filename is None:
             raise
         return _fail(parser.prog, f"{error.filename}: {error.strerror}.", 2)
 
 
-def _full(error):
+def _full(error: Exception) -> str | None:
     """What of the disk has no room for what an OSError or an sqlite3.OperationalError was raised about: text, or None."""
     if isinstance(error, OSError):
-        return FULL.get(error.errno)
+        return FULL.get(error.errno) if error.errno is not None else None
     return FULL[errno.ENOSPC] if "disk is full" in str(error) else None
 
 
-def without_ros_arguments(arguments):
+def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
     """A command line without what is for ROS: from each --ros-args to the next -- or the end."""
     own, ours = [], True
     for argument in arguments:
@@ -96,10 +105,10 @@ def without_ros_arguments(arguments):
     return own
 
 
-def check_folders(*paths):
+def check_folders(*paths: str | Path | None) -> None:
     """Raise InputError, before the work, unless the folder of each file to write is there, and can be written to; None is passed
     over."""
-    for path in map(Path, filter(None, paths)):
+    for path in [Path(path) for path in paths if path]:
         if not path.absolute().parent.is_dir():
             raise InputError(f"{path}: its directory does not exist; make it first.")
         if path.is_dir():
@@ -108,7 +117,7 @@ def check_folders(*paths):
             _check_writable(path, path.absolute().parent)
 
 
-def output_folder(text, option="--out"):
+def output_folder(text: str | Path, option: str = "--out") -> Path:
     """Path of a folder to write to. Raises InputError, before the work, if it is a file, or cannot be made or written to."""
     out = Path(text)
     if out.exists() and not out.is_dir():
@@ -122,7 +131,7 @@ def output_folder(text, option="--out"):
     return out
 
 
-def _check_writable(path, folder):
+def _check_writable(path: Path, folder: Path) -> None:
     """Raise InputError unless a file can be made in the folder, for the sake of path; leaves none."""
     try:
         with tempfile.TemporaryFile(dir=folder):
@@ -131,13 +140,13 @@ def _check_writable(path, folder):
         raise InputError(f"{path}: cannot be written ({error.strerror}: {folder}); give another place.") from error
 
 
-def write_json(path, content):
+def write_json(path: str | Path, content: dict[str, Any]) -> None:
     """Write a dict as JSON, with the version of the suite; NaN must be None by now (ValueError otherwise)."""
     text = json.dumps({"written_by": written_by(), **content}, indent=1, allow_nan=False)
     Path(path).write_text(text + "\n")
 
 
-def say(name, sentence):
+def say(name: str, sentence: object) -> None:
     """Tell what happens, on stderr: `name: sentence`, made `printable`."""
     print(f"{name}: {printable(sentence)}", file=sys.stderr, flush=True)
 
@@ -148,6 +157,6 @@ def show(*lines: str) -> None:
     sys.stdout.flush()
 
 
-def _fail(name, sentence, code):
+def _fail(name: str, sentence: object, code: int) -> int:
     say(name, f"error: {sentence}")
     return code

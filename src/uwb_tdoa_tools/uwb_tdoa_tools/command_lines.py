@@ -4,38 +4,48 @@
     node("ekf_node", {"effects_file": "effects.yaml"})
 """
 
+from __future__ import annotations
+
 import os
 import shlex
 import shutil
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
 
 RUN = "UWB_TDOA_RUN"  # variable of the environment in which ./dev says how the user started it
 PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf", "debias_node": "uwb_tdoa_ekf", "compile_nodes": "uwb_tdoa_ekf"}
 
 
-def tool(name, *words):
+def tool(name: str, *words: object) -> str:
     """The line that starts an executable with words, which are quoted where a shell needs it."""
     return " ".join([started(name), *([shlex.join(map(str, words))] if words else [])])
 
 
-def started(name):
+def started(name: str) -> str:
     """How an executable is started: the beginning of its line."""
     return f"{os.environ.get(RUN, 'ros2 run')} {PACKAGES.get(name, 'uwb_tdoa_tools')} {name}"
 
 
-def as_it_runs(line):
+def as_it_runs(line: str) -> str:
     """A line that begins with what ./dev does as ros2 does, as it runs where the user is; any other one as it is."""
     if line.startswith(("ros2 topic ", "ros2 node ", "ros2 param ")) and RUN in os.environ and not shutil.which("ros2"):
         return f"{os.environ[RUN].removesuffix(' run')} {line}"
     return line
 
 
-def node(name, parameters, files=()):
+def node(name: str, parameters: Mapping[str, object], files: Iterable[str | Path] = ()) -> str:
     """The line that starts a node. parameters : {name: value}; files : paths of parameter files."""
     words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
     return tool(name, "--ros-args", *words, *(word for file in files for word in ("--params-file", file)))
 
 
-def judging(recordings, survey=None, effects=None, config=None, truth=True):
+def judging(
+    recordings: Iterable[str | Path], survey: str | Path | None = None, effects: str | Path | None = None,
+    config: str | Path | None = None, truth: bool = True,
+) -> str:  # fmt: skip
     """The line that judges an estimate on recordings with the files of a calibration, by ground truth, or, where they hold none, by itself;
     None for files that there are not."""
     options = {"--survey": survey, "--effects": effects, "--config": config}
@@ -43,7 +53,9 @@ def judging(recordings, survey=None, effects=None, config=None, truth=True):
     return tool("evaluate", *words) if truth else tool("localize", *words, "--out", "localized/")
 
 
-def nodes(anchors=None, effects=None, config=None):
+def nodes(
+    anchors: str | Path | None = None, effects: str | Path | None = None, config: str | Path | None = None
+) -> tuple[str, str]:
     """The two lines that start the nodes with the files of a calibration; None for those that there are not."""
     parameters = {name: file for name, file in (("anchors_file", anchors), ("effects_file", effects)) if file}
     return node("bias_node", parameters), node("ekf_node", parameters, [config] if config else ())

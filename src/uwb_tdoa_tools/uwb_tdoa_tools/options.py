@@ -11,8 +11,11 @@
     reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
+from __future__ import annotations
+
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.network import UNPROVEN, load_network
 from uwb_tdoa_bias.effects import EffectSet
@@ -31,18 +34,25 @@ from .surveying.distances import read_distances
 from .surveying.marks import read_marks
 from .surveying.tape import Tape
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Callable, Iterable, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from .diagnosis.constraints.distance import Distance
+    from .diagnosis.constraints.mark import Mark
+
 TOPICS = (  # that are read from bags
     "uwb/tdoa", "uwb/anchors", "imu/data", *(sensor.topics[0][0] for sensor in SENSORS.values()), "ground_truth/pose", "odometry",
 )  # fmt: skip
 
 
-def add_recordings(parser, nargs="+"):
+def add_recordings(parser: ArgumentParser, nargs: str = "+") -> None:
     """FLIGHT..., and how to read them."""
     parser.add_argument("flights", nargs=nargs, metavar="FLIGHT", help=inputs.HELP)
     add_reading(parser)
 
 
-def add_reading(parser):
+def add_reading(parser: ArgumentParser) -> None:
     """--survey, --namespace, --topic and --salvage: how recordings are read."""
     add = parser.add_argument
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
@@ -54,7 +64,7 @@ def add_reading(parser):
     add("--salvage", action="store_true", help="read cut or damaged recordings as far as they are sound, with a remark")
 
 
-def reading_of(args, truth=True):
+def reading_of(args: Namespace, truth: bool = True) -> inputs.Reading:
     """The Reading that those options ask for. truth : as of Reading. Raises InputError."""
     topics = {}
     for text in args.topics:
@@ -65,19 +75,21 @@ def reading_of(args, truth=True):
     return inputs.Reading(args.survey, args.namespace, topics, args.salvage, truth)
 
 
-def add_filter(parser, effects="effects.yaml to correct the TDOAs with, before the filter"):
+def add_filter(
+    parser: ArgumentParser, effects: str = "effects.yaml to correct the TDOAs with, before the filter"
+) -> None:
     """--effects and --config. effects : help of the first."""
     parser.add_argument("--effects", metavar="FILE", help=effects)
     parser.add_argument("--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)")
 
 
-def filter_of(args):
+def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
     """(FilterConfig, EffectSet or None) that --config and --effects name. Raises InputError."""
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
 
 
-def add_estimator(parser):
+def add_estimator(parser: ArgumentParser) -> None:
     """--effects, --config, --model, --no-bias, -p, --without and --smooth: how positions are estimated."""
     add_filter(parser, "effects.yaml: systematic effects to correct for")
     add = parser.add_argument
@@ -97,7 +109,7 @@ def add_estimator(parser):
     add("--smooth", action="store_true", help="smooth: use what came after each estimate too")
 
 
-def estimator_of(args, say):
+def estimator_of(args: Namespace, say: Callable[[str], object]) -> Estimator:
     """The Estimator that those options ask for. say(sentence) : told what it lacks. Raises InputError."""
     config, effects = filter_of(args)
     config = with_parameters(config, args.parameters + [f"use_{aid}:=false" for aid in args.without])
@@ -111,13 +123,13 @@ def estimator_of(args, say):
     return Estimator(config, effects, network, args.smooth)
 
 
-def given(args, name):
+def given(args: Namespace, name: str) -> bool:
     """Whether the option of that name is given."""
     value = getattr(args, name)
     return value is not False and value not in (None, "", [])
 
 
-def refuse(args, names, because):
+def refuse(args: Namespace, names: Iterable[str], because: str) -> None:
     """Raise InputError for the first of some options that is given and has no part in what is asked for, rather than pass it over."""
     for name in names:
         if given(args, name):
@@ -125,7 +137,7 @@ def refuse(args, names, because):
             raise InputError(f"{option}: {because}; leave it out.")
 
 
-def add_most(parser, default):
+def add_most(parser: ArgumentParser, default: int) -> None:
     """--most: how many TDOAs to learn from at most."""
     parser.add_argument(
         "--most", metavar="N", type=whole_number, default=default,
@@ -136,7 +148,7 @@ def add_most(parser, default):
 OF_TAPE = "std", "height_std", "trusted", "trusted_std"  # fields of Tape, for which the covariance of the last calibration stands
 
 
-def add_tape(parser):
+def add_tape(parser: ArgumentParser) -> None:
     """--std, --height-std, --trusted, --trusted-std and --unknown: how well anchors are known."""
     add = parser.add_argument
     add("--std", type=float, metavar="M", help=f"m, standard deviation of a coordinate as given (default {Tape.std:g})")
@@ -146,7 +158,7 @@ def add_tape(parser):
     add("--unknown", nargs="+", default=[], metavar="A", help="anchors whose position is not known at all")
 
 
-def tape_of(args, effects):
+def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
     """The Tape that those options speak of. effects : EffectSet of --effects, or None: what its covariance says of all anchors stands
     against no option. Raises InputError."""
     if effects is not None and effects.covariance is not None:
@@ -154,7 +166,7 @@ def tape_of(args, effects):
     return Tape(**{name: getattr(args, name) for name in OF_TAPE if given(args, name)}, unknown=tuple(args.unknown))
 
 
-def add_align(parser, judges=False):
+def add_align(parser: ArgumentParser, judges: bool = False) -> None:
     """--align. judges : of a tool that judges by ground truth, and may move its frame too; else of what learns from it."""
     words = "ground truth on another clock (another epoch): none refuses it (default), time finds how far they are apart"
     if judges:
@@ -165,12 +177,12 @@ def add_align(parser, judges=False):
     parser.add_argument("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=words)
 
 
-def add_rerun(parser):
+def add_rerun(parser: ArgumentParser) -> None:
     """--rerun: a recording for the viewer Rerun."""
     parser.add_argument("--rerun", metavar="FILE", help=rerun_file.HELP)
 
 
-def rerun_of(args, count, say):
+def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:
     """Path of the file that --rerun asks for; None without it, or without the library, of which say(sentence) is told. count : of
     flights, of which it shows one. Raises InputError."""
     if not args.rerun:
@@ -181,26 +193,26 @@ def rerun_of(args, count, say):
     return Path(args.rerun) if rerun_file.is_there(say) else None
 
 
-def add_known(parser):
+def add_known(parser: ArgumentParser) -> None:
     """--marks and --distances: what is known beside a recording."""
     add = parser.add_argument
     add("--marks", metavar="FILE", help="YAML: measured places where the tag stood or passed, and when (docs/calibration.md)")
     add("--distances", metavar="FILE", help="CSV with columns a, b, distance, std: measured distances between anchors, m")
 
 
-def known_of(args, flights):
+def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distance, ...]:
     """Constraints on Flights that those options give: tuple. Raises InputError."""
-    out = [] if args.marks is None else read_marks(args.marks, flights)
+    out: list[Mark | Distance] = [] if args.marks is None else read_marks(args.marks, flights)
     out += [] if args.distances is None else read_distances(args.distances, flights[0].anchors)
     return tuple(out)
 
 
-def with_parameters(config, texts):
+def with_parameters(config: FilterConfig, texts: Iterable[str]) -> FilterConfig:
     """A FilterConfig with the values of texts "name:=value". Raises InputError."""
     return replace(config, **current_names(dict(map(_parameter, texts))))
 
 
-def _parameter(text):
+def _parameter(text: str) -> tuple[str, Any]:
     """(name, value) of "name:=value"."""
     name, assigned, value = text.partition(":=")
     names = [field.name for field in fields(FilterConfig)]

@@ -26,7 +26,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .progress import Progress
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Iterator
 
 CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
 
@@ -36,8 +36,7 @@ Made = TypeVar("Made")
 
 
 class MapFunction(Protocol):
-    """What gives function(item) of every item, in their order: as `map` does, but for the time and the process in
-    which each is done."""
+    """What gives function(item) of every item, in their order: as `map` does, but for the time and the process in which each is done."""
 
     def __call__(self, function: Callable[[Item], Made], items: Iterable[Item], /) -> Iterable[Made]: ...
 
@@ -47,7 +46,7 @@ class MapFunction(Protocol):
 in_one_thread: Callable[[Function], Function] = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
-def add_options(parser):
+def add_options(parser: argparse._ActionsContainer) -> None:
     """Add --jobs N and --dask ADDRESS to a tool that runs over many flights."""
     add = parser.add_mutually_exclusive_group().add_argument
     add("--jobs", metavar="N", type=whole_number, help="flights at once (default: as many as there are cores)")
@@ -58,7 +57,7 @@ def add_options(parser):
     )  # fmt: skip
 
 
-def asked(args, count, few):
+def asked(args: argparse.Namespace, count: int, few: int) -> tuple[int | None, str | None]:
     """(jobs, dask) for several calls of `over`, about `count` items: as args ask for; else as many jobs as there are cores and items, one
     for fewer items than `few`."""
     if args.jobs or args.dask:
@@ -66,7 +65,10 @@ def asked(args, count, few):
     return (min(cpu_count(), count) if count >= few else 1), None
 
 
-def over(function, items, jobs=None, dask=None, unit="flight"):
+def over(
+    function: Callable[[Item], Made], items: Iterable[Item], jobs: int | None = None, dask: str | None = None,
+    unit: str | None = "flight",
+) -> Iterator[Made]:  # fmt: skip
     """Generator of function(item) for every item, in order; tells meanwhile how many are done.
 
     To be called in the main thread. function, items, results : what pickle takes; jobs : processes, default one per
@@ -82,7 +84,7 @@ def over(function, items, jobs=None, dask=None, unit="flight"):
             yield result
 
 
-def _results(function, items, jobs, dask):
+def _results(function: Callable[[Item], Made], items: list[Item], jobs: int | None, dask: str | None) -> Iterator[Made]:
     first, rest = items[:1], items[1:]
     count = jobs or min(cpu_count(), len(rest))  # of `jobs` as many as asked for: with another number, all are started anew
     if not rest or (min(count, len(rest)) == 1 and dask is None):
@@ -91,7 +93,7 @@ def _results(function, items, jobs, dask):
     os.environ["PYTHONSAFEPATH"] = "1"  # for processes that joblib starts later, as Python 3.11 and newer understand it; see `elsewhere`
     with _cluster(dask) as backend:
 
-        def spread(calls):
+        def spread(calls: Iterable[Any]) -> Any:
             with parallel_config(**backend):  # not around the loop: the caller's own use of joblib is its own affair
                 # Arrays go as they are: numba compiles anew for those mapped from files, which cannot be written to.
                 pool = Parallel(count, return_as="generator", batch_size=1, max_nbytes=None)
@@ -110,12 +112,12 @@ def _results(function, items, jobs, dask):
                 yield result
 
 
-def _import(function):
+def _import(function: Callable[..., object]) -> None:
     """For a process that starts while the first item is done here: to have been handed `function` has imported it."""
 
 
 @contextmanager
-def _closing(outcomes):
+def _closing(outcomes: Any) -> Iterator[Any]:
     try:
         yield outcomes
     finally:
@@ -125,7 +127,7 @@ def _closing(outcomes):
 
 
 @in_one_thread
-def _attempt(function, item, folder):
+def _attempt(function: Callable[[Item], Made], item: Item, folder: str | None) -> tuple[Made | None, Exception | None]:
     """(result, None), or (None, what cli tells in one sentence): else joblib would raise it before earlier results. folder : in which
     paths of the item are, or None."""
     try:
@@ -137,7 +139,7 @@ def _attempt(function, item, folder):
 
 
 @contextmanager
-def _children_ignore_interrupts():
+def _children_ignore_interrupts() -> Iterator[None]:
     """What is started in the block does not hear Ctrl-C: this process does, and ends them without their tracebacks."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited; a mask would not do: joblib clears it
     try:
@@ -147,7 +149,7 @@ def _children_ignore_interrupts():
 
 
 @contextmanager
-def _cluster(address):
+def _cluster(address: str | None) -> Iterator[dict[str, Any]]:
     """Arguments for parallel_config while the block lasts: none for this machine."""
     if address is None:
         yield {}
@@ -169,7 +171,7 @@ def _cluster(address):
 
 
 @lru_cache(maxsize=None)  # once
-def _say_whom_it_trusts(address):
+def _say_whom_it_trusts(address: str) -> None:
     """Say that a connection is not encrypted: what Dask sends are pickles, which run code where they are read."""
     if not address.startswith(("tls://", "wss://")):
         print(
@@ -179,7 +181,7 @@ def _say_whom_it_trusts(address):
         )
 
 
-def whole_number(text):
+def whole_number(text: str) -> int:
     """Above 0, for argparse."""
     if not text.isdecimal() or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")

@@ -6,11 +6,19 @@
         progress.update()                                        # one more is done
 """
 
+from __future__ import annotations
+
 import sys
 from threading import Event, Thread
 import time
+from typing import TextIO, TYPE_CHECKING, TypeVar
 
 from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+Item = TypeVar("Item")
 
 FIRST, EVERY = 0.5, 4.0  # s until the first line where there is no terminal, and between two
 OFTEN = 0.5  # s between two changes of the line on a terminal
@@ -20,21 +28,23 @@ class Progress:
     """As a context, says what is being done, how much of it is done, and for how long, until it ends; whatever takes shorter than
     FIRST says nothing. Call it with what is being done, as often as you like."""
 
-    def __init__(self, name="", total=None, unit="", stream=None, what=""):
+    def __init__(
+        self, name: str = "", total: int | None = None, unit: str = "", stream: TextIO | None = None, what: str = ""
+    ) -> None:
         """name : what the lines begin with; total : of what is to be done, in `unit`, or None; stream : where to, default stderr; what : what is done first."""
         self._name, self._total, self._unit, self._stream = name, total, unit, stream
         self._what, self._done, self._ended = what, 0, Event()
 
-    def __call__(self, what):
+    def __call__(self, what: str) -> None:
         self._what = what
 
-    def update(self):
+    def update(self) -> None:
         """Count another unit as done."""
         self._done += 1
         if self._bar is not None and self._total is not None:
             self._bar.update()
 
-    def over(self, items, what):
+    def over(self, items: Iterable[Item], what: str) -> Iterator[Item]:
         """Generator of items, which tells how many of them are done."""
         items = list(items)
         for done, item in enumerate(items):
@@ -42,7 +52,7 @@ class Progress:
             yield item
         self(f"{what} done, finishing")
 
-    def __enter__(self):
+    def __enter__(self) -> Progress:
         stream = self._stream or sys.stderr
         self._start, self._bar = time.monotonic(), None
         if stream.isatty():
@@ -52,13 +62,13 @@ class Progress:
         self._thread.start()
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join()
         if self._bar is not None:
             self._bar.close()
 
-    def _tell(self, stream):
+    def _tell(self, stream: TextIO) -> None:
         """Until the end, in a thread of its own."""
         pause = FIRST if self._bar is None else OFTEN
         while not self._ended.wait(pause):
@@ -70,7 +80,7 @@ class Progress:
             else:
                 self._bar.refresh()
 
-    def _line(self):
+    def _line(self) -> str:
         share = f"{self._done} of {self._total} {self._unit}s done" if self._total else ""
         parts = filter(None, (self._what, share, f"{time.monotonic() - self._start:.0f} s"))
         return f"{self._name}: " * bool(self._name) + ", ".join(parts)

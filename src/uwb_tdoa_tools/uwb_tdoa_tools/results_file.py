@@ -9,16 +9,27 @@ The first line is what was asked for; every other one is {"key": ..., "result": 
 places of their lines are held.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 import os
 from pathlib import Path
 import sys
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.version import written_by
+
+if TYPE_CHECKING:
+    from argparse import Namespace
+    from collections.abc import Callable, Iterable, Iterator
+    from .parallel import MapFunction
+
+Item = TypeVar("Item")
+Made = TypeVar("Made")
 
 BEGIN = b'{"asked"'
 LINE = 64 << 20  # bytes of one result
@@ -27,10 +38,11 @@ LINE = 64 << 20  # bytes of one result
 class ResultsFile:
     """Results by their keys, texts, in the file `path`; one that is not there is made. Results are what JSON takes, no NaN."""
 
-    def __init__(self, path, asked):
+    def __init__(self, path: str | Path, asked: dict[str, Any]) -> None:
         """asked : dict for JSON, all that results depend on besides their keys. Raises InputError if the file holds
         something else, or results that were made by another version, or with something else asked for."""
-        self._path, self._places = Path(path), {}
+        self._path = Path(path)
+        self._places: dict[str, int] = {}  # of the lines, by their keys
         asked = json.loads(json.dumps({"written_by": written_by(), **asked}))
         if not self._path.absolute().parent.is_dir():
             raise InputError(f"{path}: its directory does not exist; make it first.")
@@ -41,7 +53,7 @@ class ResultsFile:
             self._file.close()
             raise
 
-    def _begin(self, asked):
+    def _begin(self, asked: dict[str, Any]) -> None:
         self._file.seek(0)
         first = self._file.readline(LINE)
         if not first.endswith(b"\n"):  # new, or not even its first line was written
@@ -70,37 +82,37 @@ class ResultsFile:
                 raise self._foreign()
             self._places[content["key"]] = place
 
-    def __contains__(self, key):
+    def __contains__(self, key: str) -> bool:
         return key in self._places
 
-    def __getitem__(self, key):
+    def __getitem__(self, key: str) -> Any:
         self._file.seek(self._places[key])
         return self._parsed(self._file.readline())["result"]
 
-    def read(self, key, parse):
+    def read(self, key: str, parse: Callable[[Any], Made]) -> Made:
         """parse(result). Raises InputError where that fails: anybody may have written the file."""
         try:
             return parse(self[key])
         except (AssertionError, AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError):
             raise self._foreign() from None
 
-    def __setitem__(self, key, result):
+    def __setitem__(self, key: str, result: object) -> None:
         self._places[key] = self._append({"key": key, "result": result})
 
-    def __enter__(self):
+    def __enter__(self) -> ResultsFile:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def _append(self, content):
+    def _append(self, content: dict[str, Any]) -> int:
         """Place of a line that is written at the end."""
         place = self._file.seek(0, os.SEEK_END)
         self._file.write(json.dumps(content, allow_nan=False).encode() + b"\n")
         self._file.flush()
         return place
 
-    def _parsed(self, line):
+    def _parsed(self, line: bytes) -> dict[str, Any]:
         try:
             content = json.loads(line)
         except (ValueError, RecursionError):
@@ -109,21 +121,21 @@ class ResultsFile:
             raise self._foreign()
         return content
 
-    def _foreign(self):
+    def _foreign(self) -> InputError:
         return InputError(f"{self._path}: holds something else than results of this tool; name another file.")
 
 
-def resumed(over, path, done):
+def resumed(over: MapFunction, path: str | Path, done: ResultsFile) -> MapFunction:
     """over(function, items), as of `parallel.over`, that takes from a ResultsFile what is there, by the name of the function and the
     place of the item, and keeps there what is not. path : of the file; done : ResultsFile."""
 
-    def over_missing(function, items):
+    def over_missing(function: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
         name, items = getattr(function, "func", function).__name__, list(items)
         keys = [f"{name} {place}" for place in range(len(items))]
         missing = [item for key, item in zip(keys, items) if key not in done]
         if len(missing) < len(items):
             tqdm.write(f"{path} holds {len(items) - len(missing)} of {len(items)} parts; going on with the others", sys.stderr)
-        made = over(function, missing)
+        made = iter(over(function, missing))
         for key in keys:
             if key not in done:
                 done[key] = next(made)
@@ -133,7 +145,7 @@ def resumed(over, path, done):
     return over_missing
 
 
-def state_of(path):
+def state_of(path: str | Path | None) -> str:
     """What changes when a file or a folder of files does: a text; of None "None". Raises OSError."""
     if path is None:
         return "None"
@@ -142,7 +154,7 @@ def state_of(path):
     return f"{path} {sum(file.stat().st_size for file in files if file.is_file())} {max(file.stat().st_mtime_ns for file in files)}"
 
 
-def asked_of(args, besides=(), files=()):
+def asked_of(args: Namespace, besides: Iterable[str] = (), files: Iterable[str] = ()) -> dict[str, Any]:
     """What was asked of a command: {option: value}, JSON. besides : names of options that do not matter; files : of those that name
     files, whose content counts. Raises OSError."""
     asked = {name: value for name, value in vars(args).items() if name not in besides}

@@ -8,9 +8,12 @@ Services takeoff, go_to, land (Takeoff, GoTo, Land), as users of crazyswarm2 kno
 Every parameter is documented in config/vehicle_node.yaml.
 """
 
+from __future__ import annotations
+
 import json
 import sys
 import time
+from typing import Any, TYPE_CHECKING
 
 from rclpy.duration import Duration
 from std_msgs.msg import String
@@ -30,6 +33,9 @@ from .flying.trial import Task, Trial
 from .flying.verdict import judge
 from .flying.world import WORLDS, world_of
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
 PARAMETERS = {  # in the order of config/vehicle_node.yaml
     "world": Parameter("hall", "what it flies in (docs/flying.md)", choices=tuple(WORLDS)),
     "seed": Parameter(1, "of all that is random, as of fly", 0, 2**31 - 1),
@@ -48,7 +54,7 @@ class VehicleNode(ros.StreamNode):
 
     NAME = "vehicle_node"
 
-    def __init__(self, arguments=()):
+    def __init__(self, arguments: Sequence[str] = ()) -> None:
         """arguments : of the process."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
@@ -68,12 +74,12 @@ class VehicleNode(ros.StreamNode):
             self.create_service(GoTo, "go_to", self._on_go_to),
             self.create_service(Land, "land", self._on_land),
         ]  # fmt: skip
-        self._starts = None  # time.monotonic(), s, when it begins, once somebody listens
+        self._starts: float | None = None  # time.monotonic(), s, when it begins, once somebody listens
         say_unused([self], files_of(arguments))
         self.turns = Turns([self])
         self.get_logger().info("ready; waiting for who listens to imu/data and uwb/tdoa, and publishes odometry")
 
-    def take(self):
+    def take(self) -> bool:
         """A turn, if it may come. Returns True: another one is to come."""
         self._topics.listen()
         if self._starts is None and self._topics.heard():
@@ -93,7 +99,7 @@ class VehicleNode(ros.StreamNode):
             raise SystemExit(1)
         return True
 
-    def _judge(self):
+    def _judge(self) -> None:
         """Say what became of the mission under way; of the standard one with the exit code."""
         verdict, self._judged = judge(self._trial.flown), len(self._trial.missions)
         self._verdict.publish(String(data=json.dumps(verdict)))
@@ -102,7 +108,7 @@ class VehicleNode(ros.StreamNode):
             self._verdict.wait_for_all_acked(Duration(seconds=SETTLE))
             raise SystemExit(int(not verdict["landed"]))
 
-    def _answer(self, response, command, *values):
+    def _answer(self, response: Any, command: Callable[..., None], *values: object) -> Any:
         """Do what a request says, or say why not."""
         try:
             command(*values)
@@ -111,23 +117,23 @@ class VehicleNode(ros.StreamNode):
             response.message = str(error)
         return response
 
-    def _on_takeoff(self, request, response):
+    def _on_takeoff(self, request: Any, response: Any) -> Any:
         return self._answer(response, self._pilot.take_off, request.group_mask, request.height, _seconds(request.duration))
 
-    def _on_go_to(self, request, response):
+    def _on_go_to(self, request: Any, response: Any) -> Any:
         goal = request.goal.x, request.goal.y, request.goal.z
         values = request.group_mask, request.relative, goal, request.yaw, _seconds(request.duration)
         return self._answer(response, self._pilot.go_to, *values)
 
-    def _on_land(self, request, response):
+    def _on_land(self, request: Any, response: Any) -> Any:
         return self._answer(response, self._pilot.land, request.group_mask, request.height, _seconds(request.duration))
 
 
-def _seconds(duration):
+def _seconds(duration: Any) -> float:
     return duration.sec + 1e-9 * duration.nanosec
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
     return ros.run(VehicleNode, __doc__, argv)
 

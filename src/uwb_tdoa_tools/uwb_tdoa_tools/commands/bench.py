@@ -1,12 +1,19 @@
 """bench: what the suite costs on this machine, in one run."""
 
+from __future__ import annotations
+
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 from .. import cli
 from ..benchmark.figures import as_json, table
 from ..benchmark.peer import Peer
 from ..benchmark.suite import PARTS, measure
+
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
 
 DESCRIPTION = """Measure on this machine, in this run: the compiled core, whole recordings, both nodes live, several
 tags, replays, and what else nodes answer. Figures are medians with their quartiles, beside their targets.
@@ -25,12 +32,12 @@ latencies: what others used is printed. The last example keeps them away.
 """
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_bench, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "bench",
@@ -58,7 +65,7 @@ def parser():
     return made
 
 
-def _bench(args):
+def _bench(args: Namespace) -> None:
     cli.check_folders(args.json)
     other = None if args.peer is None else Peer(args.peer)
     machine, figures = measure(args.only, args.out, args.quick, args.model, other)

@@ -1,6 +1,9 @@
 """calibrate: from a recording to a calibrated tag, in one command."""
 
+from __future__ import annotations
+
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -14,6 +17,13 @@ from ..checking.recording import read_recording
 from ..diagnosis.noise import write_parameters
 from ..progress import Progress
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+    from ..calibrating.calibrate import Calibration
+    from ..readers.inputs import Reading, Recording
+
 DESCRIPTION = """From recordings to a calibrated tag: check, find what is wrong, judge that where it took no part, write it.
 
 With ground truth in every FLIGHT `diagnose` finds what is wrong; without it, or with --no-truth, which leaves it unread, `survey` finds
@@ -26,12 +36,12 @@ lines that start the nodes. --quick says within a minute what that is likely to 
 Exit code: 0 calibrated (--quick: worth it), 1 stopped, 2 bad input."""
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_calibrate, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "calibrate",
@@ -53,7 +63,7 @@ def parser():
     return made
 
 
-def _calibrate(args):
+def _calibrate(args: Namespace) -> int:
     if not (args.out or args.quick):
         raise InputError("--out: is missing; say where to write, or ask for --quick.")
     out = cli.output_folder(args.out) if args.out else None
@@ -83,13 +93,17 @@ def _calibrate(args):
         else:
             made = without_truth(flights, holdout, tape, base, config, progress)
     cli.show(made.text, made.as_text())
+    assert out is not None  # only --quick does without
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()})
     judges = args.holdout or [path for path, _ in found[-1:]]
-    return _stop(made.why_not) if made.why_not is not None else _write(made, out, judges, all(known))
+    if made.why_not is not None:
+        return _stop(made.why_not)
+    _write(made, out, judges, all(known))
+    return 0
 
 
-def _checked(reading, recordings, std):
+def _checked(reading: Reading, recordings: Sequence[Recording], std: float) -> bool:
     """Whether check finds no error in recordings that stops a calibration; says what it finds. std : m, of a coordinate of an anchor."""
     checked, sound = [], True
     with Progress("calibrate", len(recordings), "recording") as progress:
@@ -105,19 +119,21 @@ def _checked(reading, recordings, std):
     return sound
 
 
-def _stop(why):
+def _stop(why: str) -> int:
     cli.say("calibrate", f"stopped, and nothing to use is written: {why}.")
     return 1
 
 
-def _write(made, out, recordings, truth):
+def _write(made: Calibration, out: Path, recordings: Sequence[str | Path], truth: bool) -> None:
     files = anchors, effects, config = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
     made.anchors.to_yaml(anchors)
     made.effects.to_yaml(effects)
     write_parameters(config, made.tdoa_std) if made.tdoa_std is not None else config.unlink(missing_ok=True)
     there = [file if file.exists() else None for file in files]
+    survey, corrected, tuned = there
     cli.show(f"wrote {', '.join(file.name for file in there if file)} and calibration.json to {out}")
-    cli.show(f"judge it:   {command_lines.judging(recordings, *there, truth)}", "fly by it:", *command_lines.nodes(*there))
+    cli.show(f"judge it:   {command_lines.judging(recordings, survey, corrected, tuned, truth)}")
+    cli.show("fly by it:", *command_lines.nodes(survey, corrected, tuned))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,12 @@
 """check: what a driver may have got wrong, found in a recording before anything else is done with it."""
 
+from __future__ import annotations
+
 from functools import partial
 import math
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
@@ -13,6 +16,13 @@ from ..checking.check import check, different_surveys
 from ..checking.recording import read_live, read_recording
 from ..progress import Progress
 from ..readers import read_survey
+
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Iterator, Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from ..checking.recording import Recording
+    from ..readers.inputs import Reading
 
 DESCRIPTION = """Check recordings, or live topics, against a survey, before anything else.
 
@@ -24,12 +34,12 @@ used. With --live it listens to the topics themselves, and also says who publish
 Exit code: 0 nothing is wrong (there may be warnings), 1 there are errors, 2 bad input."""
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_check, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "check",
@@ -48,7 +58,7 @@ def parser():
     return made
 
 
-def _check(args):
+def _check(args: Namespace) -> int:
     cli.check_folders(args.json)
     if bool(args.flights) == (args.live is not None):
         raise InputError("FLIGHT, --live: give recordings, or --live SECONDS, and not both.")
@@ -71,7 +81,7 @@ def _check(args):
     return int(any(one.faulty for one in reports))
 
 
-def _recordings(args, reading, survey):
+def _recordings(args: Namespace, reading: Reading, survey: str | Path | None) -> Iterator[Recording]:
     """Yield the Recording of each, or of what is live. survey : path of the one survey, or None."""
     if args.live is not None:
         yield read_live(reading, args.live, survey, partial(cli.say, "check"))
@@ -85,7 +95,7 @@ def _recordings(args, reading, survey):
             progress.update()
 
 
-def _surveys(folder):
+def _surveys(folder: Path) -> list[tuple[str, Anchors]]:
     """[(path, Anchors)] of a folder of surveys."""
     return [(str(path), read_survey(path)) for path in sorted(folder.glob("anchor_?*"))]
 

@@ -1,9 +1,12 @@
 """Convert a recording to a ROS 2 bag."""
 
+from __future__ import annotations
+
 from dataclasses import asdict
 import json
 import math
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
@@ -15,6 +18,12 @@ from ..readers import columns
 from ..readers.names import read_named
 from ..scoring.settling import on_one_clock
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Iterable, Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from ..readers.names import Named
+
 DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
 IN is a Crazyflie micro-SD event log (versions 1 and 2), a UTIL CSV file (plain or gzip), a bag, or, with --columns, one
@@ -24,12 +33,12 @@ It appears only when it is complete.
 """
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_convert, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "convert",
@@ -59,7 +68,7 @@ def parser():
     return made
 
 
-def _convert(args):
+def _convert(args: Namespace) -> None:
     offsets = _offsets(args.offsets)
     named = _named(args)
     with Progress("convert", what="reading and writing"):
@@ -85,7 +94,7 @@ def _convert(args):
         cli.say("convert", sentence)
 
 
-def _offsets(texts):
+def _offsets(texts: Iterable[str]) -> dict[str, float]:
     """{sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
     offsets = {}
     for text in texts:
@@ -100,17 +109,18 @@ def _offsets(texts):
     return offsets
 
 
-def _named(args):
+def _named(args: Namespace) -> Named | None:
     """Named anchors for --columns, or None. Raises InputError."""
     if args.columns and not args.survey:
         raise InputError("--columns: CSV files do not say where the anchors are; give a survey file (--survey FILE).")
     return read_named(args.survey) if args.columns else None
 
 
-def _read(args, named):
+def _read(args: Namespace, named: Named | None) -> Flight:
     """The Flight."""
     if args.columns:
         options.refuse(args, ("namespace", "topics"), "says where topics are in bags, and --columns is of CSV files")
+        assert named is not None  # as `_named` has seen to it
         return columns.read_columns(args.input, columns.parse_columns(args.columns), named, args.salvage)
     if len(args.input) > 1:
         raise InputError(f"IN: {len(args.input)} recordings are given; convert one by one, or name --columns.")

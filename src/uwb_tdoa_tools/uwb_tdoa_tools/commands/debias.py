@@ -1,7 +1,10 @@
 """debias: map the bias of estimated positions, take it out, and say what that is worth."""
 
+from __future__ import annotations
+
 from pathlib import Path
 import sys
+from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
@@ -12,6 +15,11 @@ from ..debiasing.evaluation import Estimator
 from ..debiasing.mapping import fit_map
 from ..debiasing.shrinking import bear_out
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
+    from ..readers.inputs import Recording
+
 DESCRIPTION = """Map the bias of estimated positions over the room, after Grasso et al. (Sensors 2022, 22, 9136), and
 take it out.
 
@@ -21,12 +29,12 @@ take it out.
 A map belongs to one room, one anchor constellation and one estimator. debias_node applies it on line."""
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(lambda args: {"fit": _fit, "judge": _judge}[args.command](args), parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "debias",
@@ -58,7 +66,7 @@ def parser():
     return made
 
 
-def _fit(args):
+def _fit(args: Namespace) -> None:
     cli.check_folders(args.out, args.json)
     if not (args.flights or args.static):
         raise InputError("FLIGHT: there is none; give flights with ground truth, or --static points.")
@@ -86,7 +94,7 @@ def _fit(args):
     _write(args.json, figures)
 
 
-def _judge(args):
+def _judge(args: Namespace) -> None:
     cli.check_folders(args.json)
     estimator, made = Estimator(options.reading_of(args), *options.filter_of(args), args.align), BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
@@ -94,11 +102,13 @@ def _judge(args):
     _write(args.json, {"map": report.about_figures(made), "runs": rows})
 
 
-def _judged(args, estimator, recordings, made):
+def _judged(
+    args: Namespace, estimator: Estimator, recordings: Sequence[Recording], made: BiasMap
+) -> list[dict[str, Any]]:
     return report.rows(parallel.over(estimator, recordings, args.jobs, args.dask), made, estimator.effects)
 
 
-def _write(path, figures):
+def _write(path: str | Path | None, figures: dict[str, Any]) -> None:
     if path is not None:
         cli.write_json(path, figures)
 

@@ -1,9 +1,12 @@
 """demo: a flight through both nodes over ROS topics, and how far the estimate is from ground truth."""
 
+from __future__ import annotations
+
 from functools import partial
 from pathlib import Path
 import sys
 import time
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.network import UNPROVEN
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -11,6 +14,12 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import cli, options
 from ..live import demo
 from ..scoring.table import lines_of_errors
+
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from ..scoring.metrics import Score
 
 DESCRIPTION = """Take a flight, write it as a bag, replay the bag through bias_node and ekf_node over ROS topics, and
 compare the estimate with ground truth.
@@ -23,12 +32,12 @@ without ROS. The exit code is 1 if the estimate diverged, or messages were lost 
 """
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_demo, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "demo",
@@ -49,7 +58,7 @@ def parser():
     return made
 
 
-def _demo(args):
+def _demo(args: Namespace) -> int:
     if not 0.0 < args.rate < float("inf"):
         raise InputError(f"--rate: {args.rate:g} is not a speed; give a number above 0.")
     if args.survey and not args.flight:
@@ -63,6 +72,7 @@ def _demo(args):
         cli.show("flying     a simulated vehicle")
         case = demo.simulated(args.out, args.effects, args.model)
     flight = case.flight
+    assert flight.truth is not None
     length = flight.truth.t[-1] - flight.truth.t[0]
     cli.show(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
     if case.became:
@@ -86,7 +96,7 @@ def _demo(args):
     return int(scores[-2].row()["diverged"] or not in_time)  # of the nodes
 
 
-def _told(scores):
+def _told(scores: Sequence[Score]) -> str:
     """What correction did to the error, in words."""
     before, after = (score.row()["rmse_3d"] for score in scores[:2])
     if len(scores) == 2:
@@ -96,7 +106,7 @@ def _told(scores):
     return change + (worse if after > before else "")
 
 
-def _all_in_time(flight, became):
+def _all_in_time(flight: Flight, became: dict[str, int]) -> bool:
     """Print what became of every message. Returns whether all were there in time."""
     told = ", ".join(f"{count} {name}" for name, count in became.items() if not name.startswith("imu_"))
     cli.show(f"nodes      TDOAs {len(flight.tdoa)}: {told}")

@@ -1,8 +1,11 @@
 """diagnose: from a residual to the missing effect to a smaller error."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import partial
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -17,6 +20,10 @@ from ..diagnosis.self_survey import noise_of
 from ..localizing.rerun_file import write_diagnosis
 from ..progress import Progress
 from ..surveying.paths import DRIFT, read_paths
+
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
 
 DESCRIPTION = """Find out what is wrong with the measurements of some flights, and put it right.
 
@@ -33,12 +40,12 @@ UNUSED = {  # by references, of the options of what is known
 }  # fmt: skip
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_diagnose, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "diagnose",
@@ -78,7 +85,7 @@ def parser():
     return made
 
 
-def _diagnose(args):
+def _diagnose(args: Namespace) -> None:
     out = cli.output_folder(args.out)
     options.refuse(args, UNUSED[args.reference], f"no part of it is used with --reference {args.reference}")
     config, effects = options.filter_of(args)

@@ -1,9 +1,12 @@
 """How good is the estimate? Errors against ground truth, of the filter run here or of a recorded odometry."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
@@ -13,16 +16,20 @@ from ..scoring import table
 from ..scoring.judge import Judge, results
 from ..scoring.metrics import FIGURES, Pool, as_json
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
+
 NO_MATTER = ("flights", "survey", "json", "markdown", "beside", "resume", "jobs", "dask")  # to what is kept of a flight
 NOT_OF_ODOMETRY = "effects", "config", "model", "no_bias", "parameters", "without", "smooth"
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_evaluate, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "evaluate",
@@ -62,7 +69,7 @@ def parser():
     return made
 
 
-def _evaluate(args):
+def _evaluate(args: Namespace) -> int:
     cli.check_folders(args.json, args.markdown, args.plot)
     if args.odometry:
         options.refuse(args, NOT_OF_ODOMETRY, "has no part in an odometry that was recorded, which is judged as it is (--odometry)")

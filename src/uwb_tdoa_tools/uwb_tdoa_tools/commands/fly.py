@@ -1,8 +1,11 @@
 """fly: a simulated vehicle takes off, flies and lands by the estimate, again and again."""
 
+from __future__ import annotations
+
 import argparse
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -17,6 +20,9 @@ from ..flying.trial import Task
 from ..flying.world import MOMENTS, WORLDS, world_of
 from ..results_file import asked_of
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 NO_MATTER = "flights", "seed", "jobs", "dask", "at_least", "json", "plot", "record", "resume"  # to what becomes of a flight
 DESCRIPTION = """Fly a simulated quadrotor in closed loop, in lockstep and without ROS: its controller gets position, velocity and
 attitude from nothing but the estimate, by the very code of ekf_node, and its rates from the gyroscope. Four seconds at rest, up to
@@ -26,12 +32,12 @@ A flight has landed if it took off, came down within 0.3 m of the wanted place a
 if fewer than --at-least have."""
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_fly, parser(), argv)
 
 
-def parser():
+def parser() -> argparse.ArgumentParser:
     """Its options."""
     made = cli.parser(
         "fly",
@@ -71,7 +77,7 @@ def parser():
     return made
 
 
-def _fly(args):
+def _fly(args: argparse.Namespace) -> int:
     cli.check_folders(args.json, args.plot)
     if args.record is not None:
         cli.output_folder(args.record).mkdir(parents=True, exist_ok=True)
@@ -88,7 +94,7 @@ def _fly(args):
     with fleet.kept(args.resume, asked_of(args, NO_MATTER, ("config", "effects", "model", "peer"))) as done:
         for verdict, picture in fleet.flown(tasks, done, args.record, args.plot is not None, args.jobs, args.dask):
             verdicts.append(verdict)
-            pictures.append(picture)
+            pictures += [] if picture is None else [picture]
     summed = summary(verdicts)
     cli.show(text(summed))
     if args.json is not None:

@@ -1,6 +1,9 @@
 """inject: add a declared effect to a recorded or simulated flight."""
 
+from __future__ import annotations
+
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -10,6 +13,10 @@ from ..bags.files import STORAGES
 from ..progress import Progress
 from ..simulation.inject import catalogue, inject, parse_effect
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
+
 DESCRIPTION = """Add a declared effect to a flight, and write the flight that would have been recorded with it as a
 ROS 2 bag.
 
@@ -17,12 +24,12 @@ A value is PARAMETER=NUMBER, as in effects.yaml; a number alone is for the effec
 them."""
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_inject, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "inject",
@@ -45,7 +52,7 @@ def parser():
     return made
 
 
-def _inject(args):
+def _inject(args: Namespace) -> None:
     if args.list:
         cli.show(catalogue())
         return

@@ -1,10 +1,17 @@
 """localize: where the tag was, and how far that is to be believed."""
 
+from __future__ import annotations
+
 from functools import partial
 import sys
+from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
 from ..localizing.localize import Localizer, all_good, check_names
+
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
 
 DESCRIPTION = """Where the tag was: trajectories of recordings, without ground truth, which is not read.
 
@@ -18,12 +25,12 @@ of the time; doubtful: the filter was lost, or began anew, or many TDOAs speak a
 Exit code: 0 all are good, 1 some are not, 2 bad input."""
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_localize, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "localize",
@@ -46,7 +53,7 @@ def parser():
     return made
 
 
-def _localize(args):
+def _localize(args: Namespace) -> int:
     out = cli.output_folder(args.out)
     cli.check_folders(args.json)
     say = partial(cli.say, "localize")

@@ -1,7 +1,10 @@
 """plan: where a tag can be located among given anchors, how precisely, and where the anchors had better be."""
 
+from __future__ import annotations
+
 from pathlib import Path
 import sys
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -17,13 +20,17 @@ from ..planning.pairing import OF_PROTOCOL, PAIRINGS
 from ..progress import Progress
 from ..readers import inputs, read_survey
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
 
-def main(argv=None):
+
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_plan, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "plan",
@@ -37,7 +44,9 @@ def parser():
         "plan survey.txt --volume --improve add --out plan/",
         "plan hall.yaml --radio-reach 18 --height 1.2 --out plan/",
     )
-    add, number, path, default = made.add_argument, {"type": float}, {"type": Path}, "(default: %(default)s)"
+    number: dict[str, Any] = {"type": float}
+    path: dict[str, Any] = {"type": Path}
+    add, default = made.add_argument, "(default: %(default)s)"
     add("anchors", metavar="ANCHORS", help="anchors .yaml or survey (.txt, .csv)")
     add("--out", metavar="DIR", **path, required=True, help="where to write; replaces what an earlier plan left there")
     add("--json", metavar="FILE", **path, help="write the figures here too")
@@ -80,7 +89,7 @@ def parser():
     return made
 
 
-def _plan(args):
+def _plan(args: Namespace) -> None:
     cli.check_folders(args.json)
     args.flyable = args.flyable or ("pairings" if args.radio_reach is None else "round")
     anchors = read_survey(args.anchors)
@@ -102,7 +111,7 @@ def _plan(args):
     with Progress("plan") as progress:
         progress("mapping")
         found = chart(installation, grid, args.flyable)
-    figures = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
+    figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
     report.say_summary(figures["map"])
     figures["addition"] = run.addition(found, anchors, options.goal_of(args, installation).installed, options.places_of(args, room), args.flyable)
     report.say_flyable(figures["map"], figures["addition"], args.flyable)

@@ -1,7 +1,10 @@
 """Record ROS topics to a bag, for those who have no `ros2 bag record`."""
 
+from __future__ import annotations
+
 from functools import partial
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
@@ -10,6 +13,10 @@ from ..bags.files import STORAGES
 from ..live.record import record
 from ..live.session import PACKAGE
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
+
 DESCRIPTION = """Record ROS topics to a bag, like `ros2 bag record`, until SIGINT (Ctrl-C) or SIGTERM.
 
 Topics are found as they appear; each is subscribed to with the strongest QoS that all its publishers offer. Messages
@@ -17,12 +24,12 @@ are stored as they come, with the time of their arrival. The bag appears when th
 """
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_record, parser(), argv, ros=True)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "record",
@@ -38,7 +45,7 @@ def parser():
     return made
 
 
-def _record(args):
+def _record(args: Namespace) -> int:
     if bool(args.topics) == args.all:
         raise InputError("topics: name the topics to record, or give --all for all of them, not both.")
     say = partial(cli.say, "record")
@@ -51,6 +58,7 @@ def _record(args):
     if recorded.missing:
         say(f"no message came on {', '.join(recorded.missing)}")
         return 1
+    return 0
 
 
 if __name__ == "__main__":

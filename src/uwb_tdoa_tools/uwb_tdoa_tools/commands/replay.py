@@ -1,12 +1,18 @@
 """Replay a bag over ROS topics, for those who have no `ros2 bag play`."""
 
+from __future__ import annotations
+
 import argparse
 from functools import partial
 import sys
+from typing import TYPE_CHECKING
 
 from .. import cli
 from ..live.replay import ACKNOWLEDGE_LIMIT, Options, replay
 from ..live.session import PACKAGE
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 bag play`.
 
@@ -21,12 +27,12 @@ as in the last examples.
 """
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_replay, parser(), argv, ros=True)
 
 
-def parser():
+def parser() -> argparse.ArgumentParser:
     """Its options."""
     made = cli.parser(
         "replay",
@@ -59,7 +65,7 @@ def parser():
     return made
 
 
-def _replay(args):
+def _replay(args: argparse.Namespace) -> int:
     say = partial(cli.say, "replay")
     done = replay(
         args.bag,
@@ -84,7 +90,7 @@ def _replay(args):
     return int(bool(done.wrong) or not done.acknowledged)
 
 
-def _positive(text):
+def _positive(text: str) -> float:
     try:
         value = float(text)
     except ValueError:

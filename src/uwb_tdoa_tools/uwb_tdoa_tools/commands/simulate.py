@@ -1,8 +1,11 @@
 """simulate: fly a path through a room with anchors and write what IMU, UWB tag and motion capture would record."""
 
+from __future__ import annotations
+
 from dataclasses import fields
 from pathlib import Path
 import sys
+from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.sensors import SENSORS
@@ -18,13 +21,17 @@ from ..simulation.schedule import PROTOCOLS
 from ..simulation.summary import catalogue, summary
 from ..simulation.trajectories import TRAJECTORIES
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
 
-def main(argv=None):
+
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_simulate, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     default = SimulationConfig()
     made = cli.parser(
@@ -59,7 +66,8 @@ def parser():
     name = "name, random-SEED or random-SEED-COUNT (default: corners)"
     room.add_argument("--constellation", metavar="NAME", default=default.constellation, help=name)
     room.add_argument("--anchors", metavar="FILE.yaml", type=Path, help="your own anchors, with orientations")
-    add, off, share = radio.add_argument, {"action": "store_false"}, default.outlier_probability
+    add, share = radio.add_argument, default.outlier_probability
+    off: dict[str, Any] = {"action": "store_false"}
     add("--protocol", choices=PROTOCOLS, default=default.protocol, help="(default: tdoa2)")
     add("--radio-reach", metavar="M", type=float, help="anchors farther from the tag than that are not heard (default: all are)")
     add("--noise", dest="noise_std", metavar="M", type=float, default=default.noise_std, help="standard deviation, m (default: 0.06)")
@@ -82,7 +90,7 @@ def parser():
     return made
 
 
-def _simulate(args):
+def _simulate(args: Namespace) -> None:
     if args.list:
         cli.show(catalogue())
         return
@@ -113,7 +121,7 @@ def _simulate(args):
         cli.show(f"wrote {args.plot}")
 
 
-def _config(args):
+def _config(args: Namespace) -> SimulationConfig:
     """SimulationConfig of the options, most of which have the names of its fields."""
     values = {field.name: getattr(args, field.name) for field in fields(SimulationConfig) if hasattr(args, field.name)}
     values["anchors"] = None if args.anchors is None else Anchors.from_yaml(args.anchors)

@@ -1,6 +1,9 @@
 """survey: better anchors from a tape measure and flights."""
 
+from __future__ import annotations
+
 import sys
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EffectSet
 
@@ -9,6 +12,10 @@ from ..diagnosis.noise import write_parameters
 from ..progress import Progress
 from ..surveying.blocked import with_blocked
 from ..surveying.survey import survey
+
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
 
 DESCRIPTION = """Make a tape-measured survey better, from flights alone.
 
@@ -26,12 +33,12 @@ to --out.
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_survey, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "survey",
@@ -51,7 +58,7 @@ def parser():
     return made
 
 
-def _survey(args):
+def _survey(args: Namespace) -> int:
     out = cli.output_folder(args.out)
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)

@@ -1,9 +1,12 @@
 """train: learn the systematic error of TDOAs from flights with ground truth."""
 
+from __future__ import annotations
+
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
 from ..progress import Progress
@@ -11,16 +14,24 @@ from ..results_file import ResultsFile, asked_of, resumed, state_of
 from ..scoring.settling import told
 from ..training import labels as labelling, models, shrinking
 
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
+    from contextlib import AbstractContextManager
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from ..parallel import MapFunction
+    from ..readers.inputs import Reading
+
 NO_MATTER = ("flights", "survey", "name", "out", "resume", "jobs", "dask")  # to what is kept of a training, beside states of recordings
 MOST = 1_500_000  # TDOAs; what they take: docs/speed.md
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """The executable. Returns the exit code."""
     return cli.run(_train, parser(), argv)
 
 
-def parser():
+def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "train",
@@ -57,7 +68,7 @@ def parser():
     return made
 
 
-def _train(args):
+def _train(args: Namespace) -> None:
     cli.output_folder(args.out)
     reading = options.reading_of(args)
     jobs, dask = parallel.asked(args, len(reading.find(args.flights)), 2)  # as many for folds as for flights: else all start anew
@@ -69,7 +80,7 @@ def _train(args):
             _write(args, flights, resumed(over, args.resume, done) if done else over, progress)
 
 
-def _kept(args, reading):
+def _kept(args: Namespace, reading: Reading) -> AbstractContextManager[ResultsFile | None]:
     """The ResultsFile of --resume, or a context of None."""
     if args.resume is None:
         return nullcontext()
@@ -77,7 +88,7 @@ def _kept(args, reading):
     return ResultsFile(args.resume, {**asked_of(args, NO_MATTER), "flights": recordings})
 
 
-def _write(args, several, over, progress):
+def _write(args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress) -> None:
     """Train on several Flights, and write all of it. over : as of `shrinking.train`; progress : Progress."""
     flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)
@@ -91,13 +102,13 @@ def _write(args, several, over, progress):
     )
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
-    label, x, *errors = result.curve
+    label, x, of_training, of_validation = result.curve
     from ..training.plots import plot_curve  # takes a second to import
 
-    plot_curve(label, x, *errors, args.out / "training.png")
+    plot_curve(label, x, of_training, of_validation, args.out / "training.png")
     for name, (before, after) in result.errors.items():
         cli.show(f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m (root mean square)")
-    curve = {label: x, "training": errors[0], "validation": errors[1]}
+    curve = {label: x, "training": of_training, "validation": of_validation}
     cli.show(borne_out.as_text())
     content = {**result.meta, "curve": curve, "validation": result.errors, "borne_out": borne_out.as_dict()}
     cli.write_json(args.out / "training.json", content)
