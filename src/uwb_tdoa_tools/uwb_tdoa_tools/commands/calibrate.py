@@ -97,10 +97,7 @@ def _calibrate(args: Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()})
     judges = args.holdout or [path for path, _ in found[-1:]]
-    if made.why_not is not None:
-        return _stop(made.why_not)
-    _write(made, out, judges, all(known))
-    return 0
+    return _stop(made.why_not) if made.why_not is not None else _write(made, out, judges, all(known))
 
 
 def _checked(reading: Reading, recordings: Sequence[Recording], std: float) -> bool:
@@ -124,16 +121,16 @@ def _stop(why: str) -> int:
     return 1
 
 
-def _write(made: Calibration, out: Path, recordings: Sequence[str | Path], truth: bool) -> None:
+def _write(made: Calibration, out: Path, recordings: Sequence[str | Path], truth: bool) -> int:
     files = anchors, effects, config = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
     made.anchors.to_yaml(anchors)
     made.effects.to_yaml(effects)
     write_parameters(config, made.tdoa_std) if made.tdoa_std is not None else config.unlink(missing_ok=True)
-    there = [file if file.exists() else None for file in files]
-    survey, corrected, tuned = there
-    cli.show(f"wrote {', '.join(file.name for file in there if file)} and calibration.json to {out}")
+    survey, corrected, tuned = (file if file.exists() else None for file in files)
+    cli.show(f"wrote {', '.join(file.name for file in files if file.exists())} and calibration.json to {out}")
     cli.show(f"judge it:   {command_lines.judging(recordings, survey, corrected, tuned, truth)}")
     cli.show("fly by it:", *command_lines.nodes(survey, corrected, tuned))
+    return 0
 
 
 if __name__ == "__main__":

@@ -127,17 +127,16 @@ def outer(
 
 @compiled
 def inner(
-    thrust: float, rates: np.ndarray, gyro: np.ndarray, before: np.ndarray, dt: float, gains: Record, vehicle: Record,
-    speeds: np.ndarray,
-) -> None:  # fmt: skip
-    """From thrust, N, and rates (3,) rad/s, both wanted, to rotor speeds (4,) rad/s. gyro, before : (3,) rad/s, felt now and dt s ago;
-    gains, vehicle : numbers of both."""
+    thrust: float, rates: np.ndarray, gyro: np.ndarray, dt: float, gains: Record, vehicle: Record, speeds: np.ndarray
+) -> None:
+    """From thrust, N, and rates (3,) rad/s, both wanted, to rotor speeds (4,) rad/s. gyro : (2, 3) rad/s, felt now and
+    dt s ago; gains, vehicle : numbers of both."""
     if thrust <= 0.0:
         speeds[:] = 0.0
         return
-    mx = vehicle.inertia_xy * (gains.rate * (rates[0] - gyro[0]) - gains.damping * (gyro[0] - before[0]) / dt)
-    my = vehicle.inertia_xy * (gains.rate * (rates[1] - gyro[1]) - gains.damping * (gyro[1] - before[1]) / dt)
-    mz = vehicle.inertia_z * gains.yaw_rate * (rates[2] - gyro[2])
+    mx = vehicle.inertia_xy * (gains.rate * (rates[0] - gyro[0, 0]) - gains.damping * (gyro[0, 0] - gyro[1, 0]) / dt)
+    my = vehicle.inertia_xy * (gains.rate * (rates[1] - gyro[0, 1]) - gains.damping * (gyro[0, 1] - gyro[1, 1]) / dt)
+    mz = vehicle.inertia_z * gains.yaw_rate * (rates[2] - gyro[0, 2])
     most = vehicle.thrust * vehicle.top_speed**2
     for k in range(ROTORS):
         tilt = 0.25 * (CORNERS[k, 1] * mx - CORNERS[k, 0] * my) / (0.5 * vehicle.arm)

@@ -37,7 +37,7 @@ def interval(
     dt = STEP * STEPS
     speeds, scratch, felt, earlier = np.empty(4), np.empty((2, STATE)), np.empty(3), np.empty(STATE)
     for i in range(len(truth)):
-        inner(thrust, rates, gyro[0], gyro[1], dt, gains, known, speeds)
+        inner(thrust, rates, gyro, dt, gains, known, speeds)
         earlier[:] = state
         feet = 0
         turn = np.zeros(3)

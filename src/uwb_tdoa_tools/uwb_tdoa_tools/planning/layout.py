@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .check import Wrap
     from .goal import Goal
 
+SEED = 0  # of the starts, and of the points at which they are judged
 ROUGH = 80  # points that the starts are judged at
 DRAWN = 16  # layouts drawn for every start; the best are taken
 SWEEPS = 40  # steps of one descent
@@ -112,7 +113,7 @@ class Layout:
 
 def optimise(
     goal: Goal, places: Places, count: int, fixed: Anchors | None = None, start: np.ndarray | None = None,
-    starts: int = 16, seed: int = 0, progress: Wrap = iter,
+    starts: int = 16, progress: Wrap = iter,
 ) -> Anchors:  # fmt: skip
     """Anchors at the `count` best places, turned in the best directions; after those of `fixed`, which stay.
 
@@ -120,11 +121,11 @@ def optimise(
     progress : wraps the starts. Descents from all starts at a few of the goal's points; the best of what
     they lead to descend again, with the points that turn out to be the worst. The best score at all points wins."""
     layout = Layout(places, count, fixed, goal.points.mean(axis=0), are_turned(goal.installation.anchors))
-    rows = _some(goal, ROUGH, seed)
+    rows = _some(goal, ROUGH)
     looked_at = replace(goal, points=goal.points[rows])
     from scipy.stats import qmc  # takes a second to import
 
-    drawn = qmc.Halton(count * places.numbers, seed=seed).random(DRAWN * starts)
+    drawn = qmc.Halton(count * places.numbers, seed=SEED).random(DRAWN * starts)
     begin = [layout.start(numbers) for numbers in drawn]
     begin = sorted(begin, key=lambda x: looked_at.score(layout.anchors(x)))[:starts]
     if start is not None:
@@ -211,11 +212,11 @@ def _free_ids(taken: np.ndarray, count: int) -> np.ndarray:
     return np.setdiff1d(np.arange(count + taken.max() + 1), taken)[:count]
 
 
-def _some(goal: Goal, count: int, seed: int) -> np.ndarray:
+def _some(goal: Goal, count: int) -> np.ndarray:
     """Rows of some of the goal's points."""
     if goal.objective == "worst":
         return spread(goal.points, count)
-    return np.random.default_rng(seed).permutation(len(goal.points))[:count]
+    return np.random.default_rng(SEED).permutation(len(goal.points))[:count]
 
 
 def _refined(goal: Goal, layout: Layout, x: np.ndarray, rows: np.ndarray) -> np.ndarray:

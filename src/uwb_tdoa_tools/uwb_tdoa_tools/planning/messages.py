@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -104,29 +105,39 @@ def _markers(store: Typestore, chart: Chart, anchors: Anchors, stamp: int) -> An
     error = chart.error[surface]
     worse = (error - error.min(initial=np.inf)) / max(np.ptp(error) if len(error) else 0.0, 1e-9)
     green_to_red = np.column_stack([np.minimum(2 * worse, 1), np.minimum(2 - 2 * worse, 1), 0 * worse, 0 * worse + 0.4])
-    found = [_marker(store, anchors.frame, stamp, "flyable", 0, _CUBES, grid.step, grid.points[surface], green_to_red)]
-    found.append(_marker(store, anchors.frame, stamp, "anchors", 0, _SPHERES, 0.15, anchors.positions))
+    drawn = [_Drawn("flyable", _CUBES, grid.step, points=grid.points[surface], colours=green_to_red)]
+    drawn.append(_Drawn("anchors", _SPHERES, 0.15, points=anchors.positions))
     for number, p in zip(anchors.ids.tolist(), anchors.positions):
-        found.append(
-            _marker(store, anchors.frame, stamp, "ids", number, _TEXT, 0.25, at=p + [0, 0, 0.25], text=str(number))
-        )
-    return types["visualization_msgs/msg/MarkerArray"](found)
+        drawn.append(_Drawn("ids", _TEXT, 0.25, number, at=p + [0, 0, 0.25], text=str(number)))
+    header = _header(store, anchors.frame, stamp)
+    return types["visualization_msgs/msg/MarkerArray"]([_marker(store, header, one) for one in drawn])
 
 
-def _marker(
-    store: Typestore, frame: str, stamp: int, namespace: str, number: int, kind: int, size: float,
-    points: Sequence[float] | np.ndarray = (), colours: Sequence[float] | np.ndarray = (),
-    at: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0), text: str = "",
-) -> Any:  # fmt: skip
+@dataclass(frozen=True)
+class _Drawn:
+    """What a marker shows. kind : of visualization_msgs/Marker; size : m; points (n, 3) m and colours (n, 4), red, green,
+    blue and opacity, of its parts; at (3,) m : where it is."""
+
+    namespace: str
+    kind: int
+    size: float
+    number: int = 0
+    points: Sequence[float] | np.ndarray = ()
+    colours: Sequence[float] | np.ndarray = ()
+    at: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
+    text: str = ""
+
+
+def _marker(store: Typestore, header: Any, drawn: _Drawn) -> Any:
     types = store.types
     colour, zero = types["std_msgs/msg/ColorRGBA"], types["builtin_interfaces/msg/Duration"](0, 0)
     nothing = types["sensor_msgs/msg/CompressedImage"](_header(store, "", 0), "", np.empty(0, np.uint8))
     return types["visualization_msgs/msg/Marker"](
-        _header(store, frame, stamp), namespace, number, kind, 0, _pose(store, at),
-        types["geometry_msgs/msg/Vector3"](size, size, size), colour(0.1, 0.3, 0.9, 1.0), zero, False,
-        [types["geometry_msgs/msg/Point"](*p) for p in np.asarray(points).tolist()],
-        [colour(*c) for c in np.asarray(colours).tolist()],
-        "", nothing, [], text, "", types["visualization_msgs/msg/MeshFile"]("", np.empty(0, np.uint8)), False,
+        header, drawn.namespace, drawn.number, drawn.kind, 0, _pose(store, drawn.at),
+        types["geometry_msgs/msg/Vector3"](*[drawn.size] * 3), colour(0.1, 0.3, 0.9, 1.0), zero, False,
+        [types["geometry_msgs/msg/Point"](*p) for p in np.asarray(drawn.points).tolist()],
+        [colour(*c) for c in np.asarray(drawn.colours).tolist()],
+        "", nothing, [], drawn.text, "", types["visualization_msgs/msg/MeshFile"]("", np.empty(0, np.uint8)), False,
     )  # fmt: skip
 
 

@@ -40,7 +40,7 @@ def plot_precision(installation: Installation, chart: Chart, path: str | Path) -
             (row[0], 100.0 * per_axis, "99 % of one axis within +- cm"),
             (row[1], chart.dop, "PDOP"),
         ):
-            _field(ax, chart, chart.hull, values, k, label)
+            _field(ax, chart, values, k, label)
             _room(ax, installation, chart.grid, k)
         row[0].set_title(f"{row[0].get_title()}, 99 % ellipses times {_ellipses(row[0], chart, k)}", **TITLE)
     _save(figure, "Precision of one round of TDOAs", path)
@@ -56,7 +56,7 @@ def plot_failure(installation: Installation, chart: Chart, path: str | Path) -> 
     for row, k in zip(axes, layers):
         points = chart.grid.layer(chart.grid.points, k).reshape(-1, 3)
         discriminant = subsets.discriminant(points).reshape(len(y), len(x), -1)
-        _field(row[0], chart, chart.hull, 100.0 * chart.ambiguous, k, "pairings with two solutions, %", levels=False, scale=share)
+        _field(row[0], chart, 100.0 * chart.ambiguous, k, "pairings with two solutions, %", levels=False, scale=share)
         row[1].contourf(x, y, chart.grid.layer(chart.flyable, k).astype(float), levels=[0.5, 1.5], colors=[FLYABLE])
         for q in range(discriminant.shape[2]):
             row[1].contour(x, y, discriminant[:, :, q], levels=[0.0], colors="0.55", linewidths=0.5)
@@ -130,7 +130,7 @@ def plot_layouts(
     scale = (100.0 * finite.min(), 100.0 * np.quantile(finite, 0.99))
     for row, k in zip(axes, layers):
         for ax, (title, installation, chart) in zip(row, charts):
-            _field(ax, chart, chart.hull, 100.0 * chart.error, k, "bound, 3D rms, cm", scale=scale)
+            _field(ax, chart, 100.0 * chart.error, k, "bound, 3D rms, cm", scale=scale)
             x, y, _ = chart.grid.axes
             _hatch(ax, chart, k)
             _room(ax, installation, chart.grid, k)
@@ -161,12 +161,12 @@ def _panels(count: int, wide: int) -> tuple[Figure, np.ndarray]:
 
 
 def _field(
-    ax: Axes, chart: Chart, judged: np.ndarray, values: np.ndarray, k: int, label: str, levels: bool = True,
+    ax: Axes, chart: Chart, values: np.ndarray, k: int, label: str, levels: bool = True,
     scale: tuple[float, float] | None = None,
 ) -> None:  # fmt: skip
     """Colours scaled to what lies inside the hull, or to `scale`; contour lines over them."""
     x, y, _ = chart.grid.axes
-    inside = values[judged & np.isfinite(values)]
+    inside = values[chart.hull & np.isfinite(values)]
     inside = inside if len(inside) else np.array([0.0, 1.0])
     low, high = scale or (inside.min(), np.quantile(inside, 0.98))
     high = high if high > low else low + 1.0  # all the same
