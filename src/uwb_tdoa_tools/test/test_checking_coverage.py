@@ -26,7 +26,7 @@ def windows(anchors, heard, seconds=20):
 
 def said(positions=BOX, places=PLACES, heard=lambda t, a, b: t >= 0.0, seconds=20):
     anchors = Anchors.from_positions(positions)
-    view = coverage.View(anchors, windows(anchors, heard, seconds), places)
+    view = coverage.CoverageView(anchors, windows(anchors, heard, seconds), places)
     return {finding.rule: finding for rule in coverage.RULES for finding in rule(view)}
 
 

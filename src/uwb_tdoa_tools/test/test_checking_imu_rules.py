@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 from uwb_tdoa_tools.checking import imu_rules
-from uwb_tdoa_tools.checking.case import Case
+from uwb_tdoa_tools.checking.ordered import OrderedRecording
 
 from checking_flights import recording
 
 
 @pytest.fixture(scope="module")
 def healthy():
-    return Case.of(recording())
+    return OrderedRecording.of(recording())
 
 
 def test_a_right_imu_is_left_alone(healthy):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.checking import tdoa_rules
-from uwb_tdoa_tools.checking.case import LONG, Case
+from uwb_tdoa_tools.checking.ordered import LONG, OrderedRecording
 from uwb_tdoa_tools.checking.survey_fit import SPREAD, spread
 
 from checking_flights import recording
@@ -14,7 +14,7 @@ from checking_flights import recording
 
 @pytest.fixture(scope="module")
 def healthy():
-    return Case.of(recording())
+    return OrderedRecording.of(recording())
 
 
 @pytest.mark.slow
@@ -71,8 +71,8 @@ def test_the_part_that_is_tried_is_where_the_tag_moves():
     t = np.arange(0.0, 100.0, 0.01)
     d = np.where((t > 60.0) & (t < 80.0), np.sin(t), 0.0)
     zeros = np.zeros(len(t), dtype=int)
-    case = Case.of(recording())
-    still = replace(case, tdoa=replace(case.tdoa, t=t, a=zeros, b=zeros + 1, d=d), imu=None)
+    ordered = OrderedRecording.of(recording())
+    still = replace(ordered, tdoa=replace(ordered.tdoa, t=t, a=zeros, b=zeros + 1, d=d), imu=None)
     part = still.part(14.0)
     assert (
         58.0 < part.tdoa.t[0]
@@ -83,7 +83,7 @@ def test_the_part_that_is_tried_is_where_the_tag_moves():
 
 
 def test_ids_are_not_tried_where_the_tag_stands():
-    hovering = Case.of(recording(10, trajectory="hover"))
+    hovering = OrderedRecording.of(recording(10, trajectory="hover"))
     assert spread(tdoa_rules.survey_fit(hovering).places) < SPREAD
     assert list(tdoa_rules.swapped(hovering)) == []
 

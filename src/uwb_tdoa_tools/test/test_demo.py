@@ -6,7 +6,7 @@ from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN
 
 pytest.importorskip("rclpy")
 from uwb_tdoa_tools.commands import calibrate, check, demo, localize  # noqa: E402
-from uwb_tdoa_tools.live.demo import Case, next_steps  # noqa: E402
+from uwb_tdoa_tools.live.demo import DemoFlight, next_steps  # noqa: E402
 from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
 
 
@@ -43,9 +43,9 @@ class Told:
 
 
 def test_it_says_what_corrects_and_that_nothing_does_unless_it_is_asked_for(tmp_path):
-    case = Case(None, None, None)
-    assert case.corrector() is None and case.correction().startswith("nothing: neither --effects nor --model is given")
-    assert UNPROVEN in Case(SimpleNamespace(anchors=corners()), None, SHIPPED).correction()
+    plain = DemoFlight(None, None, None)
+    assert plain.corrector() is None and plain.correction().startswith("nothing: neither --effects nor --model is given")
+    assert UNPROVEN in DemoFlight(SimpleNamespace(anchors=corners()), None, SHIPPED).correction()
 
 
 @pytest.mark.parametrize(

@@ -133,7 +133,7 @@ def play(follower, stamps):
         follower.wait(round(stamp * SECOND), stop)
         if stop:
             return number
-        follower.note_tdoa(round(stamp * SECOND))
+        follower.add_tdoa(round(stamp * SECOND))
     return len(stamps)
 
 
@@ -206,7 +206,7 @@ def test_the_filter_waits_for_aids_as_long_as_the_replay_takes_it_to():
 
 def test_tdoas_that_wait_with_the_filter_for_a_height_are_not_waited_for(filtered):
     follower, residuals = filtered
-    follower.note_aid("/height", 10 * SECOND)
+    follower.add_aid("/height", 10 * SECOND)
     assert play(follower, STAMPS) == 22  # it waits for half of its lag
     residuals.say(*STAMPS[:6])
     assert play(follower, STAMPS[22:]) == 5

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.streams import ERROR
 
-from ..checking.case import Case
+from ..checking.ordered import OrderedRecording
 from ..checking.survey_fit import displacement
 from ..checking.tdoa_rules import survey_fit
 from ..diagnosis import diagnose
@@ -71,7 +71,7 @@ def stopping(recording: Recording, findings: Iterable[Finding], std: float) -> l
     as much as a tape may be off. std : m, of a coordinate."""
     errors = [finding for finding in findings if finding.severity == ERROR]
     if any(finding.rule == MISFIT for finding in errors):
-        fit = survey_fit(Case.of(recording))
+        fit = survey_fit(OrderedRecording.of(recording))
         if np.median(displacement(fit.positions, fit.solve()[1])) <= OFF * std:
             errors = [finding for finding in errors if finding.rule != MISFIT]
     return errors

@@ -12,7 +12,7 @@ from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, mos
 
 from ..readers.streams import protocol
 from . import coverage, imu_rules, labels, tdoa_rules, wiring
-from .case import Case
+from .ordered import OrderedRecording
 from .sensor_rules import sensors
 from .survey_fit import displacement
 from .tdoa_rules import SAME, furthest
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 ROUNDS = 3  # mistakes that are undone one after the other
 # Where one of these stands, nothing, or not the IMU, can be tried.
-HOPELESS = {
+NOTHING_TO_TRY = {
     "stamps_zero",
     "stamps_stand",
     "stamps_unit",
@@ -88,17 +88,17 @@ def check(recording: Recording, others: Sequence[Survey] = ()) -> Report:
         return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)
     names = {finding.rule for finding in found}
     places, explained = np.empty((0, 3)), set()
-    if names & HOPELESS:
+    if names & NOTHING_TO_TRY:
         cause, remedy = (
             "sign, ids, survey and axes were not tried",
             "put the errors right, record again, and check again",
         )
         found.append(Finding("not_tried", NOTE, cause, "the streams are of no use for that", remedy, np.nan))
     else:
-        tried, places = _tried(_undone(Case.of(recording), found), names, others)
+        tried, places = _tried(_undone(OrderedRecording.of(recording), found), names, others)
         explained = set().union(*(EXPLAINS.get(finding.rule, ()) for finding in tried))
         found = [finding for finding in found if finding.rule not in explained] + tried
-    view = coverage.View(recording.anchors, list(streams.tdoa), places)
+    view = coverage.CoverageView(recording.anchors, list(streams.tdoa), places)
     for covered in coverage.RULES:
         found += (finding for finding in covered(view) if finding.rule not in explained)
     return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)
@@ -114,21 +114,21 @@ def fed(recording: Recording) -> StreamRules:
     return streams
 
 
-def _undone(case: Case, found: list[Finding]) -> Case:
-    """The case without the mistakes that the streams show themselves, so that it can be tried."""
+def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
+    """The OrderedRecording without the mistakes that the streams show themselves, so that it can be tried."""
     for finding in found:
-        if (imu := case.imu) is None:
+        if (imu := ordered.imu) is None:
             break
         if finding.rule == "imu_force_unit":
-            case = case.with_imu(accel=imu.accel * finding.value)
+            ordered = ordered.with_imu(accel=imu.accel * finding.value)
         elif finding.rule == "imu_rate_unit":
-            case = case.with_imu(gyro=np.deg2rad(imu.gyro))
+            ordered = ordered.with_imu(gyro=np.deg2rad(imu.gyro))
         elif finding.rule == "imu_turned":
             turn = upright(np.median(imu.accel, axis=0))
-            case = case.with_imu(accel=imu.accel @ turn.T, gyro=imu.gyro @ turn.T)
+            ordered = ordered.with_imu(accel=imu.accel @ turn.T, gyro=imu.gyro @ turn.T)
         elif finding.rule == "stamps_apart":
-            case = case.with_imu(t=imu.t - finding.value)
-    return case
+            ordered = ordered.with_imu(t=imu.t - finding.value)
+    return ordered
 
 
 def upright(force: np.ndarray) -> np.ndarray:
@@ -139,23 +139,23 @@ def upright(force: np.ndarray) -> np.ndarray:
     return np.stack([side, np.cross(up, side), up])
 
 
-def _tried(case: Case, names: set[str], others: Sequence[Survey]) -> tuple[list[Finding], np.ndarray]:
+def _tried(ordered: OrderedRecording, names: set[str], others: Sequence[Survey]) -> tuple[list[Finding], np.ndarray]:
     """([Finding], places of the tag (k, 3) m): what is found by undoing it."""
-    found, given = [], case
+    found, given = [], ordered
     for _ in range(ROUNDS):
-        finding, case = tdoa_rules.best(case, others)
+        finding, ordered = tdoa_rules.best(ordered, others)
         if finding is None:
             break
         found.append(finding)
-    fit = tdoa_rules.survey_fit(case)
+    fit = tdoa_rules.survey_fit(ordered)
     blamed = [finding for finding in found if finding.rule in BLAMED]
     if not found:
         found += _misfit(fit)
     elif blamed and tdoa_rules.gained(fit) is not None:  # what was put right did not make it fit
         found = [finding for finding in found if finding not in blamed]
         found += [*_misfit(tdoa_rules.survey_fit(given))] or [*_misfit(fit)]
-    if case.imu is not None and not names & WITHOUT_IMU and not any(f.rule == "survey_misfit" for f in found):
-        finding = imu_rules.fit(case)
+    if ordered.imu is not None and not names & WITHOUT_IMU and not any(f.rule == "survey_misfit" for f in found):
+        finding = imu_rules.fit(ordered)
         found += [finding] if finding else []
         if finding and (mixed := [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]):
             found = [other for other in found if other is not finding and other not in mixed] + [_other_room(*mixed)]

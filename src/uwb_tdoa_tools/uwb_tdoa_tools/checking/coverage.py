@@ -1,4 +1,4 @@
-"""What the anchors and the motion of the tag let anybody know. A rule takes a View and yields Findings."""
+"""What the anchors and the motion of the tag let anybody know. A rule takes a CoverageView and yields Findings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHORT = 10.0  # s
 
 
 @dataclass(frozen=True)
-class View:
+class CoverageView:
     """anchors : Anchors; windows : [TdoaWindow]; places (k, 3) m, where the tag was located, none if that was not
     tried."""
 
@@ -33,7 +33,7 @@ class View:
     places: np.ndarray
 
 
-def missing(view: View) -> Iterator[Finding]:
+def missing(view: CoverageView) -> Iterator[Finding]:
     """Anchors of the survey that are never, hardly ever or for a while not heard."""
     if not view.windows:  # a recording of less than a second
         return
@@ -69,7 +69,7 @@ def _silence(windows: Sequence[TdoaWindow], heard: np.ndarray) -> tuple[float, f
     return longest
 
 
-def flat(view: View) -> Iterator[Finding]:
+def flat(view: CoverageView) -> Iterator[Finding]:
     """Anchors in one plane tell next to nothing about the distance from it, and nothing about the side."""
     p = view.anchors.positions
     if len(p) < 4:
@@ -88,7 +88,7 @@ def flat(view: View) -> Iterator[Finding]:
         )
 
 
-def below(view: View) -> Iterator[Finding]:
+def below(view: CoverageView) -> Iterator[Finding]:
     """Everything below zero: z down."""
     z = view.anchors.positions[:, 2]
     if z.max() <= 0.05 and np.ptp(z) > 0.5:
@@ -103,7 +103,7 @@ def below(view: View) -> Iterator[Finding]:
         )
 
 
-def outside(view: View) -> Iterator[Finding]:
+def outside(view: CoverageView) -> Iterator[Finding]:
     """A tag beyond its anchors."""
     p = view.anchors.positions
     if not len(view.places):
@@ -122,7 +122,7 @@ def outside(view: View) -> Iterator[Finding]:
         )
 
 
-def still(view: View) -> Iterator[Finding]:
+def still(view: CoverageView) -> Iterator[Finding]:
     """A recording of which little can be learned."""
     if not len(view.places):
         return

@@ -22,7 +22,7 @@ from uwb_tdoa_ekf.streams.explain import Unexplained, compare
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from .case import Case
+    from .ordered import OrderedRecording
 
     # ratio of what stays unexplained, its standard errors; (3, 3) for the accelerometer, for the gyroscope
     Arrangement = tuple[float, float, np.ndarray, np.ndarray]
@@ -40,9 +40,9 @@ UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
 SCALES = {180.0 / np.pi: "rad/s, divided by 57.3 once too often", 2.0 * np.pi: "revolutions/s, not rad/s"}
 
 
-def fit(case: Case) -> Finding | None:
-    """What does not fit about the IMU: Finding or None. case : Case whose TDOAs are right."""
-    brief = replace(case, imu=averaged(case.imu)).part(PART)
+def fit(recording: OrderedRecording) -> Finding | None:
+    """What does not fit about the IMU: Finding or None. recording : OrderedRecording whose TDOAs are right."""
+    brief = replace(recording, imu=averaged(recording.imu)).part(PART)
     if brief.imu is None or len(brief.imu) < SLOWEST * PART / 2.0:
         return None
     base = _unexplained(brief)
@@ -95,10 +95,10 @@ def _scaled(trials: Sequence[Arrangement]) -> np.ndarray | None:
     return gyro if abs(abs(np.linalg.det(gyro)) - 1.0) > 0.1 else None
 
 
-def _all(case: Case, base: Unexplained) -> list[Arrangement]:
+def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     """Trials of all arrangements of the gyroscope against the accelerometer, and its mirror image; the yaw is free
     anyway."""
-    short = case.part(BRIEF)
+    short = recording.part(BRIEF)
     of_short = _unexplained(short)
     arrangements = []
     for accel in (UPRIGHT, MIRROR):
@@ -108,19 +108,18 @@ def _all(case: Case, base: Unexplained) -> list[Arrangement]:
             ratio, _ = compare(of_short, _unexplained(_arranged(short, accel, gyro)))
             arrangements.append((ratio, accel, gyro))
     arrangements.sort(key=lambda entry: entry[0] if np.isfinite(entry[0]) else np.inf)
-    return [(*compare(base, _unexplained(_arranged(case, a, g))), a, g) for _, a, g in arrangements[:CHOSEN]]
+    return [(*compare(base, _unexplained(_arranged(recording, a, g))), a, g) for _, a, g in arrangements[:CHOSEN]]
 
 
-def _arranged(case: Case, accel: np.ndarray, gyro: np.ndarray) -> Case:
+def _arranged(recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) -> OrderedRecording:
     """The samples turned by (3, 3) matrices."""
-    assert case.imu is not None
-    return case.with_imu(
-        accel=np.ascontiguousarray(case.imu.accel @ accel.T), gyro=np.ascontiguousarray(case.imu.gyro @ gyro.T)
-    )
+    assert recording.imu is not None
+    forces, rates = recording.imu.accel @ accel.T, recording.imu.gyro @ gyro.T
+    return recording.with_imu(accel=np.ascontiguousarray(forces), gyro=np.ascontiguousarray(rates))
 
 
-def _unexplained(case: Case) -> Unexplained:
-    residuals = run_offline(case.flight(), LEANING).residuals
+def _unexplained(recording: OrderedRecording) -> Unexplained:
+    residuals = run_offline(recording.flight(), LEANING).residuals
     return Unexplained.of(residuals.t, residuals.innovation)
 
 

@@ -25,7 +25,7 @@ def numbers(flight: Flight) -> list[Finding]:
     streams.feed_tdoa(of.t, np.full(len(of), np.nan), of.a, of.b, of.d)
     streams.finish()
     found = streams.findings()
-    found += coverage.missing(coverage.View(flight.anchors, list(streams.tdoa), np.empty((0, 3))))
+    found += coverage.missing(coverage.CoverageView(flight.anchors, list(streams.tdoa), np.empty((0, 3))))
     if imu is not None and not any(finding.rule == "imu_clipped" for finding in found):
         found += inertial_values.saturated(flight)
     found = [finding for finding in found if finding.severity != NOTE]

@@ -8,7 +8,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .case import Case
+from .ordered import OrderedRecording
 from .check import different_surveys
 from .recording import of_flight
 from .tdoa_rules import gained, survey_fit
@@ -35,7 +35,9 @@ def survey_remarks(flight: Flight) -> Iterator[str]:
     if lacking:
         share = 100.0 * np.mean(~known)
         yield f"the survey has no anchor {_listed(lacking)}: {share:.0f} % of the TDOAs are not used; survey it, too."
-    if len(tdoa) and np.ptp(tdoa.t) > SHORTEST and gained(survey_fit(Case.of(of_flight(flight)))) is not None:
+    if not (len(tdoa) and np.ptp(tdoa.t) > SHORTEST):
+        return
+    if gained(survey_fit(OrderedRecording.of(of_flight(flight)))) is not None:
         yield "the survey does not fit the TDOAs: of another room, or anchors have been moved; `check` says more."
 
 

@@ -1,7 +1,7 @@
 """What is wrong with all TDOAs, or with the ids of the anchors? Found by what fits: each mistake is undone, and the
 recording says whether more of it is explained then.
 
-A rule takes a Case and yields Trials: the case with one mistake undone, and the Finding if that was it.
+A rule takes an OrderedRecording and yields Trials: that with one mistake undone, and the Finding if that was it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
-from .case import LONG, SHORT, Case
+from .ordered import LONG, SHORT, OrderedRecording
 from uwb_tdoa_ekf.streams.explain import SCALE, compare
 from .survey_fit import SPREAD, SurveyFit, spread
 
@@ -46,27 +46,28 @@ SAME = 0.2  # m at most between the places of an anchor in two surveys of one in
 
 @dataclass(frozen=True)
 class Trial:
-    """case : Case with a mistake undone; finding : callable of the ratio, its standard errors -> Finding; share : of
-    the TDOAs that it changes."""
+    """recording : OrderedRecording with a mistake undone; finding : callable of the ratio, its standard errors -> Finding;
+    share : of the TDOAs that it changes."""
 
-    case: Case
+    recording: OrderedRecording
     finding: Callable[[float, float], Finding]
     share: float = 1.0
 
 
-def in_metres(case: Case) -> bool:
+def in_metres(recording: OrderedRecording) -> bool:
     """Whether the TDOAs scatter as metres do. (In nanoseconds those of a quiet radio do, too.)"""
-    return NOISE[0] <= successive(case.tdoa) <= NOISE[1]
+    return NOISE[0] <= successive(recording.tdoa) <= NOISE[1]
 
 
-def units(case: Case) -> Iterator[tuple[Finding, Case]]:
-    """In metres? The noise of the radio is known, and that a motion explains most of it. Yields (Finding, Case)."""
-    noise = successive(case.tdoa)
-    if not noise > 0.0 or (in_metres(case) and case.part(LONG).unexplained().mean < WELL):
+def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecording]]:
+    """In metres? The noise of the radio is known, and that a motion explains most of it. Yields (Finding,
+    OrderedRecording)."""
+    noise = successive(recording.tdoa)
+    if not noise > 0.0 or (in_metres(recording) and recording.part(LONG).unexplained().mean < WELL):
         return
     near = sorted(UNITS.items(), key=lambda unit: abs(np.log(unit[1] * noise / USUAL)))[:2]
     (name, scale), (other, its) = near
-    trial = case.with_tdoa(d=case.tdoa.d * scale)
+    trial = recording.with_tdoa(d=recording.tdoa.d * scale)
     if not NOISE[0] <= scale * noise <= NOISE[1] or not trial.part(LONG).unexplained().mean < WELL:
         return
     evidence = f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
@@ -83,23 +84,23 @@ def successive(tdoa: Tdoas) -> float:
     return float(np.median(np.abs(np.diff(d))[follows])) if follows.any() else 0.0
 
 
-def sign(case: Case) -> Iterator[Trial]:
+def sign(recording: OrderedRecording) -> Iterator[Trial]:
     """All signs the other way."""
     line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
-    yield Trial(case.with_tdoa(d=-case.tdoa.d), _says("tdoa_sign", "the sign of all TDOAs is wrong", line))
+    yield Trial(recording.with_tdoa(d=-recording.tdoa.d), _says("tdoa_sign", "the sign of all TDOAs is wrong", line))
 
 
-def survey(case: Case, others: Sequence[Survey]) -> Iterator[Trial]:
+def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[Trial]:
     """Another survey. others : [(name, Anchors)]. Those of one installation, of different days, count as one."""
     while others:
         (name, anchors), *rest = others
         alike = [other for other, its in rest if same_place(anchors, its)]
         others = [(other, its) for other, its in rest if other not in alike]
-        if same_place(anchors, case.anchors):
+        if same_place(anchors, recording.anchors):
             continue
         names = " or ".join([name, *alike])
         cause = f"the survey is of another room or day: {names} fits"
-        yield Trial(replace(case, anchors=anchors), _says("survey_other", cause, f"--survey {name}"))
+        yield Trial(replace(recording, anchors=anchors), _says("survey_other", cause, f"--survey {name}"))
 
 
 def same_place(one: Anchors, other: Anchors) -> bool:
@@ -115,9 +116,9 @@ def furthest(one: Anchors, other: Anchors) -> float:
     return float(off.max()) if len(off) else np.inf
 
 
-def renumbered(case: Case) -> Iterator[Trial]:
+def renumbered(recording: OrderedRecording) -> Iterator[Trial]:
     """Ids that the survey does not have: the same anchors in the same order, with other numbers?"""
-    heard, known = np.unique(np.r_[case.tdoa.a, case.tdoa.b]), np.sort(case.anchors.ids)
+    heard, known = np.unique(np.r_[recording.tdoa.a, recording.tdoa.b]), np.sort(recording.anchors.ids)
     if len(heard) != len(known) or np.isin(heard, known).all():
         return
     table = dict(zip(heard.tolist(), known.tolist()))
@@ -125,17 +126,17 @@ def renumbered(case: Case) -> Iterator[Trial]:
     line = f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]"
     cause = f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} "
     cause += f"is {known[0]} ... {known[-1]} there"
-    yield Trial(_relabelled(case, table), _says("ids_renumbered", cause, line))
+    yield Trial(_relabelled(recording, table), _says("ids_renumbered", cause, line))
 
 
-def swapped(case: Case) -> Iterator[Trial]:
+def swapped(recording: OrderedRecording) -> Iterator[Trial]:
     """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more is explained.
     Not along a line: in a room that is symmetrical about it, anchors differ by their systematic errors alone."""
-    if spread(survey_fit(case).places) < SPREAD:
+    if spread(survey_fit(recording).places) < SPREAD:
         return
     table: dict[int, int] = {}
-    trial, brief = case, case.part(SHORT)
-    ids = np.intersect1d(case.anchors.ids, np.r_[case.tdoa.a, case.tdoa.b]).tolist()
+    trial, brief = recording, recording.part(SHORT)
+    ids = np.intersect1d(recording.anchors.ids, np.r_[recording.tdoa.a, recording.tdoa.b]).tolist()
     for _ in range(len(ids) - 1):
         base = brief.unexplained()
         ratios = []
@@ -160,23 +161,23 @@ def swapped(case: Case) -> Iterator[Trial]:
     )
 
 
-def contrary(case: Case) -> Iterator[Trial]:
+def contrary(recording: OrderedRecording) -> Iterator[Trial]:
     """Single pairs with the other sign: a filter that hardly believes them knows. Or all pairs that name the larger id
     first."""
-    tdoa = case.tdoa
+    tdoa = recording.tdoa
     pairs = np.unique(np.column_stack([tdoa.a, tdoa.b]), axis=0)
     backward = tdoa.a > tdoa.b
     if 0.2 < backward.mean() < 0.8:
         line = "message.distance_difference = distance_to_b - distance_to_a  # in the order of the message's ids"
         cause = "the sign of the TDOAs does not follow the order of the anchors"
-        yield Trial(_flipped(case, backward), _says("tdoa_one_sign", cause, line))
-    wrong = _contrary(case.part(LONG), pairs)
+        yield Trial(_flipped(recording, backward), _says("tdoa_one_sign", cause, line))
+    wrong = _contrary(recording.part(LONG), pairs)
     if not 0 < len(wrong) <= MOST_PAIRS:
         return
     flip = np.zeros(len(tdoa), dtype=bool)
     for a, b in wrong:
         flip |= (tdoa.a == a) & (tdoa.b == b)
-    trial = _flipped(case, flip)
+    trial = _flipped(recording, flip)
     if gained(survey_fit(trial)) is not None:
         return  # of a survey of another room some pairs seem to have the other sign, and still it does not fit
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
@@ -184,9 +185,9 @@ def contrary(case: Case) -> Iterator[Trial]:
     yield Trial(trial, _says("pair_sign", f"the sign of the pairs {names} is wrong", line), flip.mean())
 
 
-def _contrary(case: Case, pairs: np.ndarray) -> list[tuple[int, int]]:
+def _contrary(recording: OrderedRecording, pairs: np.ndarray) -> list[tuple[int, int]]:
     """The pairs, [(a, b)], most of whose TDOAs are nearer to the negative of what the filter predicts."""
-    tdoa, run = case.tdoa, run_offline(case.flight(), FilterConfig(use_imu=False)).residuals
+    tdoa, run = recording.tdoa, run_offline(recording.flight(), FilterConfig(use_imu=False)).residuals
     predicted = tdoa.d - run.innovation
     counted = np.isfinite(predicted) & (np.abs(tdoa.d) > FAR) & (np.abs(predicted) > FAR)
     other = np.abs(tdoa.d + predicted) < np.abs(tdoa.d - predicted)
@@ -198,35 +199,35 @@ def _contrary(case: Case, pairs: np.ndarray) -> list[tuple[int, int]]:
     return wrong
 
 
-def _flipped(case: Case, rows: np.ndarray) -> Case:
-    return case.with_tdoa(d=np.where(rows, -case.tdoa.d, case.tdoa.d))
+def _flipped(recording: OrderedRecording, rows: np.ndarray) -> OrderedRecording:
+    return recording.with_tdoa(d=np.where(rows, -recording.tdoa.d, recording.tdoa.d))
 
 
-def moved(case: Case) -> Iterator[Trial]:
+def moved(recording: OrderedRecording) -> Iterator[Trial]:
     """An anchor that is not where the survey has it: there, TDOAs are explained that no motion explains otherwise."""
-    fit = survey_fit(case)
+    fit = survey_fit(recording)
     gain = gained(fit)
     if gain is None:
         return
-    alone = [fit.solve([row]) for row in range(len(case.anchors))]
+    alone = [fit.solve([row]) for row in range(len(recording.anchors))]
     row = int(np.argmin([loss for loss, _ in alone]))
     share = (fit.before - alone[row][0]) / gain
     if share < ALONE:
         return
     shift = alone[row][1][row] - fit.positions[row]
-    number = int(case.anchors.ids[row])
+    number = int(recording.anchors.ids[row])
     where = ", ".join(f"{s:+.1f}" for s in shift)
     cause = f"anchor {number} is not where the survey has it, but about ({where}) m from there"
     line = f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
-    anchors = case.anchors.at(alone[row][1])
-    yield Trial(replace(case, anchors=anchors), _says("anchor_moved", cause, line))
+    anchors = recording.anchors.at(alone[row][1])
+    yield Trial(replace(recording, anchors=anchors), _says("anchor_moved", cause, line))
 
 
-def survey_fit(case: Case) -> SurveyFit:
+def survey_fit(recording: OrderedRecording) -> SurveyFit:
     """SurveyFit of the TDOAs between known anchors."""
-    a, b = case.rows()
+    a, b = recording.rows()
     known = (a >= 0) & (b >= 0) & (a != b)
-    return SurveyFit(case.tdoa.t[known], a[known], b[known], case.tdoa.d[known], case.anchors.positions)
+    return SurveyFit(recording.tdoa.t[known], a[known], b[known], recording.tdoa.d[known], recording.anchors.positions)
 
 
 def gained(fit: SurveyFit) -> float | None:
@@ -237,27 +238,27 @@ def gained(fit: SurveyFit) -> float | None:
     return gain if gain > GAIN else None
 
 
-def best(case: Case, others: Sequence[Survey] = ()) -> tuple[Finding | None, Case]:
-    """(Finding, Case with it undone), or (None, case): of all that can be tried, what explains the most, if it is
+def best(recording: OrderedRecording, others: Sequence[Survey] = ()) -> tuple[Finding | None, OrderedRecording]:
+    """(Finding, OrderedRecording with it undone), or (None, recording): of all that can be tried, what explains the most, if it is
     certain, and more than systematic errors could: along a line, in a room that is symmetrical about it, swapped ids
     differ by these alone.
 
     Smaller TDOAs are always explained better: another unit is believed at once where the noise speaks against metres,
     and else only where nothing different helps."""
-    if not in_metres(case):
-        for found in units(case):
+    if not in_metres(recording):
+        for found in units(recording):
             return found
-    base, trials = case.part(LONG).unexplained(), []
+    base, trials = recording.part(LONG).unexplained(), []
     for rule in (sign, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
-        for trial in rule(case):
-            other = trial.case.part(LONG).unexplained()
+        for trial in rule(recording):
+            other = trial.recording.part(LONG).unexplained()
             ratio, z = compare(base, other)
             if ratio < RATIO and z > DEVIATIONS and base.mean - other.mean > BY_ERRORS * trial.share:
                 trials.append((ratio, z, trial))
     if trials:
         ratio, z, trial = min(trials, key=lambda entry: entry[0])
-        return trial.finding(ratio, z), trial.case
-    return next(units(case), (None, case))
+        return trial.finding(ratio, z), trial.recording
+    return next(units(recording), (None, recording))
 
 
 def _says(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]:
@@ -268,11 +269,11 @@ def _says(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]
     return finding
 
 
-def _relabelled(case: Case, table: dict[int, int]) -> Case:
+def _relabelled(recording: OrderedRecording, table: dict[int, int]) -> OrderedRecording:
     """Ids replaced as the dict `table` says, all at once."""
     columns = {}
-    for name, ids in (("a", case.tdoa.a), ("b", case.tdoa.b)):
+    for name, ids in (("a", recording.tdoa.a), ("b", recording.tdoa.b)):
         columns[name] = ids.copy()
         for one, two in table.items():
             columns[name][ids == one] = two
-    return case.with_tdoa(**columns)
+    return recording.with_tdoa(**columns)

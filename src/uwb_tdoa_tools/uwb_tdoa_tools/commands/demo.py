@@ -67,18 +67,18 @@ def _demo(args: Namespace) -> int:
     started = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
     if args.flight:
-        case = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
+        chosen = demo.measured(args.flight, options.reading_of(args), args.effects, args.model)
     else:
         cli.show("flying     a simulated vehicle")
-        case = demo.simulated(args.out, args.effects, args.model)
-    flight = case.flight
+        chosen = demo.simulated(args.out, args.effects, args.model)
+    flight = chosen.flight
     assert flight.truth is not None
     length = flight.truth.t[-1] - flight.truth.t[0]
     cli.show(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
-    if case.became:
-        cli.show(f"flown      by the estimate: {case.became}")
-    cli.show(f"correction {case.correction()}")
-    flown = demo.fly(case, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
+    if chosen.became:
+        cli.show(f"flown      by the estimate: {chosen.became}")
+    cli.show(f"correction {chosen.correction()}")
+    flown = demo.fly(chosen, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
     scores, in_time = flown.scores, _all_in_time(flight, flown.became)
     if not in_time:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
@@ -89,7 +89,7 @@ def _demo(args: Namespace) -> int:
     plot_comparison(flight, scores[:-1], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
     if rerun is not None:
-        flown.show(rerun, flight, [case.became, _told(scores)])
+        flown.show(rerun, flight, [chosen.became, _told(scores)])
         cli.show(f"rerun      {rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
     cli.show("next       " + "\n           ".join(demo.next_steps(args.flight or args.out / "flight.bag", args.survey)))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from .. import cli, options, parallel
 from ..progress import Progress
 from ..results_file import ResultsFile, asked_of, resumed, state_of
-from ..scoring.settling import told
+from ..scoring.settling import with_settled_truth
 from ..training import labels as labelling, models, shrinking
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def _train(args: Namespace) -> None:
     with _kept(args, reading) as done:
         over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # no line beside that of Progress
         flights = reading.flights(args.flights, args.most, jobs, dask)
-        flights = list(parallel.over(partial(told, align=args.align), flights, jobs, dask))
+        flights = list(parallel.over(partial(with_settled_truth, align=args.align), flights, jobs, dask))
         with Progress("train") as progress:
             _write(args, flights, resumed(over, args.resume, done) if done else over, progress)
 

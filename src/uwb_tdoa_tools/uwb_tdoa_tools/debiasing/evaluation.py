@@ -15,7 +15,7 @@ from ..readers.inputs import Reading
 from ..scoring.alignment import NONE
 from ..scoring.evaluation import evaluate, judging_truth
 from ..scoring.metrics import Score
-from ..scoring.settling import told
+from ..scoring.settling import with_settled_truth
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,7 +42,7 @@ def fly(
             f"{flight.name}: it holds no ground truth to map the bias with; diagnose --reference heights, odometry or marks finds what is "
             "wrong without it, and --effects takes that."
         )
-    flight = told(flight, effects, config, align)
+    flight = with_settled_truth(flight, effects, config, align)
     score, run = evaluate(flight, config, effects)
     return flight, score, run.odometry
 

@@ -34,7 +34,7 @@ class Source(Protocol):
     @property
     def why(self) -> str: ...
 
-    def tell(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
+    def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
 
     def take(self, measured: Measured) -> None:
@@ -71,7 +71,7 @@ class OurFilter:
         self._parts = [NOTHING]
         self._newest: Odometry | None = None
 
-    def tell(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
+    def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
         self._estimator.tell_pose(t, p, std**2 * np.eye(3), yaw, std)
 

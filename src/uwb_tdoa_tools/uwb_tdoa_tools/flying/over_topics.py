@@ -89,7 +89,7 @@ class OverTopics:
         """Wait until those who listen have the anchors, and hear everything else, too."""
         self._latched.wait_for_all_acked(Duration(seconds=LATCHED_LIMIT))
 
-    def tell(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
+    def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         """See OurFilter; is said before what is measured first."""
         self._told = t, p, std, yaw
 
@@ -135,7 +135,7 @@ class OverTopics:
         self._pace.heard(float(t))
 
     def _pose_of(self, t: float, p: np.ndarray, std: float, yaw: float) -> PoseWithCovarianceStamped:
-        """PoseWithCovarianceStamped, see `tell`; a variance of 0 says that nobody knows."""
+        """PoseWithCovarianceStamped, see `set_pose`; a variance of 0 says that nobody knows."""
         message, known = PoseWithCovarianceStamped(), not math.isnan(yaw)
         message.header.stamp, message.header.frame_id = self._stamp(t), self._anchors.frame
         at, turn = message.pose.pose.position, message.pose.pose.orientation

@@ -89,7 +89,7 @@ class Trial:
         yaw = self.simulator.yaw + off
         self.source: Source | TheirFilter = source or _filter_of(task, place, yaw)
         if task.told == "place" and not isinstance(self.source, TheirFilter):
-            self.source.tell(TOLD_AT, place, TOLD_STD, yaw if task.yaw == "known" else math.nan)
+            self.source.set_pose(TOLD_AT, place, TOLD_STD, yaw if task.yaw == "known" else math.nan)
         self.controller = Controller(task.gains, self.simulator.believed)
         self.transport = Transport(world.latency, world.jitter, random(seed, "transport"))
         self.missions: list[Mission] = []

@@ -34,7 +34,7 @@ SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # told nothing, as the node
 
 
 @dataclass(frozen=True)
-class Case:
+class DemoFlight:
     """What is flown. flight : Flight; effects_file, model : what corrects it, or None; SHIPPED is a model; became : what became of a flight
     that was simulated, in words."""
 
@@ -59,9 +59,9 @@ class Case:
         return f"{corrector.model} ({', '.join(sources)})"
 
 
-def simulated(folder: str | Path, effects_file: str | Path | None = None, model: str | None = None) -> Case:
-    """Case of a flight by nothing but its estimate, among anchors that are late; corrected, if nothing else is given, with their
-    true delays as a calibration would find them: an effects.yaml in the folder. Raises InputError."""
+def simulated(folder: str | Path, effects_file: str | Path | None = None, model: str | None = None) -> DemoFlight:
+    """DemoFlight by nothing but its estimate, among anchors that are late; corrected, if nothing else is given, with
+    their true delays as a calibration would find them: an effects.yaml in the folder. Raises InputError."""
     if not (effects_file or model):
         delays = Radio(SIMULATED.world, SIMULATED.seed, 1.0).constants[:, 0]
         values = dict(zip(SIMULATED.world.anchors.ids.tolist(), delays.round(4).tolist()))
@@ -69,22 +69,23 @@ def simulated(folder: str | Path, effects_file: str | Path | None = None, model:
         EffectSet((AnchorDelay(values, source="the simulation's own values"),)).to_yaml(effects_file)
     effects = EffectSet.from_yaml(effects_file) if effects_file else None
     flown = trial.fly(replace(SIMULATED, effects=effects))
-    return Case(flown.flight, effects_file, model, sentence(judge(flown)))
+    return DemoFlight(flown.flight, effects_file, model, sentence(judge(flown)))
 
 
 def measured(
     path: str | Path, reading: Reading, effects_file: str | Path | None = None, model: str | None = None
-) -> Case:
-    """Case of a recording, read by a Reading, corrected with what is given and nothing else. Raises InputError."""
+) -> DemoFlight:
+    """DemoFlight of a recording, read by a Reading, corrected with what is given and nothing else. Raises
+    InputError."""
     flight = reading.one(path)
     if flight.truth is None:
         raise InputError(f"{path}: holds no ground truth to compare with; take a flight that has it.")
     airborne(flight.truth)
-    return Case(flight, effects_file, model)
+    return DemoFlight(flight, effects_file, model)
 
 
 @dataclass(frozen=True)
-class Flown:
+class DemoResult:
     """became : {what became of the messages: count}, see `accounts`; scores : [Score], of the filter without correction, of the nodes, and of
     the filter with correction; or, if nothing corrects, of the nodes and of the filter; nodes : RecordedOdometry;
     without_ros : Run of the filter with what the nodes correct with; raw : Odometry of the filter without correction, or None if nothing corrects."""
@@ -100,16 +101,18 @@ class Flown:
         write_rerun(path, flight, self.nodes, self.without_ros.residuals, list(sentences), flight.truth, self.raw)
 
 
-def fly(case: Case, folder: Path, rate: float = 1.0, say: Callable[[str], object] = print) -> Flown:
-    """Write the flight of a Case as a bag, play it to both nodes, and run the filter without ROS beside them: Flown.
+def fly(planned: DemoFlight, folder: Path, rate: float = 1.0, say: Callable[[str], object] = print) -> DemoResult:
+    """Write the flight of a DemoFlight as a bag, play it to both nodes, and run the filter without ROS beside them:
+    DemoResult.
 
     The bags and the output of the nodes go to the folder. Raises InputError, LiveError. say(text) : told what happens.
     """
-    flight, bag, correction = case.flight, folder / "flight.bag", case.corrector()
+    flight, bag, correction = planned.flight, folder / "flight.bag", planned.corrector()
     assert flight.truth is not None
     write_bag(flight, bag, force=True)
-    model = SHIPPED if case.model == SHIPPED else _absolute(case.model)
-    bias, ekf = {"effects_file": _absolute(case.effects_file), "model_file": model}, {"use_imu": flight.imu is not None}
+    model = SHIPPED if planned.model == SHIPPED else _absolute(planned.model)
+    bias = {"effects_file": _absolute(planned.effects_file), "model_file": model}
+    ekf = {"use_imu": flight.imu is not None}
     live = run_live(bag, folder, rate, bias, ekf, say)
     nodes, raw = read_odometry(live.recorded), run_offline(flight)
     estimates = {"nodes": nodes, "without ROS": raw.odometry}
@@ -118,7 +121,7 @@ def fly(case: Case, folder: Path, rate: float = 1.0, say: Callable[[str], object
         estimates = {"raw": raw.odometry, "corrected": nodes, "corrected, without ROS": corrected.odometry}
     scores = [Score(name, one, flight.truth) for name, one in estimates.items()]
     without_ros, before = (corrected, raw.odometry) if correction else (raw, None)
-    return Flown(accounts(live.bias, live.ekf, flight), scores, nodes, without_ros, before)
+    return DemoResult(accounts(live.bias, live.ekf, flight), scores, nodes, without_ros, before)
 
 
 def next_steps(recording: str | Path, survey: str | Path | None = None) -> list[str]:

@@ -38,7 +38,7 @@ LEARNED = 20  # TDOAs that tell by how much bias_node shifts their stamps
 class Follower:
     """Watches a topic whose messages have a header, and says when to wait for it.
 
-    Where somebody also publishes uwb/residual, one message for each TDOA, TDOAs are followed too (`note_tdoa`).
+    Where somebody also publishes uwb/residual, one message for each TDOA, TDOAs are followed too (`add_tdoa`).
     """
 
     def __init__(self, node: Node, topic: str, lag: float = LAG) -> None:
@@ -57,13 +57,13 @@ class Follower:
         self._silent = False
         self._tdoas = _Tdoas(node, round(1e9 * AID_SHARE * lag))
 
-    def note_tdoa(self, stamp: int) -> None:
+    def add_tdoa(self, stamp: int) -> None:
         """A TDOA with this stamp, ns, has been played."""
-        self._tdoas.note(stamp)
+        self._tdoas.add(stamp)
 
-    def note_aid(self, topic: str, stamp: int) -> None:
+    def add_aid(self, topic: str, stamp: int) -> None:
         """What one of the SENSORS measured, with this stamp, ns, has been played, for the filter."""
-        self._tdoas.note_aid(topic, stamp)
+        self._tdoas.add_aid(topic, stamp)
 
     def wait(self, stamp: int, stop: Stop) -> float:
         """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to be played, and
@@ -130,7 +130,7 @@ class _Tdoas:
         self._aids: dict[str, int] = {}  # {topic: ns, newest stamp that was played}
         self._learned, self._behind = 0, False  # whether START_STEP is too little, because the recorded IMU is behind its TDOAs
 
-    def note(self, stamp: int) -> None:
+    def add(self, stamp: int) -> None:
         if self._newest is not None and stamp < self._newest - LEAD:  # a recording that starts again
             self._start_over()
         if self._newest is None:
@@ -139,7 +139,7 @@ class _Tdoas:
         if self._learned < LEARNED:
             self._first.append(stamp)
 
-    def note_aid(self, topic: str, stamp: int) -> None:
+    def add_aid(self, topic: str, stamp: int) -> None:
         self._aids[topic] = stamp
 
     def wait(self, starting: bool, stop: Stop) -> float:

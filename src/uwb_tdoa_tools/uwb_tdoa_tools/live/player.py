@@ -114,9 +114,9 @@ class Player:
             if self._publish(publisher, data):
                 self.played.counts[topic] += 1
                 if self.follower is not None and topic in self._tdoas:
-                    self.follower.note_tdoa(stamp_of(data))
+                    self.follower.add_tdoa(stamp_of(data))
                 elif self.follower is not None and topic in self._aids and publisher.get_subscription_count():
-                    self.follower.note_aid(topic, stamp_of(data))
+                    self.follower.add_aid(topic, stamp_of(data))
 
     def _wait_for_latched(self) -> float:
         """Wait, before the first message of a stream, until what is latched (the anchors) has been acknowledged.

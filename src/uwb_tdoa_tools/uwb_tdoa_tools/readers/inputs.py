@@ -28,7 +28,7 @@ SURVEY_HELP = (
     "the recordings whose path contains KEY; counts in place of the anchors that bags hold, which keep their own where no KEY fits"
 )
 
-_TOLD: set[str | Path | None] = set()  # surveys of which has been told that they count for bags
+_REPORTED: set[str | Path | None] = set()  # surveys of which has been told that they count for bags
 
 
 def find_flights(
@@ -61,16 +61,16 @@ def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
     try:
         its_survey = survey_for(path, survey)
     except InputError:
-        _tell_once(f"{path}: no survey in {survey} fits; the anchors that it holds count, as in other bags that none fits.")
+        _report_once(f"{path}: no survey in {survey} fits; the anchors that it holds count, as in other bags that none fits.")
         return None
-    _tell_once(f"{path}: the anchors of {its_survey} count here, whatever anchors the bag holds; so in every bag that is read with it.", its_survey)
+    _report_once(f"{path}: the anchors of {its_survey} count here, whatever anchors the bag holds; so in every bag that is read with it.", its_survey)
     return its_survey
 
 
-def _tell_once(sentence: str, about: str | Path | None = None) -> None:
+def _report_once(sentence: str, about: str | Path | None = None) -> None:
     """Tell a sentence on stderr, and nothing more about the same survey, or about surveys that do not fit (None), in this process."""
-    if about not in _TOLD:
-        _TOLD.add(about)
+    if about not in _REPORTED:
+        _REPORTED.add(about)
         tqdm.write(printable(sentence), file=sys.stderr)
 
 
@@ -86,7 +86,7 @@ def survey_for(path: str | Path, survey: str | Path | None) -> str | Path | None
     return keys[fitting[-1]]
 
 
-def tell(path: str | Path, remarks: Iterable[str]) -> None:
+def report_remarks(path: str | Path, remarks: Iterable[str]) -> None:
     """Tell sentences on a recording, on stderr, beside a progress bar."""
     for remark in remarks:
         tqdm.write(printable(f"{path}: {remark}"), file=sys.stderr)
@@ -124,7 +124,7 @@ class Reading:
         """Flight of a pair (recording, survey or None); tells on stderr what is missing in it. Raises InputError."""
         path, survey = recording
         flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, self.truth)
-        tell(path, flight.meta.get("remarks", ()))
+        report_remarks(path, flight.meta.get("remarks", ()))
         return flight
 
     def one(self, path: str | Path) -> Flight:

@@ -15,7 +15,7 @@ from ..checking.against_truth import of_truth
 from ..checking.remarks import survey_remarks
 from ..localizing.estimate import Estimator
 from ..localizing.rerun_file import write_rerun
-from ..readers.inputs import Reading, tell
+from ..readers.inputs import Reading, report_remarks
 from ..results_file import ResultsFile, state_of
 from . import table
 from .alignment import ALIGN, NONE, alignment_of, need_truth
@@ -53,20 +53,20 @@ class Judge:
     def __call__(self, recording: Recording) -> Result:
         flight = self.reading.read(recording)
         need_truth(flight, self.align == NONE)
-        tell(flight.name, () if self.odometry else survey_remarks(flight))
+        report_remarks(flight.name, () if self.odometry else survey_remarks(flight))
         odometry: Odometry | RecordedOdometry
         residuals: Residuals | None
         if self.odometry:
             recorded = read_odometry(self.odometry, *self._where)
             odometry, residuals = recorded, None
-            tell(self.odometry, recorded.remarks)
+            report_remarks(self.odometry, recorded.remarks)
         else:
             run = self.estimator(flight)
             odometry, residuals = run.odometry, run.residuals
             flight = replace(flight, truth=judging_truth(flight, self.estimator.effects))
         assert flight.truth is not None  # need_truth
         found = alignment_of(flight, odometry)
-        tell(flight.name, self._of_truth(flight, found))
+        report_remarks(flight.name, self._of_truth(flight, found))
         truths = {how: found.applied(flight.truth, how) for how in ALIGN}
         scores = {how: Score(flight.name, odometry, one, residuals, flight.tdoa.t) for how, one in truths.items()}
         score, truth = scores[self.align], truths[self.align]

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.effects import EffectSet
 
 from ..checking.repairs import repairs
 from ..localizing.estimate import Estimator
-from ..readers.inputs import tell
+from ..readers.inputs import report_remarks
 from .alignment import FRAME, NONE, TIME, alignment_of, apart, need_truth, on_another_clock, paths
 
 if TYPE_CHECKING:
@@ -40,12 +40,12 @@ def settled(
     return replace(flight, truth=found.least().applied(flight.truth, FRAME if found.other_frame else TIME)), tuple(said)
 
 
-def told(
+def with_settled_truth(
     flight: Flight, effects: EffectSet | None = None, config: FilterConfig | None = None, align: str = NONE
 ) -> Flight:
     """The Flight of `settled`; what was found is told on stderr. Can be handed to other processes."""
     flight, said = settled(flight, effects, config, align)
-    tell(flight.name, (f"{sentence}." for sentence in said))
+    report_remarks(flight.name, (f"{sentence}." for sentence in said))
     return flight
 
 
@@ -56,7 +56,7 @@ def on_one_clock(flight: Flight, align: str = NONE) -> Flight:
         return flight
     need_truth(flight, align == NONE)
     found = alignment_of(flight, Estimator()(flight).odometry)
-    tell(flight.name, [f"{found.of_clock()}: they are moved."])
+    report_remarks(flight.name, [f"{found.of_clock()}: they are moved."])
     return replace(flight, truth=found.applied(flight.truth, TIME))
 
 

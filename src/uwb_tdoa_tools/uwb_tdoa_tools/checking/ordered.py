@@ -22,7 +22,7 @@ PERIOD = 1.0  # s over which the motion is measured that says which part is trie
 
 
 @dataclass(frozen=True)
-class Case:
+class OrderedRecording:
     """anchors : Anchors; tdoa : Tdoas and imu : Imu or None, in order of their stamps and finite."""
 
     anchors: Anchors
@@ -30,8 +30,8 @@ class Case:
     imu: Imu | None
 
     @classmethod
-    def of(cls, recording: Recording) -> Case:
-        """Case of a Recording."""
+    def of(cls, recording: Recording) -> OrderedRecording:
+        """OrderedRecording of a Recording."""
         tdoa, imu = recording.tdoa, recording.imu
         good = np.flatnonzero(np.isfinite(tdoa.t) & np.isfinite(tdoa.d))
         tdoa = _rows(tdoa, good[np.argsort(tdoa.t[good], kind="stable")])
@@ -40,7 +40,7 @@ class Case:
             imu = _rows(imu, good[np.argsort(imu.t[good], kind="stable")])
         return cls(recording.anchors, tdoa, imu if imu is not None and len(imu) else None)
 
-    def part(self, length: float) -> Case:
+    def part(self, length: float) -> OrderedRecording:
         """The `length` s in which the TDOAs move most; the whole if it is not longer."""
         t = self.tdoa.t
         if not len(t) or t[-1] - t[0] <= length:
@@ -54,11 +54,11 @@ class Case:
             self, tdoa=_rows(self.tdoa, slice(first, end)), imu=imu if imu is not None and len(imu) else None
         )
 
-    def with_tdoa(self, **columns: np.ndarray) -> Case:
+    def with_tdoa(self, **columns: np.ndarray) -> OrderedRecording:
         """The same with other columns of the TDOAs."""
         return replace(self, tdoa=replace(self.tdoa, **columns))
 
-    def with_imu(self, **columns: np.ndarray) -> Case:
+    def with_imu(self, **columns: np.ndarray) -> OrderedRecording:
         """The same with other columns of the inertial samples."""
         assert self.imu is not None
         return replace(self, imu=replace(self.imu, **columns))
@@ -81,10 +81,10 @@ def _rows(stream: Part, rows: np.ndarray | slice) -> Part:
     return type(stream)(*(np.ascontiguousarray(column[rows]) for column in vars(stream).values()))
 
 
-def _busiest(case: Case, length: float) -> float:
+def _busiest(recording: OrderedRecording, length: float) -> float:
     """Stamp at which the `length` s begin in which the TDOAs of each pair change most from second to second."""
-    t, d = case.tdoa.t, case.tdoa.d
-    pair = case.tdoa.a * 65536 + case.tdoa.b
+    t, d = recording.tdoa.t, recording.tdoa.d
+    pair = recording.tdoa.a * 65536 + recording.tdoa.b
     second = np.floor((t - t[0]) / PERIOD).astype(np.int64)
     seconds = second[-1] + 2
     keys, inverse = np.unique(np.unique(pair, return_inverse=True)[1].reshape(-1) * seconds + second, return_inverse=True)
