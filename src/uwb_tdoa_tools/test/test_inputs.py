@@ -165,8 +165,8 @@ def test_a_survey_that_is_given_counts_whatever_anchors_a_bag_holds_and_that_is_
     assert [flight.anchors.positions[0, 0] for flight in reading.flights(bags)] == [0.5, 0.5]
     assert [reading.one(bag).anchors.positions[0, 0] for bag in bags] == [0.5, 0.5]
     assert [flight.anchors.positions[0, 0] for flight in Reading().flights(bags)] == [0.1, 0.1]
-    said = capsys.readouterr().err
-    assert said.count(f"the anchors of {survey} count here") == 1 == len(said.splitlines())
+    said = [line for line in capsys.readouterr().err.splitlines() if " flights done, " not in line]  # as a slow computer says
+    assert len(said) == 1 and f"the anchors of {survey} count here" in said[0]
 
 
 @pytest.mark.parametrize("given", [{"namespace": "tag1"}, {"topics": {"uwb/tdoa": "/theirs"}}])
