@@ -202,7 +202,8 @@ def add_known(parser: ArgumentParser) -> None:
 
 def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distance, ...]:
     """Constraints on Flights that those options give: tuple. Raises InputError."""
-    out: list[Mark | Distance] = [] if args.marks is None else read_marks(args.marks, flights)
+    out: list[Mark | Distance] = []
+    out += [] if args.marks is None else read_marks(args.marks, flights)
     out += [] if args.distances is None else read_distances(args.distances, flights[0].anchors)
     return tuple(out)
 

@@ -36,7 +36,8 @@ Made = TypeVar("Made")
 
 
 class MapFunction(Protocol):
-    """What gives function(item) of every item, in their order: as `map` does, but for the time and the process in which each is done."""
+    """What gives function(item) of every item, in their order: as `map` does, but for the time and the process in
+    which each is done."""
 
     def __call__(self, function: Callable[[Item], Made], items: Iterable[Item], /) -> Iterable[Made]: ...
 

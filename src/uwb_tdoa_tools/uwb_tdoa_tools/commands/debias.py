@@ -85,7 +85,7 @@ def _fit(args: Namespace) -> None:
     made.save(args.out)
     cli.show(f"wrote {args.out}: {report.about(made)}")
     cli.show(borne_out.as_text() if borne_out else "how much of it flights to come bear out is not known: give several flights")
-    figures = {"map": report.about_figures(made), "fitted": report.rows(fitted, made, estimator.effects)}
+    figures: dict[str, Any] = {"map": report.about_figures(made), "fitted": report.rows(fitted, made, estimator.effects)}
     figures["borne_out"] = borne_out.as_dict() if borne_out else None
     report.say_rows("in sample", figures["fitted"])
     if held:

@@ -24,6 +24,9 @@ from ..surveying.paths import DRIFT, read_paths
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
+    from ..diagnosis.constraints.distance import Distance
+    from ..diagnosis.constraints.mark import Mark
+    from ..diagnosis.references.path import OdometryPath
 
 DESCRIPTION = """Find out what is wrong with the measurements of some flights, and put it right.
 
@@ -102,7 +105,7 @@ def _diagnose(args: Namespace) -> None:
     for option in ("marks", "odometry"):
         if args.reference == option and getattr(args, option) is None:
             raise InputError(f"--reference {option}: --{option} says which, and is missing.")
-    known = options.known_of(args, (*flights, *holdout))
+    known: tuple[Mark | Distance | OdometryPath, ...] = options.known_of(args, (*flights, *holdout))
     if args.odometry is not None:
         known = (*known, *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace))
     reference = REFERENCES[args.reference](config, known, *[args.align][: args.reference == "truth"])
