@@ -19,7 +19,7 @@ from ..progress import Progress
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
     from ..calibrating.calibrate import Calibration
     from ..readers.inputs import Reading, Recording
