@@ -14,8 +14,8 @@ from sensor_msgs.msg import FluidPressure  # noqa: E402
 from uwb_tdoa_bias.foundation import ros, ros_spinning  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_streams import PERIOD, Streams, Turns  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_wire import Wire  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_streams import PERIOD, Streams, RoundRobin  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec  # noqa: E402
 
 MANY = 300
 DEEP = QoSProfile(depth=1000)
@@ -100,11 +100,11 @@ def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
             stop.set_result(None)
 
     streams = Streams(node, epoch, lambda: None)
-    streams.add(Wire(FluidPressure, "fluid_pressure"), "pressure", take)
+    streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
     publisher, clock = other.create_publisher(FluidPressure, "pressure", DEEP), other.create_publisher(Clock, "/clock", DEEP)
     until(lambda: publisher.get_subscription_count() and clock.get_subscription_count())
     assert not {Clock, FluidPressure} & {each.msg_type for each in node.subscriptions}
-    spinner = Spinner([node], Turns([streams]))
+    spinner = Spinner([node], RoundRobin([streams]))
     spinner._serve()
     for second in range(1, MANY + 1):
         publisher.publish(FluidPressure())
@@ -129,11 +129,11 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
         stop.set_result(None)
 
     streams = Streams(node, ros.Epoch(), lambda: None)
-    streams.add(Wire(FluidPressure, "fluid_pressure"), "pressure", take)
+    streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
     publisher = other.create_publisher(FluidPressure, "pressure", DEEP)
     until(publisher.get_subscription_count)
     node.create_timer(0.1, lambda: publisher.publish(FluidPressure()))  # the process sleeps in its executor until then
-    spinner = Spinner([node], Turns([streams]))
+    spinner = Spinner([node], RoundRobin([streams]))
     spinner.spin(stop)
     assert 0.0 <= heard[0] < 5.0
     spinner.close()
@@ -148,10 +148,10 @@ def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
             time.sleep(self.seconds)
             return self.busy
 
-    assert Turns([Slow(0.0, False)]).take() is None
-    assert PERIOD <= Turns([Slow(0.0, True), Slow(0.0, False)]).take() <= 0.01  # a busy computer takes its time
-    assert 0.004 <= Turns([Slow(0.005, True)]).take() <= 0.01
-    assert Turns([Slow(0.05, True)]).take() == 0.01
+    assert RoundRobin([Slow(0.0, False)]).take() is None
+    assert PERIOD <= RoundRobin([Slow(0.0, True), Slow(0.0, False)]).take() <= 0.01  # a busy computer takes its time
+    assert 0.004 <= RoundRobin([Slow(0.005, True)]).take() <= 0.01
+    assert RoundRobin([Slow(0.05, True)]).take() == 0.01
 
 
 def test_a_request_that_cannot_be_taken_ends_nothing(surroundings):

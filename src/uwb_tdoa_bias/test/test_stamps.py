@@ -37,7 +37,7 @@ def test_the_time_of_useless_items_is_noted():
     gate = StampGate()
     gate.take(1.0, "x")
     for t, newest in ((float("nan"), 1.0), (1.5, 1.5), (1.2, 1.5), (500.0, 1.5), (-500.0, 1.5)):
-        gate.note(t)
+        gate.pass_time(t)
         assert gate.newest == newest
 
 

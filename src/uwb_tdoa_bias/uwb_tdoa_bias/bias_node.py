@@ -27,8 +27,8 @@ from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from .foundation.ros_frames import FramesInput, unknown_frame
 from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
-from .foundation.ros_streams import StreamOutput, Streams, Turns
-from .foundation.ros_wire import Wire
+from .foundation.ros_streams import StreamOutput, Streams, RoundRobin
+from .foundation.ros_cdr import CdrCodec
 from .correction.pose_queue import PoseQueue
 from .correction.network import load_network
 from .correction.poses import parts_of
@@ -37,7 +37,7 @@ from .foundation.stamps import StampGate
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
     from .foundation.anchors import Anchors
-    from .foundation.ros_wire import Template
+    from .foundation.ros_cdr import Template
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
     "anchors_file": ANCHORS_FILE,
@@ -96,7 +96,7 @@ class BiasNode(ros.StreamNode):
         self._hold = PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
-        self._wire = Wire(TdoaCorrected, *CORRECTED)
+        self._wire = CdrCodec(TdoaCorrected, *CORRECTED)
         self._templates: dict[tuple[str, str], Template] = {}  # by frame and model, the latest
         self._frame = self._body  # of the TDOAs
         self._frame_trouble: str | None = None
@@ -106,13 +106,13 @@ class BiasNode(ros.StreamNode):
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.streams = Streams(self, self._epoch, self._release)
-        self.streams.add(Wire(Odometry, *POSE), "odometry", self._on_odometry, handed=member is not None)
-        self.streams.add(Wire(Tdoa, *MEASURED), "uwb/tdoa", self._on_tdoa)
+        self.streams.add(CdrCodec(Odometry, *POSE), "odometry", self._on_odometry, handed=member is not None)
+        self.streams.add(CdrCodec(Tdoa, *MEASURED), "uwb/tdoa", self._on_tdoa)
         self._diagnostics = ros.Diagnostics(self, self._report)
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self.turns = Turns([self.streams])
+            self.turns = RoundRobin([self.streams])
         self.get_logger().info(f"ready; correcting with: {self._model[NETWORK]}")
 
     @property

@@ -6,23 +6,23 @@ import numpy as np
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import Measurements, new_memory
+from uwb_tdoa_ekf.core.memory import Measurements, new_state
 
 
-def drive(flight, config=None, memory=None, cuts=()):
+def drive(flight, config=None, state=None, cuts=()):
     """Odometry and residuals of the engine, fed in the pieces between the stamps `cuts`: fields by attribute."""
-    memory = memory_for(flight) if memory is None else memory
-    tuning, whole, parts = (config or FilterConfig()).tuning(), measurements(flight), []
+    state = state_for(flight) if state is None else state
+    parameters, whole, parts = (config or FilterConfig()).parameters(), measurements(flight), []
     edges = [-np.inf, *sorted(cuts), np.inf]
     for low, high in zip(edges, edges[1:]):
         piece = Measurements(*(part[(part["t"] > low) & (part["t"] <= high)] for part in whole))
-        parts.append(feed(memory, tuning, piece)[:2])
+        parts.append(feed(state, parameters, piece)[:2])
     return tuple(np.concatenate(column).view(np.recarray) for column in zip(*parts))
 
 
-def memory_for(flight):
-    """Memory of a filter that has seen nothing of a Flight."""
-    return new_memory(flight.anchors.positions)
+def state_for(flight):
+    """FilterState of a filter that has seen nothing of a Flight."""
+    return new_state(flight.anchors.positions)
 
 
 def errors(flight, odometry):
@@ -37,14 +37,14 @@ def assert_equal(left, right):
             np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
-def assert_sound(memory, odometry):
+def assert_sound(state, odometry):
     """Finite states, unit quaternions, covariances."""
     assert np.isfinite(odometry.x).all()
     np.testing.assert_allclose(np.linalg.norm(odometry.x[:, 6:10], axis=1), 1.0, atol=1e-9)
     assert (np.diff(odometry.t) >= 0.0).all()
     if len(odometry):
         assert_covariance(odometry.covariance)
-    hypotheses = memory.record.hypotheses
+    hypotheses = state.record.hypotheses
     assert np.isfinite(hypotheses["x"]).all()
     for P in hypotheses["P"][np.isfinite(hypotheses["log_weight"])]:
         assert_covariance(P)

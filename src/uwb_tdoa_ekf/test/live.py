@@ -5,7 +5,8 @@ from dataclasses import fields, replace
 import numpy as np
 
 from uwb_tdoa_ekf.core.aids import STREAMS
-from uwb_tdoa_ekf.estimator import VERDICTS, Estimator
+from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_ekf.offline import run_offline
 
 IMU, TDOA, FIRST_AID = range(3)

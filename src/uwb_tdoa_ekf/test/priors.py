@@ -3,7 +3,7 @@
 from covariances import random_covariance
 import numpy as np
 
-from uwb_tdoa_ekf.core.memory import new_memory
+from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.state import inject
 from uwb_tdoa_ekf.core.update import project
 
@@ -14,7 +14,7 @@ class Prior:
     def __init__(self, seed, states=(0, 1, 2), surprise=1.0):
         """states : the error states measured; surprise : size of the innovation in its standard deviations."""
         self.rng = rng = np.random.default_rng(seed)
-        self._ekf = new_memory(np.zeros((1, 3))).record
+        self._ekf = new_state(np.zeros((1, 3))).record
         self.hypothesis, self.innovation = self._ekf.hypotheses[0], self._ekf.innovation
         self.hypothesis.x[:3] = rng.uniform(-5, 5, 3)
         self.hypothesis.P[:] = random_covariance(rng)

@@ -44,10 +44,10 @@ def assert_row_is_the_derivative(prior, compare):
 
 @given(seeds)
 def test_a_range_depends_on_z_and_tilt(seed):
-    prior, tuning = tilted(seed), FilterConfig().tuning()[0]
+    prior, parameters = tilted(seed), FilterConfig().parameters()[0]
     R = np.empty((3, 3))
     assert_row_is_the_derivative(
-        prior, lambda: height.compare(prior.hypothesis, 0.5, 1.3, tuning, R, prior.innovation)
+        prior, lambda: height.compare(prior.hypothesis, 0.5, 1.3, parameters, R, prior.innovation)
     )
 
 

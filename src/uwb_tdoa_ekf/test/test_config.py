@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.core.config import CHOICES, RENAMED, TUNING, FilterConfig, current_names
+from uwb_tdoa_ekf.core.config import CHOICES, RENAMED, PARAMETERS, FilterConfig, current_names
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"
 SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover", "use_height", "use_pressure", "use_velocity")
@@ -23,11 +23,11 @@ def write(tmp_path, text):
 
 
 def test_defaults_are_valid_and_reach_the_core_under_the_same_names():
-    config, (tuning,) = FilterConfig(), FilterConfig().tuning()
-    for name in TUNING.names:
+    config, (parameters,) = FilterConfig(), FilterConfig().parameters()
+    for name in PARAMETERS.names:
         if name not in CHOICES:
-            assert tuning[name] == getattr(config, name), name
-    assert TUNING.names == tuple(field.name for field in fields(FilterConfig))
+            assert parameters[name] == getattr(config, name), name
+    assert PARAMETERS.names == tuple(field.name for field in fields(FilterConfig))
 
 
 def test_the_parameter_file_has_every_parameter_in_order_with_its_default_unit_and_meaning():
@@ -108,16 +108,16 @@ def test_names_must_be_known(field, value):
 def test_choices_are_given_to_the_core_as_their_places():
     for i, robust in enumerate(CHOICES["robust"]):
         for k, loss in enumerate(CHOICES["loss"]):
-            (tuning,) = FilterConfig(robust=robust, loss=loss).tuning()
-            assert (tuning["robust"], tuning["loss"]) == (i, k)
+            (parameters,) = FilterConfig(robust=robust, loss=loss).parameters()
+            assert (parameters["robust"], parameters["loss"]) == (i, k)
 
 
 def test_how_a_number_was_written_changes_nothing(tmp_path):
     path = write(tmp_path, "ekf_node: {ros__parameters: {gate: 3, tdoa_std: 1, odometry_rate: 100, use_imu: true}}")
     config = FilterConfig.from_yaml(path)
     assert isinstance(config.gate, float)
-    expected = FilterConfig(gate=3.0, tdoa_std=1.0, odometry_rate=100.0).tuning()
-    np.testing.assert_array_equal(config.tuning(), expected)
+    expected = FilterConfig(gate=3.0, tdoa_std=1.0, odometry_rate=100.0).parameters()
+    np.testing.assert_array_equal(config.parameters(), expected)
 
 
 def test_from_yaml_takes_what_tunes_the_filter_and_passes_over_the_rest(tmp_path):

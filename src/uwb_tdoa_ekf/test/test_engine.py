@@ -4,7 +4,7 @@ import re
 import time
 
 from covariances import assert_covariance
-from driving import assert_equal, assert_sound, cut, drive, errors, memory_for
+from driving import assert_equal, assert_sound, cut, drive, errors, state_for
 from flights import fly, position_at
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -91,8 +91,8 @@ def test_without_an_imu_it_follows_a_slow_tag(config):
 def test_bridges_seconds_without_imu_or_tdoas():
     flight = fly(9, 20.0)
     for gap in (without_imu(flight, 8.0, 11.0), replace(flight, tdoa=cut(flight.tdoa, 0.0, 8.0))):
-        memory = memory_for(flight)
-        assert_sound(memory, drive(gap, memory=memory)[0])
+        state = state_for(flight)
+        assert_sound(state, drive(gap, state=state)[0])
     odometry, _ = drive(without_imu(flight, 8.0, 11.0))
     assert errors(flight, odometry[odometry.t > 3.0]).max() < 0.6
     silent = replace(flight, tdoa=Tdoas(*np.concatenate([_columns(flight, 0, 8), _columns(flight, 10, 20)], axis=1)))
@@ -142,24 +142,24 @@ def nasty(seed, imu_size):
 @given(st.integers(0, 2**32 - 1), st.sampled_from(ROBUST), st.booleans())
 def test_nothing_but_finite_states_and_covariances_comes_out(seed, robust, use_imu):
     flight = nasty(seed, 40.0)
-    memory = memory_for(flight)
-    odometry, _ = drive(flight, FilterConfig(robust=robust, use_imu=use_imu), memory)
-    assert_sound(memory, odometry)
+    state = state_for(flight)
+    odometry, _ = drive(flight, FilterConfig(robust=robust, use_imu=use_imu), state)
+    assert_sound(state, odometry)
 
 
 def test_motion_between_samples_is_their_mean():
     """Two seconds blind with every 20th sample of a perfect sensor end near where those with all of them do: 3.6 cm,
     where holding each sample instead of their mean gives 7.2 cm."""
     flight = fly(15, 5.0, imu_rate=1000.0)
-    memory = memory_for(flight)
+    state = state_for(flight)
     early = replace(flight, imu=cut(flight.imu, 0.0, 3.0), tdoa=cut(flight.tdoa, 0.0, 3.0))
-    drive(early, memory=memory)
+    drive(early, state=state)
     ends = []
     for every in (1, 20):
         blind = cut(flight.imu, 3.0, 5.0)
         blind = Imu(blind.t[every - 1 :: every], blind.gyro[every - 1 :: every], blind.accel[every - 1 :: every])
-        twin = memory.copy()
-        drive(replace(flight, imu=blind, tdoa=cut(flight.tdoa, 9.0, 9.0)), memory=twin)
+        twin = state.copy()
+        drive(replace(flight, imu=blind, tdoa=cut(flight.tdoa, 9.0, 9.0)), state=twin)
         ends.append(twin.record.hypotheses["x"][twin.record.best].copy())
     np.testing.assert_allclose(ends[1][:6], ends[0][:6], atol=0.045)
 
@@ -189,26 +189,26 @@ def test_stamps_that_repeat_are_used_and_move_nothing():
 @pytest.mark.parametrize("robust", ROBUST)
 def test_stays_sound_over_an_hour_of_updates(robust):
     flight, config = fly(13, 60.0, imu_rate=100.0, tdoa_rate=50.0), FilterConfig(robust=robust, odometry_rate=1.0)
-    memory = memory_for(flight)
+    state = state_for(flight)
     for lap in range(60):
         later = replace(
             flight,
             imu=replace(flight.imu, t=flight.imu.t + 60.0 * lap),
             tdoa=replace(flight.tdoa, t=flight.tdoa.t + 60.0 * lap),
         )
-        assert_sound(memory, drive(later, config, memory)[0])
-    assert memory.record.running
+        assert_sound(state, drive(later, config, state)[0])
+    assert state.record.running
 
 
 @pytest.mark.slow
 def test_a_clock_that_leaps_forward_does_not_stall_the_filter():
     """From a start at zero to the wall clock would be 1.7e9 s; this is a thousandth of it."""
     flight = fly(14, 2.0)
-    memory = memory_for(flight)
-    drive(flight, memory=memory)
+    state = state_for(flight)
+    drive(flight, state=state)
     imu, d = flight.imu, flight.tdoa
     leap = replace(flight, imu=replace(imu, t=imu.t + 1.7e6), tdoa=replace(d, t=d.t + 1.7e6))
     begin = time.perf_counter()
-    odometry, _ = drive(leap, memory=memory)
+    odometry, _ = drive(leap, state=state)
     assert time.perf_counter() - begin < 5.0
-    assert_sound(memory, odometry)
+    assert_sound(state, odometry)

@@ -11,7 +11,8 @@ from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, STARTUP, USED
-from uwb_tdoa_ekf.estimator import VERDICTS, Estimator
+from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_ekf.offline import run_offline
 
 seeds = st.integers(0, 2**32 - 1)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.core.verdicts import REPEATED
-from uwb_tdoa_ekf.estimator import MOST_WAITING, Estimator
+from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.reorder_buffer import MOST_WAITING
 from uwb_tdoa_ekf.offline import run_offline
 
 BEGIN, END = 5.0, 9.0  # s, of a fault

@@ -9,17 +9,17 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import (
     ALIKE, BLUR_STD, BLURRED, IN_TIME, KNOWN, MOST_PAIRS, NOT_USED, PAIR, blur, explain, find_lateness, find_pairs, in_time, is_still, may_be_late,
 )  # fmt: skip
-from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
+from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.workspace import set_bounds
 
 POSITIONS = np.array(corners((7.0, 8.0, 3.0)).positions) + [0.0, 0.0, 0.15]  # four at 0.15 m, four at 3.15 m
 LOW = POSITIONS[:, 2] < 1.0
-TUNING = FilterConfig().tuning()
+PARAMETERS = FilterConfig().parameters()
 
 
 @compiled
-def explained(pairs, anchors, bounds, prior, tuning, z, z_std, lateness, x, covariance):
-    return explain(pairs, anchors, bounds, prior, tuning[0], z, z_std, lateness, x, covariance)
+def explained(pairs, anchors, bounds, prior, parameters, z, z_std, lateness, x, covariance):
+    return explain(pairs, anchors, bounds, prior, parameters[0], z, z_std, lateness, x, covariance)
 
 
 @compiled
@@ -47,7 +47,7 @@ def heard(p, v=(0.0, 0.0, 0.0), late=0.0, std=0.08, seed=0, seconds=0.5, n=180):
 
 
 def still(pairs, p):
-    return is_still(pairs, new_memory(POSITIONS).anchors, np.array(p), np.empty((3, 3)))
+    return is_still(pairs, new_state(POSITIONS).anchors, np.array(p), np.empty((3, 3)))
 
 
 def test_anchors_may_be_late_where_both_antennas_are_low_and_far_apart():
@@ -61,7 +61,7 @@ def test_anchors_may_be_late_where_both_antennas_are_low_and_far_apart():
 
 
 def test_tdoas_are_noisier_near_the_ground_and_nowhere_else():
-    hypotheses = new_memory(POSITIONS).ekf["hypotheses"][0]
+    hypotheses = new_state(POSITIONS).ekf["hypotheses"][0]
     for z, ground, share in ((-0.1, 0.0, 1.0), (0.0, 0.0, 1.0), (0.5 * BLURRED, 0.0, 0.5), (BLURRED, 0.0, 0.0), (3.0, 0.0, 0.0), (3.0, 3.0, 1.0)):
         hypotheses["x"][0, 2] = z
         assert blurred(hypotheses, ground) == pytest.approx((share * BLUR_STD) ** 2)
@@ -76,10 +76,10 @@ def test_what_may_be_late_may_be_late_from_lower_too(tag, anchor, distance, less
 
 @pytest.mark.parametrize("off, used", [(0.0, True), (0.2, True), (3.3, False), (-3.3, True), (0.5, True)])
 def test_a_tdoa_of_a_late_anchor_says_nothing_and_no_other_is_doubted(off, used):
-    memory = new_memory(POSITIONS)
-    anchors, ekf = memory.anchors, memory.record
+    state = new_state(POSITIONS)
+    anchors, ekf = state.anchors, state.record
     low, high = np.flatnonzero(LOW)[0], np.flatnonzero(~LOW)[0]
-    hypothesis, innovation = memory.ekf["hypotheses"][0], np.zeros(1, ekf.innovation.dtype)
+    hypothesis, innovation = state.ekf["hypotheses"][0], np.zeros(1, ekf.innovation.dtype)
     hypothesis["x"][0, :3] = [3.5, 4.0, 0.03]
     hypothesis["P"][0, 2, 2] = 0.01
     innovation["value"], innovation["prior_variance"], innovation["noise_variance"] = off, 0.05, 0.0625
@@ -108,24 +108,24 @@ def test_a_pair_is_one_in_either_order_and_its_value_that_of_the_first():
 
 @pytest.mark.parametrize("late", [0.0, 3.3])
 def test_on_the_ground_it_is_found_whether_or_not_anchors_are_late(late):
-    memory, bounds, prior = new_memory(POSITIONS), np.empty((2, 3)), np.zeros((4, 3))
-    anchors = memory.anchors
-    set_bounds(memory.record.extent, 1.0, bounds)
+    state, bounds, prior = new_state(POSITIONS), np.empty((2, 3)), np.zeros((4, 3))
+    anchors = state.anchors
+    set_bounds(state.record.extent, 1.0, bounds)
     prior[0], prior[1:] = bounds.mean(axis=0), np.eye(3) / 25.0
     for seed in range(10):
         p = np.array([*np.random.default_rng(seed).uniform([1.5, 1.5], [5.5, 6.5]), 0.03])
         each = np.where(LOW, late + 0.2 * np.random.default_rng(seed).standard_normal(8), 0.0) if late else 0.0
         x, covariance = np.array([3.5, 4.0, 0.05]), np.empty((3, 3))
         lateness = ALIKE if late else IN_TIME
-        cost = explained(heard(p, late=each, seed=seed), anchors, bounds, prior, TUNING, 0.05, 0.15, lateness, x, covariance)
+        cost = explained(heard(p, late=each, seed=seed), anchors, bounds, prior, PARAMETERS, 0.05, 0.15, lateness, x, covariance)
         assert np.isfinite(cost) and np.linalg.norm(x - p) < 0.25
         assert (np.linalg.eigvalsh(covariance) > 0.0).all()
 
 
 def test_what_is_known_of_late_anchors_places_it_better_than_what_they_have_in_common():
     floor = np.where(LOW, 3.4, 0.3) + 0.1 * np.arange(8)
-    memory, bounds, prior = new_memory(POSITIONS, floor=(floor, 0.05, np.nan)), np.empty((2, 3)), np.zeros((4, 3))
-    set_bounds(memory.record.extent, 1.0, bounds)
+    state, bounds, prior = new_state(POSITIONS, floor=(floor, 0.05, np.nan)), np.empty((2, 3)), np.zeros((4, 3))
+    set_bounds(state.record.extent, 1.0, bounds)
     prior[0], prior[1:] = bounds.mean(axis=0), np.eye(3) / 25.0
     off = {ALIKE: [], KNOWN: []}
     for seed in range(10):
@@ -133,7 +133,7 @@ def test_what_is_known_of_late_anchors_places_it_better_than_what_they_have_in_c
         pairs = heard(p, late=floor, seed=seed)
         for lateness, each in off.items():
             x = np.array([3.5, 4.0, 0.05])
-            explained(pairs, memory.anchors, bounds, prior, TUNING, 0.05, 0.15, lateness, x, covariance)
+            explained(pairs, state.anchors, bounds, prior, PARAMETERS, 0.05, 0.15, lateness, x, covariance)
             each.append(np.linalg.norm(x - p))
         assert off[KNOWN][-1] < 0.1
     assert np.mean(off[KNOWN]) < 0.5 * np.mean(off[ALIKE])

@@ -6,14 +6,14 @@ import pytest
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed, most_records, run
 from uwb_tdoa_ekf.core.history import RECORD, RESET, UPDATE
-from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, Output, new_memory
+from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, Output, new_state
 from uwb_tdoa_ekf.core.verdicts import USED
 
 
 def recorded(flight, config=None):
     """(records, residuals) of a flight that is fed at once."""
     records, fed = [], measurements(flight)
-    _, residuals, _ = feed(new_memory(flight.anchors.positions), (config or FilterConfig()).tuning(), fed, records)
+    _, residuals, _ = feed(new_state(flight.anchors.positions), (config or FilterConfig()).parameters(), fed, records)
     assert sum(map(len, records)) <= most_records(fed)
     return np.concatenate(records), residuals
 
@@ -44,16 +44,16 @@ def test_a_record_leads_to_the_next():
 
 def test_a_history_that_is_full_is_an_error_and_no_silence():
     flight = fly(7, 2.0)
-    memory, fed = new_memory(flight.anchors.positions), measurements(flight)
+    state, fed = new_state(flight.anchors.positions), measurements(flight)
     n, k = len(fed.imu), len(fed.tdoa)
     output = Output(np.empty(n + k, ODOMETRY), np.empty(k, RESIDUAL), np.empty(k // 2, RECORD))
     with pytest.raises(IndexError, match="history is full"):
-        run(memory, FilterConfig().tuning(), fed, output)
+        run(state, FilterConfig().parameters(), fed, output)
 
 
 def test_nothing_is_recorded_unless_asked_for():
     flight = fly(8, 2.0)
-    memory = new_memory(flight.anchors.positions)
-    feed(memory, FilterConfig().tuning(), measurements(flight))
-    assert memory.record.recorded == 0
-    np.testing.assert_array_equal(memory.record.since_record, np.eye(15))
+    state = new_state(flight.anchors.positions)
+    feed(state, FilterConfig().parameters(), measurements(flight))
+    assert state.record.recorded == 0
+    np.testing.assert_array_equal(state.record.since_record, np.eye(15))

@@ -9,7 +9,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.hypotheses import (
     LARGEST_NIS, MERGED_WITHIN, PRUNED_BELOW, YAW_STD, add_log_likelihood, add_spread_of_means, select, yaw_offset,
 )  # fmt: skip
-from uwb_tdoa_ekf.core.memory import HYPOTHESES, PLACES, YAWS, new_memory
+from uwb_tdoa_ekf.core.memory import HYPOTHESES, PLACES, YAWS, new_state
 from uwb_tdoa_ekf.offline import run_offline
 
 NOISE = dict(accel_noise=0.01, gyro_noise=0.001)  # a common sensor that does not vibrate
@@ -22,7 +22,7 @@ def yaw_errors(flight, odometry):
 
 
 def ekf_with(yaws, log_weights):
-    ekf = new_memory(np.zeros((4, 3))).record
+    ekf = new_state(np.zeros((4, 3))).record
     ekf.hypotheses["log_weight"] = np.append(log_weights, np.full(HYPOTHESES - len(log_weights), -np.inf))
     for h, yaw in enumerate(yaws):
         ekf.hypotheses["x"][h, 6:10] = Rotation.from_euler("z", yaw).as_quat()

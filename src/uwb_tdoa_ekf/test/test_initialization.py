@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.verdicts import REJECTED, STARTUP, USED
 from uwb_tdoa_ekf.core.initialization import remember
-from uwb_tdoa_ekf.core.memory import TDOA, WINDOW, new_memory, structured
+from uwb_tdoa_ekf.core.memory import TDOA, WINDOW, new_state, structured
 
 
 def test_starts_by_itself_within_its_window_and_knows_where_it_is():
@@ -60,26 +60,26 @@ def test_finds_a_tag_again_that_was_carried_away(robust):
     positions = far.anchors.positions
     d = tdoa(p, positions[far.anchors.index(far.tdoa.a)], positions[far.anchors.index(far.tdoa.b)])
     d += 0.1 * np.random.default_rng(0).standard_normal(len(d))
-    memory = memory_for(far)
-    odometry, _ = drive(replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), memory)
-    assert memory.record.recoveries <= 2
+    state = memory_for(far)
+    odometry, _ = drive(replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), state)
+    assert state.record.recoveries <= 2
     assert np.linalg.norm(odometry.x[odometry.t > 8.0, :3] - there, axis=1).max() < 0.3
-    assert_sound(memory, odometry)
+    assert_sound(state, odometry)
 
 
 def test_a_good_flight_needs_no_recovery():
     for seed in range(3):
         flight = fly(seed, 10.0, outliers=0.1)
-        memory = memory_for(flight)
-        drive(flight, memory=memory)
-        assert memory.record.recoveries == 0
+        state = memory_for(flight)
+        drive(flight, state=state)
+        assert state.record.recoveries == 0
 
 
 def test_the_window_keeps_the_latest_tdoas_in_order():
-    memory, fed = new_memory(np.zeros((4, 3))), 5 * WINDOW + 7
-    ekf = memory.record
+    state, fed = new_state(np.zeros((4, 3))), 5 * WINDOW + 7
+    ekf = state.record
     for k in range(fed):
-        remember(ekf, structured(TDOA, *np.array([[0.01 * k], [k % 4], [0], [k], [0.0]]))[0], memory.anchors)
+        remember(ekf, structured(TDOA, *np.array([[0.01 * k], [k % 4], [0], [k], [0.0]]))[0], state.anchors)
     assert WINDOW <= ekf.kept <= 2 * WINDOW
     np.testing.assert_array_equal(ekf.window["d"][: ekf.kept], np.arange(fed - ekf.kept, fed))
 

@@ -4,25 +4,25 @@ from driving import assert_equal, cut, drive, memory_for
 from flights import fly
 import numpy as np
 
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, new_memory, structured
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, new_state, structured
 
 
 def test_a_copy_of_the_memory_is_a_copy_of_the_filter():
     flight = fly(2, 4.0)
-    memory = memory_for(flight)
+    state = memory_for(flight)
     early = replace(flight, imu=cut(flight.imu, 0.0, 2.0), tdoa=cut(flight.tdoa, 0.0, 2.0))
     late = replace(flight, imu=cut(flight.imu, 2.0, 4.0), tdoa=cut(flight.tdoa, 2.0, 4.0))
-    drive(early, memory=memory)
-    twin = memory.copy()
-    assert_equal(drive(late, memory=memory), drive(late, memory=twin))
+    drive(early, state=state)
+    twin = state.copy()
+    assert_equal(drive(late, state=state), drive(late, state=twin))
 
 
 def test_the_record_is_a_view():
-    memory = new_memory(np.arange(12.0).reshape(4, 3))
-    memory.record.imu.gyro[1], memory.record.hypotheses["x"][2, 0], memory.record.best = 3.0, 4.0, 2
-    assert memory.ekf["imu"]["gyro"][0, 1] == 3.0 and memory.ekf["hypotheses"]["x"][0, 2, 0] == 4.0
-    assert memory.ekf["best"].tolist() == [2]
-    np.testing.assert_array_equal(memory.anchors["position"][3], [9.0, 10.0, 11.0])
+    state = new_state(np.arange(12.0).reshape(4, 3))
+    state.record.imu.gyro[1], state.record.hypotheses["x"][2, 0], state.record.best = 3.0, 4.0, 2
+    assert state.ekf["imu"]["gyro"][0, 1] == 3.0 and state.ekf["hypotheses"]["x"][0, 2, 0] == 4.0
+    assert state.ekf["best"].tolist() == [2]
+    np.testing.assert_array_equal(state.anchors["position"][3], [9.0, 10.0, 11.0])
 
 
 def test_structured_puts_columns_into_fields():

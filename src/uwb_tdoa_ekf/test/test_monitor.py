@@ -3,8 +3,8 @@ import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.verdicts import INVALID, REJECTED, USED
-from uwb_tdoa_ekf.estimator import Odometry, Residuals
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
+from uwb_tdoa_ekf.results import Odometry, Residuals
 
 ANCHORS = Anchors.from_positions(np.random.default_rng(0).uniform(-4, 4, (6, 3)), ids=[3, 5, 7, 9, 11, 13])
 IDS, RATE = ANCHORS.ids, 100  # Hz

@@ -5,7 +5,7 @@ import pytest
 from flights import corners, fly
 from dataclasses import replace
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.memory import new_memory
+from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.noise import excess_variance, learn
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -13,14 +13,14 @@ from uwb_tdoa_ekf.offline import run_offline
 def taught(std, noise, seconds=20.0, seed=0):
     """Excess variances after TDOAs at 400 Hz whose anchors have the standard deviations `noise`, (N,) m."""
     rng, n = np.random.default_rng(seed), len(noise)
-    memory, tuning = new_memory(np.zeros((n, 3))), FilterConfig(tdoa_std=std).tuning()[0]
-    anchors, innovation, sampled = memory.anchors, memory.record.innovation, []
+    state, parameters = new_state(np.zeros((n, 3))), FilterConfig(tdoa_std=std).parameters()[0]
+    anchors, innovation, sampled = state.anchors, state.record.innovation, []
     for k in range(int(400 * seconds)):
         a = rng.integers(n)
         b = (a + 1 + rng.integers(n - 1)) % n
         innovation.value = rng.standard_normal() * np.hypot(noise[a], noise[b])
         innovation.noise_variance = std**2 + excess_variance(anchors[a], anchors[b])
-        learn(anchors[a], anchors[b], k / 400.0, innovation, tuning)
+        learn(anchors[a], anchors[b], k / 400.0, innovation, parameters)
         sampled.append(anchors["excess_variance"].copy())
     return np.mean(sampled[len(sampled) // 2 :], axis=0)
 
@@ -40,44 +40,44 @@ def test_what_is_as_noisy_as_expected_has_no_excess():
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50), st.floats(0.0, 1e3))
 def test_variances_stay_finite_and_not_negative(values, prior_variance):
-    memory, tuning = new_memory(np.zeros((3, 3))), FilterConfig(tdoa_std=0.1).tuning()[0]
-    innovation, innovation.prior_variance = memory.record.innovation, prior_variance
+    state, parameters = new_state(np.zeros((3, 3))), FilterConfig(tdoa_std=0.1).parameters()[0]
+    innovation, innovation.prior_variance = state.record.innovation, prior_variance
     for k, value in enumerate(values):
-        a, b = memory.anchors[k % 3], memory.anchors[(k + 1) % 3]
+        a, b = state.anchors[k % 3], state.anchors[(k + 1) % 3]
         innovation.value, innovation.noise_variance = value, 0.01 + excess_variance(a, b)
-        learn(a, b, 0.01 * k, innovation, tuning)
-        learned = memory.anchors["excess_variance"]
+        learn(a, b, 0.01 * k, innovation, parameters)
+        learned = state.anchors["excess_variance"]
         assert np.isfinite(learned).all() and (learned >= 0.0).all()
 
 
 def test_one_outlier_counts_as_few_standard_deviations_at_most():
-    memory = new_memory(np.zeros((2, 3)))
-    memory.anchors["learned"] = 0.0
-    (a, b), innovation = memory.anchors, memory.record.innovation
+    state = new_state(np.zeros((2, 3)))
+    state.anchors["learned"] = 0.0
+    (a, b), innovation = state.anchors, state.record.innovation
     innovation.value, innovation.noise_variance = 1e9, 0.01
-    learn(a, b, 0.01, innovation, FilterConfig(tdoa_std=0.1).tuning()[0])
+    learn(a, b, 0.01, innovation, FilterConfig(tdoa_std=0.1).parameters()[0])
     assert excess_variance(a, b) < 0.01
 
 
 def test_the_first_tdoa_of_an_anchor_counts_in_full_whenever_it_comes():
     learned = []
     for t in (0.01, 1000.0):
-        memory = new_memory(np.zeros((2, 3)))
-        (a, b), innovation = memory.anchors, memory.record.innovation
+        state = new_state(np.zeros((2, 3)))
+        (a, b), innovation = state.anchors, state.record.innovation
         innovation.value, innovation.noise_variance = 0.3, 0.01
-        learn(a, b, t, innovation, FilterConfig(tdoa_std=0.1).tuning()[0])
+        learn(a, b, t, innovation, FilterConfig(tdoa_std=0.1).parameters()[0])
         learned.append(excess_variance(a, b))
     assert learned == pytest.approx([0.3**2 - 0.1**2] * 2)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_one_innovation_after_a_silence_does_not_replace_what_was_learned(value):
-    memory = new_memory(np.zeros((2, 3)))
-    memory.anchors["learned"], memory.anchors["excess_variance"] = 1.0, 0.09
-    (a, b), innovation = memory.anchors, memory.record.innovation
+    state = new_state(np.zeros((2, 3)))
+    state.anchors["learned"], state.anchors["excess_variance"] = 1.0, 0.09
+    (a, b), innovation = state.anchors, state.record.innovation
     innovation.value, innovation.noise_variance = value, 0.01 + excess_variance(a, b)
-    learn(a, b, 6.0, innovation, FilterConfig(tdoa_std=0.1).tuning()[0])
-    assert memory.anchors["excess_variance"] == pytest.approx(0.09, rel=0.5)
+    learn(a, b, 6.0, innovation, FilterConfig(tdoa_std=0.1).parameters()[0])
+    assert state.anchors["excess_variance"] == pytest.approx(0.09, rel=0.5)
 
 
 def test_an_anchor_that_is_late_for_a_while_disturbs_less():

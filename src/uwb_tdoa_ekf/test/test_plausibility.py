@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_memory, structured
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
 from uwb_tdoa_ekf.core.plausibility import CLEARED, RATE, TILT, TURN, WEIGHT
 from uwb_tdoa_ekf.core.state import GRAVITY
 
@@ -30,11 +30,11 @@ def sensed(attitude, acceleration=0.0):
 
 def left_out(gyro, accel):
     """[(s, reason)] of the samples that are left out."""
-    memory, tuning, out = new_memory(np.zeros((4, 3))), FilterConfig().tuning(), []
+    state, parameters, out = new_state(np.zeros((4, 3))), FilterConfig().parameters(), []
     for row in structured(IMU_SAMPLE, T, gyro, accel)[:, None]:
-        feed(memory, tuning, Measurements(row, np.empty(0, TDOA)))
-        if memory.record.distrusted:
-            out.append((row["t"][0], int(memory.record.plausibility.reason)))
+        feed(state, parameters, Measurements(row, np.empty(0, TDOA)))
+        if state.record.distrusted:
+            out.append((row["t"][0], int(state.record.plausibility.reason)))
     return out
 
 

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.sensors import Ranges
 from uwb_tdoa_ekf.core import ranges
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.memory import AID, new_memory
+from uwb_tdoa_ekf.core.memory import AID, new_state
 from uwb_tdoa_ekf.core.verdicts import INVALID, REPEATED, USED
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
@@ -83,14 +83,14 @@ def test_outliers_are_not_used(ranged):
 
 
 def test_the_jacobian_is_that_of_the_distance():
-    memory, tuning = new_memory(np.zeros((1, 3))), FilterConfig().tuning()[0]
-    hypothesis, innovation = memory.record.hypotheses[0], memory.record.innovation
+    state, parameters = new_state(np.zeros((1, 3))), FilterConfig().parameters()[0]
+    hypothesis, innovation = state.record.hypotheses[0], state.record.innovation
     aid, anchor = np.zeros(1, AID)[0], np.array([1.0, -2.0, 3.0])
     aid["value"][0], x = 4.0, np.array([0.5, 0.7, -0.2])
 
     def compared(p):
         hypothesis["x"][:3] = p
-        ranges.compare(hypothesis, anchor, aid, tuning, innovation)
+        ranges.compare(hypothesis, anchor, aid, parameters, innovation)
         return innovation["value"]
 
     compared(x)
@@ -103,12 +103,12 @@ def test_the_jacobian_is_that_of_the_distance():
 
 
 def test_two_ranges_make_a_tdoa():
-    memory = new_memory(np.zeros((3, 3)))
+    state = new_state(np.zeros((3, 3)))
     one, two = np.zeros(2, AID)
     one["t"], one["anchor"], one["value"][0], one["std"][0] = 1.0, 2, 3.0, 0.3
     two["t"], two["anchor"], two["value"][0], two["std"][0] = 1.05, 1, 4.5, 0.4
-    assert not ranges.pair(memory.ekf[0], one) and ranges.pair(memory.ekf[0], two)
-    made = memory.ekf[0]["paired"][0]
+    assert not ranges.pair(state.ekf[0], one) and ranges.pair(state.ekf[0], two)
+    made = state.ekf[0]["paired"][0]
     assert (made["t"], made["a"], made["b"], made["d"]) == (1.05, 2, 1, 1.5) and made["variance"] == pytest.approx(0.25)
     one["t"] = 2.0  # a second later
-    assert not ranges.pair(memory.ekf[0], one)
+    assert not ranges.pair(state.ekf[0], one)

@@ -17,15 +17,15 @@ HUGE = 1e8
 
 
 def tuned(**config):
-    return FilterConfig(**config).tuning()[0]
+    return FilterConfig(**config).parameters()[0]
 
 
-def m_estimation(prior, noise, tuning):
+def m_estimation(prior, noise, parameters):
     """Eqs. 8 - 13 of Zhao et al. (RA-L 2021) as they stand there, the Jacobian at the prior mean, no weight of the
     measurement below SMALLEST_WEIGHT: error, covariance, weight."""
     S, error, value = np.linalg.cholesky(prior.hypothesis.P), np.zeros(15), prior.innovation.value
-    loss, state_scale, scale = (tuning[name] for name in ("loss", "state_scale", "measurement_scale"))
-    for _ in range(tuning["iterations"]):
+    loss, state_scale, scale = (parameters[name] for name in ("loss", "state_scale", "measurement_scale"))
+    for _ in range(parameters["iterations"]):
         scaled = np.linalg.solve(S, error)  # eq. 9
         rescaled = S @ np.diag([1.0 / weight(loss, e, state_scale) for e in scaled]) @ S.T  # eq. 10
         w = max(weight(loss, (value - prior.h @ error) / np.sqrt(noise), scale), SMALLEST_WEIGHT)
@@ -56,8 +56,8 @@ def test_gate_judges_with_the_variance_of_one_measurement_and_leaves_all_as_it_w
 def test_innovation_with_a_huge_scale_gives_the_textbook_update(seed, loss, length):
     prior = Prior(seed)
     expected = prior.textbook(prior.innovation.noise_variance * length)
-    tuning = tuned(loss=loss, measurement_scale=HUGE, tdoa_correlation_length=length)
-    update_innovation(prior.hypothesis, prior.innovation, tuning)
+    parameters = tuned(loss=loss, measurement_scale=HUGE, tdoa_correlation_length=length)
+    update_innovation(prior.hypothesis, prior.innovation, parameters)
     assert prior.innovation.weight == pytest.approx(1.0)
     prior.assert_is(*expected)
 
@@ -69,8 +69,8 @@ def test_innovation_divides_the_variance_by_the_weight_of_what_is_whitened(seed,
     whitened = innovation.value / np.sqrt(innovation.prior_variance + innovation.noise_variance)
     w = weight(LOSSES.index(loss), whitened, 2.5)
     expected = prior.textbook(innovation.noise_variance * length / w)
-    tuning = tuned(loss=loss, measurement_scale=2.5, tdoa_correlation_length=length)
-    update_innovation(prior.hypothesis, innovation, tuning)
+    parameters = tuned(loss=loss, measurement_scale=2.5, tdoa_correlation_length=length)
+    update_innovation(prior.hypothesis, innovation, parameters)
     assert innovation.weight == (w if w >= NEGLIGIBLE else 0.0)
     if w >= NEGLIGIBLE:
         prior.assert_is(*expected)
@@ -83,8 +83,8 @@ def test_m_estimation_with_huge_scales_gives_the_textbook_update(seed, loss, len
     prior = Prior(seed)
     expected = prior.textbook(prior.innovation.noise_variance * length)
     scales = dict(measurement_scale=HUGE, state_scale=HUGE, iterations=iterations)
-    tuning = tuned(loss=loss, tdoa_correlation_length=length, **scales)
-    update_m_estimation(prior.hypothesis, prior.innovation, tuning)
+    parameters = tuned(loss=loss, tdoa_correlation_length=length, **scales)
+    update_m_estimation(prior.hypothesis, prior.innovation, parameters)
     assert prior.innovation.weight == pytest.approx(1.0)
     prior.assert_is(*expected)
 
@@ -93,10 +93,10 @@ def test_m_estimation_with_huge_scales_gives_the_textbook_update(seed, loss, len
 def test_m_estimation_is_that_of_the_paper(seed, loss, length, iterations, state_scale, scale):
     prior = Prior(seed, surprise=2.0)
     scales = dict(measurement_scale=scale, state_scale=state_scale, iterations=iterations)
-    tuning = tuned(loss=loss, tdoa_correlation_length=length, **scales)
-    error, covariance, expected = m_estimation(prior, prior.innovation.noise_variance * length, tuning)
+    parameters = tuned(loss=loss, tdoa_correlation_length=length, **scales)
+    error, covariance, expected = m_estimation(prior, prior.innovation.noise_variance * length, parameters)
     posterior = prior.after(error, covariance)
-    update_m_estimation(prior.hypothesis, prior.innovation, tuning)
+    update_m_estimation(prior.hypothesis, prior.innovation, parameters)
     assert prior.innovation.weight == pytest.approx(expected, rel=1e-6)
     prior.assert_is(*posterior, rtol=1e-6)
 
@@ -109,8 +109,8 @@ def test_m_estimation_follows_an_outlier_less_than_the_textbook(loss):
     prior.project()
     textbook, _ = prior.textbook(0.01)
     before = prior.hypothesis.x.copy()
-    tuning = tuned(loss=loss, tdoa_correlation_length=1.0, state_scale=HUGE, measurement_scale=2.5, iterations=2)
-    update_m_estimation(prior.hypothesis, prior.innovation, tuning)
+    parameters = tuned(loss=loss, tdoa_correlation_length=1.0, state_scale=HUGE, measurement_scale=2.5, iterations=2)
+    update_m_estimation(prior.hypothesis, prior.innovation, parameters)
     assert 0.0 < prior.innovation.weight < 0.2
     assert np.linalg.norm(prior.hypothesis.x - before) < 0.5 * np.linalg.norm(textbook - before)
 

@@ -1,24 +1,24 @@
 import numpy as np
 import pytest
-from test_ground import LOW, POSITIONS, TUNING, heard
+from test_ground import LOW, POSITIONS, PARAMETERS, heard
 
 from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_ekf.core.memory import new_memory
+from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.standing import weigh
 from uwb_tdoa_ekf.core.workspace import set_bounds
 
 
 @compiled
-def weighed(ekf, pairs, anchors, tuning, x, covariance):
-    return weigh(ekf[0], pairs, anchors, tuning[0], np.nan, np.nan, x, covariance)
+def weighed(ekf, pairs, anchors, parameters, x, covariance):
+    return weigh(ekf[0], pairs, anchors, parameters[0], np.nan, np.nan, x, covariance)
 
 
-def placed(p, elsewhere, late=0.0, seed=0, memory=None):
+def placed(p, elsewhere, late=0.0, seed=0, state=None):
     """(position (3,), standard deviations (3,), on the ground?) of a tag at rest at p, if a start has found it `elsewhere`."""
-    memory = memory or new_memory(POSITIONS)
-    set_bounds(memory.record.extent, 1.0, memory.record.workspace)
+    state = state or new_state(POSITIONS)
+    set_bounds(state.record.extent, 1.0, state.record.workspace)
     x, covariance = np.array([*elsewhere, 0.0, 0.0, 0.0]), 0.04 * np.eye(6)
-    lead = weighed(memory.ekf, heard(p, late=late, seed=seed), memory.anchors, TUNING, x, covariance)
+    lead = weighed(state.ekf, heard(p, late=late, seed=seed), state.anchors, PARAMETERS, x, covariance)
     return x[:3], np.sqrt(np.diag(covariance)[:3]), lead > 0.0
 
 
@@ -58,8 +58,8 @@ def test_where_two_explanations_are_alike_its_deviation_is_as_large_as_they_are_
 def test_delays_that_are_known_count_where_they_were_seen(seen, true):
     """Elsewhere the echoes are others: there they differ by what nobody knows."""
     floor, p = np.where(LOW, 3.4, 0.3) + 0.1 * np.arange(8), [2.5, 5.0, 0.03]
-    memory = new_memory(POSITIONS, floor=(floor, 0.05, seen))
+    state = new_state(POSITIONS, floor=(floor, 0.05, seen))
     late = floor if true else np.where(LOW, 2.2, 0.0)
-    x, std, on_ground = placed(p, [2.5, 5.0, 7.5], late, memory=memory)
-    assert on_ground and memory.record.late_as_known == true
+    x, std, on_ground = placed(p, [2.5, 5.0, 7.5], late, state=state)
+    assert on_ground and state.record.late_as_known == true
     assert np.linalg.norm(x - p) < (0.1 if true else 0.3) and (np.abs(x - p) < 3.0 * std).all()

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
+from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.startup import APART, INLIER, level, locate, share_of_inliers, split
 from uwb_tdoa_ekf.core.workspace import set_bounds
 
@@ -41,9 +41,9 @@ def window_of(t, a, b, d):
 def places(tdoas, positions, count=2, std=STD):
     """(x (count, 6), covariance (count, 6, 6), cost (count,), share) as of `locate`."""
     x, covariance, cost, workspace = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count), np.empty((2, 3))
-    memory, tuning = new_memory(positions), FilterConfig(tdoa_std=std).tuning()[0]
-    set_bounds(memory.record.extent, 1.0, workspace)
-    share = locate(window_of(*tdoas), memory.anchors, workspace, tuning, np.nan, np.nan, x, covariance, cost)
+    state, parameters = new_state(positions), FilterConfig(tdoa_std=std).parameters()[0]
+    set_bounds(state.record.extent, 1.0, workspace)
+    share = locate(window_of(*tdoas), state.anchors, workspace, parameters, np.nan, np.nan, x, covariance, cost)
     return x, covariance, cost, share
 
 
@@ -205,7 +205,7 @@ def test_share_of_inliers_at_the_truth_is_one_less_the_outliers():
     d[:25] += INLIER + 0.01
     d[25:50] -= INLIER - 0.01
     tdoas = window_of(t, a, b, d)
-    assert share_of_inliers(tdoas, new_memory(positions).anchors, np.concatenate([p, v])) == 0.75
+    assert share_of_inliers(tdoas, new_state(positions).anchors, np.concatenate([p, v])) == 0.75
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -6,8 +6,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_ekf.core.config import TUNING
-from uwb_tdoa_ekf.core.memory import new_memory
+from uwb_tdoa_ekf.core.config import PARAMETERS
+from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.state import GRAVITY, coast, exponential, inject, predict, propagate, rotation, turn
 
 seeds = st.integers(0, 2**32 - 1)
@@ -32,19 +32,19 @@ def minus(x, y):
 
 
 def ekf_with(x, P):
-    ekf = new_memory(np.zeros((1, 3))).record
+    ekf = new_state(np.zeros((1, 3))).record
     ekf.hypotheses["x"][0], ekf.hypotheses["P"][0] = x, P
     return ekf
 
 
 def predicted(x, P, dt, gyro, accel, weight, psd=(0.0, 0.0, 0.0), rest=(0.0, 0.0, 0.0)):
     """State and covariance after one prediction; psd of the accelerometer, rest: gyroscope and both bias walks."""
-    ekf, tuning = ekf_with(x, P), np.zeros(1, TUNING)[0]
+    ekf, parameters = ekf_with(x, P), np.zeros(1, PARAMETERS)[0]
     for name, value in zip(("gyro", "accel", "accel_weight", "accel_psd"), (gyro, accel, weight, psd)):
         ekf.imu[name] = value
     for name, value in zip(("gyro_noise", "accel_bias_walk", "gyro_bias_walk"), np.sqrt(rest)):
-        tuning[name] = value
-    predict(ekf.hypotheses[0], ekf.imu, tuning, dt, ekf.transition)
+        parameters[name] = value
+    predict(ekf.hypotheses[0], ekf.imu, parameters, dt, ekf.transition)
     return ekf.hypotheses["x"][0], ekf.hypotheses["P"][0]
 
 
@@ -148,7 +148,7 @@ def test_propagate_is_the_upper_rows_of_the_documented_phi(seed):
     rng, x, gyro, accel, weight = random_case(seed)
     M, ekf = rng.standard_normal((15, 15)), ekf_with(x, np.eye(15))
     ekf.imu.gyro, ekf.imu.accel, ekf.imu.accel_weight = gyro, accel, weight
-    predict(ekf.hypotheses[0], ekf.imu, np.zeros(1, TUNING)[0], 0.01, ekf.transition)
+    predict(ekf.hypotheses[0], ekf.imu, np.zeros(1, PARAMETERS)[0], 0.01, ekf.transition)
     propagate(M, ekf.transition)
     expected = documented_phi(x, 0.01, gyro, accel, weight) @ M
     np.testing.assert_allclose(ekf.transition.product, expected[:9], atol=1e-12)

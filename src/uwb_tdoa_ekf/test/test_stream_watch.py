@@ -8,7 +8,7 @@ import pytest
 from test_stream_rules import ANCHORS, streams
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_memory, structured
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
 from uwb_tdoa_ekf.monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 
 
@@ -104,8 +104,8 @@ def test_nothing_is_said_of_measured_flights(shared_data):
             watch.add_imu(*(column[of_imu] for column in (imu.t, late[0], imu.gyro, imu.accel)))
             watch.add_tdoa(*(column[of_tdoa] for column in (tdoa.t, late[1], tdoa.a, tdoa.b, tdoa.d)))
             assert watch.findings() == [], (name, second - begin)
-        memory, samples = new_memory(flight.anchors.positions), structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
-        feed(memory, FilterConfig().tuning(), Measurements(samples, np.empty(0, TDOA)))
-        assert memory.record.plausibility.contradicted == -np.inf, name  # the filter never goes without its IMU
+        state, samples = new_state(flight.anchors.positions), structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
+        feed(state, FilterConfig().parameters(), Measurements(samples, np.empty(0, TDOA)))
+        assert state.record.plausibility.contradicted == -np.inf, name  # the filter never goes without its IMU
         count += 1
     assert count == 22

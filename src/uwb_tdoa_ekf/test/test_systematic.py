@@ -3,7 +3,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_ekf.core import systematic
-from uwb_tdoa_ekf.core.memory import new_memory
+from uwb_tdoa_ekf.core.memory import new_state
 
 ANCHORS = np.array([[x, y, z] for x in (0.0, 7.0) for y in (0.0, 8.0) for z in (0.2, 3.0)])
 STD = 0.25
@@ -14,26 +14,26 @@ def _observe(ekf, anchors, a, b, t, last):
     systematic.observe(ekf[0].information, anchors[a], anchors[b], ekf[0].innovation, t, last)
 
 
-def informed(p, seconds=5.0, rate=400.0, heard=range(8), memory=None, begin=0.0):
-    """A Memory that has taken TDOAs round the ring of the anchors `heard` at a place p (3,)."""
-    memory, heard = memory or new_memory(ANCHORS), list(heard)
+def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
+    """A FilterState that has taken TDOAs round the ring of the anchors `heard` at a place p (3,)."""
+    state, heard = state or new_state(ANCHORS), list(heard)
     way = np.array(p) - ANCHORS
     unit = way / np.linalg.norm(way, axis=1)[:, None]
     for k in range(int(seconds * rate)):
         a, b = heard[k % len(heard)], heard[(k + 1) % len(heard)]
-        innovation = memory.record.innovation
+        innovation = state.record.innovation
         innovation.row[:3] = unit[b] - unit[a]
         innovation.noise_variance, innovation.weight, innovation.curvature = STD**2, 1.0, 0.0
         t = begin + k / rate
-        _observe(memory.ekf, memory.anchors, a, b, t, t - 1.0 / rate if k else -np.inf)
-    return memory
+        _observe(state.ekf, state.anchors, a, b, t, t - 1.0 / rate if k else -np.inf)
+    return state
 
 
-def stated(memory, P, correlation_length=np.inf):
+def stated(state, P, correlation_length=np.inf):
     covariance = np.full((3, 3), np.nan)
     whole = np.zeros((15, 15))
     whole[:3, :3] = P
-    systematic.fill(memory.record.information, whole, correlation_length, covariance)
+    systematic.fill(state.record.information, whole, correlation_length, covariance)
     return covariance
 
 
@@ -56,22 +56,22 @@ def test_it_does_not_become_less_with_more_tdoas():
 
 
 def test_what_is_not_heard_any_more_is_forgotten_but_silence_is_not_taken_for_that():
-    memory, P = informed([3.0, 4.0, 1.5]), 0.01 * np.eye(3)
-    before = np.trace(stated(memory, P))
-    informed([3.0, 4.0, 1.5], 0.01, memory=memory, begin=30.0)
-    assert np.trace(stated(memory, P)) < 2.0 * before
-    informed([3.0, 4.0, 1.5], 5.0, heard=(0, 1), memory=memory, begin=31.0)
-    assert np.trace(stated(memory, P)) > 5.0 * before
+    state, P = informed([3.0, 4.0, 1.5]), 0.01 * np.eye(3)
+    before = np.trace(stated(state, P))
+    informed([3.0, 4.0, 1.5], 0.01, state=state, begin=30.0)
+    assert np.trace(stated(state, P)) < 2.0 * before
+    informed([3.0, 4.0, 1.5], 5.0, heard=(0, 1), state=state, begin=31.0)
+    assert np.trace(stated(state, P)) > 5.0 * before
 
 
 def test_of_white_noise_nothing_persists():
-    memory, P = informed([3.0, 4.0, 1.5]), np.eye(3)
-    assert not stated(memory, P, 1.0).any()
-    assert 0.5 < np.trace(stated(memory, P, 6.0)) / np.trace(stated(memory, P)) < 1.0
+    state, P = informed([3.0, 4.0, 1.5]), np.eye(3)
+    assert not stated(state, P, 1.0).any()
+    assert 0.5 < np.trace(stated(state, P, 6.0)) / np.trace(stated(state, P)) < 1.0
 
 
 def test_it_is_bounded_by_what_the_filter_knows():
     P = np.diag([0.01, 0.02, 0.03])
-    memory = new_memory(ANCHORS)
-    np.testing.assert_allclose(stated(memory, P), systematic.MOST * P, rtol=1e-9)
-    assert not stated(memory, np.zeros((3, 3))).any()
+    state = new_state(ANCHORS)
+    np.testing.assert_allclose(stated(state, P), systematic.MOST * P, rtol=1e-9)
+    assert not stated(state, np.zeros((3, 3))).any()

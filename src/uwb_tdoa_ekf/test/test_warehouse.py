@@ -8,7 +8,7 @@ from warehouse_table import after_gaps, heard_at_start, judge
 
 from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import SIDES, FilterConfig
-from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
+from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.estimator import Estimator
 
 WITHOUT_IMU = FilterConfig(use_imu=False)
@@ -17,16 +17,16 @@ SLOW = {"duration": 12.0, "speed": 1.0}
 
 def surroundings(positions, a, b, reach=30.0, tag_side="unknown"):
     """(2, 3) m: bounds after the anchors in rows a and b were heard, and the memory."""
-    memory, bounds = new_memory(positions), np.empty((2, 3))
+    state, bounds = new_state(positions), np.empty((2, 3))
     window = structured(TDOA, 0.01 * np.arange(len(a)), a, b, np.zeros(len(a)))
-    workspace.listen(memory.record, window, memory.anchors, reach, SIDES.index(tag_side))
-    workspace.surround(memory.record, 1.0, bounds)
-    return bounds, memory
+    workspace.listen(state.record, window, state.anchors, reach, SIDES.index(tag_side))
+    workspace.surround(state.record, 1.0, bounds)
+    return bounds, state
 
 
 def test_in_a_room_it_is_searched_in_the_whole_room_whoever_is_heard():
     positions, whole = room("corners").anchors.positions, np.empty((2, 3))
-    workspace.set_bounds(new_memory(positions).record.extent, 1.0, whole)
+    workspace.set_bounds(new_state(positions).record.extent, 1.0, whole)
     np.testing.assert_array_equal(surroundings(positions, [0, 1], [1, 2])[0], whole)
 
 
@@ -42,10 +42,10 @@ def test_in_a_hall_it_is_searched_within_reach_of_all_that_are_heard():
 def test_a_side_that_is_told_bounds_the_search(name, side, axis, sign):
     positions = room(name).anchors.positions
     rows = np.arange(len(positions) - 1)
-    bounds, memory = surroundings(positions, rows, rows + 1, tag_side=side)
-    assert bounds[0 if sign > 0 else 1, axis] == pytest.approx(positions[0, axis]) and not memory.ekf["flat"][0][axis]
-    _, memory = surroundings(positions, rows, rows + 1)
-    assert memory.ekf["flat"][0][axis]
+    bounds, state = surroundings(positions, rows, rows + 1, tag_side=side)
+    assert bounds[0 if sign > 0 else 1, axis] == pytest.approx(positions[0, axis]) and not state.ekf["flat"][0][axis]
+    _, state = surroundings(positions, rows, rows + 1)
+    assert state.ekf["flat"][0][axis]
 
 
 def test_a_side_of_anchors_that_are_in_no_plane_means_nothing():

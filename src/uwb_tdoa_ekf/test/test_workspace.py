@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_ekf.core.memory import new_memory
+from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.workspace import SMALLEST, STD, constrain, contains, set_bounds
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -14,7 +14,7 @@ MARGIN = 1.0  # m
 
 def bounds_of(positions):
     bounds = np.empty((2, 3))
-    set_bounds(new_memory(positions).record.extent, MARGIN, bounds)
+    set_bounds(new_state(positions).record.extent, MARGIN, bounds)
     return bounds
 
 
@@ -34,7 +34,7 @@ def test_it_ends_a_margin_beyond_the_anchors_and_is_never_flat():
 
 @pytest.mark.parametrize("axis, off", [(0, -2.0), (1, 0.7), (2, 5.0)])
 def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off):
-    bounds, ekf = bounds_of(np.array(corners().positions)), new_memory(np.array(corners().positions)).record
+    bounds, ekf = bounds_of(np.array(corners().positions)), new_state(np.array(corners().positions)).record
     hypothesis = ekf.hypotheses[0]
     hypothesis.x[:3] = 0.5 * (bounds[0] + bounds[1])
     hypothesis.x[axis] = bounds[int(off > 0.0), axis] + off
@@ -48,7 +48,7 @@ def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off):
 
 
 def test_a_tag_inside_is_left_alone():
-    bounds, ekf = bounds_of(np.array(corners().positions)), new_memory(np.array(corners().positions)).record
+    bounds, ekf = bounds_of(np.array(corners().positions)), new_state(np.array(corners().positions)).record
     hypothesis = ekf.hypotheses[0]
     hypothesis.x[:3] = bounds[1]
     before = hypothesis.copy()
@@ -58,7 +58,7 @@ def test_a_tag_inside_is_left_alone():
 
 def test_what_is_known_better_than_its_bounds_is_not_drawn_back():
     """A tag outside whose TDOAs agree: every one of them used to tell the bound anew, and the deviation fell with their rate."""
-    bounds, ekf = bounds_of(np.array(corners().positions)), new_memory(np.array(corners().positions)).record
+    bounds, ekf = bounds_of(np.array(corners().positions)), new_state(np.array(corners().positions)).record
     hypothesis = ekf.hypotheses[0]
     hypothesis.x[:3] = bounds[1] + 3.0
     hypothesis.P[:3, :3] = 0.5 * np.eye(3)

@@ -5,7 +5,7 @@ python src/uwb_tdoa_ekf/test/warehouse_table.py [--starts N] [--seeds N] [--only
 
 import argparse
 
-from driving import drive, memory_for
+from driving import drive, state_for
 from flights import position_at
 from halls import HALLS, fly, hall, room
 import numpy as np
@@ -17,8 +17,8 @@ from uwb_tdoa_ekf.core.verdicts import STARTUP
 def judge(flight, config):
     """Figures of one run. at_2 : m, error 2 s after the first TDOA, inf where there is no estimate; rmse : m, from 10 s on; nees : mean of
     the position, 3 where it is honest; start : s after the first TDOA; spent, stamps : TDOAs, and stamps of them, until then."""
-    memory = memory_for(flight)
-    odometry, residuals = drive(flight, config, memory)
+    state = state_for(flight)
+    odometry, residuals = drive(flight, config, state)
     began = residuals.verdict != STARTUP
     spent = int(np.argmax(began)) if began.any() else len(began)
     stamps = len(np.unique(flight.tdoa.t[: spent + 1]))

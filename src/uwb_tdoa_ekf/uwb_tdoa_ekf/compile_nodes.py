@@ -4,9 +4,12 @@ Compiled code is kept in the folder that NUMBA_CACHE_DIR names, by default ~/.ca
 the processor change. `./dev build` and `./dev demo` call this; after a `colcon build` call it as the user who starts the nodes.
 """
 
+from __future__ import annotations
+
 import argparse
 import sys
 import time
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction import corrector
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network
@@ -14,20 +17,24 @@ from uwb_tdoa_bias.effects import EffectSet
 
 from .warm_up import warm_up
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from argparse import ArgumentParser
 
-def parser():
+
+def parser() -> ArgumentParser:
     """Its options: none."""
     layout = argparse.RawDescriptionHelpFormatter
     examples = "examples:\n  compile_nodes"
     return argparse.ArgumentParser(prog="compile_nodes", description=__doc__, epilog=examples, formatter_class=layout)
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Compile what is not compiled yet; returns the exit code."""
     try:
         parser().parse_args(argv)
     except SystemExit as ended:  # argparse has said it already
-        return ended.code
+        return int(ended.code or 0)
     began = time.monotonic()
     warm_up()
     corrector.warm_up(EffectSet(), load_network(SHIPPED))

@@ -6,10 +6,13 @@ odometry (nav_msgs/Odometry)
 Every parameter is documented in config/debias_node.yaml.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from copy import copy
 import math
 import sys
+from typing import Any, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
@@ -20,6 +23,9 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 
 from .debias import BiasMap, LayerConfig, Layers
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 GAP = 1.0  # s; after a longer silence, or when time goes back, the layers start anew
 LARGEST_OUTSIDE = 0.5  # share of positions outside of the map, before it becomes a warning
@@ -44,7 +50,7 @@ class DebiasNode(ros.StreamNode):
 
     NAME = "debias_node"
 
-    def __init__(self, arguments=()):
+    def __init__(self, arguments: Sequence[str] = ()) -> None:
         """arguments : of the process."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
@@ -54,7 +60,9 @@ class DebiasNode(ros.StreamNode):
         if not file:
             raise InputError("map: is empty; give a file that `debias` wrote.")
         self._map, self._layers = BiasMap.load(file), Layers(LayerConfig(**layers))
-        self._epoch, self._counts, self._rate, self._counts_before = ros.Epoch(), Counter(), ros.Rate(), Counter()
+        self._epoch, self._rate = ros.Epoch(), ros.Rate()
+        self._counts: Counter[str] = Counter()
+        self._counts_before: Counter[str] = Counter()
         self._newest = -math.inf
         self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
         self._publisher = ros.publish_stream(self, Odometry, "odometry/debiased")
@@ -65,7 +73,7 @@ class DebiasNode(ros.StreamNode):
         self._diagnostics = ros.Diagnostics(self, self._report)
         self.get_logger().info(f"ready; {len(self._map.at)} markers, {self._map.interpolator}")
 
-    def _on_odometry(self, message):
+    def _on_odometry(self, message: Odometry) -> None:
         self._counts["received"] += 1
         point = message.pose.pose.position
         p = np.array([point.x, point.y, point.z])
@@ -82,7 +90,7 @@ class DebiasNode(ros.StreamNode):
         self._counts[kind] += 1
         self._publisher.publish(message)
 
-    def _layered(self, message, p):
+    def _layered(self, message: Odometry, p: np.ndarray) -> np.ndarray:
         """The position after the layers, which also need the velocity, in the world frame; NaN where one is not
         known."""
         u = message.twist.twist.linear
@@ -95,12 +103,12 @@ class DebiasNode(ros.StreamNode):
         self._newest = t
         return self._layers.filter(t, p, Rotation.from_quat(state[6:]).apply(state[3:6]))
 
-    def _report(self):
+    def _report(self) -> tuple[bytes, str, dict[str, str | int]]:
         kinds = ("corrected", "faded", "outside", "invalid")
         recent = {name: self._counts[name] - self._counts_before[name] for name in kinds}
         self._counts_before = Counter(self._counts)
         rate = self._rate.of(self._counts["received"])
-        values = {name: self._counts[name] for name in ("received", *kinds)}
+        values: dict[str, Any] = {name: self._counts[name] for name in ("received", *kinds)}
         values |= {"odometry rate": f"{rate:.1f} Hz", "map": self._map.source, "markers": len(self._map.at)}
         values |= {"publishers of odometry": self._input.subscription.get_publisher_count()}
         values |= {"subscribers of odometry/debiased": self._publisher.get_subscription_count()}
@@ -111,7 +119,7 @@ class DebiasNode(ros.StreamNode):
             level, text = DiagnosticStatus.WARN, unreadable
         return level, text, values
 
-    def _judge(self, recent, total):
+    def _judge(self, recent: dict[str, int], total: int) -> tuple[bytes, str]:
         if not total:
             return DiagnosticStatus.WARN, "no odometry: start ekf_node in this namespace"
         if recent["invalid"]:
@@ -122,7 +130,7 @@ class DebiasNode(ros.StreamNode):
         return DiagnosticStatus.OK, "debiasing"
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
     return ros.run(DebiasNode, __doc__, argv)
 

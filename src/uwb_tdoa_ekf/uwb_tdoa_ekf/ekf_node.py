@@ -8,11 +8,14 @@ Service ~/reset (std_srvs/Trigger): start anew.
 Every parameter is documented in config/ekf_node.yaml.
 """
 
+from __future__ import annotations
+
 from collections import Counter, deque
 from functools import partial
 import math
 import sys
 import time
+from typing import Any, TYPE_CHECKING, cast
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
@@ -26,14 +29,15 @@ from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
 from uwb_tdoa_bias.foundation.ros_frames import FramesInput, unknown_frame
 from uwb_tdoa_bias.foundation.ros_parameters import files_of, refuse_unknown, say_unused
-from uwb_tdoa_bias.foundation.ros_streams import Streams, Turns
-from uwb_tdoa_bias.foundation.ros_wire import Wire, message_class
+from uwb_tdoa_bias.foundation.ros_streams import Streams, RoundRobin
+from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
 from .core.config import RENAMED
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
-from .estimator import STREAMS, VERDICTS, Estimator, invalid
+from .core.verdicts import INVALID
+from .estimator import Estimator
 from .frames import rotation_std
 from .imu_mount import ImuMount
 from .monitoring.health import OK, WARN, Health, together
@@ -41,8 +45,19 @@ from .monitoring.status import status_of, yaw_in_words
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
 from .streams import most_severe_first
-from .told_pose import told_pose
+from .pose_message import pose_from_message
+from .reorder_buffer import STREAMS
+from .results import VERDICTS, Residuals
 from .warm_up import warm_up
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+    from rclpy.clock import ROSClock
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.ros import Refusals, Report
+    from .core.config import FilterConfig
+    from .estimator import Odometry
+    from .streams.finding import Finding
 
 # Of each stream: topic, type and the fields of its messages that are read.
 TOPICS = {
@@ -66,7 +81,7 @@ class EkfNode(ros.StreamNode):
 
     NAME = "ekf_node"
 
-    def __init__(self, arguments=(), member=None, **options):
+    def __init__(self, arguments: Sequence[str] = (), member: set[str] | None = None, **options: Any) -> None:
         """arguments : of the process; member : of a localization_node, which has it take its turns and hands it the corrected TDOAs:
         names of parameters that are for others, too; options : of Node."""
         super().__init__(self.NAME, **options)
@@ -79,14 +94,15 @@ class EkfNode(ros.StreamNode):
         volume, effects_file = own["flyable_volume"], own["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._aid_corrector = AidCorrector(self._effects.effects)
-        self._estimator = None
-        self._epoch, self._clock = ros.Epoch(), self.get_clock()
-        self._attitude, self._last_tdoa = None, -math.inf  # quaternion and covariance of the newest odometry; of a TDOA or range, time.monotonic(), s
-        self._received_before = {}  # messages by topic, by the last report
-        self._early = deque()  # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one message each
-        self._past = Counter()  # accounts of estimators that were replaced, and of messages that none received
-        self._lately = []  # frames of the IMU since the last report, and the last one before it
-        self._placed = {}  # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of coming
+        self._estimator: Estimator = None  # type: ignore[assignment]  # until there are anchors
+        self._epoch, self._ros_clock = ros.Epoch(), cast("ROSClock", self.get_clock())
+        self._attitude: tuple[np.ndarray, np.ndarray] | None = None  # quaternion and covariance of the newest odometry
+        self._last_tdoa = -math.inf  # of a TDOA or range, time.monotonic(), s
+        self._received_before: dict[str, int] = {}  # messages by topic, by the last report
+        self._early: deque[tuple[str, tuple[Any, ...]]] = deque()  # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one message each
+        self._past: Counter[str] = Counter()  # accounts of estimators that were replaced, and of messages that none received
+        self._lately: list[str] = []  # frames of the IMU since the last report, and the last one before it
+        self._placed: dict[str, tuple[ImuMount | None, str | None]] = {}  # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of coming
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
         refuse_unknown(self, {*RENAMED, *(member or ())})
         self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute, unless compile_nodes has done so")
@@ -96,7 +112,7 @@ class EkfNode(ros.StreamNode):
         self.outputs = Outputs(self, self._epoch, self._frames.frames, self._body, own["publish_tf"], own["odom_frame"])
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.streams = self._subscribe({"uwb/tdoa_corrected"} if member is not None else ())
-        self._told = ros.Input(self, PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
+        self._pose = ros.Input(self, PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
         self._reset = self.create_service(Trigger, "~/reset", self._on_reset)
         follow_changes(self, lambda: self._config, self._on_config)
         self._status = StatusOutput(self)
@@ -104,10 +120,10 @@ class EkfNode(ros.StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self.turns = Turns([self.streams])
+            self.turns = RoundRobin([self.streams])
         self.get_logger().info("ready")
 
-    def _subscribe(self, handed):
+    def _subscribe(self, handed: Collection[str]) -> Streams:
         """Streams of everything that the filter takes. handed : topics that a node of this process hands over."""
         streams = Streams(self, self._epoch, self._advance)
         self._takers = {"imu": self._take_imu, "tdoa": self._take_tdoa} | {name: partial(self._take_sensor, name) for name in SENSORS}
@@ -115,15 +131,15 @@ class EkfNode(ros.StreamNode):
             if stream in SENSORS and not getattr(self._config, f"use_{stream}"):
                 continue
             for topic, kind, *fields in topics:
-                streams.add(Wire(kind, *fields), topic, partial(self._receive, stream), topic in handed)
+                streams.add(CdrCodec(kind, *fields), topic, partial(self._receive, stream), topic in handed)
         streams.wait_for("uwb/tdoa_corrected", self.due)
         return streams
 
-    def due(self):
+    def due(self) -> float:
         """Stamp, s since 1970, up to which no odometry will come."""
         return -math.inf if self._estimator is None else self._estimator.next_odometry + self._epoch.begin
 
-    def _on_anchors(self, anchors):
+    def _on_anchors(self, anchors: Anchors) -> None:
         if self._estimator is not None:
             self._publish(*self._estimator.finish())
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
@@ -137,12 +153,12 @@ class EkfNode(ros.StreamNode):
             self._takers[stream](*part)
         self._advance()
 
-    def _on_config(self, config):
+    def _on_config(self, config: FilterConfig) -> None:
         self._config = config
         if self._estimator is not None:
-            self._estimator.retune(config)
+            self._estimator.configure(config)
 
-    def _on_reset(self, _, response):
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._estimator is not None and not self.frozen
         if response.success:
             response.message = "starting over"
@@ -151,22 +167,22 @@ class EkfNode(ros.StreamNode):
             response.message = self.refuse("a reset") if self.frozen else "there are no anchors yet: nothing has started"
         return response
 
-    def _start_over(self):
+    def _start_over(self) -> None:
         self._publish(*self._estimator.reset())
         self._watch.restart()
 
-    def _on_pose(self, message):
+    def _on_pose(self, message: Odometry) -> None:
         if self.frozen and self.outputs.published:
             self.refuse("a pose on initialpose after the first odometry")
             return
         try:
             if self._estimator is None:
                 raise InputError("there are no anchors yet; give the pose again when there are.")
-            self._estimator.tell_pose(*told_pose(message, self.outputs.world, self._epoch, self._estimator.newest))
+            self._estimator.set_pose(*pose_from_message(message, self.outputs.world, self._epoch, self._estimator.newest))
         except InputError as error:
             self.get_logger().warning(f"initialpose: not taken: {error}")
 
-    def _on_frames(self):
+    def _on_frames(self) -> None:
         """A constant transform is new, or another."""
         before, self._placed = self._placed, {}
         for frame in before:
@@ -177,11 +193,12 @@ class EkfNode(ros.StreamNode):
             self.get_logger().warning(f"the transform of '{moved[0]}' is new: starting over")
             self._start_over()
 
-    def _place_imu(self, frame, say=True):
+    def _place_imu(self, frame: str, say: bool = True) -> ImuMount | None:
         """ImuMount of an IMU of this frame, None for one that is taken as the body's; say : log what is wrong, once for each."""
         if frame in self._placed:
             return self._placed[frame][0]
-        mount = trouble = None
+        mount: ImuMount | None = None
+        trouble: str | None = None
         if frame not in ("", self._body):
             between = self._frames.frames.between(self._body, frame)
             if between is None:
@@ -194,7 +211,7 @@ class EkfNode(ros.StreamNode):
             self._placed[frame] = mount, trouble
         return mount
 
-    def _frame_troubles(self):
+    def _frame_troubles(self) -> list[str]:
         """What is wrong with the frames of the IMU, a list of sentences."""
         lately, self._lately = self._lately, self._lately[-1:]
         troubles = [*filter(None, (self._placed[frame][1] for frame in lately if frame in self._placed))]
@@ -203,7 +220,7 @@ class EkfNode(ros.StreamNode):
             troubles.insert(0, f"imu/data comes in {len(lately)} frames ({names}): stop all but one of the drivers")
         return troubles
 
-    def _receive(self, stream, *part):
+    def _receive(self, stream: str, *part: Any) -> None:
         """Messages of a stream, see Streams."""
         n = len(part[1])
         self._health.received[stream] += n
@@ -218,14 +235,14 @@ class EkfNode(ros.StreamNode):
             stream, (_, t, rows, _) = self._early.popleft()
             self._past["invalid" if stream == "tdoa" else f"{stream}_invalid"] += 1
             if stream == "tdoa":
-                self.outputs.publish_residuals(invalid(t, rows["anchor_a"], rows["anchor_b"]))
+                self.outputs.publish_residuals(Residuals.refused(t, rows["anchor_a"], rows["anchor_b"], INVALID))
 
-    def _advance(self):
+    def _advance(self) -> None:
         self._frames.catch_up()
         if self._estimator is not None:
             self._publish(*self._estimator.advance())
 
-    def _take_imu(self, frame, t, rows, arrival):
+    def _take_imu(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         mount = self._place_imu(frame)
         if frame not in self._lately and len(self._lately) < MOST_FRAMES:
             self._lately.append(frame)
@@ -245,18 +262,18 @@ class EkfNode(ros.StreamNode):
         self._watch.add_imu(t + self._epoch.begin, self._arrived(arrival), gyro, accel)
         self._estimator.add_imu(t, gyro, accel)
 
-    def _take_tdoa(self, frame, t, rows, arrival):
+    def _take_tdoa(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         a, b = rows["anchor_a"], rows["anchor_b"]
         self._watch.add_tdoa(t + self._epoch.begin, self._arrived(arrival), a, b, rows["raw"])
         variance = rows["bias_std"] ** 2 + rows["variance"]
         self._estimator.add_tdoa(t, a, b, rows["corrected"], variance, rows["bias_slope"], rows["bias_state"])
 
-    def _take_sensor(self, name, frame, t, rows, arrival):
+    def _take_sensor(self, name: str, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         """Messages of one of the SENSORS."""
         sensor = SENSORS[name]
         self._estimator.add(name, self._aid_corrector.correct(name, sensor.read(t, {field: rows[field] for field in sensor.fields})))
 
-    def _publish(self, odometry, residuals):
+    def _publish(self, odometry: Odometry, residuals: Residuals) -> None:
         if len(odometry.t):
             rates, variances = self._estimator.rates_at(odometry.t)
             self.outputs.publish_odometry(odometry, rates - odometry.gyro_bias, variances)
@@ -266,13 +283,13 @@ class EkfNode(ros.StreamNode):
         if len(residuals.t):
             self.outputs.publish_residuals(residuals)
 
-    def _arrived(self, arrival):
+    def _arrived(self, arrival: np.ndarray) -> np.ndarray:
         """When messages arrived on the clock of the node, (n,) s; NaN while it has none."""
-        if not self._clock.ros_time_is_active:
+        if not self._ros_clock.ros_time_is_active:
             return arrival
-        return np.full(len(arrival), 1e-9 * self._clock.now().nanoseconds or math.nan)
+        return np.full(len(arrival), 1e-9 * self._ros_clock.now().nanoseconds or math.nan)
 
-    def _stream_findings(self):
+    def _stream_findings(self) -> list[Finding]:
         """What the rules over streams find; [] without anchors."""
         if self._estimator is None:
             return []
@@ -281,7 +298,7 @@ class EkfNode(ros.StreamNode):
             self._watch.restart()
         return most_severe_first([*self._watch.findings(), *filter(None, [self._estimator.without_imu])])
 
-    def _wiring(self):
+    def _wiring(self) -> list[str]:
         """What is wrong with who publishes what to whom, a list of sentences."""
         received = {topics[0][0]: self._health.received[stream] for stream, topics in TOPICS.items()}
         troubles = []
@@ -293,17 +310,17 @@ class EkfNode(ros.StreamNode):
         return [*filter(None, [*troubles, ros.several_publishers(self, "odometry")])]
 
     @property
-    def _single(self):
+    def _single(self) -> list[Refusals]:
         """ros.Refusals of what comes one at a time."""
-        return [self._told.refusals, *self._anchors.refusals, *self._frames.refusals]
+        return [self._pose.refusals, *self._anchors.refusals, *self._frames.refusals]
 
-    def _behind(self):
+    def _behind(self) -> float | None:
         """s from the stamp of the newest odometry to now, by the clock of the node; None without odometry."""
         if not self.outputs.published:
             return None
         return 1e-9 * (self.get_clock().now().nanoseconds - Time.from_msg(self.outputs.stamp).nanoseconds)
 
-    def _tell_status(self):
+    def _tell_status(self) -> None:
         """Say on `status` whether the odometry may be flown by; not while simulated time stands still: then nothing can come."""
         if self._diagnostics.paused:
             return
@@ -311,23 +328,23 @@ class EkfNode(ros.StreamNode):
         stamp = self.outputs.stamp if self.outputs.published else self.get_clock().now().to_msg()
         self._status.publish(status_of(self._estimator, yaw_std, age), yaw_std, age, stamp, self.outputs.world)
 
-    def _yaw_std(self):
+    def _yaw_std(self) -> float:
         """Standard deviation of the rotation about the world's z axis, rad; NaN unless there is odometry."""
         if self._estimator is None or not self._estimator.running or self._attitude is None:
             return math.nan
         return rotation_std(*self._attitude)[0, 2]
 
-    def _report(self):
+    def _report(self) -> Report:
         self._frames.catch_up()  # where there is no odometry
         counts, estimator = Counter(self._past), self._estimator
         waiting = Counter(stream for stream, _ in self._early)
         if estimator is not None:
             counts.update(estimator.counts, recoveries=estimator.recoveries)
-            waiting = dict(zip(STREAMS, estimator.waiting))
+            waiting = Counter(dict(zip(STREAMS, estimator.waiting)))
         self._health.behind = self._behind()
         troubles = self._wiring(), self._stream_findings()
         level, text, values = self._health.report(self._anchors.refused, estimator, counts, *troubles)
-        alarms = estimator.alarms if estimator is not None else []
+        alarms: list[str] = estimator.alarms if estimator is not None else []
         refused = estimator.refused_pose if estimator is not None else None
         heard = ", ".join(self._lately[:MOST_NAMED])
         frames = [*self._frame_troubles(), self._frames.trouble]
@@ -336,7 +353,7 @@ class EkfNode(ros.StreamNode):
             level, text = WARN, together(others)
         values |= {"yaw": yaw_in_words(self._yaw_std()), "frames of imu/data": heard or "none yet"}
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
-        outside = self._imu_corrector.outside if estimator is not None else []
+        outside: list[str] = self._imu_corrector.outside if estimator is not None else []
         values |= {"beyond where effects were seen": "; ".join(outside) or "nothing"}
         values |= {"TDOAs received": self._health.received["tdoa"]} | {name: counts[name] for name in VERDICTS.values()}
         values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.received["imu"]}
@@ -354,7 +371,7 @@ class EkfNode(ros.StreamNode):
         return level, text, values
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
     topics = (f"{topic} ({kind.replace('/msg', '')})" for sensor in SENSORS.values() for topic, kind in sensor.topics)
     return ros.run(EkfNode, __doc__.replace("SENSORS", ",\n".join(topics)), argv)

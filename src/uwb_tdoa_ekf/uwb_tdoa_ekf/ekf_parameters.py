@@ -1,6 +1,9 @@
 """The parameters of ekf_node: those of FilterConfig, and what is the node's own."""
 
+from __future__ import annotations
+
 from dataclasses import fields, replace
+from typing import Any, TYPE_CHECKING
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -8,6 +11,12 @@ from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_FILE
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare, declare_all
 
 from .core.config import CHOICES, RENAMED, FilterConfig, current_names
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from rclpy.node import Node
+    from uwb_tdoa_bias.foundation.ros_parameters import ParameterNode
+    from rclpy.parameter import Parameter as RosParameter
 
 PUBLISH_TF = NONE, BASE, ODOM = "none", "base", "odom"
 PARAMETERS = {  # in the order of config/ekf_node.yaml
@@ -42,12 +51,12 @@ PARAMETERS = {  # in the order of config/ekf_node.yaml
 }  # fmt: skip
 
 
-def names_of_parameters():
+def names_of_parameters() -> set[str]:
     """Names of all."""
     return {field.name for field in fields(FilterConfig)} | {*PARAMETERS}
 
 
-def declare_parameters(node):
+def declare_parameters(node: ParameterNode) -> tuple[FilterConfig, dict[str, Any]]:
     """Declare all; returns (FilterConfig, {name: value} of the others). What was given under an old name counts, with a
     warning."""
     old = {name: _value_of_old(node, name) for name in RENAMED}
@@ -63,15 +72,15 @@ def declare_parameters(node):
     return FilterConfig(**values), declare_all(node, PARAMETERS)
 
 
-def follow_changes(node, config, on_change):
+def follow_changes(node: Node, config: Callable[[], FilterConfig], on_change: Callable[[FilterConfig], None]) -> None:
     """Let the parameters of FilterConfig that are not fixed be set in flight. config() : the present one; on_change(config)
     is called with another."""
 
-    def changed(parameters):
+    def changed(parameters: list[RosParameter]) -> FilterConfig:
         names = {field.name for field in fields(FilterConfig)}
         return replace(config(), **{p.name: p.value for p in parameters if p.name in names})
 
-    def judge(parameters):
+    def judge(parameters: list[RosParameter]) -> SetParametersResult:
         try:
             changed(parameters)
         except InputError as error:
@@ -82,7 +91,7 @@ def follow_changes(node, config, on_change):
     node.add_post_set_parameters_callback(lambda parameters: on_change(changed(parameters)))
 
 
-def _value_of_old(node, name):
+def _value_of_old(node: Node, name: str) -> float | None:
     """What was given for a parameter that the node does not have any more, or None."""
     value = node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True)).value
     node.undeclare_parameter(name)

@@ -4,7 +4,10 @@ The filter: position and velocity in the world, attitude error in the body frame
 frame with rotations about its fixed axes, twist in the child (body) frame.
 """
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,11 +15,14 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .core.state import rotation
 
+if TYPE_CHECKING:
+    from .results import Odometry
+
 POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a TwistWithCovariance
 UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
 
 
-def to_odometry(q, v, covariance):
+def to_odometry(q: np.ndarray, v: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Velocity in the body frame, and the covariance of what an Odometry holds.
 
     q : (n, 4) x y z w, body to world; v : (n, 3) m/s, world; covariance : (n, 9, 9) of [p, v, attitude], the attitude
@@ -29,7 +35,7 @@ def to_odometry(q, v, covariance):
 
 
 @compiled
-def _to_odometry(q, v, covariance, u, out):
+def _to_odometry(q: np.ndarray, v: np.ndarray, covariance: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
     R, jacobian, half = np.empty((3, 3)), np.zeros((9, 9)), np.empty((9, 9))
     for n in range(len(q)):
         rotation(q[n, 0], q[n, 1], q[n, 2], q[n, 3], R)
@@ -47,7 +53,7 @@ def _to_odometry(q, v, covariance, u, out):
 
 
 @compiled
-def _multiply(a, b, out):
+def _multiply(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
     for i in range(9):
         for j in range(9):
             total = 0.0
@@ -56,7 +62,7 @@ def _multiply(a, b, out):
             out[i, j] = total
 
 
-def rotation_std(q, covariance):
+def rotation_std(q: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Standard deviations of the rotation about the world's axes, (n, 3) rad: those of to_odometry. Arguments as there,
     without v."""
     out = np.empty((len(q), 3))
@@ -65,7 +71,7 @@ def rotation_std(q, covariance):
 
 
 @compiled
-def _rotation_std(q, covariance, out):
+def _rotation_std(q: np.ndarray, covariance: np.ndarray, out: np.ndarray) -> None:
     R = np.empty((3, 3))
     for n in range(len(q)):
         rotation(q[n, 0], q[n, 1], q[n, 2], q[n, 3], R)
@@ -77,7 +83,7 @@ def _rotation_std(q, covariance, out):
             out[n, axis] = math.sqrt(variance)
 
 
-def pose_and_twist(odometry, rates, rate_variances):
+def pose_and_twist(odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST), of Odometry messages."""
     velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
     pose, twist = np.empty((len(odometry), POSE)), np.zeros((len(odometry), TWIST))
@@ -87,7 +93,10 @@ def pose_and_twist(odometry, rates, rate_variances):
 
 
 @compiled
-def _fill(p, q, velocity, covariance, rates, rate_variances, pose, twist):
+def _fill(
+    p: np.ndarray, q: np.ndarray, velocity: np.ndarray, covariance: np.ndarray, rates: np.ndarray,
+    rate_variances: np.ndarray, pose: np.ndarray, twist: np.ndarray,
+) -> None:  # fmt: skip
     for n in range(len(p)):
         pose[n, :3], pose[n, 3:7], twist[n, :3] = p[n], q[n], velocity[n]
         known = math.isfinite(rates[n, 0]) and math.isfinite(rate_variances[n])

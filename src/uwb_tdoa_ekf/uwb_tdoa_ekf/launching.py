@@ -1,5 +1,7 @@
 """What the launch files start: which node, in which namespace, with which of the values. Without launch itself."""
 
+from __future__ import annotations
+
 import atexit
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -72,12 +74,12 @@ class Start:
     name: str | None = None
 
     @property
-    def label(self):
+    def label(self) -> str:
         """What it is called in messages."""
         return f"{self.namespace.strip('/')}/{self.name or self.executable}".lstrip("/")
 
     @property
-    def words(self):
+    def words(self) -> list[str]:
         """What it is told, as arguments after --ros-args."""
         words = ["--log-level", self.log_level]
         for part in self.parameters:
@@ -101,12 +103,12 @@ class Ended:
 class Lives:
     """Those of one node: whether it is started again."""
 
-    def __init__(self, label, respawn, on_exit):
+    def __init__(self, label: str, respawn: bool, on_exit: str) -> None:
         """respawn : bool; on_exit : "shutdown" or "stay"."""
         self._label, self._respawn, self._on_exit = label, respawn, on_exit
         self._crashes = 0  # in a row
 
-    def ended(self, code, alive):
+    def ended(self, code: int, alive: float) -> Ended:
         """Ended, of a node that has ended by itself with this exit code, or by minus this signal, after so many seconds."""
         if code in IN_ORDER:
             return Ended()
@@ -127,7 +129,7 @@ def discovery(environment: Mapping[str, str], given: str = "") -> dict[str, str]
     return {RANGE: given or environment.get(RANGE) or "LOCALHOST"}
 
 
-def network(environment):
+def network(environment: dict) -> str:
     """Who can hear the nodes, and command them, in a sentence. environment : variables."""
     found, peers = environment.get(RANGE) or "SUBNET", environment.get("ROS_STATIC_PEERS")
     if environment.get("ROS_LOCALHOST_ONLY") == "1":  # old, and counts
@@ -138,14 +140,18 @@ def network(environment):
     return f"{RANGE}={found}, ROS_DOMAIN_ID={environment.get('ROS_DOMAIN_ID') or 0}: heard by {WHO[found].format(also)}"
 
 
-def start(executable, namespace, values, files=(), log_level="info"):
+def start(
+    executable: str, namespace: str, values: dict, files: tuple | list[str] = (), log_level: str = "info"
+) -> Start:
     """Start of an executable with those of {name: value} that it has, and with the parameter files."""
     package, names = NODES[executable]
     own = {name: value for name, value in values.items() if name in names}
     return Start(package, executable, namespace, [*files, *([own] if own else [])], log_level)
 
 
-def tag(namespace, values, files=None, log_level="info"):
+def tag(
+    namespace: str, values: dict[str, bool | str | float], files: dict | None = None, log_level: str = "info"
+) -> list[Start]:
     """[Start] of bias_node and ekf_node of one tag; with a `map` of debias_node too. files : {executable: [paths]}.
 
     Raises InputError for a value that none of them has.
@@ -167,7 +173,7 @@ class Fleet:
     processes: str
 
     @classmethod
-    def read(cls, path: str) -> "Fleet":
+    def read(cls, path: str) -> Fleet:
         """Raises InputError."""
         content = read_yaml(path)
         listed = content.pop("tags", None) if isinstance(content, dict) else None
@@ -186,7 +192,7 @@ class Fleet:
             raise InputError(f"{path}: tags: {lacks}: names no host, and other tags do; name it, or a host for all beside 'tags'.")
         return cls(str(path), merged, hosts, str(processes))
 
-    def at(self, host: str) -> "Fleet":
+    def at(self, host: str) -> Fleet:
         """The tags whose nodes this machine runs: all, where the file names no host. Raises InputError if there is none."""
         if set(self.hosts.values()) == {None}:
             return self
@@ -229,7 +235,7 @@ def tags(path: str, values: Mapping, log_level: str = "info", processes: str = "
     return pooled(starts, processes) if processes else starts
 
 
-def pooled(starts, processes):
+def pooled(starts: list[Start], processes: int | str) -> list[Start]:
     """The same of `tags` with so many localization_nodes instead of bias_nodes and ekf_nodes; what these are told is in a file that
     is written for them. processes : number, or its text, or "auto": one for each core. Raises InputError if it is none, or a tag has a parameter file of its own."""
     if processes == AUTO:
@@ -253,7 +259,7 @@ def pooled(starts, processes):
     return out
 
 
-def refuse_unknown(values, *executables):
+def refuse_unknown(values: dict[str, bool | str | float], *executables: str) -> None:
     """Raise InputError for a value that none of the executables has, or that is none."""
     known = set().union(*(NODES[name][1] for name in executables))
     for name, value in values.items():
@@ -264,13 +270,13 @@ def refuse_unknown(values, *executables):
             raise InputError(f"{name}: {value!r} is no value; give a number, a text, true or false, or leave it out.")
 
 
-def typed(texts):
+def typed(texts: dict[str, str]) -> dict[str, bool | str]:
     """{name: value} of {name: text} as they come on a command line; empty ones are left out."""
     kinds = {"true": True, "false": False}
     return {name: kinds.get(text, text) for name, text in texts.items() if text != ""}
 
 
-def _beside(path, file):
+def _beside(path: Path, file: list | str) -> str:
     """A path that a file names, relative to that file. Raises InputError."""
     if not isinstance(file, str):
         raise InputError(f"{file!r} is no path; write a text.")

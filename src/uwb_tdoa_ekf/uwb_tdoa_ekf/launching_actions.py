@@ -1,7 +1,10 @@
 """What launching.py says, as actions of launch."""
 
+from __future__ import annotations
+
 import os
 import time
+from typing import TYPE_CHECKING
 
 from ament_index_python.packages import get_package_share_directory
 from launch.actions import LogInfo, OpaqueFunction, TimerAction
@@ -11,19 +14,28 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .launching import Lives, discovery, network
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from launch.action import Action
+    from launch.launch_context import LaunchContext
+    from launch.events.process import ProcessExited
+    from .launching import Start
 
-def actions(starts, respawn, on_exit, discovery_range, rviz, use_sim_time=False):
+
+def actions(
+    starts: Iterable[Start], respawn: str, on_exit: str, discovery_range: str, rviz: str, use_sim_time: str = "false"
+) -> list[Action]:
     """Of [Start]s, as texts of launch arguments say: what is told of the network, the nodes, and RViz if rviz is "true"."""
     of_nodes = discovery(os.environ, discovery_range)
     nodes = [_node(each, Lives(each.label, respawn == "true", on_exit), of_nodes) for each in starts]
     return [LogInfo(msg=network({**os.environ, **of_nodes})), *nodes, *([_rviz(use_sim_time)] if rviz == "true" else [])]
 
 
-def _node(start, lives, variables):
+def _node(start: Start, lives: Lives, variables: Mapping[str, str]) -> Node:
     """The action of a Start, which its Lives may have started again. Nothing is told to it by a file that launch_ros would leave."""
     began = time.monotonic()
 
-    def on_exit(event, context):
+    def on_exit(event: ProcessExited, context: LaunchContext) -> Action | None:
         if context.is_shutdown:
             return None
         then = lives.ended(event.returncode, time.monotonic() - began)
@@ -46,7 +58,7 @@ def _node(start, lives, variables):
     )
 
 
-def _rviz(use_sim_time):
+def _rviz(use_sim_time: str) -> Node:
     """RViz with our layout."""
     layout = f"{get_package_share_directory('uwb_tdoa_ekf')}/rviz/tdoa.rviz"
     told = ["-p", f"use_sim_time:={str(use_sim_time).lower()}"]

@@ -8,11 +8,14 @@ Every parameter of this node itself is documented in config/localization_node.ya
 too, for all tags, or in a parameter file for one: /tag1/ekf_node.
 """
 
+from __future__ import annotations
+
 from functools import partial
 import math
 import sys
 import time
 import traceback
+from typing import Any, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_tdoa_bias import bias_node
@@ -20,11 +23,15 @@ from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, say_unused
-from uwb_tdoa_bias.foundation.ros_streams import Turns
+from uwb_tdoa_bias.foundation.ros_streams import Handed, RoundRobin
 
 from .core.config import RENAMED
 from .ekf_node import EkfNode
 from .ekf_parameters import names_of_parameters
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from uwb_tdoa_bias.foundation.ros import Report
 
 PARAMETERS = {
     "tags": Parameter([""], 'namespaces of the tags, below that of this node, e.g. ["tag1", "tag2"]; "" is its own'),
@@ -40,7 +47,7 @@ class LocalizationNode(ros.StreamNode):
 
     NAME = "localization_node"
 
-    def __init__(self, arguments=()):
+    def __init__(self, arguments: Sequence[str] = ()) -> None:
         """arguments : of the process."""
         super().__init__(self.NAME)
         tags = declare_all(self, PARAMETERS)["tags"]
@@ -49,24 +56,25 @@ class LocalizationNode(ros.StreamNode):
         self._tags = [Tag(self, tag, partial(self._start, tag, list(arguments))) for tag in tags]
         for tag in self._tags:
             tag.begin()
-        if all(tag.refused for tag in self._tags):
-            raise self._tags[0].refused
+        refused = [tag.refused for tag in self._tags if tag.refused is not None]
+        if len(refused) == len(self._tags):
+            raise refused[0]
         self.members = [node for tag in self._tags for node in tag.members]
         say_unused([self, *self.members], files_of(arguments))
-        self.turns = Turns(self._tags)
+        self.turns = RoundRobin(self._tags)
         self._diagnostics = ros.Diagnostics(self, self._report)
         self.get_logger().info(f"ready; tags: {', '.join(tags) or 'one'}")
 
-    def _report(self):
+    def _report(self) -> Report:
         troubles = [tag.trouble for tag in self._tags if tag.trouble]
         level, text = (DiagnosticStatus.ERROR, troubles[0]) if troubles else (DiagnosticStatus.OK, "all tags are served")
         return level, text, {"tags": len(self._tags), "not served": "; ".join(troubles) or "none"}
 
-    def _start(self, tag, arguments):
+    def _start(self, tag: str, arguments: list[str]) -> Pair:
         """Pair of a tag."""
         namespace = f"{self.get_namespace().rstrip('/')}/{tag}".rstrip("/") or "/"
         given = ["--ros-args", *(["-p", f"body_frame:={tag}/base_link"] if tag else []), "--", *_for_all(arguments)]
-        options = {"namespace": namespace, "cli_args": given, "use_global_arguments": False}
+        options: dict[str, Any] = {"namespace": namespace, "cli_args": given, "use_global_arguments": False}
         names = {*bias_node.PARAMETERS, *names_of_parameters(), *RENAMED, *PARAMETERS}
         bias = BiasNode(member=names, **options)
         try:
@@ -80,18 +88,21 @@ class Tag:
     """A tag, whose nodes are started again when they fail. refused : InputError with which they were not started at all; trouble : a
     sentence while they are not there, or None."""
 
-    def __init__(self, node, name, start):
+    def __init__(self, node: LocalizationNode, name: str, start: Callable[[], Pair]) -> None:
         """node : LocalizationNode; start() : Pair of the tag, anew; raises InputError."""
-        self.refused = self.trouble = self._pair = self._failure = None
+        self.refused: InputError | None = None
+        self.trouble: str | None = None
+        self._pair: Pair | None = None
+        self._failure: Exception | None = None
         self._node, self._name, self._start = node, name, start
         self._began, self._due, self._wait = 0.0, math.inf, 0.0  # s of time.monotonic(); s
 
     @property
-    def members(self):
+    def members(self) -> list[ros.StreamNode]:
         """Nodes that are there."""
         return [] if self._pair is None else [self._pair.bias, self._pair.ekf]
 
-    def begin(self):
+    def begin(self) -> None:
         """Start its nodes. What they refuse at their first start is not tried again."""
         try:
             self._pair = self._start()
@@ -104,15 +115,15 @@ class Tag:
         for node in self.members:
             node.on_failure = self._fail
 
-    def take(self):
+    def take(self) -> bool:
         """A turn of its Pair, if it is there. Returns whether there was anything, or is."""
         if self._failure is not None:
-            self._end()
+            self._end(self._failure)
         if self._pair is None:
             if time.monotonic() < self._due:
                 return False
             self.begin()
-            self._node.spinner.replace([], self.members)
+            self._replace([])
             return False
         try:
             return self._pair.take()
@@ -120,21 +131,26 @@ class Tag:
             self._fail(error)
             return False
 
-    def _fail(self, error):
+    def _fail(self, error: Exception) -> None:
         """Note what was raised; the nodes end with the next turn, when none of their callbacks is under way."""
         self._failure = error
 
-    def _end(self):
-        error, gone, self._failure, self._pair = self._failure, self.members, None, None
+    def _end(self, error: Exception) -> None:
+        gone, self._failure, self._pair = self.members, None, None
         self._node.get_logger().error("".join(traceback.format_exception(error)))
         if time.monotonic() > self._began + SOUND:
             self._wait = 0.0
         self._again(error)
-        self._node.spinner.replace(gone, [])
+        self._replace(gone)
         for node in gone:
             node.destroy_node()
 
-    def _again(self, error):
+    def _replace(self, gone: list[ros.StreamNode]) -> None:
+        """Have those nodes served that are there, instead of others."""
+        assert self._node.spinner is not None  # who takes a turn is spun
+        self._node.spinner.replace(gone, self.members)
+
+    def _again(self, error: Exception) -> None:
         """Say why its nodes are not there, and until when."""
         then = "is not started again"
         if self.refused is None:
@@ -148,15 +164,17 @@ class Tag:
 class Pair:
     """The nodes of a tag, which hand over to each other."""
 
-    def __init__(self, bias, ekf):
+    def __init__(self, bias: BiasNode, ekf: EkfNode) -> None:
         """bias : BiasNode; ekf : EkfNode."""
         self.bias, self.ekf = bias, ekf
-        self._corrected, self._odometry = ekf.streams.inputs["uwb/tdoa_corrected"], bias.streams.inputs["odometry"]
-        bias.output.hand_to(self._corrected)
-        ekf.outputs.odometry.hand_to(self._odometry)
+        corrected, odometry = ekf.streams.inputs["uwb/tdoa_corrected"], bias.streams.inputs["odometry"]
+        assert isinstance(corrected, Handed) and isinstance(odometry, Handed)  # as of members
+        self._odometry = odometry
+        bias.output.hand_to(corrected)
+        ekf.outputs.odometry.hand_to(odometry)
         bias.streams.wait_for("uwb/tdoa", ekf.due)
 
-    def take(self):
+    def take(self) -> bool:
         """Give everything that has arrived to those that take it. Returns whether there was anything, or is."""
         busy = [self.bias.streams.take(), self.ekf.streams.take()]
         while self.bias.holds and len(self._odometry):  # poses that TDOAs wait for
@@ -165,7 +183,7 @@ class Pair:
         return any(busy)
 
 
-def _for_all(arguments):
+def _for_all(arguments: list[str]) -> list[str]:
     """The arguments of a process without the name and the namespace of its node."""
     flags = [k for k, word in enumerate(arguments) if word in ("-r", "--remap")]
     names = [k for k in flags if k + 1 < len(arguments) and arguments[k + 1].partition(":=")[0] in OF_PROCESS]
@@ -173,7 +191,7 @@ def _for_all(arguments):
     return [word for k, word in enumerate(arguments) if k not in dropped]
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
     return ros.run(LocalizationNode, __doc__, argv)
 

@@ -1,7 +1,10 @@
 """What ekf_node publishes: odometry, transforms, residuals."""
 
+from __future__ import annotations
+
 import math
 import time
+from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
@@ -11,11 +14,18 @@ from uwb_tdoa_bias.foundation.later import rotations
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.foundation.ros_frames import TF_QOS
 from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
-from uwb_tdoa_bias.foundation.ros_wire import Wire
+from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM
 from .frames import pose_and_twist
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.ros import Epoch, StreamNode
+    from uwb_tdoa_bias.foundation.transforms import Frames
+    from .monitoring.status import Status
+    from .results import Residuals
+    import numpy as np
 
 STATUS_PERIOD = 0.95  # s; it is looked at five times a second
 ODOMETRY = "pose", "twist"
@@ -26,11 +36,12 @@ UNPLACED = 100  # odometries in a row without odom -> body on /tf, before it is 
 class StatusOutput:
     """Publishes EstimatorStatus on `status`: each second, and at once when it changes."""
 
-    def __init__(self, node):
+    def __init__(self, node: StreamNode) -> None:
         self._publisher = node.create_publisher(EstimatorStatus, "status", STATUS_QOS)
-        self._said, self._due = None, -math.inf
+        self._said: Status | None = None
+        self._due = -math.inf
 
-    def publish(self, status, yaw_std, tdoa_age, stamp, frame):
+    def publish(self, status: Status, yaw_std: float, tdoa_age: float, stamp: Time, frame: str) -> None:
         """Publish if it is due. status : monitoring.status.Status; yaw_std : rad; tdoa_age : s; stamp : builtin_interfaces/Time."""
         now = time.monotonic()
         if status == self._said and now < self._due:
@@ -46,12 +57,12 @@ class Outputs:
     """published : number of messages on odometry; stamp : of the newest; world : name of its frame; odometry, residual :
     StreamOutputs."""
 
-    def __init__(self, node, epoch, frames, body, publish_tf, odom):
+    def __init__(self, node: StreamNode, epoch: Epoch, frames: Frames, body: str, publish_tf: str, odom: str) -> None:
         """epoch : ros.Epoch; frames : transforms.Frames; body, odom : names of frames; publish_tf : of PUBLISH_TF."""
         self._epoch, self._frames, self._body = epoch, frames, body
         self._odom = odom if publish_tf == ODOM else None
         self.published = self._unplaced = 0  # messages; those in a row for which /tf had no odom -> body
-        self._wires = Wire(Odometry, *ODOMETRY), Wire(TdoaResidual, *RESIDUAL)
+        self._wires = CdrCodec(Odometry, *ODOMETRY), CdrCodec(TdoaResidual, *RESIDUAL)
         self._transform = TransformStamped(child_frame_id=self._odom or body)
         self._tf = TFMessage(transforms=[self._transform])  # one for all: what is published is copied
         self.stamp = Time()  # of the newest odometry
@@ -60,7 +71,7 @@ class Outputs:
         self.residual = StreamOutput(node, TdoaResidual, "uwb/residual")
         self._tf_publisher = node.create_publisher(TFMessage, "/tf", TF_QOS) if publish_tf != NONE else None
 
-    def set_world(self, frame):
+    def set_world(self, frame: str) -> None:
         """Name the world frame."""
         self.world = self._transform.header.frame_id = frame
         messages = Odometry(child_frame_id=self._body), TdoaResidual()
@@ -69,7 +80,7 @@ class Outputs:
         self._odometry, self._residual = (wire.template(message) for wire, message in zip(self._wires, messages))
 
     @property
-    def trouble(self):
+    def trouble(self) -> str | None:
         """What keeps a transform from being published, or None."""
         if self._unplaced < UNPLACED:
             return None
@@ -78,7 +89,7 @@ class Outputs:
             "publishes it, or set publish_tf to base"
         )
 
-    def publish_residuals(self, residuals):
+    def publish_residuals(self, residuals: Residuals) -> None:
         """Publish Residuals."""
         if not self.residual.publisher.get_subscription_count():
             return  # nobody can come and ask for them later
@@ -91,7 +102,7 @@ class Outputs:
             rows[name] = column
         self.residual.publish(self.world, self._residual, rows)
 
-    def publish_odometry(self, odometry, rates, rate_variances):
+    def publish_odometry(self, odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray) -> None:
         """Publish Odometry. rates (n, 3) rad/s and their variances (n,) rad^2/s^2, NaN where not known."""
         n = len(odometry)
         rows = self._odometry.rows(n)
@@ -106,7 +117,7 @@ class Outputs:
             self.stamp = self._epoch.stamp(odometry.t[-1].item())
         self.published += n
 
-    def _publish_transform(self, t, p, q):
+    def _publish_transform(self, t: float, p: np.ndarray, q: np.ndarray) -> None:
         """World -> body, or world -> odom such that odom -> body of /tf leads to the same."""
         if self._odom:
             between = self._frames.between(self._odom, self._body, t)
@@ -119,4 +130,5 @@ class Outputs:
         self._transform.header.stamp = self.stamp
         out.translation.x, out.translation.y, out.translation.z = p
         out.rotation.x, out.rotation.y, out.rotation.z, out.rotation.w = q
+        assert self._tf_publisher is not None  # or nobody calls this
         self._tf_publisher.publish(self._tf)

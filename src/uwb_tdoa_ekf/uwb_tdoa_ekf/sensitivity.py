@@ -5,7 +5,10 @@ The derivative of the state by every parameter goes through the recorded transit
 these derivatives knows of the path whatever the filter knew: the inertial sensor, the motion, every other measurement.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +17,13 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from .core.config import FilterConfig
 from .core.history import RESET
 from .core.state import ERROR_STATES, MOVING_STATES
-from .estimator import VERDICTS
+from .core.verdicts import USED
 from .offline import Run, run_offline
 
-USED = next(value for value, name in VERDICTS.items() if name == "used")
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from uwb_tdoa_bias.correction.corrector import Corrector
+    from uwb_tdoa_bias.foundation.flight import Flight
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +42,7 @@ class Innovations:
     records: list
     of: list
 
-    def by_bias(self, regressors):
+    def by_bias(self, regressors: np.ndarray) -> np.ndarray:
         """Derivative of minus the innovations by parameters: (n, k).
 
         regressors (n, k): derivative of the measured TDOAs by the parameters, of which the run knew nothing. A bias that
@@ -44,7 +50,7 @@ class Innovations:
         """
         return self.and_positions(regressors, ())[0]
 
-    def and_positions(self, regressors, stamps):
+    def and_positions(self, regressors: np.ndarray, stamps: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """What `by_bias` gives, and the derivative of the estimated position at stamps (m,), s, ascending: (m, 3, k)."""
         regressors, stamps = np.ascontiguousarray(regressors, dtype=float), np.asarray(stamps, dtype=float)
         out, positions = np.zeros_like(regressors), np.zeros((len(stamps), 3, regressors.shape[1]))
@@ -54,16 +60,19 @@ class Innovations:
         return out, positions
 
 
-def record_innovations(flight, config=None, corrector=None):
+def record_innovations(
+    flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None
+) -> Innovations:
     """Run a Flight through bias correction and filter, without its pressure, and keep what `Innovations` need. Takes what
     run_offline takes."""
-    config = replace(config or FilterConfig(), use_pressure=False)  # its offset is not among the states of the history
-    records = []
+    # Its offset is not among the states of the history.
+    config = replace(config or FilterConfig(), use_pressure=False)  # type: ignore[call-arg]  # parameters of SENSORS are known at run time
+    records: list[np.ndarray] = []
     run = run_offline(flight, config, corrector, records)
     residuals = run.residuals
     used = np.flatnonzero(residuals.verdict == USED)
     rows = used[np.argsort(residuals.t[used], kind="stable")]
-    waiting = {}
+    waiting: dict[tuple[float, float], list[int]] = {}
     for place, row in enumerate(rows.tolist()):
         waiting.setdefault((residuals.t[row], residuals.innovation[row]), []).append(place)
     of = []
@@ -75,7 +84,10 @@ def record_innovations(flight, config=None, corrector=None):
 
 
 @compiled
-def _through(records, of, regressors, states, out, stamps, passed, positions):
+def _through(
+    records: np.ndarray, of: np.ndarray, regressors: np.ndarray, states: np.ndarray, out: np.ndarray,
+    stamps: np.ndarray, passed: int, positions: np.ndarray,
+) -> int:  # fmt: skip
     """states (2, 15, k): derivative of the error state by the parameters, and room for the next one. `passed` of the stamps
     (m,) lie behind; returns how many do then, and fills their positions (m, 3, k)."""
     before, after = states[0], states[1]

@@ -4,8 +4,11 @@ Modified Bryson-Frazier recursion (Bierman, Fixed interval smoothing with discre
 backwards through the scalar updates of the filter's history, with its robust weights, inverting no covariance.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,11 +19,17 @@ from .core.history import RESET
 from .core.hypotheses import YAW_STD
 from .core.memory import ODOMETRY
 from .core.state import ERROR_STATES, MOVING_STATES, inject
-from .estimator import Odometry
 from .offline import run_offline
+from .results import Odometry
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.correction.corrector import Corrector
+    from uwb_tdoa_bias.foundation.compiled import Record
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from .offline import Run
 
 
-def smooth(flight, config=None, corrector=None):
+def smooth(flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None) -> Run:
     """Run a Flight through bias correction, filter and smoother.
 
     Takes what run_offline takes and returns its Run with the odometry smoothed: at the stamps of updates, thinned to
@@ -28,11 +37,12 @@ def smooth(flight, config=None, corrector=None):
     from the beginning.
     Memory: 3.5 kB per update.
     """
-    config = replace(config or FilterConfig(), use_pressure=False)  # its offset is not among the states of the history
+    # Its offset is not among the states of the history.
+    config = replace(config or FilterConfig(), use_pressure=False)  # type: ignore[call-arg]  # parameters of SENSORS are known at run time
     if config.use_imu and config.initial_yaw_std > YAW_STD:
         offset = run_offline(flight, config, corrector).yaw_offset
         config = replace(config, initial_yaw=config.initial_yaw + offset, initial_yaw_std=YAW_STD)
-    records = []
+    records: list[np.ndarray] = []
     result = run_offline(flight, config, corrector, records)
     records = [part for part in records if len(part)]
     before = [-math.inf] + [part["t"][-1] for part in records]  # stamp of the record before each array of them
@@ -57,7 +67,9 @@ def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
 
 
 @compiled
-def _backward(records, before, rate, adjoint, information, rows):
+def _backward(
+    records: np.ndarray, before: float, rate: float, adjoint: np.ndarray, information: np.ndarray, rows: np.ndarray
+) -> int:
     """Through (n,) of RECORD from the end on; `before` : s, stamp of the record in front of them.
 
     adjoint (15,), information (15, 15): Bierman's lambda and Lambda, those behind the records, which become those in
@@ -80,7 +92,7 @@ def _backward(records, before, rate, adjoint, information, rows):
 
 
 @compiled
-def _smoothed(record, adjoint, information, row):
+def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row: Record) -> None:
     """Write x - P lambda and P - P Lambda P to one of ODOMETRY."""
     P = record.P
     correction = np.zeros(ERROR_STATES)  # -P lambda
@@ -104,7 +116,7 @@ def _smoothed(record, adjoint, information, row):
 
 
 @compiled
-def _through_update(record, adjoint, information):
+def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray) -> None:
     """lambda <- C' lambda - h' y / S, Lambda <- C' Lambda C + h' h / S; C = I - K h, innovation y of variance S."""
     h, gain = record.row, record.gain
     information_gain = np.zeros(ERROR_STATES)  # Lambda K
@@ -122,7 +134,7 @@ def _through_update(record, adjoint, information):
 
 
 @compiled
-def _through_prediction(transition, adjoint, information):
+def _through_prediction(transition: np.ndarray, adjoint: np.ndarray, information: np.ndarray) -> None:
     """lambda <- Phi' lambda, Lambda <- Phi' Lambda Phi; the lower rows of Phi are those of the identity."""
     before = adjoint.copy()
     product = np.zeros((ERROR_STATES, ERROR_STATES))  # Lambda Phi

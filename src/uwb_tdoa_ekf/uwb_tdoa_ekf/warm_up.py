@@ -1,5 +1,7 @@
 """What the first messages of ekf_node would compile, compiled before: without ROS, so that it can be done before the messages are built."""
 
+from __future__ import annotations
+
 from functools import cache
 
 import numpy as np
@@ -14,7 +16,7 @@ from .monitoring.stream_watch import StreamWatch
 
 
 @cache
-def warm_up():
+def warm_up() -> None:
     """Compile, or load from numba's cache, what the first messages would."""
     estimator = Estimator(Anchors.from_positions([[0, 0, 0], [5, 0, 1], [0, 5, 2], [5, 5, 0]]))
     watch, steps = StreamWatch(estimator.anchors, 0.25), np.arange(400)
@@ -34,5 +36,5 @@ def warm_up():
     for k in range(YOUNGEST + 2):
         detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1, int), np.zeros(1), np.eye(1)))
     detector.find(0.0)
-    estimator.tell_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
+    estimator.set_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
     estimator.finish()

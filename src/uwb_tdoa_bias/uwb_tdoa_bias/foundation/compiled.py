@@ -50,6 +50,7 @@ with _hidden("scipy", "coverage"), elsewhere():
 
 _FUNCTIONS: list[Any] = []  # all that are compiled when they are first called
 SAY_EVERY = 4.0  # s
+Record = Any  # one row of a structured array, whose fields compiled code reads and writes as attributes: Python knows no type of it
 Function = TypeVar("Function", bound="Callable[..., Any]")
 
 config._config_fname = "/dev/null/.numba_config.yaml"  # numba would look into the present folder before it compiles anything

@@ -32,7 +32,7 @@ from .errors import InputError
 from .executable import interrupt
 from .ros_parameters import ParameterNode
 from .ros_spinning import Spinner
-from .ros_wire import Unreadable, decode, name_of
+from .ros_cdr import Unreadable, decode, name_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from rclpy.subscription import Subscription
     from rclpy.timer import Timer
     from rclpy.topic_endpoint_info import TopicEndpointInfo
-    from .ros_wire import Wire
+    from .ros_cdr import CdrCodec
 
 # What comes in is sensor data: best effort, which hears every publisher. Deep, because a node that was not scheduled for a
 # moment must find all of it: 10 s of a 1 kHz IMU, or 2.5 s of it replayed four times as fast. Takes memory only where it
@@ -213,8 +213,8 @@ class StreamInput:
             kind, topic, unserved, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES, raw=True
         )  # fmt: skip
 
-    def fetch(self, wire: Wire) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """What has arrived, by a Wire: [(frame, rows (n,), arrivals (n,) s since 1970)], each of successive messages of one
+    def fetch(self, wire: CdrCodec) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """What has arrived, by a CdrCodec: [(frame, rows (n,), arrivals (n,) s since 1970)], each of successive messages of one
         frame."""
         messages, stamps = [], []
         for data, information in waiting(self._subscription):
@@ -421,7 +421,7 @@ def run(node_class: type[StreamNode], description: str | None, argv: Sequence[st
     number of a signal that came before the node was ready.
 
     node_class(arguments) makes the StreamNode, in an initialised rclpy, of the arguments of the process; it has the executable's
-    NAME, and may have `members` and `turns`, ros_streams.Turns. description : for --help.
+    NAME, and may have `members` and `turns`, ros_streams.RoundRobin. description : for --help.
     """
     name = node_class.NAME
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]

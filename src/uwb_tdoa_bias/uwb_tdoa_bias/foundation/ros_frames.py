@@ -12,7 +12,7 @@ from tf2_msgs.msg import TFMessage
 from . import ros
 from .errors import InputError
 from .ros_parameters import LONGEST_NAME
-from .ros_wire import ENCAPSULATION, LENGTH, MOST_ELEMENTS, Unreadable, aligned, check_length, decode, read_text
+from .ros_cdr import ENCAPSULATION, LENGTH, MOST_ELEMENTS, Unreadable, aligned, check_length, decode, read_text
 from .transforms import Frames
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from rclpy import Future
     from .ros import StreamNode
-    from .ros_streams import Turns
+    from .ros_streams import RoundRobin
 
 try:  # not in rclpy before 7.1.4; a message costs a quarter
     from rclpy.experimental import EventsExecutor
@@ -37,7 +37,7 @@ class Spinner:
     longest_wait : s, the longest that anything has waited since this was set to 0.0.
     """
 
-    def __init__(self, nodes: list[StreamNode], turns: Turns | None = None) -> None:
+    def __init__(self, nodes: list[StreamNode], turns: RoundRobin | None = None) -> None:
         """nodes : a list that is kept up to date."""
         self.longest_wait = 0.0
         self._nodes, self._turns = nodes, turns

@@ -13,7 +13,7 @@ from .stamps import LARGEST_STEP_BACK
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from .ros import Epoch, Refusals, StreamInput, StreamNode
-    from .ros_wire import Template, Wire
+    from .ros_cdr import Template, CdrCodec
 
     Take = Callable[[str, np.ndarray, np.ndarray, np.ndarray], None]  # frame, stamps, rows and arrivals
 
@@ -30,7 +30,7 @@ class Taking(Protocol):
     def take(self) -> bool: ...
 
 
-class Turns:
+class RoundRobin:
     """Has nodes take what has arrived for them, one after the other. A node that has `turns` is given them by ros.run."""
 
     PERIOD = PERIOD
@@ -70,9 +70,9 @@ class Streams:
         be done with it yet."""
         self._awaited, self._due = self._by_topic[topic], due
 
-    def add(self, wire: Wire, topic: str, take: Take, handed: bool = False) -> None:
-        """Subscribe. wire : Wire; take(frame, t, rows, arrival) gets successive messages of one frame: their stamps (n,) s,
-        rows (n,) of the Wire, and when they arrived, (n,) s since 1970. handed : a node of this process hands them over."""
+    def add(self, wire: CdrCodec, topic: str, take: Take, handed: bool = False) -> None:
+        """Subscribe. wire : CdrCodec; take(frame, t, rows, arrival) gets successive messages of one frame: their stamps (n,) s,
+        rows (n,) of the CdrCodec, and when they arrived, (n,) s since 1970. handed : a node of this process hands them over."""
         kind = Handed if handed else ros.StreamInput
         self.inputs[topic] = kind(self._node, wire.kind, topic)
         stream = self._by_topic[topic] = _Stream(wire, take, self.inputs[topic])
@@ -130,14 +130,14 @@ class Handed:
         self._parts: list[Part] = []
 
     def hand(self, frame: str, rows: np.ndarray) -> None:
-        """Take rows (n,) with the fields of a Wire, all of one frame."""
+        """Take rows (n,) with the fields of a CdrCodec, all of one frame."""
         self._parts.append((frame, rows, np.full(len(rows), 1e-9 * time.time_ns())))
 
     def __len__(self) -> int:
         """Parts that wait."""
         return len(self._parts)
 
-    def fetch(self, wire: Wire) -> list[Part]:
+    def fetch(self, wire: CdrCodec) -> list[Part]:
         """[(frame, rows, arrivals)] since the last time."""
         parts, self._parts = self._parts, []
         return parts
@@ -154,7 +154,7 @@ class Handed:
 class _Stream:
     """What has arrived on one of them. waiting : parts; fell : the stamps of what was taken last have fallen back."""
 
-    def __init__(self, wire: Wire, take: Take, source: StreamInput | Handed) -> None:
+    def __init__(self, wire: CdrCodec, take: Take, source: StreamInput | Handed) -> None:
         self.waiting: list[Part] = []
         self.fell = False
         self._wire, self._take, self._source, self._newest = wire, take, source, -np.inf

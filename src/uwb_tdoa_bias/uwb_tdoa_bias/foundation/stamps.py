@@ -51,7 +51,7 @@ class StampGate:
             self.newest = newest
         return not self._held
 
-    def note(self, t: float) -> None:
+    def pass_time(self, t: float) -> None:
         """Note the time t, s, of an item that is good for nothing else."""
         if self._is_plausible(t):
             self.newest = max(self.newest, t)

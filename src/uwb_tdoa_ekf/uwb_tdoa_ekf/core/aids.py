@@ -1,6 +1,10 @@
 """What a tag feels beside inertia and TDOAs: one AID is one measurement of one of the SENSORS."""
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from __future__ import annotations
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from . import barometer, height, velocity
@@ -10,18 +14,18 @@ HEIGHT, PRESSURE, VELOCITY, RANGE = map(STREAMS.index, ("height", "pressure", "v
 
 
 @compiled
-def observe(ekf, tuning, aid, residual, records):
+def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray) -> None:
     """Take one of AID into a running filter that has been predicted to its stamp; fills one of RESIDUAL."""
     if aid.kind == HEIGHT:
-        height.observe(ekf, tuning, aid, residual, records)
+        height.observe(ekf, parameters, aid, residual, records)
     elif aid.kind == PRESSURE:
-        barometer.observe(ekf, tuning, aid, residual, records)
+        barometer.observe(ekf, parameters, aid, residual, records)
     else:
-        velocity.observe(ekf, tuning, aid, residual, records)
+        velocity.observe(ekf, parameters, aid, residual, records)
 
 
 @compiled
-def note(ekf, aid):
+def record(ekf: Record, aid: Record) -> None:
     """Take one of AID while the filter does not run."""
     if aid.kind == HEIGHT:
-        height.note(ekf, aid)
+        height.record(ekf, aid)

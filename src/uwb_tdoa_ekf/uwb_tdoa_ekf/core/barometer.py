@@ -4,9 +4,13 @@ Offset and drift are states beside the 15 of the error state, with their own cov
 without a barometer (variance of the offset 0) nothing is computed for them.
 """
 
+from __future__ import annotations
+
 import math
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, weight
 
 from .hypotheses import alive
@@ -21,7 +25,7 @@ UNTRIED, WORST = 10.0, 100.0  # at first, and at most, in times the told standar
 
 
 @compiled
-def observe(ekf, tuning, aid, residual, records):
+def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray) -> None:
     """Take an altitude of the standard atmosphere, one of AID, into a running filter; fills one of RESIDUAL."""
     barometer, innovation, altitude = ekf.barometer, ekf.innovation, aid.value[0]
     dt = min(max(aid.t - barometer.heard, 0.0), AVERAGE)
@@ -33,10 +37,10 @@ def observe(ekf, tuning, aid, residual, records):
         if not alive(hypothesis):
             continue
         if anew or hypothesis.offset_P[0, 0] == 0.0:
-            _take_anew(hypothesis, altitude, tuning)
+            _take_anew(hypothesis, altitude, parameters)
             continue
-        hypothesis.offset_P[0, 0] += dt * excess * tuning.pressure_walk**2
-        _compare(hypothesis, altitude, tuning, innovation)
+        hypothesis.offset_P[0, 0] += dt * excess * parameters.pressure_walk**2
+        _compare(hypothesis, altitude, parameters, innovation)
         total = innovation.prior_variance + innovation.noise_variance
         normalized = innovation.value / math.sqrt(total)
         w = weight(GEMAN_MCCLURE, normalized, GATE) if abs(normalized) < GATE else 0.0
@@ -57,11 +61,11 @@ def observe(ekf, tuning, aid, residual, records):
 
 
 @compiled
-def _compare(hypothesis, altitude, tuning, innovation):
+def _compare(hypothesis: Record, altitude: float, parameters: Record, innovation: Record) -> None:
     """Fill in what an altitude (m) says to a HYPOTHESIS and its offset."""
     innovation.entries, innovation.states[0], innovation.row[0] = 1, 2, 1.0
     innovation.value = altitude - hypothesis.x[2] - hypothesis.offset[0]
-    innovation.noise_variance = tuning.pressure_std**2
+    innovation.noise_variance = parameters.pressure_std**2
     project(hypothesis.P, innovation)
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
     for j in range(ERROR_STATES):
@@ -71,19 +75,19 @@ def _compare(hypothesis, altitude, tuning, innovation):
 
 
 @compiled
-def _take_anew(hypothesis, altitude, tuning):
+def _take_anew(hypothesis: Record, altitude: float, parameters: Record) -> None:
     """The offset is what leads from the height of the filter to an altitude; the drift is not known."""
     hypothesis.offset[0], hypothesis.offset[1] = altitude - hypothesis.x[2], 0.0
     hypothesis.offset_cross[:] = 0.0
     for j in range(ERROR_STATES):
         hypothesis.offset_cross[0, j] = -hypothesis.P[2, j]
     hypothesis.offset_P[:] = 0.0
-    hypothesis.offset_P[0, 0] = hypothesis.P[2, 2] + tuning.pressure_std**2
-    hypothesis.offset_P[1, 1] = tuning.pressure_drift**2
+    hypothesis.offset_P[0, 0] = hypothesis.P[2, 2] + parameters.pressure_std**2
+    hypothesis.offset_P[1, 1] = parameters.pressure_drift**2
 
 
 @compiled
-def predict(hypothesis, transition):
+def predict(hypothesis: Record, transition: Record) -> None:
     """After `state.predict` of a HYPOTHESIS that has an offset: its covariance with the state, by the same TRANSITION."""
     dt, cross = transition.dt, hypothesis.offset_cross
     A, B, E = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude
@@ -99,7 +103,7 @@ def predict(hypothesis, transition):
 
 
 @compiled
-def coast(hypothesis, dt):
+def coast(hypothesis: Record, dt: float) -> None:
     """The same after `state.coast`."""
     cross = hypothesis.offset_cross
     for k in range(OFFSET_STATES):
@@ -109,7 +113,7 @@ def coast(hypothesis, dt):
 
 
 @compiled
-def _drift(hypothesis, dt):
+def _drift(hypothesis: Record, dt: float) -> None:
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
     hypothesis.offset[0] += dt * hypothesis.offset[1]
     for j in range(ERROR_STATES):

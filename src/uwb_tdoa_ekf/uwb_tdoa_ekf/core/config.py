@@ -1,8 +1,11 @@
 """Every number that tunes the filter, with its unit and why it is what it is."""
 
+from collections.abc import Callable
+from dataclasses import Field, dataclass, fields, make_dataclass
 import math
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
 import warnings
-from dataclasses import dataclass, fields, make_dataclass
 
 import numpy as np
 
@@ -85,7 +88,10 @@ class _FilterParameters:
 
 # What else the tag feels
 _PARAMETERS = [(name, type(each.default), each) for sensor in SENSORS.values() for name, each in sensor.parameters.items()]
-_SensorParameters = make_dataclass("_SensorParameters", _PARAMETERS, bases=(_FilterParameters,), frozen=True)
+if TYPE_CHECKING:
+    _SensorParameters = _FilterParameters
+else:
+    _SensorParameters = make_dataclass("_SensorParameters", _PARAMETERS, bases=(_FilterParameters,), frozen=True)
 
 
 @dataclass(frozen=True)
@@ -98,7 +104,7 @@ class FilterConfig(_SensorParameters):
     # The output
     odometry_rate: float = parameter(200.0, "Hz of stamps; at most this often", high=1e6)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for each in fields(self):
             name, value = each.name, getattr(self, each.name)
             if name in CHOICES:
@@ -111,14 +117,14 @@ class FilterConfig(_SensorParameters):
                 object.__setattr__(self, name, _number(each, value))
 
     @classmethod
-    def from_parameters(cls, parameters, warn=None):
+    def from_parameters(cls, parameters: dict[str, Any], warn: Callable[[str], object] | None = None) -> "FilterConfig":
         """Of a dict by name; names that are no parameter of the filter are passed over, old ones taken with a warning
         (see `current_names`). Raises InputError."""
         parameters = current_names(parameters, warn)
         return cls(**{f.name: parameters[f.name] for f in fields(cls) if f.name in parameters})
 
     @classmethod
-    def from_yaml(cls, path):
+    def from_yaml(cls, path: str | Path) -> "FilterConfig":
         """Read the ros__parameters of a node's parameter file; those that do not tune the filter are passed over."""
         content = read_yaml(path)
         try:
@@ -129,17 +135,17 @@ class FilterConfig(_SensorParameters):
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}: expected one node's 'ros__parameters' mapping, as in ekf_node.yaml.") from error
 
-    def tuning(self):
-        """The numbers as the compiled core takes them: (1,) of TUNING, for choices their places in CHOICES."""
-        values = (getattr(self, name) for name in TUNING.names)
-        places = (CHOICES[name].index(v) if name in CHOICES else v for name, v in zip(TUNING.names, values))
-        return np.array([tuple(places)], TUNING)
+    def parameters(self) -> np.ndarray:
+        """The numbers as the compiled core takes them: (1,) of PARAMETERS, for choices their places in CHOICES."""
+        values = ((each.name, getattr(self, each.name)) for each in fields(self))
+        places = (CHOICES[name].index(value) if name in CHOICES else value for name, value in values)
+        return np.array([tuple(places)], PARAMETERS)
 
 
-TUNING = np.dtype([(f.name, np.int64 if f.name in CHOICES else f.type) for f in fields(FilterConfig)], align=True)
+PARAMETERS = np.dtype([(f.name, np.int64 if f.name in CHOICES else f.type) for f in fields(FilterConfig)], align=True)
 
 
-def current_names(parameters, warn=None):
+def current_names(parameters: dict[str, Any], warn: Callable[[str], object] | None = None) -> dict[str, Any]:
     """A dict of parameters with old names (RENAMED) replaced by the present ones.
 
     warn : is called with one sentence for each that had an old name; default: a FutureWarning. Raises InputError for a
@@ -156,14 +162,15 @@ def current_names(parameters, warn=None):
     return out
 
 
-def _number(parameter, value):
+def _number(parameter: Field[Any], value: Any) -> float:
     """`value` as the type of a field of FilterConfig; raises InputError if it is none, or out of bounds."""
+    kind: Any = parameter.type
     low, high, with_low = (parameter.metadata[name] for name in ("low", "high", "with_low"))
     try:
-        number = parameter.type(value)
+        number = kind(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not (low < number <= high or (with_low and number == low)) or number != value:
-        kind = "whole number" if parameter.type is int else "number"
-        raise InputError(f"{parameter.name}: {value!r} must be a {kind} above {low:g}, at most {high:g}.")
+        what = "whole number" if kind is int else "number"
+        raise InputError(f"{parameter.name}: {value!r} must be a {what} above {low:g}, at most {high:g}.")
     return number

@@ -4,6 +4,8 @@ The second-order term of a Gaussian filter (e.g. Bar-Shalom et al., Estimation w
 section 10.3.2), mean and variance, taken as a variance.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -1,15 +1,17 @@
-"""The compiled filter: events in stamp order in, odometry and residuals out. Everything it remembers is in Memory."""
+"""The compiled filter: events in stamp order in, odometry and residuals out. Everything it remembers is in FilterState."""
+
+from __future__ import annotations
 
 import math
 
 import numpy as np
 
 from uwb_tdoa_bias.effects.slope import N_STATES
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
 from . import aids, barometer, curvature, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, ranges, rest, robust, systematic, workspace
-from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, Output
+from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, FilterState, Measurements, Output
 from .sensor_functions import take_out
 from .startup import INLIER
 from .state import coast, predict
@@ -22,7 +24,7 @@ UNSURE_TIME = 0.5  # s of TDOAs, after a silence in which a tag got lost, in whi
 LOST_TIME = 30.0  # s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter starts anew
 MAX_STEP = 0.05  # s, longest single prediction
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
-STRAIGHT = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
+LINEAR_RANGE = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
 RECORDS_OF_TDOA = 1 + 4 + 1 + 6 + 1 + 2  # in a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, starts or recoveries
 RECORDS_OF_REST = 3  # one per axis
@@ -30,14 +32,14 @@ RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per comp
 
 
 @compiled
-def run(memory, tuning, measurements, output):
+def run(state: FilterState, parameters: np.ndarray, measurements: Measurements, output: Output) -> int:
     """Feed Measurements in stamp order, neither before what was fed earlier.
 
-    memory : Memory, whose functions are taken out of the inertial samples where they lie; tuning : (1,) of config.TUNING; output :
+    state : FilterState, whose functions are taken out of the inertial samples where they lie; parameters : (1,) of config.PARAMETERS; output :
     Output, which is filled. Returns the number of odometry
     rows. Raises IndexError if a history has less room than `most_records`.
     """
-    ekf, anchors, parameters = memory.ekf[0], memory.anchors, tuning[0]
+    ekf, anchors, values = state.ekf[0], state.anchors, parameters[0]
     imu, tdoa, aid = measurements.imu, measurements.tdoa, measurements.aids
     i = k = m = rows = 0
     while i < len(imu) or k < len(tdoa) or m < len(aid):
@@ -46,37 +48,37 @@ def run(memory, tuning, measurements, output):
         of_aid = aid[m].t if m < len(aid) else np.inf
         t = min(of_imu, of_tdoa, of_aid)
         if of_imu == t and i < len(imu):
-            if len(memory.functions) and ekf.running:
-                take_out(memory.functions, ekf.hypotheses[ekf.best].x, imu[i])
-            _on_imu(ekf, parameters, imu[i], output.history)
+            if len(state.functions) and ekf.running:
+                take_out(state.functions, ekf.hypotheses[ekf.best].x, imu[i])
+            _on_imu(ekf, values, imu[i], output.history)
             i += 1
         elif of_tdoa == t and k < len(tdoa):
-            _on_tdoa(ekf, anchors, parameters, tdoa[k], output.residuals[k], output.history)
+            _on_tdoa(ekf, anchors, values, tdoa[k], output.residuals[k], output.history)
             k += 1
         else:
-            _on_aid(ekf, anchors, parameters, aid[m], output.aids[m], output.history)
+            _on_aid(ekf, anchors, values, aid[m], output.aids[m], output.history)
             m += 1
         if ekf.running and t >= ekf.next_odometry:
-            ekf.next_odometry = (math.floor(t * parameters.odometry_rate + 1e-6) + 1.0) / parameters.odometry_rate
-            _report(ekf, parameters, t, output.odometry[rows])
+            ekf.next_odometry = (math.floor(t * values.odometry_rate + 1e-6) + 1.0) / values.odometry_rate
+            _report(ekf, values, t, output.odometry[rows])
             rows += 1
     return rows
 
 
 @compiled
-def _tell(memory, tuning, poses, records):
-    ekf, pose = memory.ekf[0], poses[0]
+def _set_pose(state: FilterState, parameters: np.ndarray, poses: np.ndarray, records: np.ndarray) -> None:
+    ekf, pose = state.ekf[0], poses[0]
     if ekf.running:
-        _advance(ekf, tuning[0], pose.t, records)
-    initialization.place(ekf, memory.anchors, tuning[0], pose.t, pose, records)
+        _advance(ekf, parameters[0], pose.t, records)
+    initialization.place(ekf, state.anchors, parameters[0], pose.t, pose, records)
 
 
-def tell_pose(memory, tuning, pose):
+def set_pose(state: FilterState, parameters: np.ndarray, pose: np.ndarray) -> None:
     """Put the filter at a pose, (1,) of POSE, that is not before what was fed earlier. Is not recorded in a history."""
-    _tell(memory, tuning, pose, history.NOTHING)
+    _set_pose(state, parameters, pose, history.NOTHING)
 
 
-def most_records(measurements):
+def most_records(measurements: Measurements) -> int:
     """Room that a history needs for Measurements that are fed at once."""
     imu, tdoa, aid = measurements
     seconds = imu["t"][-1] - imu["t"][0] if len(imu) else 0.0
@@ -88,31 +90,34 @@ def most_records(measurements):
 
 
 @compiled
-def _on_imu(ekf, tuning, sample, records):
-    fresh = inertial.observe(ekf.imu, sample, tuning.imu_timeout)
-    distrusted = plausibility.judge(ekf.plausibility, ekf.imu, sample, fresh, ekf.distrusted)
+def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray) -> None:
+    continuous = inertial.observe(ekf.imu, sample, parameters.imu_timeout)
+    distrusted = plausibility.judge(ekf.plausibility, ekf.imu, sample, continuous, ekf.distrusted)
     if distrusted != ekf.distrusted:
         ekf.distrusted = distrusted
-        _switch(ekf, tuning, records)
-    if ekf.running and _advance(ekf, tuning, sample.t, records):
-        if fresh and not ekf.distrusted:
+        _switch(ekf, parameters, records)
+    if ekf.running and _advance(ekf, parameters, sample.t, records):
+        if continuous and not ekf.distrusted:
             rest.feel(ekf, sample, sample.t - ekf.imu.t)
-        ekf.quiet = tuning.zero_velocity and fresh and not ekf.distrusted and inertial.is_quiet(ekf.imu)
-        rest.hold(ekf, sample.t, records)
-    inertial.hold(ekf.imu, sample)
+        ekf.quiet = parameters.zero_velocity and continuous and not ekf.distrusted and inertial.is_quiet(ekf.imu)
+        rest.update_zero_velocity(ekf, sample.t, records)
+    inertial.store(ekf.imu, sample)
 
 
 @compiled
-def _switch(ekf, tuning, records):
+def _switch(ekf: Record, parameters: Record, records: np.ndarray) -> None:
     """Go without inertial samples from here on, or with them again: from the attitude that they then have."""
     if ekf.running and ekf.distrusted:
         initialization.widen(ekf, records)
     elif ekf.running:
-        initialization.level_anew(ekf, tuning, records)
+        initialization.level_anew(ekf, parameters, records)
 
 
 @compiled
-def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
+def _on_tdoa(
+    ekf: Record, anchors: np.ndarray, parameters: Record, tdoa: Record, residual: Record,
+    records: np.ndarray,
+) -> None:  # fmt: skip
     residual.innovation = residual.variance = np.nan
     residual.weight, residual.verdict = 0.0, STARTUP
     if initialization.is_repeat(ekf, tdoa, anchors):
@@ -120,19 +125,22 @@ def _on_tdoa(ekf, anchors, tuning, tdoa, residual, records):
         return
     initialization.remember(ekf, tdoa, anchors)
     t, was_running = tdoa.t, ekf.running
-    if not was_running or not _advance(ekf, tuning, t, records):
+    if not was_running or not _advance(ekf, parameters, t, records):
         if not was_running:
-            _wait_for_start(ekf, anchors, tuning, t, records)
+            _wait_for_start(ekf, anchors, parameters, t, records)
         return
-    _before_update(ekf, anchors, tuning, t, records)
-    late = _update(ekf, anchors, tuning, tdoa, residual, records)
-    initialization.relocate(ekf, anchors, tuning, t, records)
+    _before_update(ekf, anchors, parameters, t, records)
+    late = _update(ekf, anchors, parameters, tdoa, residual, records)
+    initialization.relocate(ekf, anchors, parameters, t, records)
     known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
-    _after_update(ekf, anchors, tuning, t, not late, abs(residual.innovation - known) < INLIER, records)
+    _after_update(ekf, anchors, parameters, t, not late, abs(residual.innovation - known) < INLIER, records)
 
 
 @compiled
-def _on_range(ekf, anchors, tuning, aid, residual, records):
+def _on_range(
+    ekf: Record, anchors: np.ndarray, parameters: Record, aid: Record, residual: Record,
+    records: np.ndarray,
+) -> None:  # fmt: skip
     """The distance to an anchor, one of AID; as a TDOA with the one before it tells the start."""
     if ranges.is_repeat(ekf, aid):
         residual.verdict = REPEATED
@@ -140,46 +148,49 @@ def _on_range(ekf, anchors, tuning, aid, residual, records):
     if ranges.pair(ekf, aid):
         initialization.remember(ekf, ekf.paired[0], anchors)
     t, was_running = aid.t, ekf.running
-    if not was_running or not _advance(ekf, tuning, t, records):
+    if not was_running or not _advance(ekf, parameters, t, records):
         if not was_running:
-            _wait_for_start(ekf, anchors, tuning, t, records)
+            _wait_for_start(ekf, anchors, parameters, t, records)
         return
-    _before_update(ekf, anchors, tuning, t, records)
+    _before_update(ekf, anchors, parameters, t, records)
     anchor, innovation = anchors[aid.anchor], ekf.innovation
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
             continue
-        ranges.compare(hypothesis, anchor.position, aid, tuning, innovation)
+        ranges.compare(hypothesis, anchor.position, aid, parameters, innovation)
         innovation.repeated, innovation.curvature = rest.repetition(ekf, t), 0.0
-        _assimilate(ekf, h, tuning, t, residual, records)
+        _assimilate(ekf, h, parameters, t, residual, records)
         if h == ekf.best:
             systematic.observe(ekf.information, anchor, anchor, innovation, t, ekf.last_tdoa)
-    _after_update(ekf, anchors, tuning, t, True, abs(residual.innovation) < INLIER, records)
+    _after_update(ekf, anchors, parameters, t, True, abs(residual.innovation) < INLIER, records)
 
 
 @compiled
-def _before_update(ekf, anchors, tuning, t, records):
+def _before_update(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray) -> None:
     """Before an update stamped t, s: whether the tag is at rest, which anchors are heard, and whether a silence left the place open."""
-    if tuning.zero_velocity:
+    if parameters.zero_velocity:
         if t >= ekf.next_look:
-            rest.look(ekf, anchors, tuning, initialization.recent(ekf, rest.LOOK_WINDOW), t, records)
-        if not tuning.use_imu or t - ekf.imu.t > tuning.imu_timeout:
-            rest.hold(ekf, t, records)
+            rest.look(ekf, anchors, parameters, initialization.recent(ekf, rest.LOOK_WINDOW), t, records)
+        if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
+            rest.update_zero_velocity(ekf, t, records)
     if t >= ekf.next_bounds:
-        initialization.look_around(ekf, anchors, tuning, t)
-    if t - ekf.last_tdoa > tuning.start_window and initialization.is_unsure(ekf):
+        initialization.look_around(ekf, anchors, parameters, t)
+    if t - ekf.last_tdoa > parameters.start_window and initialization.is_unsure(ekf):
         ekf.unsure_until = t + UNSURE_TIME
 
 
 @compiled
-def _after_update(ekf, anchors, tuning, t, counts, agrees, records):
+def _after_update(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, counts: bool, agrees: bool,
+    records: np.ndarray,
+) -> None:  # fmt: skip
     """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the tag is elsewhere. counts :
     what was measured tells that; agrees : with the best hypothesis."""
     _stay_in_workspace(ekf, t, records)
-    if tuning.fixed_height_std > 0.0 and t >= ekf.next_floor:
+    if parameters.fixed_height_std > 0.0 and t >= ekf.next_floor:
         ekf.next_floor = t + rest.PERIOD
-        _stay_on_floor(ekf, tuning, t, records)
+        _stay_on_floor(ekf, parameters, t, records)
     followed = ekf.best
     hypotheses.select(ekf, t)
     if ekf.best // YAWS != followed // YAWS:  # at another place
@@ -190,46 +201,51 @@ def _after_update(ekf, anchors, tuning, t, counts, agrees, records):
     if ekf.consistency > initialization.AGREE:
         ekf.sure = t
     unsure = t < ekf.unsure_until
-    if tuning.recover and (unsure or ekf.consistency < INCONSISTENT) and t >= ekf.next_search:
-        initialization.recover(ekf, anchors, tuning, t, unsure, records)
+    if parameters.recover and (unsure or ekf.consistency < INCONSISTENT) and t >= ekf.next_search:
+        initialization.recover(ekf, anchors, parameters, t, unsure, records)
 
 
 @compiled
-def _on_aid(ekf, anchors, tuning, aid, residual, records):
+def _on_aid(
+    ekf: Record, anchors: np.ndarray, parameters: Record, aid: Record, residual: Record,
+    records: np.ndarray,
+) -> None:  # fmt: skip
     residual.innovation = residual.variance = np.nan
     residual.weight, residual.verdict = 0.0, STARTUP
     if aid.kind == aids.RANGE:
-        _on_range(ekf, anchors, tuning, aid, residual, records)
-    elif ekf.running and _advance(ekf, tuning, aid.t, records):
-        aids.observe(ekf, tuning, aid, residual, records)
+        _on_range(ekf, anchors, parameters, aid, residual, records)
+    elif ekf.running and _advance(ekf, parameters, aid.t, records):
+        aids.observe(ekf, parameters, aid, residual, records)
     else:
-        aids.note(ekf, aid)
+        aids.record(ekf, aid)
 
 
 @compiled
-def _wait_for_start(ekf, anchors, tuning, t, records):
+def _wait_for_start(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
+) -> None:
     """A TDOA stamped t has come while the filter does not run."""
-    if t - ekf.last_tdoa > tuning.start_window:
+    if t - ekf.last_tdoa > parameters.start_window:
         ekf.first_tdoa = t
     ekf.last_tdoa = t
     waited = t - ekf.first_tdoa
     if t < ekf.next_search:
         return
-    if waited > 0.9 * tuning.start_window:
-        initialization.start(ekf, anchors, tuning, t, waited > tuning.start_timeout, records)
+    if waited > 0.9 * parameters.start_window:
+        initialization.start(ekf, anchors, parameters, t, waited > parameters.start_timeout, records)
     if t >= ekf.next_search:
-        initialization.start_slowly(ekf, anchors, tuning, t, records)
+        initialization.start_slowly(ekf, anchors, parameters, t, records)
 
 
 @compiled
-def _advance(ekf, tuning, t, records):
+def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> bool:
     """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old, without one. Returns
     False if the filter has stopped, because nothing has told for too long where the tag is."""
     if t - ekf.t > LOST_TIME:
         return _stop(ekf, t)
-    sensed = tuning.use_imu and t - ekf.imu.t < tuning.imu_timeout and not ekf.distrusted
+    sensed = parameters.use_imu and t - ekf.imu.t < parameters.imu_timeout and not ekf.distrusted
     if sensed and ekf.t < t:
-        inertial.weigh(ekf.imu, ekf.quiet, tuning)
+        inertial.weigh(ekf.imu, ekf.quiet, parameters)
     while ekf.t < t:
         dt = min(t - ekf.t, MAX_STEP)
         for h in range(HYPOTHESES):
@@ -237,13 +253,13 @@ def _advance(ekf, tuning, t, records):
             if not hypotheses.alive(hypothesis):
                 continue
             if sensed:
-                predict(hypothesis, ekf.imu, tuning, dt, ekf.transition)
+                predict(hypothesis, ekf.imu, parameters, dt, ekf.transition)
                 if hypothesis.offset_P[0, 0] > 0.0:
                     barometer.predict(hypothesis, ekf.transition)
                 if h == ekf.best:
                     history.add_prediction(ekf, records)
             else:
-                coast(hypothesis, dt, tuning.motion_noise**2, STALE_TURN_PSD if tuning.use_imu else 0.0)
+                coast(hypothesis, dt, parameters.motion_noise**2, STALE_TURN_PSD if parameters.use_imu else 0.0)
                 if hypothesis.offset_P[0, 0] > 0.0:
                     barometer.coast(hypothesis, dt)
                 if h == ekf.best:
@@ -255,18 +271,21 @@ def _advance(ekf, tuning, t, records):
 
 
 @compiled
-def _stop(ekf, t):
+def _stop(ekf: Record, t: float) -> bool:
     """Go on as before the start. Returns False."""
     ekf.running, ekf.first_tdoa, ekf.next_search = False, t, -np.inf
     return False
 
 
 @compiled
-def _update(ekf, anchors, tuning, tdoa, residual, records):
+def _update(
+    ekf: Record, anchors: np.ndarray, parameters: Record, tdoa: Record, residual: Record,
+    records: np.ndarray,
+) -> bool:  # fmt: skip
     """Every hypothesis with one TDOA; the best one's innovation becomes the residual. Returns whether one of its anchors is late because
     it is near the ground: then it tells nothing."""
     a, b, innovation = anchors[tdoa.a], anchors[tdoa.b], ekf.innovation
-    innovation.noise_variance = tuning.tdoa_std**2 + tdoa.variance + a.delay_variance + b.delay_variance
+    innovation.noise_variance = parameters.tdoa_std**2 + tdoa.variance + a.delay_variance + b.delay_variance
     change = known = b.delay - a.delay
     on_floor = ekf.resting and ekf.late_as_known
     if on_floor and not math.isnan(a.floor_delay):
@@ -275,10 +294,10 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
     if on_floor and not math.isnan(b.floor_delay):
         known += b.floor_delay
         innovation.noise_variance += b.floor_std**2
-    if tuning.adapt_noise:
+    if parameters.adapt_noise:
         innovation.noise_variance += noise.excess_variance(a, b)
-    innovation.noise_variance += ground.blur(ekf.hypotheses[ekf.best], tuning.ground_height)
-    if not on_floor and ground.find_lateness(a, b, ekf.hypotheses[ekf.best], tdoa.t, tuning.ground_height):
+    innovation.noise_variance += ground.blur(ekf.hypotheses[ekf.best], parameters.ground_height)
+    if not on_floor and ground.find_lateness(a, b, ekf.hypotheses[ekf.best], tdoa.t, parameters.ground_height):
         _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
         in_time = ground.in_time(a, b, innovation)
         if in_time < ground.NOT_USED:
@@ -293,12 +312,12 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
             continue
         _compare(hypothesis, a, b, tdoa, known, innovation)
         innovation.repeated = rest.repetition(ekf, tdoa.t)
-        _assimilate(ekf, h, tuning, tdoa.t, residual, records)
+        _assimilate(ekf, h, parameters, tdoa.t, residual, records)
         if h == ekf.best:
             systematic.observe(ekf.information, a, b, innovation, tdoa.t, ekf.last_tdoa)
-            height.judge(ekf.height, tuning, innovation, tdoa.t)
-            if tuning.adapt_noise:
-                noise.learn(a, b, tdoa.t, innovation, tuning)
+            height.judge(ekf.height, parameters, innovation, tdoa.t)
+            if parameters.adapt_noise:
+                noise.learn(a, b, tdoa.t, innovation, parameters)
     if a.delay != 0.0 or b.delay != 0.0:
         residual.innovation += change
         if residual.verdict == USED:
@@ -307,7 +326,9 @@ def _update(ekf, anchors, tuning, tdoa, residual, records):
 
 
 @compiled
-def _compare(hypothesis, a, b, tdoa, known, innovation):
+def _compare(
+    hypothesis: Record, a: Record, b: Record, tdoa: Record, known: float, innovation: Record
+) -> None:
     """Fill in what a TDOA between two of ANCHOR, `known` (m) too long, says to a HYPOTHESIS; its Jacobian is that of the position, and
     of what its bias changes with, where the state is about as it was when the bias was told."""
     innovation.value = tdoa.d - known - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
@@ -317,7 +338,7 @@ def _compare(hypothesis, a, b, tdoa, known, innovation):
         if k >= 3:
             innovation.row[k] = 0.0
         apart = hypothesis.x[k] - tdoa.state[k]
-        if tdoa.slope[k] != 0.0 and abs(apart) < STRAIGHT:
+        if tdoa.slope[k] != 0.0 and abs(apart) < LINEAR_RANGE:
             innovation.value -= tdoa.slope[k] * apart
             innovation.row[k] += tdoa.slope[k]
             innovation.entries = max(innovation.entries, k + 1)
@@ -327,11 +348,13 @@ def _compare(hypothesis, a, b, tdoa, known, innovation):
 
 
 @compiled
-def _assimilate(ekf, h, tuning, t, residual, records):
+def _assimilate(
+    ekf: Record, h: int, parameters: Record, t: float, residual: Record, records: np.ndarray
+) -> None:
     """Hypothesis h with ekf.innovation, of whatever kind; that of the best one becomes the RESIDUAL."""
     hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
-    hypotheses.add_log_likelihood(hypothesis, innovation, tuning.tdoa_correlation_length * innovation.repeated)
-    robust.update(hypothesis, innovation, tuning)
+    hypotheses.add_log_likelihood(hypothesis, innovation, parameters.tdoa_correlation_length * innovation.repeated)
+    robust.update(hypothesis, innovation, parameters)
     if h == ekf.best:
         residual.innovation = innovation.value
         residual.variance = innovation.prior_variance + innovation.noise_variance
@@ -342,7 +365,7 @@ def _assimilate(ekf, h, tuning, t, residual, records):
 
 
 @compiled
-def _stay_in_workspace(ekf, t, records):
+def _stay_in_workspace(ekf: Record, t: float, records: np.ndarray) -> None:
     """Soft constraints of every axis, for each hypothesis that is outside."""
     for h in range(HYPOTHESES):
         if not hypotheses.alive(ekf.hypotheses[h]):
@@ -356,30 +379,32 @@ def _stay_in_workspace(ekf, t, records):
 
 
 @compiled
-def _stay_on_floor(ekf, tuning, t, records):
+def _stay_on_floor(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None:
     """The fixed height, where a hypothesis knows less of it: what is told once is not told better by being repeated."""
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
-        if hypotheses.alive(hypothesis) and hypothesis.P[2, 2] > tuning.fixed_height_std**2:
-            update_state(hypothesis, ekf.innovation, 2, tuning.fixed_height, tuning.fixed_height_std)
+        if hypotheses.alive(hypothesis) and hypothesis.P[2, 2] > parameters.fixed_height_std**2:
+            update_state(hypothesis, ekf.innovation, 2, parameters.fixed_height, parameters.fixed_height_std)
             if h == ekf.best:
                 history.add_update(ekf, t, records)
 
 
 @compiled
-def _report(ekf, tuning, t, row):
+def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     """Write the best hypothesis to one of ODOMETRY."""
     best = ekf.hypotheses[ekf.best]
     row.t = t
     row.x[:] = best.x
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
-    workspace.add_circle(ekf, tuning.fixed_height_std > 0.0 or t - ekf.height.used < height.LONGEST_GAP, best.x, row.covariance)
-    systematic.fill(ekf.information, best.P, tuning.tdoa_correlation_length, row.persistent)
+    workspace.add_circle(ekf, parameters.fixed_height_std > 0.0 or t - ekf.height.used < height.LONGEST_GAP, best.x, row.covariance)
+    systematic.fill(ekf.information, best.P, parameters.tdoa_correlation_length, row.persistent)
     row.covariance[:3, :3] += row.persistent
 
 
-def feed(memory, tuning, measurements, records=None):
+def feed(
+    state: FilterState, parameters: np.ndarray, measurements: Measurements, records: list[np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`run`, with room for what it gives: (odometry of ODOMETRY, residuals of TDOAs and those of aids, of RESIDUAL).
 
     records : list to which the records of the history are appended, an array for each call; None: nothing is recorded.
@@ -388,8 +413,8 @@ def feed(memory, tuning, measurements, records=None):
     room = history.NOTHING if records is None else np.empty(most_records(measurements), history.RECORD)
     n = len(imu) + len(tdoa) + len(aid)
     output = Output(np.empty(n, ODOMETRY), np.empty(len(tdoa), RESIDUAL), room, np.empty(len(aid), RESIDUAL))
-    rows = run(memory, tuning, measurements, output)
+    rows = run(state, parameters, measurements, output)
     if records is not None:
-        records.append(room[: memory.record.recorded].copy())
-        memory.record.recorded = 0
+        records.append(room[: state.record.recorded].copy())
+        state.record.recorded = 0
     return output.odometry[:rows], output.residuals, output.aids

@@ -5,11 +5,13 @@ equally long (two-ray ground-reflection model, e.g. Rappaport, Wireless Communic
 arrival for the first, metres late. By how much is not known; that it may be so follows from the two heights and the distance.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
 GRAZING = math.tan(math.radians(15.0))  # elevation below which the ground turns the phase of what it reflects
@@ -55,7 +57,7 @@ PAIR = np.dtype(
 
 
 @compiled
-def may_be_late(position, x, lower, ground):
+def may_be_late(position: np.ndarray, x: np.ndarray, lower: float, ground: float) -> bool:
     """Whether an anchor at `position` (3,) may be late at a tag at x (3,), m, or up to `lower` m below it, over level ground."""
     tag, anchor = max(x[2] - ground - lower, 0.0), max(position[2] - ground, 0.0)
     distance = math.hypot(x[0] - position[0], x[1] - position[1])
@@ -63,7 +65,7 @@ def may_be_late(position, x, lower, ground):
 
 
 @compiled
-def blur(hypothesis: np.void, ground: float) -> float:
+def blur(hypothesis: Record, ground: float) -> float:
     """Variance, m^2, of a TDOA at a HYPOTHESIS over level ground beyond that in the air: the ray that the ground reflects comes within the
     length of the pulse, and moves its leading edge."""
     share = min(max(1.0 - (hypothesis.x[2] - ground) / BLURRED, 0.0), 1.0)
@@ -71,7 +73,7 @@ def blur(hypothesis: np.void, ground: float) -> float:
 
 
 @compiled
-def find_lateness(a, b, hypothesis, t, ground):
+def find_lateness(a: Record, b: Record, hypothesis: Record, t: float, ground: float) -> bool:
     """Predict to stamp t, s, how probable it is that each of two ANCHORs is late at a HYPOTHESIS over level ground. Returns whether either
     can be."""
     lower = DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
@@ -84,7 +86,7 @@ def find_lateness(a, b, hypothesis, t, ground):
 
 
 @compiled
-def _predict_lateness(anchor, x, lower, t, ground):
+def _predict_lateness(anchor: Record, x: np.ndarray, lower: float, t: float, ground: float) -> None:
     if not may_be_late(anchor.position, x, lower, ground):
         anchor.late = 0.0
     else:
@@ -94,7 +96,7 @@ def _predict_lateness(anchor, x, lower, t, ground):
 
 
 @compiled
-def in_time(a, b, innovation):
+def in_time(a: Record, b: Record, innovation: Record) -> float:
     """Probability that a TDOA between two of ANCHOR, an INNOVATION after `project` of the best HYPOTHESIS, is of two anchors in time.
 
     After `find_lateness`; what is known of each anchor becomes what it is after that TDOA (a filter of four modes, Bar-Shalom et al.,
@@ -113,13 +115,13 @@ def in_time(a, b, innovation):
 
 
 @compiled
-def _lateness(r):
+def _lateness(r: float) -> float:
     """Density, 1/m, of an innovation r, m, by one late anchor."""
     return max(2.0 * r / LATEST**2, FARTHER) if r < LATEST else FARTHER
 
 
 @compiled
-def find_pairs(window, pairs):
+def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
     """Fill in (k,) of PAIR what each pair of anchors, in either order, says in a window (n,) of TDOA, n > 0. Returns how many there are.
 
     The scatter within halves of the window is that of all pairs.
@@ -165,12 +167,12 @@ def find_pairs(window, pairs):
 
 
 @compiled
-def _is_of(tdoa, a, b):
+def _is_of(tdoa: Record, a: int, b: int) -> bool:
     return (tdoa.a == a and tdoa.b == b) or (tdoa.a == b and tdoa.b == a)
 
 
 @compiled
-def is_still(pairs, anchors, x, covariance):
+def is_still(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> bool:
     """True if the TDOAs of most (k,) of PAIR stay what they are: whatever their anchors are late by, the tag does not move.
 
     x : (3,) m, about where it is; covariance (3, 3) m^2/s^2 of the velocity that they would have shown is filled, large where that is not
@@ -211,7 +213,10 @@ def is_still(pairs, anchors, x, covariance):
 
 
 @compiled
-def explain(pairs, anchors, workspace, prior, tuning, z, z_std, lateness, x, covariance):
+def explain(
+    pairs: np.ndarray, anchors: np.ndarray, workspace: np.ndarray, prior: np.ndarray, parameters: Record,
+    z: float, z_std: float, lateness: int, x: np.ndarray, covariance: np.ndarray,
+) -> float:  # fmt: skip
     """Where a tag at rest is, by what (k,) of PAIR say, as far as anchors are alike.
 
     prior : (4, 3), position that is known before, m, and its information, 1/m^2; z, z_std : m, a height that is known and its standard
@@ -228,7 +233,7 @@ def explain(pairs, anchors, workspace, prior, tuning, z, z_std, lateness, x, cov
     u[:3] = x
     u[n - 1] = USUAL_LATENESS if lateness == ALIKE else 0.0
     late, errors = np.zeros(len(rows), np.bool_), np.zeros((len(rows), 2))
-    errors[:, 1] = ANCHOR_SHARE * tuning.tdoa_std
+    errors[:, 1] = ANCHOR_SHARE * parameters.tdoa_std
     for i in range(len(rows)):
         anchor = anchors[rows[i]]
         if lateness == KNOWN and not math.isnan(anchor.floor_delay):
@@ -236,17 +241,17 @@ def explain(pairs, anchors, workspace, prior, tuning, z, z_std, lateness, x, cov
             u[3 + i] = anchor.floor_delay
     for sweep in range(SWEEPS):
         for i in range(len(rows)):
-            late[i] = lateness == ALIKE and may_be_late(anchors[rows[i]].position, u, 0.0, tuning.ground_height)
+            late[i] = lateness == ALIKE and may_be_late(anchors[rows[i]].position, u, 0.0, parameters.ground_height)
             if sweep == 0 and late[i]:
                 u[3 + i] = USUAL_LATENESS
-        _equations(pairs, anchors, places, late, errors, workspace, prior, tuning, z, z_std, u, system)
+        _equations(pairs, anchors, places, late, errors, workspace, prior, parameters, z, z_std, u, system)
         if not solve(system):
             return np.inf
         step = system[:, n]
         length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
         for j in range(n):
             u[j] += min(1.0, 2.0 / max(length, 1e-9)) * step[j]
-    cost = _equations(pairs, anchors, places, late, errors, workspace, prior, tuning, z, z_std, u, system)
+    cost = _equations(pairs, anchors, places, late, errors, workspace, prior, parameters, z, z_std, u, system)
     x[:] = u[:3]
     both = np.concatenate((system[:, :n], np.eye(n)), axis=1)
     if not solve(both):
@@ -256,7 +261,7 @@ def explain(pairs, anchors, workspace, prior, tuning, z, z_std, lateness, x, cov
 
 
 @compiled
-def heard(pairs, anchors):
+def heard(pairs: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the anchors that are heard, and for each pair the places of its two anchors among these (k, 2)."""
     rows, places, count = np.empty(MOST_ANCHORS, np.int64), np.full((len(pairs), 2), -1), 0
     for k in range(len(pairs)):
@@ -273,13 +278,17 @@ def heard(pairs, anchors):
 
 
 @compiled
-def _equations(pairs, anchors, places, late, errors, workspace, prior, tuning, z, z_std, u, system):
+def _equations(
+    pairs: np.ndarray, anchors: np.ndarray, places: np.ndarray, late: np.ndarray, errors: np.ndarray,
+    workspace: np.ndarray, prior: np.ndarray, parameters: Record, z: float, z_std: float, u: np.ndarray,
+    system: np.ndarray,
+) -> float:  # fmt: skip
     """Normal equations of a step from u (n,): position, error of each anchor heard, what late ones have in common; (n, n + 1) is filled.
     errors : (k, 2) m, expected error of an anchor that is not late, and its standard deviation. Returns the cost."""
     n = len(u)
     system[:, :] = 0.0
     row, cost = np.empty(3), 0.0
-    of_pair, of_anchor = PAIR_SHARE * tuning.tdoa_std, ANCHOR_SHARE * tuning.tdoa_std
+    of_pair, of_anchor = PAIR_SHARE * parameters.tdoa_std, ANCHOR_SHARE * parameters.tdoa_std
     states, entries = np.empty(5, np.int64), np.empty(5)
     for k in range(len(pairs)):
         i, j = places[k, 0], places[k, 1]
@@ -333,7 +342,7 @@ def _equations(pairs, anchors, places, late, errors, workspace, prior, tuning, z
 
 
 @compiled
-def _add(system, states, entries, r, weight):
+def _add(system: np.ndarray, states: np.ndarray, entries: np.ndarray, r: float, weight: float) -> None:
     """One scalar equation: sum of entries * step of the states = r."""
     last = system.shape[1] - 1
     for i in range(len(states)):
@@ -343,7 +352,7 @@ def _add(system, states, entries, r, weight):
 
 
 @compiled
-def solve(system):
+def solve(system: np.ndarray) -> bool:
     """Turn the right sides of positive definite equations, (n, n + m), into their solutions; returns False if they have none. (LAPACK is
     scipy's, whose import takes a fifth of a second.)"""
     n, columns = system.shape

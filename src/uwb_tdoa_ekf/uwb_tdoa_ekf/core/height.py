@@ -7,11 +7,13 @@ right, and the ground has changed; any other gives way. If the TDOAs in turn dis
 finder is not used for a while, and longer each time.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, weight
 
 from .hypotheses import alive
@@ -36,16 +38,16 @@ IGNORE_TIME, LONGEST_IGNORED = 3.0, 60.0  # s for which a range finder is not us
 
 
 @compiled
-def observe(ekf, tuning, aid, residual, records):
+def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray) -> None:
     """Take a range, one of AID, into a running filter at its stamp; fills one of RESIDUAL."""
     height = ekf.height
-    note(ekf, aid)
+    record(ekf, aid)
     residual.weight, residual.verdict = 0.0, REJECTED
-    innovation, distance = ekf.innovation, aid.value[0] + tuning.height_arm
-    up = compare(ekf.hypotheses[ekf.best], height.level, distance, tuning, ekf.transition.rotation, innovation)
+    innovation, distance = ekf.innovation, aid.value[0] + parameters.height_arm
+    up = compare(ekf.hypotheses[ekf.best], height.level, distance, parameters, ekf.transition.rotation, innovation)
     residual.innovation = innovation.value
     residual.variance = innovation.prior_variance + innovation.noise_variance
-    z = _plausible_z(ekf, tuning, up)
+    z = _plausible_z(ekf, parameters, up)
     if math.isnan(z):
         return
     if (not ekf.quiet and aid.t - height.changed > STUCK_TIME) or aid.t < height.ignored_until:
@@ -56,7 +58,7 @@ def observe(ekf, tuning, aid, residual, records):
     base_innovation = z - ekf.hypotheses[ekf.best].x[2]
     limit = GATE * math.sqrt(residual.variance)
     if abs(innovation.value) > limit or _is_alike(height, innovation.value):
-        if not _settle(ekf, tuning, aid.t, base_innovation, limit, records):
+        if not _settle(ekf, parameters, aid.t, base_innovation, limit, records):
             return
     since = aid.t - height.used
     height.agreed += min(since, LONGEST_GAP) if since < LONGEST_GAP else 0.0
@@ -65,11 +67,11 @@ def observe(ekf, tuning, aid, residual, records):
         hypothesis = ekf.hypotheses[h]
         if not alive(hypothesis):
             continue
-        compare(hypothesis, height.level, distance, tuning, ekf.transition.rotation, innovation)
+        compare(hypothesis, height.level, distance, parameters, ekf.transition.rotation, innovation)
         total = innovation.prior_variance + innovation.noise_variance
         w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
-        alike = max(1.0, 2.0 * CORRELATION_TIME / max(min(since, LONGEST_GAP), 1e-3))
-        innovation.total_variance = innovation.prior_variance + innovation.noise_variance * alike / w
+        inflation = max(1.0, 2.0 * CORRELATION_TIME / max(min(since, LONGEST_GAP), 1e-3))
+        innovation.total_variance = innovation.prior_variance + innovation.noise_variance * inflation / w
         kalman(hypothesis, innovation)
         if h == ekf.best:
             residual.weight, residual.verdict = w, USED
@@ -77,7 +79,7 @@ def observe(ekf, tuning, aid, residual, records):
 
 
 @compiled
-def note(ekf, aid):
+def record(ekf: Record, aid: Record) -> None:
     """Remember a range, whatever becomes of it."""
     height = ekf.height
     if aid.value[0] != height.range:
@@ -86,7 +88,9 @@ def note(ekf, aid):
 
 
 @compiled
-def compare(hypothesis, level, distance, tuning, R, innovation):
+def compare(
+    hypothesis: Record, level: float, distance: float, parameters: Record, R: np.ndarray, innovation: Record
+) -> float:
     """Fill in what a distance (m, along the body's -z to ground at `level`) says to a HYPOTHESIS, and R (3, 3), body to
     world. Returns cos(tilt)."""
     x = hypothesis.x
@@ -96,19 +100,21 @@ def compare(hypothesis, level, distance, tuning, R, innovation):
     innovation.states[1], innovation.row[1] = 6, distance * R[2, 1]
     innovation.states[2], innovation.row[2] = 7, -distance * R[2, 0]
     innovation.value = level + distance * R[2, 2] - x[2]
-    innovation.noise_variance = tuning.height_std**2
+    innovation.noise_variance = parameters.height_std**2
     project(hypothesis.P, innovation)
     return R[2, 2]
 
 
 @compiled
-def _is_alike(height, value):
+def _is_alike(height: Record, value: float) -> bool:
     """Whether an innovation (m) is that of the ranges before it that disagreed."""
     return height.disagreeing > 0 and abs(value - height.disagreement) < ALIKE
 
 
 @compiled
-def _settle(ekf, tuning, t, base_innovation, limit, records):
+def _settle(
+    ekf: Record, parameters: Record, t: float, base_innovation: float, limit: float, records: np.ndarray
+) -> bool:
     """A range disagrees: after a while that it does so alike, the ground or the filter changes. Returns whether."""
     height, value = ekf.height, ekf.innovation.value
     if not _is_alike(height, value):
@@ -121,8 +127,8 @@ def _settle(ekf, tuning, t, base_innovation, limit, records):
     if t - height.disagrees_since < STEP_TIME or height.disagreeing < STEP_COUNT:
         return False
     height.disagreeing = 0
-    if height.level != tuning.ground_height and abs(base_innovation) < min(limit, 2.0 * ALIKE):
-        height.level = tuning.ground_height
+    if height.level != parameters.ground_height and abs(base_innovation) < min(limit, 2.0 * ALIKE):
+        height.level = parameters.ground_height
         return True
     doubted = height.ignore_time > 0.0
     if (height.agreed >= SETTLED or doubted) and abs(value) < HIGHEST_STEP:
@@ -130,7 +136,7 @@ def _settle(ekf, tuning, t, base_innovation, limit, records):
         return True
     if doubted:
         return False
-    height.level, height.agreed = tuning.ground_height, 0.0
+    height.level, height.agreed = parameters.ground_height, 0.0
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
         if alive(hypothesis):
@@ -141,7 +147,7 @@ def _settle(ekf, tuning, t, base_innovation, limit, records):
 
 
 @compiled
-def judge(height, tuning, innovation, t):
+def judge(height: Record, parameters: Record, innovation: Record, t: float) -> None:
     """What one TDOA (INNOVATION of the best hypothesis) says of z beyond the filter, while a range finder holds that."""
     if t - height.used > LONGEST_GAP or t < height.ignored_until:
         height.pulls_since = t
@@ -161,17 +167,17 @@ def judge(height, tuning, innovation, t):
 
 
 @compiled
-def at_start(ekf, tuning, up, t):
+def at_start(ekf: Record, parameters: Record, up: float, t: float) -> float:
     """z of the body, m, that the last range tells with cos(tilt) `up` at stamp t (s); NaN if it tells nothing."""
     height = ekf.height
     if t - height.heard > LONGEST_GAP or t < height.ignored_until:
         return np.nan
-    return _plausible_z(ekf, tuning, up)
+    return _plausible_z(ekf, parameters, up)
 
 
 @compiled
-def _plausible_z(ekf, tuning, up):
+def _plausible_z(ekf: Record, parameters: Record, up: float) -> float:
     """z of the body, m, above the ground without steps, by the last range; NaN if that cannot be."""
-    z = tuning.ground_height + (ekf.height.range + tuning.height_arm) * up
+    z = parameters.ground_height + (ekf.height.range + parameters.height_arm) * up
     inside = ekf.workspace[0, 2] - BEYOND < z < ekf.workspace[1, 2] + BEYOND
     return z if inside and up > STEEPEST else np.nan

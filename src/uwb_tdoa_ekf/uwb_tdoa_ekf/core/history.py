@@ -1,8 +1,10 @@
 """A recording of the filter's run, for the smoother: one record per update of the best hypothesis."""
 
+from __future__ import annotations
+
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from .state import ERROR_STATES, MOVING_STATES, NOMINAL_STATES, propagate
 
@@ -27,7 +29,7 @@ NOTHING = np.empty(0, RECORD)  # no recording
 
 
 @compiled
-def add_prediction(ekf, history):
+def add_prediction(ekf: Record, history: np.ndarray) -> None:
     """After `state.predict` of the best hypothesis."""
     if len(history) > 0:
         propagate(ekf.since_record, ekf.transition)
@@ -35,7 +37,7 @@ def add_prediction(ekf, history):
 
 
 @compiled
-def add_coasting(ekf, dt, history):
+def add_coasting(ekf: Record, dt: float, history: np.ndarray) -> None:
     """After `state.coast` of the best hypothesis."""
     if len(history) > 0:
         for r in range(3):
@@ -44,7 +46,7 @@ def add_coasting(ekf, dt, history):
 
 
 @compiled
-def add_update(ekf, t, history):
+def add_update(ekf: Record, t: float, history: np.ndarray) -> None:
     """After a Kalman update of the best hypothesis with ekf.innovation."""
     if len(history) > 0:
         record = _next(ekf, t, UPDATE, history)
@@ -57,7 +59,7 @@ def add_update(ekf, t, history):
 
 
 @compiled
-def add_reset(ekf, t, history):
+def add_reset(ekf: Record, t: float, history: np.ndarray) -> None:
     """After the state of the best hypothesis was replaced: nothing carries over."""
     if len(history) > 0:
         record = _next(ekf, t, RESET, history)
@@ -65,7 +67,7 @@ def add_reset(ekf, t, history):
 
 
 @compiled
-def _next(ekf, t, kind, history):
+def _next(ekf: Record, t: float, kind: int, history: np.ndarray) -> Record:
     """The next record, with all but what is particular to its kind. Raises IndexError if there is no room."""
     if ekf.recorded == len(history):
         raise IndexError("the history is full: most_records is too small")

@@ -5,11 +5,13 @@ not tell on which side of it a tag is. One filter per direction and place runs u
 with Applications to Tracking and Navigation, 2001, section 11.6.2, static case).
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from .memory import HYPOTHESES, YAWS
 from .state import difference
@@ -22,19 +24,19 @@ LARGEST_NIS = 9.0  # normalised innovation squared that one measurement counts a
 
 
 @compiled
-def yaw_offset(h):
+def yaw_offset(h: int) -> float:
     """Angle of hypothesis h to initial_yaw, rad."""
     return h % YAWS * 2.0 * math.pi / YAWS
 
 
 @compiled
-def alive(hypothesis):
+def alive(hypothesis: Record) -> bool:
     """False once it was pruned."""
     return hypothesis.log_weight > -np.inf
 
 
 @compiled
-def add_log_likelihood(hypothesis, innovation, correlation_length):
+def add_log_likelihood(hypothesis: Record, innovation: Record, correlation_length: float) -> None:
     """Weigh a HYPOTHESIS by the Gaussian density of an INNOVATION; correlation_length as in robust.py."""
     variance = innovation.prior_variance + innovation.noise_variance * correlation_length
     nis = min(innovation.value**2 / variance, LARGEST_NIS)
@@ -42,7 +44,7 @@ def add_log_likelihood(hypothesis, innovation, correlation_length):
 
 
 @compiled
-def select(ekf, t):
+def select(ekf: Record, t: float) -> None:
     """Follow the most probable hypothesis at stamp t; prune those that are improbable, or have become the same."""
     best = 0
     for h in range(HYPOTHESES):
@@ -70,7 +72,7 @@ def select(ekf, t):
 
 
 @compiled
-def add_spread_of_means(ekf, covariance):
+def add_spread_of_means(ekf: Record, covariance: np.ndarray) -> None:
     """Add to the (9, 9) covariance of the best hypothesis what the others say: their mean square distance from it."""
     best = ekf.hypotheses[ekf.best]
     weights = 0.0

@@ -1,8 +1,12 @@
 """What the stream of inertial samples says of itself: how much it vibrates, whether the tag is quiet."""
 
+from __future__ import annotations
+
 import math
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.vibration import VIBRATION_AVERAGE, low_pass, track_vibration
 
 from .state import GRAVITY
@@ -19,7 +23,7 @@ QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
 
 
 @compiled
-def observe(imu, sample, timeout):
+def observe(imu: Record, sample: Record, timeout: float) -> bool:
     """Take an IMU_SAMPLE into the statistics of an IMU_STATE; its input becomes the mean of the last sample and this
     one. Returns whether the last one was less than `timeout` s ago."""
     dt = sample.t - imu.t
@@ -38,7 +42,7 @@ def observe(imu, sample, timeout):
 
 
 @compiled
-def _restart(imu, sample):
+def _restart(imu: Record, sample: Record) -> None:
     for k in range(3):
         imu.slow_accel[k] = imu.mean_accel[k] = imu.accel[k] = sample.accel[k]
         imu.gyro[k] = sample.gyro[k]
@@ -46,7 +50,7 @@ def _restart(imu, sample):
 
 
 @compiled
-def hold(imu, sample):
+def store(imu: Record, sample: Record) -> None:
     """Keep an IMU_SAMPLE as the input of what comes after it."""
     imu.t = sample.t
     for k in range(3):
@@ -54,7 +58,7 @@ def hold(imu, sample):
 
 
 @compiled
-def weigh(imu, quiet, tuning):
+def weigh(imu: Record, quiet: bool, parameters: Record) -> None:
     """Fill in accel_weight and accel_psd of an IMU_STATE: how far each axis of the accelerometer counts against
     hovering, and the noise that is left.
 
@@ -65,24 +69,24 @@ def weigh(imu, quiet, tuning):
     """
     slow = imu.slow_accel
     hovers = slow[2] > UPRIGHT * math.sqrt(slow[0] ** 2 + slow[1] ** 2 + slow[2] ** 2)
-    usual = tuning.accel_prior_std**2 if hovers else CARRIED_STD**2
+    usual = parameters.accel_prior_std**2 if hovers else CARRIED_STD**2
     for k in range(3):
-        error = tuning.vibration_gain * max(imu.rectified[k], LEAST_RECTIFIED) * imu.vibration[k]
+        error = parameters.vibration_gain * max(imu.rectified[k], LEAST_RECTIFIED) * imu.vibration[k]
         apart = _from_hovering(slow, k)
         prior = max(usual, apart**2 - error)
         weight = prior / (prior + error)
-        noise = tuning.accel_noise**2 + 2.0 * PERSISTENCE * (weight * error)
+        noise = parameters.accel_noise**2 + 2.0 * PERSISTENCE * (weight * error)
         imu.accel_weight[k], imu.accel_psd[k] = weight, QUIET_NOISE**2 if quiet else noise
 
 
 @compiled
-def _from_hovering(accel, axis):
+def _from_hovering(accel: np.ndarray, axis: int) -> float:
     """By how much a specific force accel (3,), m/s^2, differs along an axis from that of a body that hovers level."""
     return accel[axis] - (GRAVITY if axis == 2 else 0.0)
 
 
 @compiled
-def is_quiet(imu):
+def is_quiet(imu: Record) -> bool:
     """True if the last VIBRATION_AVERAGE seconds of samples show neither vibration nor rotation nor acceleration."""
     squared = 0.0
     for k in range(3):

@@ -1,10 +1,12 @@
 """The beginning of a run, and the new beginning of one that has lost its tag."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from . import ground, height, hypotheses, inertial, standing, systematic, workspace
 from .history import add_reset
@@ -28,7 +30,7 @@ REACH, REACH_SPEED, REACH_ACCELERATION = 0.5, 0.5, 0.5  # m, m/s, m/s^2: how far
 
 
 @compiled
-def remember(ekf, tdoa, anchors):
+def remember(ekf: Record, tdoa: Record, anchors: np.ndarray) -> None:
     """Append a TDOA to the window, without the delays of its anchors."""
     if ekf.kept == 2 * WINDOW:
         for i in range(WINDOW):
@@ -40,7 +42,7 @@ def remember(ekf, tdoa, anchors):
 
 
 @compiled
-def is_repeat(ekf, tdoa, anchors):
+def is_repeat(ekf: Record, tdoa: Record, anchors: np.ndarray) -> bool:
     """Whether the window holds a TDOA already, with its stamp, anchors and value: somebody has sent it twice."""
     d = tdoa.d - (anchors[tdoa.b].delay - anchors[tdoa.a].delay)
     for k in range(ekf.kept - 1, -1, -1):
@@ -53,38 +55,43 @@ def is_repeat(ekf, tdoa, anchors):
 
 
 @compiled
-def _height_at_start(ekf, tuning, t):
+def _height_at_start(ekf: Record, parameters: Record, t: float) -> tuple[float, float]:
     """(z, standard deviation), m, that other sensors tell at stamp t, s, of a tag whose attitude only the accelerometer tells; or NaN."""
-    accel = _mean_accel(ekf.imu, tuning)
-    return _known_height(ekf, tuning, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
+    accel = _mean_accel(ekf.imu, parameters)
+    return _known_height(ekf, parameters, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
 
 
 @compiled
-def _look_for_places(ekf, anchors, tuning, window, z, z_std, x, covariance, cost, near):
+def _look_for_places(
+    ekf: Record, anchors: np.ndarray, parameters: Record, window: np.ndarray, z: float, z_std: float,
+    x: np.ndarray, covariance: np.ndarray, cost: np.ndarray, near: np.ndarray,
+) -> float:  # fmt: skip
     """`locate` in the surroundings of the anchors of a window; the most probable place first. near (2, 3) m: the box about these anchors is
     written to it. Returns the share of TDOAs that agree with the first place."""
-    _find_surroundings(ekf, window, anchors, tuning)
-    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
+    _find_surroundings(ekf, window, anchors, parameters)
+    share = locate(window, anchors, ekf.workspace, parameters, z, z_std, x, covariance, cost)
     workspace.surround(ekf, standing.NEAR, near)
-    near[0, 2] = min(near[0, 2], tuning.ground_height)
+    near[0, 2] = min(near[0, 2], parameters.ground_height)
     standing.sort(x, covariance, cost, near)
     return share
 
 
 @compiled
-def start(ekf, anchors, tuning, t, anyhow, history):
+def start(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, anyhow: bool, history: np.ndarray
+) -> None:
     """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
-    window = recent(ekf, tuning.start_window)
+    window = recent(ekf, parameters.start_window)
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
     x, covariance, cost, near = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES), np.empty((2, 3))
-    z, z_std = _height_at_start(ekf, tuning, t)
-    share = _look_for_places(ekf, anchors, tuning, window, z, z_std, x, covariance, cost, near)
+    z, z_std = _height_at_start(ekf, parameters, t)
+    share = _look_for_places(ekf, anchors, parameters, window, z, z_std, x, covariance, cost, near)
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     at_rest, its = x[0].copy(), covariance[0].copy()
     wide = np.trace(its[:3, :3]) > APART**2  # before it holds other explanations
-    lead = standing.weigh(ekf, pairs, anchors, tuning, z, z_std, at_rest, its)
+    lead = standing.weigh(ekf, pairs, anchors, parameters, z, z_std, at_rest, its)
     still = ground.is_still(pairs, anchors, at_rest, ekf.still_covariance)
     on_ground = lead > (0.0 if still else standing.DECISIVE)
     good = still if on_ground else share >= AGREE and workspace.contains(ekf.workspace, x[0])
@@ -99,13 +106,13 @@ def start(ekf, anchors, tuning, t, anyhow, history):
         standing.sort(x, covariance, cost, near)
     for place in range(PLACES if still else 0):
         standing.stop(x[place], covariance[place], ekf.still_covariance)
-    _begin(ekf, tuning, t, x, covariance, cost, tuning.initial_yaw, tuning.initial_yaw_std)
-    ekf.resting, ekf.rest_since = still and tuning.zero_velocity, t
+    _begin(ekf, parameters, t, x, covariance, cost, parameters.initial_yaw, parameters.initial_yaw_std)
+    ekf.resting, ekf.rest_since = still and parameters.zero_velocity, t
     add_reset(ekf, t, history)
 
 
 @compiled
-def start_slowly(ekf, anchors, tuning, t, history):
+def start_slowly(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray) -> None:
     """The same where few TDOAs come: from the last SLOW_TDOAS or SLOW_STAMPS of them, if these tell one position, and in any case when
     there are so many."""
     window, stamps = _last(ekf, t)
@@ -113,39 +120,39 @@ def start_slowly(ekf, anchors, tuning, t, history):
     span, gap = t - window[0].t, 0.0
     for i in range(1, len(window)):
         gap = max(gap, window[i].t - window[i - 1].t)
-    if not (enough or len(window) >= MINIMUM) or span < tuning.start_window or gap > LONGEST_GAP * span:
+    if not (enough or len(window) >= MINIMUM) or span < parameters.start_window or gap > LONGEST_GAP * span:
         return
     x, covariance, cost, near = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES), np.empty((2, 3))
-    z, z_std = _height_at_start(ekf, tuning, t)
-    share = _look_for_places(ekf, anchors, tuning, window, z, z_std, x, covariance, cost, near)
+    z, z_std = _height_at_start(ekf, parameters, t)
+    share = _look_for_places(ekf, anchors, parameters, window, z, z_std, x, covariance, cost, near)
     if not (enough or (share >= AGREE and workspace.contains(ekf.workspace, x[0]))):
         return
     if np.trace(covariance[0, :3, :3]) > APART**2:
         split(x, covariance, cost)
         standing.sort(x, covariance, cost, near)
-    _begin(ekf, tuning, t, x, covariance, cost, tuning.initial_yaw, tuning.initial_yaw_std)
+    _begin(ekf, parameters, t, x, covariance, cost, parameters.initial_yaw, parameters.initial_yaw_std)
     ekf.resting, ekf.rest_since = False, t
     add_reset(ekf, t, history)
 
 
 @compiled
-def is_unsure(ekf):
+def is_unsure(ekf: Record) -> bool:
     """Whether the place of the tag is hardly known."""
     return np.trace(ekf.hypotheses[ekf.best].P[:3, :3]) > UNKNOWN**2
 
 
 @compiled
-def relocate(ekf, anchors, tuning, t, history):
+def relocate(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray) -> None:
     """Of a tag that few TDOAs come from, and whose place is hardly known by now: go where its last TDOAs tell it is, if they tell that better
     than the filter. So far from where the TDOAs are linearized these do together what each of them does not alone."""
-    if not is_unsure(ekf) or len(recent(ekf, tuning.start_window)) >= MINIMUM:
+    if not is_unsure(ekf) or len(recent(ekf, parameters.start_window)) >= MINIMUM:
         return
     best, window = ekf.hypotheses[ekf.best], _last(ekf, t)[0]
     x, covariance, cost = np.empty((2, 6)), np.empty((2, 6, 6)), np.empty(2)
     q = best.x[6:10]
-    z, z_std = _known_height(ekf, tuning, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
-    _find_surroundings(ekf, window, anchors, tuning)
-    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
+    z, z_std = _known_height(ekf, parameters, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
+    _find_surroundings(ekf, window, anchors, parameters)
+    share = locate(window, anchors, ekf.workspace, parameters, z, z_std, x, covariance, cost)
     told = np.trace(covariance[0, :3, :3])
     if cost[1] < np.inf:
         told += np.sum((x[1, :3] - x[0, :3]) ** 2)
@@ -160,7 +167,7 @@ def relocate(ekf, anchors, tuning, t, history):
 
 
 @compiled
-def _last(ekf, t):
+def _last(ekf: Record, t: float) -> tuple[np.ndarray, int]:
     """The last SLOW_TDOAs, or as many more as have SLOW_STAMPS, none older than SLOWEST: (n,) of TDOA, and how many stamps they have."""
     first, stamps = ekf.kept - 1, 1
     while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > t - SLOWEST:
@@ -173,21 +180,23 @@ def _last(ekf, t):
 
 
 @compiled
-def _find_surroundings(ekf, window, anchors, tuning):
+def _find_surroundings(ekf: Record, window: np.ndarray, anchors: np.ndarray, parameters: Record) -> None:
     """Where a tag is expected that hears the anchors of a window (n,) of TDOA."""
-    workspace.listen(ekf, window, anchors, tuning.radio_reach, tuning.tag_side)
-    workspace.surround(ekf, tuning.workspace_margin, ekf.workspace)
+    workspace.listen(ekf, window, anchors, parameters.radio_reach, parameters.tag_side)
+    workspace.surround(ekf, parameters.workspace_margin, ekf.workspace)
 
 
 @compiled
-def look_around(ekf, anchors, tuning, t):
+def look_around(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None:
     """Follow a running tag from the surroundings of some anchors to those of others, at stamp t, s."""
     ekf.next_bounds = t + LISTEN_PERIOD
-    _find_surroundings(ekf, recent(ekf, LISTEN_PERIOD), anchors, tuning)
+    _find_surroundings(ekf, recent(ekf, LISTEN_PERIOD), anchors, parameters)
 
 
 @compiled
-def place(ekf, anchors, tuning, t, pose, history):
+def place(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, pose: Record, history: np.ndarray
+) -> None:
     """Go to the pose that one of POSE tells; begin there, if the filter does not run.
 
     What is not told stays as it is; before the filter runs, it is anywhere in the workspace. Tilt, velocity and biases
@@ -199,7 +208,7 @@ def place(ekf, anchors, tuning, t, pose, history):
         x[:] = best.x[:6]
         covariance[:, :] = best.P[:6, :6]
     else:
-        workspace.surround(ekf, tuning.workspace_margin, ekf.workspace)
+        workspace.surround(ekf, parameters.workspace_margin, ekf.workspace)
         for k in range(3):
             x[k] = 0.5 * (ekf.workspace[0, k] + ekf.workspace[1, k])
             covariance[k, k] = (0.5 * (ekf.workspace[1, k] - ekf.workspace[0, k])) ** 2
@@ -215,8 +224,8 @@ def place(ekf, anchors, tuning, t, pose, history):
                 covariance[k, j] = covariance[j, k] = pose.covariance[k, j]
     told = not math.isnan(pose.yaw)
     if not ekf.running:
-        yaw, std = (pose.yaw, pose.yaw_std) if told else (tuning.initial_yaw, tuning.initial_yaw_std)
-        _begin(ekf, tuning, t, x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1), yaw, std)
+        yaw, std = (pose.yaw, pose.yaw_std) if told else (parameters.initial_yaw, parameters.initial_yaw_std)
+        _begin(ekf, parameters, t, x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1), yaw, std)
     else:
         for h in range(HYPOTHESES):
             hypothesis = ekf.hypotheses[h]
@@ -232,10 +241,13 @@ def place(ekf, anchors, tuning, t, pose, history):
 
 
 @compiled
-def _begin(ekf, tuning, t, x, covariance, cost, yaw, yaw_std):
+def _begin(
+    ekf: Record, parameters: Record, t: float, x: np.ndarray, covariance: np.ndarray, cost: np.ndarray,
+    yaw: float, yaw_std: float,
+) -> None:  # fmt: skip
     """Start hypotheses at positions and velocities x (k, 6), whose probabilities are exp(-cost) (k,), level, with the yaws that are possible."""
-    accel = _mean_accel(ekf.imu, tuning)
-    unknown = tuning.use_imu and yaw_std > hypotheses.YAW_STD
+    accel = _mean_accel(ekf.imu, parameters)
+    unknown = parameters.use_imu and yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):
         hypothesis, offset = ekf.hypotheses[h], hypotheses.yaw_offset(h)
         nearest = min(offset, 2.0 * math.pi - offset)
@@ -249,7 +261,7 @@ def _begin(ekf, tuning, t, x, covariance, cost, yaw, yaw_std):
         hypothesis.x[10:] = 0.0
         hypothesis.P[:] = 0.0
         _put(hypothesis, x[place], covariance[place])
-        _spread_attitude(hypothesis.P, tuning, yaw_std)
+        _spread_attitude(hypothesis.P, parameters, yaw_std)
     ekf.best = 0
     systematic.begin(ekf.information, ekf.hypotheses[0].P)
     ekf.t = ekf.last_tdoa = ekf.sure = t
@@ -258,7 +270,7 @@ def _begin(ekf, tuning, t, x, covariance, cost, yaw, yaw_std):
 
 
 @compiled
-def _turn(hypothesis, yaw, std):
+def _turn(hypothesis: Record, yaw: float, std: float) -> None:
     """Give a hypothesis another yaw, rad, about the vertical, and its standard deviation."""
     x, y, z, w = hypothesis.x[6], hypothesis.x[7], hypothesis.x[8], hypothesis.x[9]
     half = 0.5 * (yaw - math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
@@ -271,22 +283,24 @@ def _turn(hypothesis, yaw, std):
 
 
 @compiled
-def recover(ekf, anchors, tuning, t, anywhere, history):
+def recover(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, anywhere: bool, history: np.ndarray
+) -> None:
     """If the window agrees on a position and the filter on another one, go there; attitude and biases stay.
 
     A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter was right, and no farther. One that may be
     `anywhere` does, and to several places, if there are several.
     """
-    window = recent(ekf, min(tuning.start_window, RECOVERY_WINDOW))
+    window = recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
     places = PLACES if anywhere else 1
     x, covariance, cost = np.empty((places, 6)), np.empty((places, 6, 6)), np.empty(places)
     q = ekf.hypotheses[ekf.best].x[6:10]
-    z, z_std = _known_height(ekf, tuning, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
-    _find_surroundings(ekf, window, anchors, tuning)
-    share = locate(window, anchors, ekf.workspace, tuning, z, z_std, x, covariance, cost)
+    z, z_std = _known_height(ekf, parameters, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
+    _find_surroundings(ekf, window, anchors, parameters)
+    share = locate(window, anchors, ekf.workspace, parameters, z, z_std, x, covariance, cost)
     explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
     if not workspace.contains(ekf.workspace, x[0]) or share < AGREE_ANYHOW:
         return
@@ -294,7 +308,7 @@ def recover(ekf, anchors, tuning, t, anywhere, history):
         _reopen(ekf, cost)
     elif share < CLEARLY_MORE + explained:
         return
-    if not anywhere and tuning.use_imu and not ekf.distrusted and t - ekf.imu.t < tuning.imu_timeout:
+    if not anywhere and parameters.use_imu and not ekf.distrusted and t - ekf.imu.t < parameters.imu_timeout:
         since, away = t - ekf.sure, 0.0
         for k in range(3):
             away += (x[0, k] - ekf.hypotheses[ekf.best].x[k]) ** 2
@@ -314,7 +328,7 @@ def recover(ekf, anchors, tuning, t, anywhere, history):
 
 
 @compiled
-def _reopen(ekf, cost):
+def _reopen(ekf: Record, cost: np.ndarray) -> None:
     """Follow the yaws of the best hypothesis at each place again, whose probabilities are exp(-cost) (PLACES,)."""
     of_best = ekf.best // YAWS
     for yaw in range(YAWS):
@@ -325,7 +339,7 @@ def _reopen(ekf, cost):
 
 
 @compiled
-def widen(ekf, history):
+def widen(ekf: Record, history: np.ndarray) -> None:
     """What was integrated lately was wrong: nobody knows by how much, but the TDOAs."""
     for h in range(HYPOTHESES):
         for k in range(3):
@@ -335,26 +349,26 @@ def widen(ekf, history):
 
 
 @compiled
-def level_anew(ekf, tuning, history):
+def level_anew(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     """Stay at position and velocity; attitude as at a start: level, the yaw unknown; biases as at a start too."""
     best = ekf.hypotheses[ekf.best]
     x, y, z, w = best.x[6], best.x[7], best.x[8], best.x[9]
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     x, covariance = best.x[:6].copy().reshape(1, 6), best.P[:6, :6].copy().reshape(1, 6, 6)
-    _begin(ekf, tuning, ekf.t, x, covariance, np.zeros(1), yaw, 2.0 * math.pi)
+    _begin(ekf, parameters, ekf.t, x, covariance, np.zeros(1), yaw, 2.0 * math.pi)
     add_reset(ekf, ekf.t, history)
 
 
 @compiled
-def _known_height(ekf, tuning, up, t):
+def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> tuple[float, float]:
     """z (m) of a tag with cos(tilt) `up` and its standard deviation, as told by something else than TDOAs, or NaN."""
-    if tuning.fixed_height_std > 0.0:
-        return tuning.fixed_height, tuning.fixed_height_std
-    return height.at_start(ekf, tuning, up, t), max(tuning.height_std, SMALLEST_STD)
+    if parameters.fixed_height_std > 0.0:
+        return parameters.fixed_height, parameters.fixed_height_std
+    return height.at_start(ekf, parameters, up, t), max(parameters.height_std, SMALLEST_STD)
 
 
 @compiled
-def recent(ekf, seconds):
+def recent(ekf: Record, seconds: float) -> np.ndarray:
     """The TDOAs of the last `seconds`: (n,) of TDOA."""
     first = ekf.kept - 1
     since = ekf.window[ekf.kept - 1].t - seconds
@@ -364,9 +378,9 @@ def recent(ekf, seconds):
 
 
 @compiled
-def _mean_accel(imu, tuning):
+def _mean_accel(imu: Record, parameters: Record) -> np.ndarray:
     """Mean specific force (3,) m/s^2, each axis by how far it can be relied on."""
-    inertial.weigh(imu, False, tuning)
+    inertial.weigh(imu, False, parameters)
     accel = np.empty(3)
     for k in range(3):
         hovering = GRAVITY if k == 2 else 0.0
@@ -375,7 +389,7 @@ def _mean_accel(imu, tuning):
 
 
 @compiled
-def _put(hypothesis, x, covariance):
+def _put(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None:
     """Position and velocity x (6,) and their covariance (6, 6)."""
     hypothesis.x[:6] = x
     hypothesis.offset_P[:] = 0.0  # of a barometer: to be found anew
@@ -383,10 +397,10 @@ def _put(hypothesis, x, covariance):
 
 
 @compiled
-def _spread_attitude(P, tuning, yaw_std):
+def _spread_attitude(P: np.ndarray, parameters: Record, yaw_std: float) -> None:
     """The variances of attitude and biases at the start."""
     P[6, 6] = P[7, 7] = TILT_STD**2
     P[8, 8] = min(yaw_std, hypotheses.YAW_STD) ** 2
     for k in range(3):
-        P[9 + k, 9 + k] = tuning.initial_accel_bias_std**2
-        P[12 + k, 12 + k] = tuning.initial_gyro_bias_std**2
+        P[9 + k, 9 + k] = parameters.initial_accel_bias_std**2
+        P[12 + k, 12 + k] = parameters.initial_gyro_bias_std**2

@@ -1,26 +1,34 @@
 """Everything one filter remembers between two events, by name. A copy of its arrays is a copy of the filter.
 
 The types are rows of numpy's structured arrays: compiled code reads and writes `ekf.imu.slow_accel[k]` where it lies in
-memory, a function takes a whole record as one pointer, and Python sees the same bytes (`Memory.record`).
+memory, a function takes a whole record as one pointer, and Python sees the same bytes (`FilterState.record`).
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.effects.slope import N_STATES
+from uwb_tdoa_bias.foundation.compiled import Record
 
 from .ground import MOST_PAIRS, PAIR
 from .sensor_functions import rows_of
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
 from .update import INNOVATION, OFFSET_STATES
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.effects.sensor_function import SensorFunction
+
 YAWS, PLACES = 4, 2  # directions and places that a start follows at once while it is not known which is right
 HYPOTHESES = YAWS * PLACES
+Floor = tuple[np.ndarray, np.ndarray, np.ndarray]  # as of EffectSet.on_floor
 WINDOW = 512  # TDOAs kept for a start
 
 
-def _record(*columns):
+def _record(*columns: tuple[Any, ...]) -> np.dtype:
     return np.dtype(list(columns), align=True)
 
 
@@ -147,7 +155,7 @@ EKF = _record(
     ("extent", float, (2, 3)),  # m, lower and upper bounds: of all anchors,
     ("within", float, (2, 3)),  # of the reach of those that were heard lately,
     ("workspace", float, (2, 3)),  # and of where the tag is expected, see workspace.py
-    ("side", float, 3),  # on which the tag is of anchors in a plane, see workspace.told_side
+    ("side", float, 3),  # on which the tag is of anchors in a plane, see workspace.configured_side
     ("flat", float, 3),  # 1.0 for axes along which these are at one coordinate, while nobody tells on which side of that the tag is
     ("middle", float, 3),  # m, of the anchors heard lately
     ("next_bounds", float),  # s, stamp before which not to look anew who is heard
@@ -181,7 +189,7 @@ ODOMETRY = _record(
 RESIDUAL = _record(("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8))
 
 
-class Memory(NamedTuple):
+class FilterState(NamedTuple):
     """State of one filter. ekf : (1,) of EKF; anchors : (N,) of ANCHOR; functions : (k,) of SENSOR_FUNCTION, errors of the inertial
     sensor that are known."""
 
@@ -190,13 +198,13 @@ class Memory(NamedTuple):
     functions: np.ndarray
 
     @property
-    def record(self):
+    def record(self) -> Record:
         """The fields of EKF as attributes: a view."""
         return self.ekf.view(np.recarray)[0]
 
-    def copy(self):
+    def copy(self) -> FilterState:
         """Another filter that remembers the same."""
-        return Memory(*(array.copy() for array in self))
+        return FilterState(*(array.copy() for array in self))
 
 
 class Measurements(NamedTuple):
@@ -217,17 +225,17 @@ class Output(NamedTuple):
     aids: np.ndarray = np.empty(0, RESIDUAL)
 
 
-def new_memory(positions, functions=(), floor=None):
-    """Memory of a filter that has seen nothing; positions : (N, 3) m, of the anchors; functions : SensorFunctions; floor : as of
+def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), floor: Floor | None = None) -> FilterState:
+    """FilterState of a filter that has seen nothing; positions : (N, 3) m, of the anchors; functions : SensorFunctions; floor : as of
     `EffectSet.on_floor`."""
-    memory = Memory(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
-    memory.anchors["position"] = positions
-    memory.record.extent[:] = np.min(positions, axis=0), np.max(positions, axis=0)
-    memory.record.within[:] = [[-np.inf] * 3, [np.inf] * 3]
+    state = FilterState(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
+    state.anchors["position"] = positions
+    state.record.extent[:] = np.min(positions, axis=0), np.max(positions, axis=0)
+    state.record.within[:] = [[-np.inf] * 3, [np.inf] * 3]
     for stamp in ("learned", "judged", "heard"):
-        memory.anchors[stamp] = -np.inf
-    ekf = memory.record
-    memory.anchors["floor_delay"], memory.anchors["floor_std"], ekf["floor_place"][:] = floor or (np.nan, 0.0, np.nan)
+        state.anchors[stamp] = -np.inf
+    ekf = state.record
+    state.anchors["floor_delay"], state.anchors["floor_std"], ekf["floor_place"][:] = floor or (np.nan, 0.0, np.nan)
     for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge", "next_look", "next_bounds", "sure", "unsure_until"):
         ekf[stamp] = -np.inf
     ekf.imu.t = ekf.plausibility.contradicted = -np.inf
@@ -241,20 +249,22 @@ def new_memory(positions, functions=(), floor=None):
     ekf.hypotheses["P"][:] = np.eye(ERROR_STATES)
     ekf.since_record[:] = np.eye(ERROR_STATES)
     ekf.consistency = 1.0
-    return memory
+    return state
 
 
-def structured(kind, *columns):
+def structured(kind: np.dtype, *columns: Any) -> np.ndarray:
     """(n,) array of a type of this module; columns : one array for each of its fields, in their order; of the last ones that are not
     given, 0."""
     out = np.zeros(len(columns[0]), kind)
-    for name, column in zip(kind.names, columns):
+    for name, column in zip(kind.names or (), columns):
         out[name] = column
     return out
 
 
-def joined(kind, parts):
+def joined(kind: np.dtype, parts: Sequence[np.ndarray]) -> np.ndarray:
     """(n,) array of a type of this module, of several one after the other; numpy finds out anew for each what the type of all is."""
+    if len(parts) == 1:
+        return parts[0]
     out, first = np.empty(sum(map(len, parts)), kind), 0
     for part in parts:
         out[first : first + len(part)] = part

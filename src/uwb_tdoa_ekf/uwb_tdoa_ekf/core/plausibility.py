@@ -5,9 +5,13 @@ it. Samples and their stamps alone decide. The limits are beyond what 22 measure
 that flips is taken for a fault.
 """
 
+from __future__ import annotations
+
 import math
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.vibration import low_pass
 
 LIGHTEST, HEAVIEST = 2.5, 50.0  # m/s^2, mean specific force over VIBRATION_CORNER: upwards, and in all; a multirotor comes down with 3, turns with 30
@@ -23,14 +27,14 @@ WEIGHT, TURN, RATE, TILT = range(1, 5)  # what is impossible
 
 
 @compiled
-def judge(check, imu, sample, fresh, distrusted):
+def judge(check: Record, imu: Record, sample: Record, continuous: bool, distrusted: bool) -> bool:
     """Whether to go without inertial samples from this IMU_SAMPLE on. check : PLAUSIBILITY, which is updated; imu : IMU_STATE after
-    `observe` of the sample and before `hold`; fresh : what that returned; distrusted : what this returned before."""
+    `observe` of the sample and before `store`; continuous : what that returned; distrusted : what this returned before."""
     t, force, up = sample.t, imu.slow_accel, check.up
-    if not fresh:
+    if not continuous:
         check.weighed = check.upright = t
         up[:] = force
-    dt = t - imu.t if fresh else 0.0
+    dt = t - imu.t if continuous else 0.0
     _turn(up, imu.gyro, dt)
     upwards = weight = length = rate = 0.0
     tallest = 0
@@ -61,14 +65,14 @@ def judge(check, imu, sample, fresh, distrusted):
 
 
 @compiled
-def _contradict(check, force, t, reason, size):
+def _contradict(check: Record, force: np.ndarray, t: float, reason: int, size: float) -> None:
     """Something is impossible; where upwards is, the accelerometer may say anew."""
     check.contradicted, check.reason, check.size = t, reason, size
     check.up[:] = force
 
 
 @compiled
-def _turn(vector, rate, dt):
+def _turn(vector: np.ndarray, rate: np.ndarray, dt: float) -> None:
     """Turn a constant vector of the world, given in the body frame, (3,), by -rate (3,) rad/s for dt s (Rodrigues)."""
     angle = dt * math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     if angle < 1e-12:

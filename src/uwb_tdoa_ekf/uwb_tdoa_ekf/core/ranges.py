@@ -3,11 +3,13 @@
 Two distances, one after the other, are a TDOA: by such TDOAs the filter starts, and finds a tag again that it has lost.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from .update import project
 
@@ -15,7 +17,7 @@ APART = 0.2  # s; two ranges that are further apart are no TDOA
 
 
 @compiled
-def pair(ekf: np.void, aid: np.void) -> bool:
+def pair(ekf: Record, aid: Record) -> bool:
     """Make the TDOA of a range, one of AID, and the one before; returns whether they are one."""
     before, made = ekf.ranged[0], ekf.paired[0]
     told = before.anchor != aid.anchor and aid.t - before.t < APART
@@ -27,14 +29,16 @@ def pair(ekf: np.void, aid: np.void) -> bool:
 
 
 @compiled
-def is_repeat(ekf: np.void, aid: np.void) -> bool:
+def is_repeat(ekf: Record, aid: Record) -> bool:
     """Whether a range, one of AID, is the one before: somebody has sent it twice."""
     before = ekf.ranged[0]
     return before.t == aid.t and before.anchor == aid.anchor and before.value[0] == aid.value[0]
 
 
 @compiled
-def compare(hypothesis: np.void, position: np.ndarray, aid: np.void, tuning: np.void, innovation: np.void) -> None:
+def compare(
+    hypothesis: Record, position: np.ndarray, aid: Record, parameters: Record, innovation: Record
+) -> None:
     """Fill in what the distance to an anchor at `position` (3,) m says to a HYPOTHESIS."""
     x = hypothesis.x
     dx, dy, dz = x[0] - position[0], x[1] - position[1], x[2] - position[2]
@@ -43,5 +47,5 @@ def compare(hypothesis: np.void, position: np.ndarray, aid: np.void, tuning: np.
     for k, along in enumerate((dx, dy, dz)):
         innovation.states[k], innovation.row[k] = k, along / distance
     innovation.value = aid.value[0] - distance
-    innovation.noise_variance = tuning.range_std**2 + aid.std[0] ** 2
+    innovation.noise_variance = parameters.range_std**2 + aid.std[0] ** 2
     project(hypothesis.P, innovation)

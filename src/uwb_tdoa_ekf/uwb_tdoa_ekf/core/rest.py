@@ -4,11 +4,13 @@ Inertial samples alone cannot tell rest from a steady glide, and they shake whil
 their systematic errors are: at rest they stay what they are.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from . import ground, hypotheses, standing
 from .history import add_update
@@ -35,13 +37,13 @@ SAME_ERROR = 0.01  # s; TDOAs of a tag at rest have the same errors: those of ea
 
 
 @compiled
-def repetition(ekf, t):
+def repetition(ekf: Record, t: float) -> float:
     """Factor on the variance of a TDOA stamped t, s: how many times over the TDOAs of this rest have told the same, errors included."""
     return 1.0 + (t - ekf.rest_since) / SAME_ERROR if ekf.resting else 1.0
 
 
 @compiled
-def feel(ekf, sample, dt):
+def feel(ekf: Record, sample: Record, dt: float) -> None:
     """Take an IMU_SAMPLE of a tag that is at rest, dt s after the one before: if it is lifted, it moves as fast as that has made it."""
     if not ekf.resting:
         ekf.shaking += min(1.0, dt / SHAKING_MEMORY) * (np.sum(ekf.imu.vibration) - ekf.shaking)
@@ -67,12 +69,14 @@ def feel(ekf, sample, dt):
 
 
 @compiled
-def look(ekf, anchors, tuning, window, t, records):
+def look(
+    ekf: Record, anchors: np.ndarray, parameters: Record, window: np.ndarray, t: float, records: np.ndarray
+) -> None:
     """Whether the tag is at rest, by a window (n,) of TDOA up to stamp t, s, where that can be; not before ekf.next_look."""
     ekf.next_look = t + LOOK_PERIOD
     best = ekf.hypotheses[ekf.best]
     calm = ekf.quiet or np.sum(ekf.imu.vibration) < CALM * ekf.shaking
-    if not (ekf.resting or calm or standing.is_near_ground(best, tuning)):
+    if not (ekf.resting or calm or standing.is_near_ground(best, parameters)):
         return
     count = ground.find_pairs(window, ekf.pairs)
     still = ground.is_still(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
@@ -84,13 +88,13 @@ def look(ekf, anchors, tuning, window, t, records):
         ekf.doubts = 0
         ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
         stands = calm and (still or ekf.quiet)
-        landed = standing.land(ekf, ekf.pairs[:count], anchors, tuning, still, stands, t, records)
+        landed = standing.land(ekf, ekf.pairs[:count], anchors, parameters, still, stands, t, records)
         long = ekf.stills >= (LONG if t - ekf.rest_since > EARLY else LONG_ENOUGH)
         ekf.resting = stands and landed
         if not landed and long and not _moves(best, QUIET_STD):
             ekf.resting, ekf.late_as_known = True, False
         elif not landed and ekf.stills >= LONG:
-            standing.find_again(ekf, ekf.pairs[:count], window, anchors, tuning, t, records)
+            standing.find_again(ekf, ekf.pairs[:count], window, anchors, parameters, t, records)
         if ekf.resting:
             ekf.rest_since = t
         if landed and not stands:
@@ -98,7 +102,7 @@ def look(ekf, anchors, tuning, window, t, records):
 
 
 @compiled
-def hold(ekf, t, records):
+def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
     """Zero velocity, one axis after the other, for a tag at rest, and for a quiet one that TDOAs have shown to be slow."""
     if ekf.resting and not ekf.quiet and t - ekf.last_tdoa > SILENT:
         ekf.resting = False
@@ -127,7 +131,7 @@ def hold(ekf, t, records):
 
 
 @compiled
-def _moves(hypothesis, std):
+def _moves(hypothesis: Record, std: float) -> bool:
     """Whether inertial samples contradict a velocity of zero, +- std m/s."""
     for state in range(3, 6):
         if hypothesis.x[state] ** 2 > GATE**2 * (hypothesis.P[state, state] + std**2):

@@ -5,11 +5,13 @@ errors of successive ones are alike: as many as `correlation_length` tell as muc
 update therefore takes noise_variance times that, while the weight is judged with noise_variance itself.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.robust_loss import weight
 
 from .config import ROBUST
@@ -22,45 +24,45 @@ _INNOVATION, _GATE = ROBUST.index("innovation"), ROBUST.index("gate")
 
 
 @compiled
-def update(hypothesis, innovation, tuning):
-    """Robust update in the way that TUNING says. Sets weight, 0 for none, and total_variance, inf for none."""
-    if tuning.robust == _INNOVATION:
-        update_innovation(hypothesis, innovation, tuning)
-    elif tuning.robust == _GATE:
-        update_gate(hypothesis, innovation, tuning)
+def update(hypothesis: Record, innovation: Record, parameters: Record) -> None:
+    """Robust update in the way that PARAMETERS says. Sets weight, 0 for none, and total_variance, inf for none."""
+    if parameters.robust == _INNOVATION:
+        update_innovation(hypothesis, innovation, parameters)
+    elif parameters.robust == _GATE:
+        update_gate(hypothesis, innovation, parameters)
     else:
-        update_m_estimation(hypothesis, innovation, tuning)
+        update_m_estimation(hypothesis, innovation, parameters)
 
 
 @compiled
-def update_innovation(hypothesis, innovation, tuning):
+def update_innovation(hypothesis: Record, innovation: Record, parameters: Record) -> None:
     """Weight from the whitened innovation, then one Kalman update with the variance divided by it.
 
     Because the prior's own uncertainty whitens the innovation, a filter that knows little listens to everything: the
     redescending weight cannot lock it out.
     """
     prior, noise = innovation.prior_variance, innovation.noise_variance
-    w = weight(tuning.loss, innovation.value / math.sqrt(prior + noise), tuning.measurement_scale)
+    w = weight(parameters.loss, innovation.value / math.sqrt(prior + noise), parameters.measurement_scale)
     if w < NEGLIGIBLE:
         innovation.weight, innovation.total_variance = 0.0, np.inf
         return
-    innovation.weight, innovation.total_variance = w, prior + noise * tuning.tdoa_correlation_length * innovation.repeated / w
+    innovation.weight, innovation.total_variance = w, prior + noise * parameters.tdoa_correlation_length * innovation.repeated / w
     kalman(hypothesis, innovation)
 
 
 @compiled
-def update_gate(hypothesis, innovation, tuning):
+def update_gate(hypothesis: Record, innovation: Record, parameters: Record) -> None:
     """Kalman update if the innovation is within `gate` standard deviations."""
     prior, noise = innovation.prior_variance, innovation.noise_variance
-    if innovation.value**2 > tuning.gate**2 * (prior + noise):
+    if innovation.value**2 > parameters.gate**2 * (prior + noise):
         innovation.weight, innovation.total_variance = 0.0, np.inf
         return
-    innovation.weight, innovation.total_variance = 1.0, prior + noise * tuning.tdoa_correlation_length * innovation.repeated
+    innovation.weight, innovation.total_variance = 1.0, prior + noise * parameters.tdoa_correlation_length * innovation.repeated
     kalman(hypothesis, innovation)
 
 
 @compiled
-def update_m_estimation(hypothesis, innovation, tuning):
+def update_m_estimation(hypothesis: Record, innovation: Record, parameters: Record) -> None:
     """M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13; cross_covariance becomes that of the weighted prior.
 
     The error state is scaled by the Cholesky factor S of the prior (eq. 9), prior and measurement are re-weighted
@@ -74,16 +76,16 @@ def update_m_estimation(hypothesis, innovation, tuning):
     y0 = S[0, 0] * g0 + S[1, 0] * g1 + S[2, 0] * g2  # S' h'; its other elements are zero
     y1 = S[1, 1] * g1 + S[2, 1] * g2
     y2 = S[2, 2] * g2
-    noise = innovation.noise_variance * tuning.tdoa_correlation_length * innovation.repeated
-    loss = tuning.loss
+    noise = innovation.noise_variance * parameters.tdoa_correlation_length * innovation.repeated
+    loss = parameters.loss
     e0 = e1 = e2 = 0.0  # scaled error of the state, eq. 9
-    for _ in range(tuning.iterations):
+    for _ in range(parameters.iterations):
         left = innovation.value - y0 * e0 - y1 * e1 - y2 * e2
-        w = max(weight(loss, left / math.sqrt(noise), tuning.measurement_scale), SMALLEST_WEIGHT)
+        w = max(weight(loss, left / math.sqrt(noise), parameters.measurement_scale), SMALLEST_WEIGHT)
         w0, w1, w2 = (
-            weight(loss, e0, tuning.state_scale),
-            weight(loss, e1, tuning.state_scale),
-            weight(loss, e2, tuning.state_scale),
+            weight(loss, e0, parameters.state_scale),
+            weight(loss, e1, parameters.state_scale),
+            weight(loss, e2, parameters.state_scale),
         )
         total = y0 * y0 / w0 + y1 * y1 / w1 + y2 * y2 / w2 + noise / w
         step = innovation.value / total
@@ -99,7 +101,7 @@ def update_m_estimation(hypothesis, innovation, tuning):
 
 
 @compiled
-def _factorize(P, S):
+def _factorize(P: np.ndarray, S: np.ndarray) -> None:
     """S (15, 3) <- the first three columns of the Cholesky factor of P."""
     for i in range(3):
         for j in range(i, ERROR_STATES):
@@ -112,7 +114,7 @@ def _factorize(P, S):
 
 
 @compiled
-def _position_row(innovation):
+def _position_row(innovation: Record) -> tuple[float, float, float]:
     """The entries of the Jacobian row for the position."""
     g0 = g1 = g2 = 0.0
     for n in range(innovation.entries):

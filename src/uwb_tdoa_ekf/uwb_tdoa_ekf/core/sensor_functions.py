@@ -1,12 +1,15 @@
 """Errors of the inertial sensor that change with the state of the filter: taken out of each sample at the best hypothesis."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 import math
 
 import numpy as np
 
 from uwb_tdoa_bias.effects.covariates import OF_STATE
-from uwb_tdoa_bias.effects.sensor_function import STEPS
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.effects.sensor_function import STEPS, SensorFunction
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 SENSORS = ("gyro", "accel")
 SPEED, CLIMB_RATE = OF_STATE.index("speed"), OF_STATE.index("climb_rate")  # those before them are the position
@@ -21,7 +24,7 @@ SENSOR_FUNCTION = np.dtype(
 )  # fmt: skip
 
 
-def rows_of(functions):
+def rows_of(functions: Sequence[SensorFunction]) -> np.ndarray:
     """(k,) of SENSOR_FUNCTION, of SensorFunctions."""
     out = np.zeros(len(functions), SENSOR_FUNCTION)
     for row, function in zip(out, functions):
@@ -32,7 +35,7 @@ def rows_of(functions):
 
 
 @compiled
-def take_out(functions, x, sample):
+def take_out(functions: np.ndarray, x: np.ndarray, sample: Record) -> None:
     """Take (k,) of SENSOR_FUNCTION at a nominal state x out of an IMU_SAMPLE."""
     for k in range(len(functions)):
         function = functions[k]
@@ -47,7 +50,7 @@ def take_out(functions, x, sample):
 
 
 @compiled
-def _value(function, at):
+def _value(function: Record, at: float) -> float:
     place = (at - function.low) / (function.high - function.low)
     place = place - math.floor(place) if function.periodic else min(max(place, 0.0), 1.0)
     first = min(int(place * STEPS), STEPS - 1)

@@ -4,11 +4,13 @@ Nothing is assumed: the explanations are weighed by their probability, and the c
 are apart.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from . import ground
 from .history import add_reset, add_update
@@ -32,7 +34,10 @@ LANDING_STD = 0.2, 0.2, 0.5  # m, by which the filter may be wrong beyond what i
 
 
 @compiled
-def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
+def weigh(
+    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, z: float, z_std: float,
+    x: np.ndarray, covariance: np.ndarray,
+) -> float:  # fmt: skip
     """Weigh the explanations of (k,) of ground.PAIR by a tag at rest that may be anywhere in its workspace: position x (6,) with its
     covariance (6, 6), and the ground, with each lateness of ground.explain.
 
@@ -45,16 +50,16 @@ def weigh(ekf, pairs, anchors, tuning, z, z_std, x, covariance):
         prior[1 + k, k] = 1.0 / half**2
     cost, position, each = np.empty(EXPLANATIONS), np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3))
     position[0] = x[:3]
-    cost[0] = ground.explain(pairs, anchors, bounds, prior, tuning, z, z_std, ground.IN_TIME, position[0], each[0])
+    cost[0] = ground.explain(pairs, anchors, bounds, prior, parameters, z, z_std, ground.IN_TIME, position[0], each[0])
     starts, near = np.empty((4, 2)), np.empty((2, 3))
     surround(ekf, NEAR, near)
-    near[0, 2] = min(near[0, 2], tuning.ground_height)
+    near[0, 2] = min(near[0, 2], parameters.ground_height)
     cost[0] += _absurdity(near, x)
     position[0], each[0] = x[:3], covariance[:3, :3]
     for start in range(4):
         for k in range(2):
             starts[start, k] = near[0, k] + (near[1, k] - near[0, k]) * (0.75 if (start >> k) & 1 else 0.25)
-    _on_ground(ekf, pairs, anchors, prior, tuning, z, z_std, starts, cost, position, each)
+    _on_ground(ekf, pairs, anchors, prior, parameters, z, z_std, starts, cost, position, each)
     best = _mix(cost, position, each)
     ekf.late_as_known = best == 1 + ground.KNOWN
     x[:3] = position[best]
@@ -81,9 +86,12 @@ def _absurdity(near: np.ndarray, x: np.ndarray) -> float:
 
 
 @compiled
-def _on_ground(ekf, pairs, anchors, prior, tuning, z, z_std, starts, cost, position, each):
+def _on_ground(
+    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, prior: np.ndarray, parameters: Record, z: float,
+    z_std: float, starts: np.ndarray, cost: np.ndarray, position: np.ndarray, each: np.ndarray,
+) -> None:  # fmt: skip
     """Fill in cost, position and its covariance of the explanations from 1 on: on the ground, with each lateness."""
-    floor, floor_std = tuning.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD
+    floor, floor_std = parameters.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD
     if not math.isnan(z):
         floor, floor_std = z, z_std
     trial, its = np.empty(3), np.empty((3, 3))
@@ -95,7 +103,7 @@ def _on_ground(ekf, pairs, anchors, prior, tuning, z, z_std, starts, cost, posit
         cost[k] = np.inf
         for start in range(len(starts) if lateness != ground.KNOWN or known else 0):
             trial[0], trial[1], trial[2] = starts[start, 0], starts[start, 1], floor
-            c = ground.explain(pairs, anchors, ekf.workspace, prior, tuning, floor, floor_std, lateness, trial, its)
+            c = ground.explain(pairs, anchors, ekf.workspace, prior, parameters, floor, floor_std, lateness, trial, its)
             if c < cost[k]:
                 cost[k], position[k], each[k] = c, trial, its
     cost[1 + ground.ALIKE] += UNUSUAL
@@ -105,9 +113,9 @@ def _on_ground(ekf, pairs, anchors, prior, tuning, z, z_std, starts, cost, posit
 
 
 @compiled
-def _mix(cost, position, each):
+def _mix(cost: np.ndarray, position: np.ndarray, each: np.ndarray) -> int:
     """Place of the most probable explanation; its covariance becomes that of all of them about its position (spread of the means)."""
-    best = np.argmin(cost)
+    best = int(np.argmin(cost))
     weights = np.exp(cost[best] - cost)
     weights /= np.sum(weights)
     for k in range(len(cost)):
@@ -119,7 +127,7 @@ def _mix(cost, position, each):
 
 
 @compiled
-def stop(x, covariance, of_velocity):
+def stop(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None:
     """Position and velocity x (6,) and their covariance (6, 6) become those of a tag at rest, as far as of_velocity (3, 3) m^2/s^2 tells."""
     x[3:] = 0.0
     covariance[:, 3:] = 0.0
@@ -131,14 +139,14 @@ def stop(x, covariance, of_velocity):
 
 
 @compiled
-def is_near_ground(hypothesis, tuning):
+def is_near_ground(hypothesis: Record, parameters: Record) -> bool:
     """Whether a tag may stand on the ground, by the height of a HYPOTHESIS."""
     lowest = hypothesis.x[2] - ground.DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
-    return lowest < tuning.ground_height + ground.GROUND_HEIGHT + ground.GROUND_STD
+    return lowest < parameters.ground_height + ground.GROUND_HEIGHT + ground.GROUND_STD
 
 
 @compiled
-def _expected_late(pairs, anchors):
+def _expected_late(pairs: np.ndarray, anchors: np.ndarray) -> float:
     """How many anchors of (k,) of PAIR are expected to be late because the tag is low."""
     late = 0.0
     for row in ground.heard(pairs, anchors)[0]:
@@ -147,14 +155,17 @@ def _expected_late(pairs, anchors):
 
 
 @compiled
-def land(ekf, pairs, anchors, tuning, still, stands, t, records):
+def land(
+    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, still: bool, stands: bool,
+    t: float, records: np.ndarray,
+) -> bool:  # fmt: skip
     """If (k,) of PAIR tell at stamp t, s, that a tag is on the ground, go there. Returns whether.
 
     still : TDOAs stay what they are; stands : it does not move. A tag that does not stand may hover low: its place is then told to
     HOVER_STD, of one that is not still the height alone.
     """
     best = ekf.hypotheses[ekf.best]
-    if not is_near_ground(best, tuning) or not (still or _expected_late(pairs, anchors) > FEWEST_LATE):
+    if not is_near_ground(best, parameters) or not (still or _expected_late(pairs, anchors) > FEWEST_LATE):
         return False
     prior, wide = np.empty((4, 3)), best.P[:3, :3].copy()
     for k in range(3):
@@ -162,11 +173,11 @@ def land(ekf, pairs, anchors, tuning, still, stands, t, records):
     prior[0], prior[1:] = best.x[:3], _inverse(wide)
     cost, position, each = np.empty(EXPLANATIONS), np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3))
     position[0] = best.x[:3]
-    cost[0] = ground.explain(pairs, anchors, ekf.workspace, prior, tuning, np.nan, np.nan, ground.IN_TIME, position[0], each[0])
+    cost[0] = ground.explain(pairs, anchors, ekf.workspace, prior, parameters, np.nan, np.nan, ground.IN_TIME, position[0], each[0])
     starts = np.empty((1, 2))
     starts[0, 0], starts[0, 1] = best.x[0], best.x[1]
-    _on_ground(ekf, pairs, anchors, prior, tuning, np.nan, np.nan, starts, cost, position, each)
-    k = 1 + np.argmin(cost[1:])
+    _on_ground(ekf, pairs, anchors, prior, parameters, np.nan, np.nan, starts, cost, position, each)
+    k = 1 + int(np.argmin(cost[1:]))
     if cost[k] + DECISIVE > cost[0]:
         return False
     if stands:
@@ -190,18 +201,21 @@ def land(ekf, pairs, anchors, tuning, still, stands, t, records):
 
 
 @compiled
-def find_again(ekf, pairs, window, anchors, tuning, t, records):
+def find_again(
+    ekf: Record, pairs: np.ndarray, window: np.ndarray, anchors: np.ndarray, parameters: Record, t: float,
+    records: np.ndarray,
+) -> None:  # fmt: skip
     """A tag lies still at stamp t, s, but inertial samples have told that it moves: they were wrong, and it may be anywhere."""
     x, covariance = np.empty((1, 6)), np.empty((1, 6, 6))
-    locate(window, anchors, ekf.workspace, tuning, np.nan, np.nan, x, covariance, np.empty(1))
-    weigh(ekf, pairs, anchors, tuning, np.nan, np.nan, x[0], covariance[0])
+    locate(window, anchors, ekf.workspace, parameters, np.nan, np.nan, x, covariance, np.empty(1))
+    weigh(ekf, pairs, anchors, parameters, np.nan, np.nan, x[0], covariance[0])
     _put(ekf, x[0, :3], covariance[0, :3, :3], t, records)
     ekf.resting, ekf.rest_since = True, t
     ekf.recoveries += 1
 
 
 @compiled
-def _put(ekf, position, covariance, t, records):
+def _put(ekf: Record, position: np.ndarray, covariance: np.ndarray, t: float, records: np.ndarray) -> None:
     """Every hypothesis to a position (3,), m, with its covariance (3, 3), at rest; attitude and biases stay."""
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -216,7 +230,7 @@ def _put(ekf, position, covariance, t, records):
 
 
 @compiled
-def _inverse(matrix):
+def _inverse(matrix: np.ndarray) -> np.ndarray:
     """Inverse of a positive definite (3, 3)."""
     both = np.concatenate((matrix, np.eye(3)), axis=1)
     ground.solve(both)

@@ -4,16 +4,18 @@ In a room the search begins in the middle and the corners of its workspace. Wher
 begin. TDOAs that are older than a usual window, of a tag that hears few, tell less, as the tag may have moved by any acceleration since.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
 from .ground import solve
-from .workspace import reflect, rows_heard, told_side
+from .workspace import reflect, rows_heard, configured_side
 
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it,
 GRID_STARTS = 7  # and the best places of a grid over one that is larger than
@@ -33,11 +35,14 @@ SPLIT = 0.8  # standard deviations from the middle of a place to each of two tha
 
 
 @compiled
-def locate(window, anchors, workspace, tuning, z, z_std, x, covariance, cost):
+def locate(
+    window: np.ndarray, anchors: np.ndarray, workspace: np.ndarray, parameters: Record, z: float, z_std: float,
+    x: np.ndarray, covariance: np.ndarray, cost: np.ndarray,
+) -> float:  # fmt: skip
     """Robust multilateration over a window, with constant velocity.
 
-    window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see workspace.py; tuning : one of
-    TUNING; z, z_std : m, a height that is known otherwise and its standard deviation, or NaN. Writes position and velocity at the last
+    window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see workspace.py; parameters : one of
+    PARAMETERS; z, z_std : m, a height that is known otherwise and its standard deviation, or NaN. Writes position and velocity at the last
     stamp to x (k, 6), their covariance to `covariance` (k, 6, 6), and minus the logarithm of the probability of each place, less that of
     the first, to cost (k,): the most probable one first, then others that are APART, with inf where there are none. In a large workspace
     the covariance of the last one holds those for which there is no room. Returns the share of TDOAs that agree with the first, 0 to 1.
@@ -47,10 +52,10 @@ def locate(window, anchors, workspace, tuning, z, z_std, x, covariance, cost):
     floor are explained best by a tag ten metres up. The covariance counts one independent error per anchor heard, not
     per TDOA, because errors persist over the window, and grows with the disagreement that is left.
     """
-    std, ageing = tuning.tdoa_std, np.zeros(len(window))
+    std, ageing = parameters.tdoa_std, np.zeros(len(window))
     for i in range(len(window)):
-        age = max(0.0, window[len(window) - 1].t - window[i].t - tuning.start_window)
-        ageing[i] = tuning.motion_noise**2 * age**3 / 3.0 / std**2
+        age = max(0.0, window[len(window) - 1].t - window[i].t - parameters.start_window)
+        ageing[i] = parameters.motion_noise**2 * age**3 / 3.0 / std**2
     mean, prior_std = np.zeros(6), np.full(6, SPEED)
     for k in range(3):
         mean[k], prior_std[k] = 0.5 * (workspace[0, k] + workspace[1, k]), 0.5 * (workspace[1, k] - workspace[0, k])
@@ -61,7 +66,7 @@ def locate(window, anchors, workspace, tuning, z, z_std, x, covariance, cost):
     correlation_length = max(1.0, len(window) / max(1.0, len(rows) - 1.0))
     trials, losses = np.zeros((STARTS + GRID_STARTS, 6)), np.full(STARTS + GRID_STARTS, np.inf)
     residuals, system = np.zeros(len(window)), np.zeros((6, 7))
-    side = told_side(rows, anchors, tuning.tag_side)
+    side = configured_side(rows, anchors, parameters.tag_side)
     large = max(prior_std[0], prior_std[1]) > 0.5 * LARGE
     starts = STARTS + (_best_of_grid(window, anchors, mean, prior_std, ageing, trials[STARTS:]) if large else 0)
     for start in range(starts):
@@ -82,7 +87,7 @@ def locate(window, anchors, workspace, tuning, z, z_std, x, covariance, cost):
         losses[start] = 0.5 * (len(window) / correlation_length * loss * (FINE / std) ** 2 + far)
     share, least = 0.0, np.min(losses)
     for place in range(len(x)):
-        start = np.argmin(losses)
+        start = int(np.argmin(losses))
         cost[place] = losses[start] - least if losses[start] - least < IMPROBABLE else np.inf
         x[place] = trials[start]
         _normal_equations(window, anchors, x[place], ageing, NO_SCALE, system, residuals)
@@ -93,7 +98,7 @@ def locate(window, anchors, workspace, tuning, z, z_std, x, covariance, cost):
         solve(both)
         covariance[place] = both[:, 6:] * variance
         if place == 0:
-            share = np.mean(np.abs(residuals) < INLIER)
+            share = float(np.mean(np.abs(residuals) < INLIER))
         for other in range(starts):
             if np.sum((trials[other, :3] - x[place, :3]) ** 2) < APART**2:
                 losses[other] = np.inf
@@ -103,7 +108,9 @@ def locate(window, anchors, workspace, tuning, z, z_std, x, covariance, cost):
 
 
 @compiled
-def _hold_others(trials, costs, x, covariance, cost):
+def _hold_others(
+    trials: np.ndarray, costs: np.ndarray, x: np.ndarray, covariance: np.ndarray, cost: np.ndarray
+) -> None:
     """Spread the last of the places x (k, 6) that is one over the others (m, 6) that are left, whose costs (m,) are inf where they are not."""
     last = 0
     for place in range(len(x)):
@@ -122,7 +129,10 @@ def _hold_others(trials, costs, x, covariance, cost):
 
 
 @compiled
-def _best_of_grid(window, anchors, mean, prior_std, ageing, places):
+def _best_of_grid(
+    window: np.ndarray, anchors: np.ndarray, mean: np.ndarray, prior_std: np.ndarray, ageing: np.ndarray,
+    places: np.ndarray,
+) -> int:  # fmt: skip
     """Fill in places (k, 6), at rest, of a grid over `mean` +- `prior_std` (6,) that explain a window best, apart from each other. Returns
     how many."""
     step = max(GRID_STEP, math.sqrt(4.0 * prior_std[0] * prior_std[1] / GRID_POINTS))
@@ -142,7 +152,7 @@ def _best_of_grid(window, anchors, mean, prior_std, ageing, places):
             r = window[j].d - linearized_tdoa(p, anchors[window[j].a].position, anchors[window[j].b].position, row)
             losses[i] += geman_mcclure_loss(r / math.sqrt(1.0 + ageing[j]), GRID_LOSS * step)
     for place in range(len(places)):
-        i = np.argmin(losses)
+        i = int(np.argmin(losses))
         if losses[i] == np.inf:
             return place
         places[place, 0] = origin[0] + steps[0] * (i % counts[0])
@@ -164,7 +174,7 @@ def split(x: np.ndarray, covariance: np.ndarray, cost: np.ndarray) -> None:
     """
     axis, variance = np.ones(3), 0.0
     for _ in range(30):  # power iteration
-        axis = np.array([np.sum(covariance[0, i, :3] * axis) for i in range(3)])
+        axis[:] = np.array([np.sum(covariance[0, i, :3] * axis) for i in range(3)])
         variance = math.sqrt(np.sum(axis**2))
         axis /= variance
     if cost[1] < np.inf or variance < APART**2:
@@ -181,15 +191,15 @@ def split(x: np.ndarray, covariance: np.ndarray, cost: np.ndarray) -> None:
 
 
 @compiled
-def share_of_inliers(window, anchors, x):
+def share_of_inliers(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> float:
     """Share of the window's TDOAs that agree with position and velocity x (6,) at its end, 0 to 1."""
     residuals = np.empty(len(window))
     _normal_equations(window, anchors, x, np.zeros(len(window)), NO_SCALE, np.empty((6, 7)), residuals)
-    return np.mean(np.abs(residuals) < INLIER)
+    return float(np.mean(np.abs(residuals) < INLIER))
 
 
 @compiled
-def level(accel, yaw, x):
+def level(accel: np.ndarray, yaw: float, x: np.ndarray) -> None:
     """Write to x the attitude in which `accel` (3,), the mean specific force, points up, and which has this yaw."""
     roll = math.atan2(accel[1], accel[2])
     pitch = math.atan2(-accel[0], math.hypot(accel[1], accel[2]))
@@ -202,7 +212,7 @@ def level(accel, yaw, x):
 
 
 @compiled
-def _step(trial, system, prior_information, mean):
+def _step(trial: np.ndarray, system: np.ndarray, prior_information: np.ndarray, mean: np.ndarray) -> None:
     """One Gauss-Newton step of `trial` (6,), with a prior about `mean` (6,)."""
     for k in range(6):
         system[k, k] += prior_information[k]
@@ -214,7 +224,10 @@ def _step(trial, system, prior_information, mean):
 
 
 @compiled
-def _normal_equations(window, anchors, x, ageing, scale, system, residuals):
+def _normal_equations(
+    window: np.ndarray, anchors: np.ndarray, x: np.ndarray, ageing: np.ndarray, scale: float, system: np.ndarray,
+    residuals: np.ndarray,
+) -> float:  # fmt: skip
     """Weighted normal equations of the window at x (6,): information matrix and gradient to `system` (6, 7).
 
     ageing : (n,) variance of where the tag was, per axis, beyond what x says, over that of a TDOA, by which its residual counts less. Returns the mean Geman-McClure loss, 0 to 1; writes the residuals (n,), m."""

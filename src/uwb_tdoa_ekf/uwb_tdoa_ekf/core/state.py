@@ -6,11 +6,13 @@ accelerometer bias (m/s^2) and gyroscope bias (rad/s) in the body frame. Error s
 Motion model: eq. 14 of Zhao et al. (RA-L 2021).
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 GRAVITY = 9.81  # m/s^2, along -z of the world
 NOMINAL_STATES, ERROR_STATES = 16, 15
@@ -31,7 +33,7 @@ TRANSITION = np.dtype(
 
 
 @compiled
-def rotation(qx, qy, qz, qw, R):
+def rotation(qx: float, qy: float, qz: float, qw: float, R: np.ndarray) -> None:
     """R (3, 3): body to world, from a unit quaternion."""
     R[0, 0] = 1 - 2 * (qy * qy + qz * qz)
     R[0, 1] = 2 * (qx * qy - qz * qw)
@@ -45,7 +47,7 @@ def rotation(qx, qy, qz, qw, R):
 
 
 @compiled
-def exponential(r0, r1, r2):
+def exponential(r0: float, r1: float, r2: float) -> tuple[float, float, float, float]:
     """Exp(r): the quaternion x y z w of a rotation vector (rad)."""
     angle = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
     s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
@@ -53,7 +55,7 @@ def exponential(r0, r1, r2):
 
 
 @compiled
-def turn(x, bx, by, bz, bw):
+def turn(x: np.ndarray, bx: float, by: float, bz: float, bw: float) -> None:
     """q <- q * b, for a unit quaternion b of a rotation in the body frame."""
     ax, ay, az, aw = x[6], x[7], x[8], x[9]
     qx = aw * bx + ax * bw + ay * bz - az * by
@@ -65,7 +67,7 @@ def turn(x, bx, by, bz, bw):
 
 
 @compiled
-def inject(x, direction, size):
+def inject(x: np.ndarray, direction: np.ndarray, size: float) -> None:
     """Add the error direction * size, (15,), to the nominal state."""
     for j in range(6):
         x[j] += direction[j] * size
@@ -76,7 +78,7 @@ def inject(x, direction, size):
 
 
 @compiled
-def predict(hypothesis, imu, tuning, dt, transition):
+def predict(hypothesis: Record, imu: Record, parameters: Record, dt: float, transition: Record) -> None:
     """Advance a HYPOTHESIS by dt seconds with the input that an IMU_STATE holds; fills the TRANSITION."""
     _move(hypothesis.x, imu, dt, transition)
     P, T = hypothesis.P, transition.product
@@ -96,11 +98,11 @@ def predict(hypothesis, imu, tuning, dt, transition):
             if i <= 6 + r:
                 by_rotation = E[r, 0] * T[i, 6] + E[r, 1] * T[i, 7] + E[r, 2] * T[i, 8]
                 P[i, 6 + r] = P[6 + r, i] = by_rotation - dt * T[i, 12 + r]
-    _add_noise(P, transition.rotation, imu.accel_psd, tuning, dt)
+    _add_noise(P, transition.rotation, imu.accel_psd, parameters, dt)
 
 
 @compiled
-def _move(x, imu, dt, transition):
+def _move(x: np.ndarray, imu: Record, dt: float, transition: Record) -> None:
     """The nominal state; fills the TRANSITION.
 
     The specific force that drives it is between hovering (gravity along body z) and what was measured, by
@@ -127,7 +129,7 @@ def _move(x, imu, dt, transition):
 
 
 @compiled
-def propagate(M, transition):
+def propagate(M: np.ndarray, transition: Record) -> None:
     """transition.product <- the upper rows of Phi M for a matrix M (15, 15); its lower rows stay what they are.
 
     Phi, by what of it differs from the identity: dp' = dp + dv dt;  dv' = dv - R ([f]x dtheta + W dba) dt;
@@ -145,20 +147,20 @@ def propagate(M, transition):
 
 
 @compiled
-def _add_noise(P, R, accel_psd, tuning, dt):
+def _add_noise(P: np.ndarray, R: np.ndarray, accel_psd: np.ndarray, parameters: Record, dt: float) -> None:
     """White noise of the sensors over dt, and the random walks of their biases."""
     s0, s1, s2 = dt * accel_psd[0], dt * accel_psd[1], dt * accel_psd[2]
     for r in range(3):
         for c in range(r, 3):
             P[3 + r, 3 + c] += R[r, 0] * s0 * R[c, 0] + R[r, 1] * s1 * R[c, 1] + R[r, 2] * s2 * R[c, 2]
             P[3 + c, 3 + r] = P[3 + r, 3 + c]
-        P[6 + r, 6 + r] += dt * tuning.gyro_noise**2
-        P[9 + r, 9 + r] += dt * tuning.accel_bias_walk**2
-        P[12 + r, 12 + r] += dt * tuning.gyro_bias_walk**2
+        P[6 + r, 6 + r] += dt * parameters.gyro_noise**2
+        P[9 + r, 9 + r] += dt * parameters.accel_bias_walk**2
+        P[12 + r, 12 + r] += dt * parameters.gyro_bias_walk**2
 
 
 @compiled
-def coast(hypothesis, dt, accel_psd, turn_psd):
+def coast(hypothesis: Record, dt: float, accel_psd: float, turn_psd: float) -> None:
     """Advance by dt seconds with no inertial sample: constant velocity with random acceleration, attitude held.
 
     accel_psd (m/s^2)^2/Hz; turn_psd (rad/s)^2/Hz, growth of the attitude's uncertainty.
@@ -179,7 +181,7 @@ def coast(hypothesis, dt, accel_psd, turn_psd):
 
 
 @compiled
-def difference(a, b):
+def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Error state that leads from nominal state a to b, its first nine elements: [dp, dv, dtheta]."""
     ax, ay, az, aw = -a[6], -a[7], -a[8], a[9]
     bx, by, bz, bw = b[6], b[7], b[8], b[9]

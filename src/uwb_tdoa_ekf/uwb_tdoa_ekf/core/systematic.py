@@ -4,9 +4,11 @@ The filter divides errors by how many TDOAs there are. What it states therefore 
 (consider covariance, Tapley, Schutz and Born, Statistical Orbit Determination, 2004, ch. 6).
 """
 
+from __future__ import annotations
+
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from .ground import solve
 
@@ -25,7 +27,7 @@ def begin(information: np.ndarray, P: np.ndarray) -> None:
 
 
 @compiled
-def observe(information: np.ndarray, a: np.void, b: np.void, innovation: np.void, t: float, last: float) -> None:
+def observe(information: np.ndarray, a: Record, b: Record, innovation: Record, t: float, last: float) -> None:
     """Take a TDOA stamped t, s, between two of ANCHOR, an INNOVATION, into the information (3, 3), 1/m^2, of a position by a single
     TDOA of each anchor that is heard, as noisy as it is; last : s, stamp of the TDOA before."""
     fades = min(t - last, LONGEST_STEP) / MEMORY

@@ -5,9 +5,11 @@ the state predicts, and the variance of its noise. The rest is the same for all:
 `robust.update` if the measurement may be an outlier.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from .state import ERROR_STATES, inject
 
@@ -39,7 +41,7 @@ INNOVATION = np.dtype(
 
 
 @compiled
-def project(P, innovation):
+def project(P: np.ndarray, innovation: Record) -> None:
     """Fill in what the prior P (15, 15) makes of the Jacobian row: prior_variance and cross_covariance."""
     covariance = innovation.cross_covariance
     for j in range(ERROR_STATES):
@@ -55,7 +57,7 @@ def project(P, innovation):
 
 
 @compiled
-def kalman(hypothesis, innovation):
+def kalman(hypothesis: Record, innovation: Record) -> None:
     """Kalman update of a HYPOTHESIS with an INNOVATION of value, cross_covariance and total_variance."""
     P, covariance, total = hypothesis.P, innovation.cross_covariance, innovation.total_variance
     if hypothesis.offset_P[0, 0] > 0.0:
@@ -69,7 +71,7 @@ def kalman(hypothesis, innovation):
 
 
 @compiled
-def _correct_offset(hypothesis, innovation):
+def _correct_offset(hypothesis: Record, innovation: Record) -> None:
     """The part of `kalman` for the offset of the barometer and its drift."""
     cross, P, total = hypothesis.offset_cross, hypothesis.offset_P, innovation.total_variance
     first, second = innovation.on_offset * P[0, 0], innovation.on_offset * P[0, 1]  # covariance with the prediction
@@ -88,7 +90,7 @@ def _correct_offset(hypothesis, innovation):
 
 
 @compiled
-def update_state(hypothesis, innovation, state, value, std):
+def update_state(hypothesis: Record, innovation: Record, state: int, value: float, std: float) -> None:
     """Kalman update with a measurement of one of the first six states, position and velocity: `value` +- `std`."""
     innovation.entries, innovation.states[0], innovation.row[0] = 1, state, 1.0
     innovation.value, innovation.noise_variance = value - hypothesis.x[state], std * std

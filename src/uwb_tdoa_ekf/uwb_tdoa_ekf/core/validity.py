@@ -1,5 +1,7 @@
 """Which measurements cannot be any."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
@@ -12,7 +14,7 @@ LARGEST_ERROR = 1.0  # m by which |d_ab| may exceed the distance between a and b
 
 
 @compiled
-def usable(a, b, d, variance, positions):
+def usable(a: int, b: int, d: float, variance: float, positions: np.ndarray) -> bool:
     """False for an unknown anchor (row -1), a pair of one anchor, a value not finite or longer than the baseline, a variance
     that is none.
 
@@ -27,7 +29,7 @@ def usable(a, b, d, variance, positions):
 
 
 @compiled
-def usable_all(a, b, d, variance, positions):
+def usable_all(a: np.ndarray, b: np.ndarray, d: np.ndarray, variance: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """`usable` for (n,) arrays: (n,) bool."""
     out = np.empty(len(d), np.bool_)
     for i in range(len(d)):
@@ -36,7 +38,7 @@ def usable_all(a, b, d, variance, positions):
 
 
 @compiled
-def usable_slopes(slope, state):
+def usable_slopes(slope: np.ndarray, state: np.ndarray) -> np.ndarray:
     """(n,) bool: whether a bias can change with the state by a slope (n, 6), m per m or m/s, about a state (n, 6), m or m/s."""
     out = np.ones(len(slope), np.bool_)
     for i in range(len(slope)):
@@ -46,7 +48,7 @@ def usable_slopes(slope, state):
 
 
 @compiled
-def usable_imu(t, gyro, accel):
+def usable_imu(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
     """(n,) bool: finite and within the range of any sensor. t (n,) s; gyro (n, 3) rad/s, accel (n, 3) m/s^2."""
     out = np.empty(len(t), np.bool_)
     for i in range(len(t)):

@@ -1,8 +1,12 @@
 """A velocity in the body frame: wheels, optical flow, visual odometry. Slip and lost features show as innovations."""
 
+from __future__ import annotations
+
 import math
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, weight
 
 from .hypotheses import add_log_likelihood, alive
@@ -19,12 +23,12 @@ DISAGREES, AGREES = 4.0, 2.0  # mean normalised innovation squared above which i
 
 
 @compiled
-def observe(ekf, tuning, aid, residual, records):
+def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray) -> None:
     """Take a velocity, one of AID, into a running filter; fills one of RESIDUAL with its worst component."""
     state, innovation = ekf.velocity, ekf.innovation
     dt = min(max(aid.t - state.heard, 1e-3), AVERAGE)
     state.heard = aid.t
-    alike = max(1.0, 2.0 * CORRELATION_TIME / dt)
+    inflation = max(1.0, 2.0 * CORRELATION_TIME / dt)
     worst = _worst(ekf, aid, residual)
     state.nis += min(1.0, dt / AVERAGE) * (min(worst, GATE**4) - state.nis)
     state.refused = state.nis > (AGREES if state.refused else DISAGREES)
@@ -42,8 +46,8 @@ def observe(ekf, tuning, aid, residual, records):
             compare(hypothesis, aid, axis, ekf.transition.rotation, innovation)
             total = innovation.prior_variance + innovation.noise_variance
             w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
-            add_log_likelihood(hypothesis, innovation, alike)
-            innovation.total_variance = innovation.prior_variance + innovation.noise_variance * alike / w
+            add_log_likelihood(hypothesis, innovation, inflation)
+            innovation.total_variance = innovation.prior_variance + innovation.noise_variance * inflation / w
             kalman(hypothesis, innovation)
             if h == ekf.best:
                 residual.weight = min(residual.weight, w)
@@ -51,7 +55,7 @@ def observe(ekf, tuning, aid, residual, records):
 
 
 @compiled
-def _worst(ekf, aid, residual):
+def _worst(ekf: Record, aid: Record, residual: Record) -> float:
     """The largest normalised innovation squared of the components, for the best hypothesis; fills the residual."""
     innovation, worst = ekf.innovation, -1.0
     for axis in range(3):
@@ -66,7 +70,7 @@ def _worst(ekf, aid, residual):
 
 
 @compiled
-def compare(hypothesis, aid, axis, R, innovation):
+def compare(hypothesis: Record, aid: Record, axis: int, R: np.ndarray, innovation: Record) -> None:
     """Fill in what one component of a velocity in the body frame says to a HYPOTHESIS, and R (3, 3), body to world.
 
     u = R' v; with the true attitude q * Exp(dtheta), du = R' dv + [u]x dtheta.

@@ -3,11 +3,13 @@
 In a large hall that is not the hall, but what is near the anchors that are heard.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from .config import SIDES
 from .update import update_state
@@ -19,7 +21,7 @@ STD = 1.0  # m, of what is known before anything is measured: a tag outside is a
 
 
 @compiled
-def set_bounds(extent, margin, bounds):
+def set_bounds(extent: np.ndarray, margin: float, bounds: np.ndarray) -> None:
     """Write the lower and upper bounds, m, to `bounds` (2, 3): `margin` beyond `extent` (2, 3) m, that of all anchors."""
     longest = max(extent[1, 0] - extent[0, 0], extent[1, 1] - extent[0, 1])
     for k in range(3):
@@ -31,7 +33,7 @@ def set_bounds(extent, margin, bounds):
 
 
 @compiled
-def surround(ekf, margin, bounds):
+def surround(ekf: Record, margin: float, bounds: np.ndarray) -> None:
     """The same, as far as it is within the reach of the anchors heard lately, and on the side of them that is told."""
     set_bounds(ekf.extent, margin, bounds)
     for k in range(3):
@@ -44,7 +46,7 @@ def surround(ekf, margin, bounds):
 
 
 @compiled
-def told_side(rows, anchors, tag_side):
+def configured_side(rows: np.ndarray, anchors: np.ndarray, tag_side: int) -> tuple[float, float, float]:
     """On which side of which plane a tag is that hears the anchors in rows (k,): the axis across the plane, 1.0 or -1.0 for the side along
     that, 0.0 where nobody tells or the anchors are in no such plane, and its coordinate, m."""
     if tag_side == 0 or len(rows) == 0:
@@ -59,8 +61,8 @@ def told_side(rows, anchors, tag_side):
 
 
 @compiled
-def reflect(x, side):
-    """Put position and velocity x (6,) at the mirrored place, if they are on the other side than `told_side` says. Returns whether."""
+def reflect(x: np.ndarray, side: np.ndarray | tuple[float, float, float]) -> bool:
+    """Put position and velocity x (6,) at the mirrored place, if they are on the other side than `configured_side` says. Returns whether."""
     axis, sign, plane = int(side[0]), side[1], side[2]
     if (x[axis] - plane) * sign >= 0.0:
         return False
@@ -69,7 +71,7 @@ def reflect(x, side):
 
 
 @compiled
-def stay_on_side(hypothesis, side):
+def stay_on_side(hypothesis: Record, side: np.ndarray) -> bool:
     """The same for a HYPOTHESIS and its covariance."""
     if not reflect(hypothesis.x, side):
         return False
@@ -84,11 +86,11 @@ def stay_on_side(hypothesis, side):
 
 
 @compiled
-def listen(ekf, window, anchors, reach, tag_side):
+def listen(ekf: Record, window: np.ndarray, anchors: np.ndarray, reach: float, tag_side: int) -> None:
     """Note where a tag can be that has heard the anchors of a window (n,) of TDOA: within `reach`, m, of each of them, and where two of
     them are farther apart than that, within as much: they were heard, so the radio reaches farther. Note its side of them too."""
     rows = rows_heard(window)
-    side = told_side(rows, anchors, tag_side)
+    side = configured_side(rows, anchors, tag_side)
     ekf.side[0], ekf.side[1], ekf.side[2] = side
     for k in range(3):
         low, high = np.inf, -np.inf
@@ -108,7 +110,7 @@ def listen(ekf, window, anchors, reach, tag_side):
 
 
 @compiled
-def add_circle(ekf, height_known, x, covariance):
+def add_circle(ekf: Record, height_known: bool, x: np.ndarray, covariance: np.ndarray) -> None:
     """Add to the (9, 9) covariance of a position x (3,), m, what anchors along one axis of the world leave open: the tag may be anywhere on a
     circle about them. height_known : whether something else tells z."""
     square, across = 0.0, 0
@@ -124,7 +126,7 @@ def add_circle(ekf, height_known, x, covariance):
 
 
 @compiled
-def rows_heard(window):
+def rows_heard(window: np.ndarray) -> np.ndarray:
     """Rows of the anchors in a window (n,) of TDOA, each once."""
     rows, count = np.empty(2 * len(window), np.int64), 0
     for i in range(len(window)):
@@ -140,7 +142,7 @@ def rows_heard(window):
 
 
 @compiled
-def contains(bounds, x):
+def contains(bounds: np.ndarray, x: np.ndarray) -> bool:
     """True if position x (3,), m, is within `bounds` (2, 3)."""
     for k in range(3):
         if not bounds[0, k] <= x[k] <= bounds[1, k]:
@@ -149,7 +151,7 @@ def contains(bounds, x):
 
 
 @compiled
-def is_filled(bounds, P):
+def is_filled(bounds: np.ndarray, P: np.ndarray) -> bool:
     """True if a tag whose error has covariance P may be anywhere in `bounds` (2, 3): its standard deviation exceeds their diagonal."""
     spread = size = 0.0
     for k in range(3):
@@ -159,7 +161,7 @@ def is_filled(bounds, P):
 
 
 @compiled
-def constrain(hypothesis, innovation, bounds, axis):
+def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: int) -> bool:
     """Soft constraint of one axis: pull a tag that is outside towards its workspace, and one of which less is known than that. Returns
     whether there was anything to do.
 

@@ -1,7 +1,10 @@
 """The map from a measured position to its bias, after Grasso et al. (Sensors 2022, 22, 9136), eqs. 20 and 21; and its
 file."""
 
-from dataclasses import dataclass, replace
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
@@ -12,6 +15,10 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.limits import MAP_MARKERS
 
 from .network import AngularNetwork
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
 
 FORMAT, VERSION = "uwb_tdoa position bias map", 1
 UNITS = "metres, square metres for added, in the world frame named by frame; bias is measured minus true"
@@ -47,8 +54,12 @@ class BiasMap:
     interpolator: str = "thin_plate"
     frame: str = "map"
     source: str = ""
+    _hull: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False, compare=False)
+    _tree: cKDTree = field(init=False, repr=False, compare=False)
+    _surface: Callable[[np.ndarray], np.ndarray] = field(init=False, repr=False, compare=False)
+    _mean_square: np.ndarray = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, kind in _ARRAYS.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
         n, d = self.at.shape if self.at.ndim == 2 else (0, 0)
@@ -84,15 +95,15 @@ class BiasMap:
         object.__setattr__(self, "_mean_square", self.bias.T @ self.bias / n)
 
     @property
-    def planar(self):
+    def planar(self) -> bool:
         """Whether it knows x and y only; z is then left as it is."""
         return self.at.shape[1] == 2
 
-    def scaled(self, share):
+    def scaled(self, share: float) -> BiasMap:
         """The BiasMap of a share, 0 ... 1, of all biases; the rest, which is not taken out, is in `added`."""
         return replace(self, bias=share * self.bias, added=share**2 * self.added + (1.0 - share) ** 2 * self._mean_square)
 
-    def validity(self, p):
+    def validity(self, p: np.ndarray) -> np.ndarray:
         """How far the map is valid at positions p (m, 3), m: (m,), 1 inside of the known region, 0 from FADE beyond it."""
         p = p[:, : self.at.shape[1]]
         normals, offsets = self._hull
@@ -100,11 +111,11 @@ class BiasMap:
         far_from_markers = self._tree.query(p)[0] - self.step
         return np.clip(1.0 - np.maximum(outside, far_from_markers) / FADE, 0.0, 1.0)
 
-    def bias_at(self, p):
+    def bias_at(self, p: np.ndarray) -> np.ndarray:
         """beta of eq. 20 at measured positions p (m, 3), m: (m, 3) m, already faded; 0 in z if the map is planar."""
         return self._faded(p, self.validity(p))
 
-    def _faded(self, p, validity):
+    def _faded(self, p: np.ndarray, validity: np.ndarray) -> np.ndarray:
         out = np.zeros((len(p), 3))
         known = validity > 0.0
         if known.any():
@@ -112,7 +123,7 @@ class BiasMap:
             out[known, :d] = validity[known, None] * self._surface(p[known, :d])
         return out
 
-    def correct(self, p, covariance):
+    def correct(self, p: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions without their bias (eq. 21) and the covariance of what is left.
 
         p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, validity). With validity w, what is added to
@@ -125,19 +136,19 @@ class BiasMap:
         covariance[:, :d, :d] += known * self.added + unknown * self._mean_square
         return p - self._faded(p, validity), covariance, validity
 
-    def save(self, path):
+    def save(self, path: Path) -> None:
         """Write what `load` reads: a numpy .npz file that names its format, version and units."""
-        about = {"format": FORMAT, "version": VERSION, "units": UNITS, "frame": self.frame, "source": self.source}
-        content = {
+        about: dict[str, Any] = {"format": FORMAT, "version": VERSION, "units": UNITS, "frame": self.frame, "source": self.source}
+        content: dict[str, Any] = {
             "step": self.step,
             "interpolator": self.interpolator,
             **{name: getattr(self, name) for name in _ARRAYS},
         }
         with open(path, "wb") as file:
-            np.savez_compressed(file, **about, **content)
+            np.savez_compressed(file, **{**about, **content})
 
     @classmethod
-    def load(cls, path):
+    def load(cls, path: str | Path) -> BiasMap:
         """Read a file that `save` wrote; raises InputError."""
         what, remedy = f"position bias map of version {VERSION}", "make one with `debias`"
         kinds = {name: "i" if kind is int else "f" for name, kind in _ARRAYS.items()}
@@ -146,7 +157,7 @@ class BiasMap:
         try:
             if str(content["format"]) != FORMAT or int(content["version"]) != VERSION:
                 raise ValueError(f"format {content['format']}, version {content['version']}")
-            fields = {name: content[name] for name in _ARRAYS} | {name: str(content[name]) for name in texts[2:]}
+            fields: dict[str, Any] = {name: content[name] for name in _ARRAYS} | {name: str(content[name]) for name in texts[2:]}
             return cls(**fields, step=float(content["step"]))
         except (TypeError, ValueError, OverflowError) as error:  # InputError is a ValueError
             raise InputError(f"{path}: is no {what} ({error}); {remedy}.") from error

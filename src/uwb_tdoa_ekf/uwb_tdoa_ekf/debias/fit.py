@@ -1,6 +1,8 @@
 """Making a BiasMap out of measured and true positions, and saying how precise it is elsewhere."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import brentq
@@ -9,6 +11,9 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .bias_map import BiasMap
 from .markers import collect, corrected_bias, measured_places
+
+if TYPE_CHECKING:
+    from .markers import Markers
 
 FOLDS = 5  # into which parts are shared out, if there are more
 LOST = 1.0  # m; what is further off is no measurement of a bias
@@ -22,12 +27,12 @@ class Part:
     that are more than LOST apart, or not finite, are left out.
     """
 
-    def __init__(self, measured, true, covariance=None):
+    def __init__(self, measured: np.ndarray, true: np.ndarray, covariance: np.ndarray | None = None) -> None:
         usable = np.linalg.norm(measured - true, axis=1) <= LOST
         self.measured, self.true = measured[usable], true[usable]
         self.covariance = None if covariance is None else covariance[usable]
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.measured)
 
 
@@ -42,7 +47,10 @@ class _Options(NamedTuple):
     source: str
 
 
-def fit(parts, step, least=1, planar=False, interpolator="thin_plate", frame="map", source=""):
+def fit(
+    parts: list[Part], step: float, least: int = 1, planar: bool = False, interpolator: str = "thin_plate",
+    frame: str = "map", source: str = "",
+) -> BiasMap:  # fmt: skip
     """BiasMap of a list of Part. Raises InputError where they hold too little.
 
     step : m, of the grid; least : measurements that make a marker; planar : map x and y only.
@@ -66,16 +74,17 @@ def fit(parts, step, least=1, planar=False, interpolator="thin_plate", frame="ma
             error, covariance = _position_errors(bias_map, part)
             errors.append(error)
             covariances.append(covariance)
-    bias_errors = np.concatenate(bias_errors)
-    if len(bias_errors) == 0:  # nothing was known elsewhere: as unsure as without a map
+    deviations = np.concatenate(bias_errors)
+    if len(deviations) == 0:  # nothing was known elsewhere: as unsure as without a map
         return _fit(parts, options, whole.bias.T @ whole.bias / len(whole.bias))
-    added = bias_errors.T @ bias_errors / len(bias_errors)
-    if sum(map(len, errors)) and all(covariance is not None for covariance in covariances):
-        added = added * _needed(np.concatenate(errors), np.concatenate(covariances), added)
+    added = deviations.T @ deviations / len(deviations)
+    known = [covariance for covariance in covariances if covariance is not None]
+    if sum(map(len, errors)) and len(known) == len(covariances):
+        added = added * _needed(np.concatenate(errors), np.concatenate(known), added)
     return _fit(parts, options, added)
 
 
-def _bias_errors(bias_map, parts, options):
+def _bias_errors(bias_map: BiasMap, parts: list[Part], options: _Options) -> np.ndarray:
     """Biases of the markers that parts make, less what a map of others says where it is valid: (n, d) m."""
     markers = _markers(parts, options)
     at = _in_space(measured_places(markers, markers.bias))
@@ -83,7 +92,7 @@ def _bias_errors(bias_map, parts, options):
     return error[bias_map.validity(at) == 1.0]
 
 
-def _position_errors(bias_map, part):
+def _position_errors(bias_map: BiasMap, part: Part) -> tuple[np.ndarray, np.ndarray | None]:
     """What a map of others leaves of the errors of a Part where it is valid, (n, d) m; their covariances or None."""
     d, valid = bias_map.at.shape[1], bias_map.validity(part.measured) == 1.0
     p = part.measured[valid]
@@ -91,11 +100,11 @@ def _position_errors(bias_map, part):
     return error, None if part.covariance is None else part.covariance[valid, :d, :d]
 
 
-def _needed(error, covariance, added):
+def _needed(error: np.ndarray, covariance: np.ndarray, added: np.ndarray) -> float:
     """The factor of `added` with which the mean of e' (P + factor added)^-1 e is d, the number of dimensions; 0 or
     more."""
 
-    def excess(factor):
+    def excess(factor: float) -> float:
         solved = np.linalg.solve(covariance + factor * added, error[:, :, None])[:, :, 0]
         return np.mean(np.einsum("nd,nd->n", error, solved)) - error.shape[1]
 
@@ -104,7 +113,7 @@ def _needed(error, covariance, added):
     return brentq(excess, 0.0, LARGEST, rtol=1e-3) if excess(LARGEST) < 0.0 else LARGEST
 
 
-def _fit(parts, options, added):
+def _fit(parts: list[Part], options: _Options, added: np.ndarray) -> BiasMap:
     markers = _markers(parts, options)
     bias = corrected_bias(markers)
     at = measured_places(markers, bias)
@@ -112,22 +121,21 @@ def _fit(parts, options, added):
     return BiasMap(markers.cell, at, bias, markers.std, markers.count, added, step, *about)
 
 
-def _markers(parts, options):
+def _markers(parts: list[Part], options: _Options) -> Markers:
     parts = [part for part in parts if len(part)]
     if not parts:
         raise InputError(
             f"positions: none is within {LOST:g} m of the truth; is it in the same frame, by the same clock?"
         )
     d, step, least = 2 if options.planar else 3, options.step, options.least
-    markers = collect(
-        *(np.concatenate([getattr(part, name)[:, :d] for part in parts]) for name in ("measured", "true")), step, least
-    )
+    measured, true = (np.concatenate([getattr(part, name)[:, :d] for part in parts]) for name in ("measured", "true"))
+    markers = collect(measured, true, step, least)
     if len(markers) == 0:
         raise InputError(f"step: no cell of {step:g} m holds {least} positions; give a larger step, or more data.")
     return markers
 
 
-def _folds(parts):
+def _folds(parts: list[Part]) -> list[list[Part]]:
     """Lists of parts to be left out together; stretches of it, if there is only one."""
     if len(parts) > 1:
         return [parts[k::FOLDS] for k in range(min(FOLDS, len(parts)))]
@@ -137,6 +145,6 @@ def _folds(parts):
     return [[Part(*stretch)] for stretch in zip(*columns, covariances)]
 
 
-def _in_space(p):
+def _in_space(p: np.ndarray) -> np.ndarray:
     """(n, 3) of (n, 2) or (n, 3)."""
     return np.pad(p, ((0, 0), (0, 3 - p.shape[1])))

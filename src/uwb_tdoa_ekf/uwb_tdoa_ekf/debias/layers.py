@@ -4,6 +4,8 @@ They found no gain in precision from them, nor do we (docs/debiasing.md); they a
 further.
 """
 
+from __future__ import annotations
+
 from collections import deque
 from dataclasses import dataclass
 
@@ -34,7 +36,7 @@ class LayerConfig:
     flipping_speed: tuple = (1.0, 1.0, 1.0)
     least_weight: float = 0.5
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("max_speed", "flipping_speed"):
             value = getattr(self, name)
             if np.shape(value) != (3,) or not all(0.0 < speed < np.inf for speed in value):
@@ -51,22 +53,22 @@ class LayerConfig:
 class Layers:
     """Takes one estimate after the other; remembers what the formulas need."""
 
-    def __init__(self, config):
+    def __init__(self, config: LayerConfig) -> None:
         self._config = config
         self.reset()
 
     @property
-    def idle(self):
+    def idle(self) -> bool:
         """Whether positions pass unchanged."""
         return not (self._config.saturate or self._config.smooth < 1.0 or self._config.adams_moulton)
 
-    def reset(self):
+    def reset(self) -> None:
         """Forget the past: after a gap, or when time has gone back."""
-        self._t = None
-        self._p = deque(maxlen=self._config.history + 1)  # newest first
-        self._v = deque(maxlen=len(_ADAMS_MOULTON))
+        self._t: float | None = None
+        self._p: deque[np.ndarray] = deque(maxlen=self._config.history + 1)  # newest first
+        self._v: deque[np.ndarray] = deque(maxlen=len(_ADAMS_MOULTON))
 
-    def filter(self, t, p, v):
+    def filter(self, t: float, p: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Position (3,) m of the estimate at stamp t, s, with position p (3,) m and velocity v (3,) m/s, world
         frame."""
         config = self._config
@@ -87,7 +89,9 @@ class Layers:
         return out
 
 
-def _saturated(p, v, last_p, last_v, dt, config):
+def _saturated(
+    p: np.ndarray, v: np.ndarray, last_p: np.ndarray, last_v: np.ndarray, dt: float, config: LayerConfig
+) -> tuple[np.ndarray, np.ndarray]:
     """Position and velocity whose steps are possible (A19 - A25). The paper limits a velocity from above; here also
     from below."""
     limit = np.array(config.max_speed)
@@ -97,13 +101,13 @@ def _saturated(p, v, last_p, last_v, dt, config):
     return last_p + _scale(dt * limit, step) * step, v  # A24, A25
 
 
-def _scale(limit, vector):
+def _scale(limit: float | np.ndarray, vector: np.ndarray) -> float | np.ndarray:
     """min(limit / |vector|, 1), which is 1 for no vector at all."""
     length = np.linalg.norm(vector)
     return np.minimum(limit / length, 1.0) if length > 0.0 else 1.0
 
 
-def _smoothed(history, share):
+def _smoothed(history: np.ndarray, share: float) -> np.ndarray:
     """A26: weighted mean of positions (n + 1, 3), the newest first."""
     n = len(history) - 1
     weights = share * (1.0 - share) ** np.arange(n + 1)

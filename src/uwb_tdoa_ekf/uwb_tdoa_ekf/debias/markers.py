@@ -5,7 +5,10 @@ Static data (many measurements at each point of a grid) and dynamic data (one at
 way: the markers of a path are the means of what was measured in each cell of a grid.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -31,11 +34,11 @@ class Markers:
     std: np.ndarray
     count: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.cell)
 
 
-def collect(measured, true, step, least=1):
+def collect(measured: np.ndarray, true: np.ndarray, step: float, least: int = 1) -> Markers:
     """Markers of N pairs of positions: one for each cell of a grid of `step` m that holds at least `least` pairs.
 
     measured, true : (N, d) m. The grid starts at the smallest true coordinates, so that points surveyed on a grid of
@@ -45,7 +48,7 @@ def collect(measured, true, step, least=1):
     cells, of, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     of = of.ravel()
 
-    def mean(values):
+    def mean(values: np.ndarray) -> np.ndarray:
         return np.stack([np.bincount(of, column) for column in values.T], axis=1) / count[:, None]
 
     error = measured - true
@@ -55,7 +58,7 @@ def collect(measured, true, step, least=1):
     return Markers(cells[keep], mean(true)[keep], bias[keep], std[keep], count[keep])
 
 
-def corrected_bias(markers):
+def corrected_bias(markers: Markers) -> np.ndarray:
     """b*, (n, d) m: the bias to expect where a marker was measured, eqs. 17 and 18.
 
     Along each axis through a marker, cubic splines through the biases of the markers on that line are averaged with the
@@ -82,6 +85,6 @@ def corrected_bias(markers):
     return total / d
 
 
-def measured_places(markers, bias):
+def measured_places(markers: Markers, bias: np.ndarray) -> np.ndarray:
     """Where the markers are measured, (n, d) m: the deformed grid of eq. 19, X + b*."""
     return markers.true + bias

@@ -1,5 +1,7 @@
 """The radial-basis-function network of Grasso et al. (Sensors 2022, 22, 9136), appendix A, and its extension to 3D."""
 
+from __future__ import annotations
+
 from itertools import product
 
 import numpy as np
@@ -26,7 +28,7 @@ class AngularNetwork:
     stays 8 (26) at the rim, where there are fewer, as published: values there come out too close to the smallest one.
     """
 
-    def __init__(self, cell, at, values, step):
+    def __init__(self, cell: np.ndarray, at: np.ndarray, values: np.ndarray, step: float) -> None:
         """cell : (n, d) int, place in the grid; at : (n, d) m; values : (n, k); step : of the grid, m."""
         self._at, d = np.asarray(at, dtype=float), at.shape[1]
         self._cutoff = 2.0 * step  # the 1 m of eq. A8, on the paper's grid of 0.5 m
@@ -36,7 +38,7 @@ class AngularNetwork:
         neighbour, there = _neighbours(cell, offsets)
         away = self._at[neighbour] - self._at[:, None]
         distance = np.linalg.norm(away, axis=2)
-        there &= distance > 0.0
+        there = there & np.asarray(distance > 0.0)
         c3 = (1.0 - SHARE) / (len(offsets) * SHARE)  # A4
         own = np.where(self._values > 0.0, self._values, 1.0)
         ratio = np.clip(c3 * self._values[neighbour] / own[:, None], SMALLEST_RATIO, 1.0)
@@ -49,12 +51,12 @@ class AngularNetwork:
         self._width_alone = -np.log(c3) / step**2  # as if all neighbours were alike
         self._width_of = _over_angle if d == 2 else _over_direction
 
-    def __call__(self, x):
+    def __call__(self, x: np.ndarray) -> np.ndarray:
         """Values at places x (m, d), m: (m, k). Far from every node: the smallest value, or 0 if none is negative
         (A8)."""
         return np.concatenate([self._at_places(part) for part in np.array_split(x, len(x) // CHUNK + 1)])
 
-    def _at_places(self, x):
+    def _at_places(self, x: np.ndarray) -> np.ndarray:
         away = x[:, None] - self._at
         squared = np.einsum("mnd,mnd->mn", away, away)
         place, node = np.nonzero(squared < self._cutoff**2)
@@ -66,7 +68,7 @@ class AngularNetwork:
         return self._offset + np.stack([np.bincount(place, column, len(x)) for column in terms.T], axis=1)
 
 
-def _neighbours(cell, offsets):
+def _neighbours(cell: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the nodes in the cells at `offsets` from each node, (n, K), and whether there is one, (n, K) bool."""
     shifted = cell - cell.min(axis=0) + 1
     shape = tuple(shifted.max(axis=0) + 2)
@@ -78,7 +80,7 @@ def _neighbours(cell, offsets):
     return found, key[found] == wanted
 
 
-def _over_angle(away, towards, there, widths):
+def _over_angle(away: np.ndarray, towards: np.ndarray, there: np.ndarray, widths: np.ndarray) -> np.ndarray:
     """Widths (P, k) in the directions `away` (P, 2), linear over the angle between the neighbours to the left and
     right."""
     full = 2.0 * np.pi
@@ -93,7 +95,7 @@ def _over_angle(away, towards, there, widths):
     return (1.0 - part) * widths[row, last] + part * widths[row, following]
 
 
-def _over_direction(away, towards, there, widths):
+def _over_direction(away: np.ndarray, towards: np.ndarray, there: np.ndarray, widths: np.ndarray) -> np.ndarray:
     """Widths (P, k) in the directions `away` (P, 3)."""
     length = np.linalg.norm(away, axis=1, keepdims=True)
     cosine = np.einsum("pd,pkd->pk", away / np.maximum(length, 1e-12), towards)

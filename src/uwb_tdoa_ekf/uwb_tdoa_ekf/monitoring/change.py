@@ -12,14 +12,21 @@ it is heard to the last one that is remembered. What a delay does to a slice is 
 slices in which an onset is looked for.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .slices import LENGTH
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .slices import Slice
 
 MEAN_STD = 0.15  # m, of a delay that is the same everywhere,
 PLACE_STD, PLACE_LENGTH = 0.2, 0.9  # m, of one that depends on the place, and how far it is alike,
@@ -47,7 +54,7 @@ class Change:
     rival: float
     left: float
 
-    def at(self, t):
+    def at(self, t: float) -> np.ndarray:
         """The delay, m, at stamps t, s."""
         return np.where(t > self.since, self.size + self.slope * (t - self.since), 0.0)
 
@@ -55,18 +62,22 @@ class Change:
 class ChangeDetector:
     """Takes Slices in the order of their stamps; `find` tests them; what it found is taken out by `take_out`."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         room = CAPACITY
-        self._rows, self._columns = np.empty(0, int), {}  # of the anchors with a column, and the column of each row
+        self._rows: np.ndarray = np.empty(0, int)  # of the anchors with a column, and the column of each row
+        self._columns: dict[int, int] = {}
         self._t, self._p = np.zeros(room), np.zeros((room, 3))
+        self._delays: np.ndarray
+        self._white: np.ndarray
         self._delays, self._freedom = np.zeros((room, 0)), np.zeros(room)  # without what was taken out; combinations measured
         self._factor, self._white = np.zeros((room, room)), np.zeros((room, 0))  # Cholesky factor; whitened errors
         self._squares = np.zeros(room)  # normalised squares
-        self._response = np.zeros((WINDOW, 0, 0))  # of the latest slices, in turn, for the anchors that were heard,
-        self._place = np.full((WINDOW, 0), -1)  # and where the anchor of a column is among them
-        self._known, self._count, self._added = [], 0, 0
+        self._response: np.ndarray = np.zeros((WINDOW, 0, 0))  # of the latest slices, in turn, for the anchors that were heard,
+        self._place: np.ndarray = np.full((WINDOW, 0), -1)  # and where the anchor of a column is among them
+        self._known: list[Change] = []
+        self._count = self._added = 0
 
-    def add(self, piece):
+    def add(self, piece: Slice) -> None:
         """Take a Slice."""
         if self._count == CAPACITY:
             self._forget_oldest(CAPACITY // 4)
@@ -81,14 +92,14 @@ class ChangeDetector:
         self._response[turn, :n, :n] = piece.response
         self._whiten(k)
 
-    def delays_at(self, t, rows):
+    def delays_at(self, t: float, rows: Sequence[int] | np.ndarray) -> np.ndarray:
         """(k,) m: what was taken out of the anchors in rows (k,), at stamp t, s."""
         total = np.zeros(len(rows))
         for change in self._known:
             total[np.asarray(rows) == change.row] += change.at(t)
         return total
 
-    def _columns_of(self, rows):
+    def _columns_of(self, rows: np.ndarray) -> np.ndarray:
         """(k,) columns of anchors, by their rows (k,), with new ones for those that have none; room for so many in a slice."""
         new = [row for row in rows.tolist() if row not in self._columns]
         if new:
@@ -100,25 +111,25 @@ class ChangeDetector:
             self._response = np.pad(self._response, ((0, 0), (0, more), (0, more)))
         return np.array([self._columns[row] for row in rows.tolist()], int)
 
-    def find(self, after):
+    def find(self, after: float) -> Change | None:
         """The Change that explains the latest slices best, of onsets later than `after`, s; None without enough of them."""
         first = self._first(after)
         onsets = self._count - first - YOUNGEST
         if onsets <= 0:
             return None
-        value, ratio, scale = self._compare(first)
+        value, ratio, scales = self._compare(first)
         ratio[onsets:][np.abs(value[onsets:]) > FASTEST_DRIFT] = 0.0
         ratio[onsets:] /= CLEARLY
         shape, column = np.unravel_index(np.argmax(ratio), ratio.shape)
-        best, scale, later = float(ratio[shape, column]), scale[shape], slice(first + shape % onsets, self._count)
+        best, scale, later = float(ratio[shape, column]), scales[shape], slice(first + shape % onsets, self._count)
         explained = best * scale * (CLEARLY if shape >= onsets else 1.0)
         left = (np.sum(self._white[later] ** 2) - explained) / max(np.sum(self._freedom[later]) * scale, 1e-9)
         rival = float(np.max(np.delete(ratio, column, axis=1), initial=0.0))
-        since, value = self._t[first + shape % onsets] - 0.5 * LENGTH, float(value[shape, column])
-        size, slope = (value, 0.0) if shape < onsets else (0.0, value)
+        since, change = self._t[first + shape % onsets] - 0.5 * LENGTH, float(value[shape, column])
+        size, slope = (change, 0.0) if shape < onsets else (0.0, change)
         return Change(int(self._rows[column]), float(since), size, slope, best, rival, float(left))
 
-    def refined(self, change):
+    def refined(self, change: Change) -> Change | None:
         """The step that was taken out last, with the size that it has by now, or None; takes that out instead."""
         first = self._first(change.since)
         if change.slope or self._t[first] - change.since > LENGTH or self._count - first <= YOUNGEST:
@@ -130,12 +141,12 @@ class ChangeDetector:
         self._subtract(replace(change, size=more))
         return better
 
-    def take_out(self, change):
+    def take_out(self, change: Change) -> None:
         """Go on as if an anchor had not changed; what it does beyond that is a Change again."""
         self._known.append(change)
         self._subtract(change)
 
-    def _subtract(self, change):
+    def _subtract(self, change: Change) -> None:
         column = self._columns[change.row]
         for k in range(self._first(change.since), self._count):  # later than any onset that is found
             place, response = self._place[self._turn(k)], self._response[self._turn(k)]
@@ -144,15 +155,15 @@ class ChangeDetector:
                 self._delays[k, heard] -= response[place[heard], place[column]] * change.at(self._t[k])
             self._whiten(k)
 
-    def _turn(self, k):
+    def _turn(self, k: int | np.ndarray) -> int | np.ndarray:
         """Where the response of slice k is, one of the latest; or of several."""
         return (self._added - self._count + k) % WINDOW
 
-    def _first(self, after):
+    def _first(self, after: float) -> int:
         """Place of the first slice of the window that is later than `after`, s."""
         return max(0, self._count - WINDOW, int(np.searchsorted(self._t[: self._count], after)))
 
-    def _compare(self, first):
+    def _compare(self, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Steps (m), then ramps (m/s), that began with each slice from `first` on but the youngest: their most likely
         values and their ratios, (2 k, N), and the mean square of the errors before each, (2 k,)."""
         n, turns = self._count - first, self._turn(np.arange(first, self._count))
@@ -174,11 +185,11 @@ class ChangeDetector:
         ratio[:, some] = score * value[:, some] / scale[:, None]
         return value, ratio, scale
 
-    def _whiten(self, k):
+    def _whiten(self, k: int) -> None:
         """Row k of the factor, and its whitened error."""
         _whiten(k, self._t, self._p, self._delays, self._freedom, self._factor, self._white, self._squares)
 
-    def _forget_oldest(self, n):
+    def _forget_oldest(self, n: int) -> None:
         for array in (self._t, self._p, self._delays, self._freedom):
             array[: CAPACITY - n] = array[n:].copy()
         self._count = CAPACITY - n
@@ -192,7 +203,10 @@ class ChangeDetector:
 
 
 @compiled
-def _whiten(k, t, p, delays, freedom, factor, white, squares):
+def _whiten(
+    k: int, t: np.ndarray, p: np.ndarray, delays: np.ndarray, freedom: np.ndarray, factor: np.ndarray,
+    white: np.ndarray, squares: np.ndarray,
+) -> None:  # fmt: skip
     row, error = factor[k], delays[k].copy()
     variance = MEAN_STD**2 + PLACE_STD**2 + LOCAL_STD**2 + NOISE_STD**2
     for i in range(k):
@@ -210,7 +224,7 @@ def _whiten(k, t, p, delays, freedom, factor, white, squares):
 
 
 @compiled
-def _inverse(factor, first, n):
+def _inverse(factor: np.ndarray, first: int, n: int) -> np.ndarray:
     """(n, n): inverse of the part of a lower triangular matrix that begins with row and column `first`."""
     out = np.zeros((n, n))
     for i in range(n):
@@ -222,7 +236,9 @@ def _inverse(factor, first, n):
 
 
 @compiled
-def _seen(place, response, errors, weights):
+def _seen(
+    place: np.ndarray, response: np.ndarray, errors: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Of n slices what a delay of each anchor makes of whitened errors (n, M) that are there, (n, M), and how much of it any two
     of them would see, weighted (n, n): (n, n, M). place : (n, M), of an anchor in the response (H, H) of each slice, or -1."""
     n, anchors = errors.shape

@@ -1,14 +1,28 @@
 """What ekf_node says about itself on /diagnostics, and what to do about it."""
 
+from __future__ import annotations
+
 from collections import Counter
 import time
+from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
+
 from uwb_tdoa_bias.foundation.ros import Rate
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 
 from ..streams import ERROR as SEVERE
 from .volume import VolumeCheck
+
+if TYPE_CHECKING:
+    import numpy as np
+    from collections.abc import Mapping, Sequence
+    from uwb_tdoa_bias.foundation.flyable import FlyableVolume
+    from uwb_tdoa_bias.foundation.ros import Report
+    from ..core.config import FilterConfig
+    from ..estimator import Estimator
+    from ..streams.finding import Finding
 
 START_TIMEOUT = 5.0  # s of data without a start position before it becomes a warning
 BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is of another time
@@ -23,22 +37,25 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 class Health:
     """Judges once a second, by the wall clock."""
 
-    def __init__(self, config, lag, volume=None):
+    def __init__(self, config: FilterConfig, lag: float, volume: FlyableVolume | None = None) -> None:
         """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
-        self.received = Counter()  # messages of each stream: imu, tdoa, and those of aids
-        self.last_odometry = None  # time.monotonic(), s
-        self.last_position = None  # (3,) m and its covariance (3, 3) m^2
-        self.behind = None  # s from the stamp of the newest odometry to the present time of ROS
+        self.received: Counter[str] = Counter()  # messages of each stream: imu, tdoa, and those of aids
+        self.last_odometry: float | None = None  # time.monotonic(), s
+        self.last_position: tuple[np.ndarray, np.ndarray] | None = None  # (3,) m and its covariance (3, 3) m^2
+        self.behind: float | None = None  # s from the stamp of the newest odometry to the present time of ROS
         self._use_imu, self._lag = config.use_imu, lag
         self._volume = VolumeCheck(volume)
         self._imu_rate, self._tdoa_rate, self._located_rate = Rate(), Rate(), Rate()
-        self._aids_before = {}  # messages of each, received and not used, by the last report
-        self._aids_bad = {}  # reports in a row in which most messages of an aid were not used for a reason
-        self._aids_heard = {}  # messages of each so far, and since when no more of them, time.monotonic(), s
-        self._starting = None
-        self._counts = {}
+        self._aids_before: dict[str, dict[str, int]] = {}  # messages of each, received and not used, by the last report
+        self._aids_bad: dict[tuple[str, str], int] = {}  # reports in a row in which most messages of an aid were not used for a reason
+        self._aids_heard: dict[str, tuple[int, float]] = {}  # messages of each so far, and since when no more of them, time.monotonic(), s
+        self._starting: float | None = None  # time.monotonic(), s
+        self._counts: dict[str, int] = {}
 
-    def report(self, refused, estimator, counts, wiring=(), findings=()):
+    def report(
+        self, refused: str | None, estimator: Estimator | None, counts: Mapping[str, int], wiring: Sequence[str] = (),
+        findings: Sequence[Finding] = (),
+    ) -> Report:  # fmt: skip
         """Returns (level, text, values).
 
         refused : what was wrong with the last anchors, or None; estimator : Estimator or None;
@@ -53,6 +70,7 @@ class Health:
             self._starting = None
         elif self._starting is None:
             self._starting = now
+        judgement: tuple[bytes, str]
         if refused:
             judgement = ERROR, refused
         elif estimator is None:
@@ -67,16 +85,16 @@ class Health:
             judgement = self._judge_use(counts)
         elif estimator.lost:
             judgement = WARN, estimator.lost
-        elif now - self._starting > START_TIMEOUT:
+        elif self._starting is not None and now - self._starting > START_TIMEOUT:
             judgement = WARN, "no start position found: check ids and positions of the anchors, and that four are heard"
         else:
             judgement = OK, "looking for the start position"
         if judgement == (OK, "running"):
             judgement = self._judge_aids(now, counts)
-        if judgement == (OK, "running") and estimator.side_unknown:
+        if judgement == (OK, "running") and estimator is not None and estimator.side_unknown:
             judgement = WARN, estimator.side_unknown
-        at_position = {}
-        if running and self.last_position is not None:
+        at_position: dict[str, str] = {}
+        if estimator is not None and running and self.last_position is not None:
             trouble, at_position = self._volume.judge(estimator.anchors, *self.last_position)
             if trouble and judgement[0] == OK:
                 judgement = WARN, trouble
@@ -95,13 +113,13 @@ class Health:
         values |= {f"found {finding.rule}": f"{finding.value:.4g}" for finding in findings}
         return *judgement, values | at_position
 
-    def _judge_aids(self, now, counts):
+    def _judge_aids(self, now: float, counts: Mapping[str, int]) -> tuple[bytes, str]:
         """Whether sensors that were there still are, and are used."""
         judgement = OK, "running"
         for aid, sensor in SENSORS.items():
             received = self.received[aid]
-            before, since = self._aids_heard.get(aid, (0, now))
-            if received != before:
+            heard, since = self._aids_heard.get(aid, (0, now))
+            if received != heard:
                 since = now
             self._aids_heard[aid] = received, since
             reasons = {
@@ -123,7 +141,7 @@ class Health:
                     judgement = WARN, f"more than half of the messages on {sensor.topics[0][0]} {words}"
         return judgement
 
-    def _judge_use(self, counts):
+    def _judge_use(self, counts: Mapping[str, int]) -> tuple[bytes, str]:
         """What became of the TDOAs since the last time."""
         reasons = {
             "late": (
@@ -141,20 +159,20 @@ class Health:
         return OK, "running"
 
 
-def _worst(wiring, findings):
+def _worst(wiring: Sequence[str], findings: Sequence[Finding]) -> tuple[bytes, str]:
     """(level, text) of what is wrong, the worst first; findings come most severe first."""
     severe = [finding for finding in findings if finding.severity == SEVERE]
     said = [*(f.sentence for f in severe), *wiring, *(f.sentence for f in findings if f not in severe)]
     return ERROR if severe else WARN, together(said)
 
 
-def together(sentences):
+def together(sentences: Sequence[str]) -> str:
     """One text of several sentences, the first MOST_SAID of them."""
     more = len(sentences) - MOST_SAID
     return " | ".join([*sentences[:MOST_SAID], *([f"and {more} more"] if more > 0 else [])])
 
 
-def _behind(seconds):
+def _behind(seconds: float | None) -> str:
     if seconds is None:
         return "unknown"
     if abs(seconds) > BEHIND[1]:

@@ -1,7 +1,14 @@
 """What is said of inertial samples that the filter goes without, see core/plausibility.py."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from ..core.plausibility import RATE, TILT, TURN, WEIGHT
 from ..streams import ERROR, Finding
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.compiled import Record
 
 SAID = {
     WEIGHT: (
@@ -21,7 +28,7 @@ SAID = {
 }  # fmt: skip
 
 
-def implausible(check):
+def implausible(check: Record) -> Finding:
     """The Finding of a PLAUSIBILITY by which inertial samples are left out."""
     cause, evidence, remedy = SAID[int(check.reason)]
     cause = f"{cause}: the filter goes without the IMU"

@@ -5,9 +5,11 @@ The innovations of half a second become a Slice, and a ChangeDetector tests the 
 gone.
 """
 
+from __future__ import annotations
+
 from itertools import starmap
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +19,11 @@ from ..core.verdicts import REJECTED
 from .change import ChangeDetector
 from .slices import LENGTH, reduced
 from .swap import swapped
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from ..results import Odometry, Residuals
+    from .change import Change
 
 MOVING = 0.3  # m/s; on the floor, residuals are not those of the air
 SETTLE = 8.0  # s in motion before an onset is looked for
@@ -50,41 +57,45 @@ class Heard(NamedTuple):
 class Monitor:
     """Feed it odometry and residuals, say until which stamp they are complete, ask for `alarms` and `delays`."""
 
-    def __init__(self, anchors):
+    def __init__(self, anchors: Anchors) -> None:
         """anchors : Anchors."""
         self._anchors = anchors
         self._forget()
 
-    def _forget(self):
+    def _forget(self) -> None:
         self._odometry, self._residuals = [NO_ODOMETRY], [NO_RESIDUALS]  # of the present slice and later
-        self._end = self._last = None  # s, stamps: at which the present slice ends, and of what was added last
+        self._end: float | None = None  # s, stamps: at which the present slice ends,
+        self._last = -math.inf  # and of what was added last
         self._detector = ChangeDetector()
-        self._changes = {}  # row: Changes of an anchor that is not what it was
-        self._latest_change = None  # while its size is still found out
-        self._latest = []  # of the last slices: rows a, b (n,), measured d (n,) m, place (3,) m
-        self._slices, self._heard = 0, {}  # slices of all; row: Heard
-        self._counts = []  # TDOAs of the last slices
-        self._swapped, self._silent = (), ()  # rows
-        self._instead = (), 0  # rows of another swap, or of none, and slices in a row that say so
-        self._moving_since = None  # s, stamp
-        self._bias = self._bias_now = None  # (6,): gyroscope, accelerometer; as calibrated, and the latest
-        self._bias_calibration = []
+        self._changes: dict[int, list[Change]] = {}  # row: Changes of an anchor that is not what it was
+        self._latest_change: Change | None = None  # while its size is still found out
+        self._latest: list[tuple[np.ndarray, ...]] = []  # of the last slices: rows a, b (n,), measured d (n,) m, place (3,) m
+        self._slices = 0  # of all
+        self._heard: dict[int, Heard] = {}  # by row
+        self._counts: list[int] = []  # TDOAs of the last slices
+        self._swapped: tuple[int, ...] = ()  # rows
+        self._silent: tuple[int, ...] = ()
+        self._instead: tuple[tuple[int, ...], int] = (), 0  # rows of another swap, or of none, and slices in a row that say so
+        self._moving_since = math.nan  # s, stamp
+        self._bias: np.ndarray | None = None
+        self._bias_now: np.ndarray | None = None  # (6,): gyroscope, accelerometer; as calibrated, and the latest
+        self._bias_calibration: list[np.ndarray] = []
 
     @property
-    def end(self):
+    def end(self) -> float:
         """Stamp, s, at which the present slice ends; inf before the first TDOA."""
         return math.inf if self._end is None else self._end
 
     @property
-    def delays(self):
+    def delays(self) -> tuple[np.ndarray, np.ndarray]:
         """Of the anchors that are not what they were, at the present stamp: (N,) m, and their variances (N,) m^2."""
         delays, variances = np.zeros((2, len(self._anchors)))
         changed = [*self._changes]
-        delays[changed] = self._detector.delays_at(self._end, changed)
+        delays[changed] = self._detector.delays_at(self.end, changed)
         variances[changed] = [delays[row] ** 2 / found[-1].ratio for row, found in self._changes.items()]
         return delays, variances
 
-    def add(self, odometry, residuals):
+    def add(self, odometry: Odometry, residuals: Residuals) -> None:
         """Take Odometry and the Residuals that came with it."""
         if len(odometry):
             self._odometry.append([odometry.t, odometry.p, odometry.v, odometry.gyro_bias, odometry.accel_bias])
@@ -99,14 +110,14 @@ class Monitor:
         if not began:
             self._keep_one_slice()
 
-    def _keep_one_slice(self):
+    def _keep_one_slice(self) -> None:
         """Forget the odometry before the first slice, or before the one that it would be in if it began now."""
         odometry = [np.concatenate(columns) for columns in zip(*self._odometry)]
         if len(odometry[0]):
             begin = math.floor(odometry[0][-1] / LENGTH) * LENGTH if self._end is None else self._end - LENGTH
             self._odometry = [[column[odometry[0] >= begin] for column in odometry]]
 
-    def judge(self, until):
+    def judge(self, until: float) -> None:
         """Everything stamped before `until`, s, was added: judge the slices that end there or earlier."""
         if self._end is None or until < self._end:
             return
@@ -124,15 +135,15 @@ class Monitor:
             self._odometry = [odometry]
             self._keep_one_slice()
 
-    def _judge(self, end, residuals, odometry):
+    def _judge(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
         """One slice that ends at `end`, s: its columns."""
         _, a, b, innovation, accepted = residuals
         a, b = self._anchors.index(a), self._anchors.index(b)
         t, p, v, gyro_bias, accel_bias = odometry
         self._listen(a, b, p.mean(axis=0) if len(t) else None)
-        if self._moving_since is None and (np.linalg.norm(v, axis=1) > MOVING).any():
+        if math.isnan(self._moving_since) and (np.linalg.norm(v, axis=1) > MOVING).any():
             self._moving_since = end
-        if self._moving_since is None or not (len(t) and len(a)):
+        if math.isnan(self._moving_since) or not (len(t) and len(a)):
             return
         self._follow_biases(end, np.concatenate([gyro_bias[-1], accel_bias[-1]]))
         place = p.mean(axis=0)
@@ -141,7 +152,7 @@ class Monitor:
             self._detector.add(reduced(end - 0.5 * LENGTH, place, self._anchors.positions, a, b, innovation))
             self._look_for_change(end)
 
-    def _look_for_change(self, end):
+    def _look_for_change(self, end: float) -> None:
         change = self._detector.find(self._moving_since + SETTLE)
         if change is not None and _is_clear(change) and abs(change.at(end)) > SMALLEST_CHANGE:
             self._detector.take_out(change)
@@ -152,7 +163,7 @@ class Monitor:
         delays = self._detector.delays_at(end, [*self._changes])
         self._changes = {row: found for (row, found), delay in zip(self._changes.items(), delays) if abs(delay) > SMALLEST_CHANGE}
 
-    def _look_for_swap(self, a, b, innovation, place):
+    def _look_for_swap(self, a: np.ndarray, b: np.ndarray, innovation: np.ndarray, place: np.ndarray) -> bool:
         """Whether this slice looks like one: it is named once several do."""
         positions = self._anchors.positions
         measured = innovation + tdoa(place, positions[a], positions[b])
@@ -164,7 +175,7 @@ class Monitor:
             self._swapped = found
         return bool(found)
 
-    def _listen(self, a, b, place):
+    def _listen(self, a: np.ndarray, b: np.ndarray, place: np.ndarray | None) -> None:
         """Which anchors are not heard any more, while others are? Not those that the tag has left behind: one must be nearer to its place
         (3,), m, None: not known, than where the anchor was heard, or than those that are."""
         rows = np.unique(np.concatenate([a, b])).tolist()
@@ -180,16 +191,16 @@ class Monitor:
             self._heard = {row: was for row, was in self._heard.items() if self._was_often(was) or self._slices - was.last < FORGET}
         self._silent = tuple(sorted(silent)) if sum(self._counts) >= FEWEST else ()
 
-    def _is_silent(self, was, away, reach):
+    def _is_silent(self, was: Heard, away: float, reach: float) -> bool:
         return self._slices - was.last >= SILENT and self._was_often(was) and away <= max(was.farthest, reach)
 
-    def _was_often(self, was):
+    def _was_often(self, was: Heard) -> bool:
         return was.slices > OFTEN * max(was.last, SILENT)
 
-    def _distances(self, rows, place):
+    def _distances(self, rows: list[int], place: np.ndarray) -> dict[int, float]:
         return dict(zip(rows, np.linalg.norm(self._anchors.positions[rows] - place, axis=1).tolist()))
 
-    def _follow_biases(self, end, bias):
+    def _follow_biases(self, end: float, bias: np.ndarray) -> None:
         if end < self._moving_since + CALIBRATE:
             self._bias_calibration.append(bias)
         elif self._bias is None and self._bias_calibration:
@@ -197,29 +208,30 @@ class Monitor:
         self._bias_now = bias
 
     @property
-    def alarms(self):
+    def alarms(self) -> list:
         """Sentences on what has changed; empty while nothing has."""
         swaps = [self._swap(*self._anchors.ids[[*self._swapped]])] if self._swapped else []
         return [*swaps, *starmap(self._sentence, self._changes.items()), *self._silence(), *self._axis_alarms()]
 
-    def _swap(self, one, other):
+    def _swap(self, one: int, other: int) -> str:
         return f"two anchors are exchanged, {one} and {other}: correct their ids, or their positions on uwb/anchors"
 
-    def _silence(self):
+    def _silence(self) -> list:
         return [f"anchor {self._anchors.ids[row]} is not heard any more: check its power and sight" for row in self._silent]
 
-    def _sentence(self, row, found):
-        size = float(self._detector.delays_at(self._end, [row])[0])
-        again = [change for change in found if change.at(self._end) * size > 0.0]  # further in the same direction
+    def _sentence(self, row: int, found: list[Change]) -> str:
+        end = self.end
+        size = float(self._detector.delays_at(end, [row])[0])
+        again = [change for change in found if change.at(end) * size > 0.0]  # further in the same direction
         if found[-1].slope or len(again) > 1:
-            what = f"its clock drifts ({size / (self._end - again[0].since):+.3f} m/s)"
+            what = f"its clock drifts ({size / (end - again[0].since):+.3f} m/s)"
         elif size > 0.0:
             what = "it is late: blocked (NLOS), moved, or its delay has changed"
         else:
             what = "it is early: moved, or its delay has changed"
         return f"anchor {self._anchors.ids[row]}: {size:+.2f} m since the start of the flight: {what}"
 
-    def _axis_alarms(self):
+    def _axis_alarms(self) -> list:
         if self._bias is None or self._bias_now is None:
             return []
         change, out = self._bias_now - self._bias, []
@@ -231,6 +243,6 @@ class Monitor:
         return out
 
 
-def _is_clear(change):
+def _is_clear(change: Change) -> bool:
     """Whether a Change is large, of one anchor alone, and all that has happened."""
     return change.ratio > max(LIMIT, CLEARLY * change.rival) and change.left < MOST_LEFT

@@ -1,11 +1,18 @@
 """Are the signs of all TDOAs the wrong way round? No counter shows that: a second filter, without the IMU, is fed with both
 signs, and what each leaves unexplained is compared, as `check` does."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from ..core.memory import new_memory
+from ..core.memory import new_state
 from ..streams import ERROR, Finding
 from ..streams.explain import Unexplained, compare, innovations
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
 # What must stay unexplained less, and by how many standard errors. On 37 measured flights, of any 10 to 40 s from the start or
 # in the air: healthy ones 0.98 and 0.2, those with the other sign 0.81 and 2.5 after 30 s in the air, most after 12.
@@ -18,17 +25,19 @@ class SignWatch:
 
     finding : Finding, or None."""
 
-    def __init__(self, anchors):
+    def __init__(self, anchors: Anchors) -> None:
         """anchors : Anchors."""
         self._anchors = anchors
-        self.finding, self._certain = None, False
+        self.finding: Finding | None = None
+        self._certain = False
         self._begin()
 
-    def _begin(self):
-        self._memories = [new_memory(self._anchors.positions) for _ in range(2)]
-        self._stamps, self._innovations = [], ([], [])
+    def _begin(self) -> None:
+        self._states = [new_state(self._anchors.positions) for _ in range(2)]
+        self._stamps: list[np.ndarray] = []
+        self._innovations: tuple[list[np.ndarray], list[np.ndarray]] = [], []
 
-    def feed(self, t, a, b, d):
+    def feed(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> None:
         """Take raw TDOAs (n,) of about a second: stamps, s; ids; m. Those that came too late for this are left out."""
         if self._certain:
             return
@@ -39,16 +48,16 @@ class SignWatch:
             return
         t, a, b, d = t[rows], self._anchors.index(a[rows]), self._anchors.index(b[rows]), d[rows]
         self._stamps.append(t)
-        for memory, kept, sign in zip(self._memories, self._innovations, (1.0, -1.0)):
-            kept.append(innovations(memory, t, a, b, sign * d, self._anchors.positions))
+        for state, kept, sign in zip(self._states, self._innovations, (1.0, -1.0)):
+            kept.append(innovations(state, t, a, b, sign * d, self._anchors.positions))
         self._judge()
 
-    def _judge(self):
+    def _judge(self) -> None:
         t = np.concatenate(self._stamps)
         right, wrong = (Unexplained.of(t, np.concatenate(kept)) for kept in self._innovations)
         if _better(right, wrong):
             self.finding, self._certain = None, True
-            self._memories = self._stamps = self._innovations = None
+            self._states, self._stamps, self._innovations = [], [], ([], [])
         elif _better(wrong, right):
             ratio, z = compare(right, wrong)
             evidence = f"the other way round {100.0 * (1.0 - ratio):.0f} % less stays unexplained, {z:.0f} standard errors"
@@ -59,7 +68,7 @@ class SignWatch:
             self._begin()
 
 
-def _better(one, other):
+def _better(one: Unexplained, other: Unexplained) -> bool:
     """Whether one Unexplained certainly leaves less than the other."""
     ratio, z = compare(other, one)
     return ratio < RATIO and z > DEVIATIONS

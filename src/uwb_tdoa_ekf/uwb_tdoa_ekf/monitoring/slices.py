@@ -5,6 +5,8 @@ delay_b - delay_a + (u_b - u_a) e, with u the directions from the anchors to the
 what is left are the combinations of delays that no place explains.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +34,9 @@ class Slice:
     response: np.ndarray
 
 
-def reduced(t, p, positions, a, b, innovation):
+def reduced(
+    t: float, p: np.ndarray, positions: np.ndarray, a: np.ndarray, b: np.ndarray, innovation: np.ndarray
+) -> Slice:
     """The Slice of TDOAs between the anchors (rows) a and b (n,), with innovations (n,) m; positions : (N, 3) m."""
     value = np.clip(innovation, -CLIP, CLIP)
     rows, a, b, value = _heard_most(a, b, value)
@@ -50,7 +54,9 @@ def reduced(t, p, positions, a, b, innovation):
     return Slice(t, p, rows, both[:, 0], both[:, 1:])
 
 
-def _heard_most(a, b, value):
+def _heard_most(
+    a: np.ndarray, b: np.ndarray, value: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(rows, a, b, value): the anchors that are heard, MOST at most, and the TDOAs between them, with places among these rows."""
     rows, both = np.unique(np.concatenate([a, b]), return_inverse=True)
     often = np.sort(np.argsort(-np.bincount(both, minlength=len(rows)), kind="stable")[:MOST])

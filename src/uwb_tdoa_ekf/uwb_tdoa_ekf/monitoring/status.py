@@ -1,7 +1,13 @@
 """Whether the odometry may be flown by, for who does: one decision, from what the Estimator says of itself."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..estimator import Estimator
 
 YAW_KNOWN = math.radians(20.0)  # rad; while four yaws are followed it is 100 degrees, with one left below 20: docs/reliability.md
 SILENT = 1.0  # s without TDOAs that are said: the position then goes by the IMU alone
@@ -17,19 +23,19 @@ class Status:
     why: str
 
     @property
-    def lost(self):
+    def lost(self) -> bool:
         """Whether it ran, and does not know any more where the tag is."""
         return self.status == LOST
 
 
-def yaw_in_words(std):
+def yaw_in_words(std: float) -> str:
     """Text on a yaw of a standard deviation, rad, NaN without odometry."""
     if math.isnan(std):
         return "unknown: there is no odometry"
     return f"{'known' if std <= YAW_KNOWN else 'not known yet'}: +-{math.degrees(std):.0f} degrees"
 
 
-def status_of(estimator, yaw_std, tdoa_age):
+def status_of(estimator: Estimator | None, yaw_std: float, tdoa_age: float) -> Status:
     """Status of an Estimator, None without anchors. yaw_std : rad, NaN without odometry; tdoa_age : s since a TDOA arrived, inf
     before the first."""
     if estimator is None:

@@ -1,10 +1,19 @@
 """The rules over streams in flight: over the last seconds, and without those that say nothing there."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..streams import NOTE, StreamRules, most_severe_first
 from .sign_watch import SignWatch
 from ..streams.stamp_rules import usual
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from ..streams.finding import Finding
 
 KEPT = 4  # windows of a second that are judged together
 FEWEST = 3  # of them, below which nothing is said
@@ -19,26 +28,27 @@ ALIKE = 0.5  # share of the swing of one stream's latency that the other has too
 class StreamWatch:
     """Keeps what arrives and judges it when it is asked, once a second."""
 
-    def __init__(self, anchors, lag, ignored=()):
+    def __init__(self, anchors: Anchors, lag: float, ignored: Sequence[str] = ()) -> None:
         """anchors : Anchors; lag : s, what the node waits for; ignored : names of rules that do not hold for this tag."""
         self._anchors, self._lag, self._ignored = anchors, lag, NOT_IN_FLIGHT | set(ignored)
         self.restart()
 
-    def restart(self):
+    def restart(self) -> None:
         """Forget everything: another time has begun."""
         self._rules = StreamRules(self._anchors, KEPT)
-        self._imu, self._tdoa = [], []
+        self._imu: list[tuple[np.ndarray, ...]] = []
+        self._tdoa: list[tuple[np.ndarray, ...]] = []
         self._sign = SignWatch(self._anchors)
 
-    def add_imu(self, t, arrival, gyro, accel):
+    def add_imu(self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> None:
         """Take samples: stamps and arrivals, (n,) s, of one clock if possible; gyro (n, 3) rad/s; accel (n, 3) m/s^2."""
         self._imu.append((t, arrival, gyro, accel))
 
-    def add_tdoa(self, t, arrival, a, b, d):
+    def add_tdoa(self, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> None:
         """Take raw TDOAs: stamps and arrivals, (n,) s; a, b (n,) ids; d (n,) m."""
         self._tdoa.append((t, arrival, a, b, d))
 
-    def findings(self):
+    def findings(self) -> list[Finding]:
         """What stands: a list of Finding, most severe first."""
         imu, self._imu = self._imu, []
         tdoa, self._tdoa = self._tdoa, []
@@ -56,7 +66,7 @@ class StreamWatch:
             found = [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
         return most_severe_first([*found, *filter(None, [self._sign.finding])])
 
-    def _counts(self, finding):
+    def _counts(self, finding: Finding) -> bool:
         if finding.severity == NOTE or finding.rule in self._ignored:
             return False
         if finding.rule == "stamps_unit":
@@ -65,7 +75,7 @@ class StreamWatch:
             return finding.value > self._lag and not self._starved()
         return True
 
-    def _starved(self):
+    def _starved(self) -> bool:
         """Whether both streams arrive in blocks: then it is this node that was not scheduled."""
         spreads = [
             usual([window.stamps for window in windows], "spread")

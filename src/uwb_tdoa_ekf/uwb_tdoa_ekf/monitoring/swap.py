@@ -1,5 +1,7 @@
 """Two anchors that were exchanged: each sends from where the other is said to be."""
 
+from __future__ import annotations
+
 from itertools import combinations
 
 import numpy as np
@@ -13,7 +15,7 @@ WITHIN, SHARE = 1.0, 0.9  # m, in which this share of all TDOAs must be then: on
 FEWEST = 20  # TDOAs with either of the two
 
 
-def swapped(positions, a, b, d, p):
+def swapped(positions: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, p: np.ndarray) -> tuple[int, ...]:
     """Rows of two anchors, the smaller first, which, exchanged, explain what is wrong, or ().
 
     positions : (N, 3) m; a, b : (n,) rows; d : (n,) m, measured; p : (n, 3) m, where the filter had the tag. A filter that
@@ -24,7 +26,8 @@ def swapped(positions, a, b, d, p):
     error = np.abs(d - tdoa(p, positions[a], positions[b]))
     total = np.bincount(a, error, n) + np.bincount(b, error, n)
     mean = total / np.maximum(np.bincount(a, minlength=n) + np.bincount(b, minlength=n), 1)
-    best, pair = LARGE, ()
+    best = LARGE
+    pair: tuple[int, ...] = ()
     suspects = [row for row in np.argsort(-mean)[:SUSPECTS].tolist() if mean[row] > LARGE]
     for i, k in combinations(suspects, 2):
         concerned = np.isin(a, (i, k)) | np.isin(b, (i, k))

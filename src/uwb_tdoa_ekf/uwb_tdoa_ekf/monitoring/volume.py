@@ -1,15 +1,25 @@
 """Whether the tag is where it can be located, and the filter's own covariance against what is possible there."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 
 
 class VolumeCheck:
     """Judges positions by a FlyableVolume, or says nothing without one."""
 
-    def __init__(self, volume=None):
+    def __init__(self, volume: FlyableVolume | None = None) -> None:
         self._volume = volume
 
-    def judge(self, anchors, position, covariance):
+    def judge(
+        self, anchors: Anchors, position: np.ndarray, covariance: np.ndarray
+    ) -> tuple[str | None, dict[str, str]]:
         """(what is wrong, or None; {key: text}). anchors : Anchors; position (3,) m; covariance (3, 3) m^2 of it.
 
         Efficiency is the variance of the bound of one round of TDOAs over that which the filter claims. The filter also

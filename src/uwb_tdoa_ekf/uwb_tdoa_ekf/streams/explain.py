@@ -4,15 +4,21 @@ Two hypotheses about one stream, e.g. that its signs are right or all wrong, are
 unexplained, block by block: systematic errors disturb both alike, so that their difference tells more than either.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core.config import FilterConfig
 from ..core.engine import feed
-from ..core.memory import IMU_SAMPLE, TDOA, Measurements, new_memory, structured
+from ..core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
 from ..core.validity import usable_all
+
+if TYPE_CHECKING:
+    from ..core.memory import FilterState
 
 SCALE = 0.5  # m, of the Geman-McClure loss: an innovation of that size leaves a half unexplained
 BLOCK = 2.0  # s
@@ -29,7 +35,7 @@ class Unexplained:
     blocks: dict
 
     @classmethod
-    def of(cls, t, innovation):
+    def of(cls, t: np.ndarray, innovation: np.ndarray) -> Unexplained:
         """t (n,) s, rising; innovation (n,) m, not finite where the TDOA was of no use: that explains nothing."""
         if not len(t):
             return cls({})
@@ -43,12 +49,12 @@ class Unexplained:
         return cls({int(n): float(m) for n, m, k in zip(numbers, mean, count) if k > FEW})
 
     @property
-    def mean(self):
+    def mean(self) -> float:
         """Mean loss; NaN without a block."""
         return float(np.mean(list(self.blocks.values()))) if self.blocks else math.nan
 
 
-def compare(one, other):
+def compare(one: Unexplained, other: Unexplained) -> tuple[float, float]:
     """(ratio, z): the mean loss of Unexplained `other` over that of `one`, and by how many standard errors `other`
     leaves less unexplained; over the blocks that both have. (NaN, 0) with fewer than four of them."""
     both = one.blocks.keys() & other.blocks.keys()
@@ -59,15 +65,17 @@ def compare(one, other):
     return float(np.mean(b) / max(np.mean(a), 1e-9)), float(np.mean(a - b) / max(error, 1e-9))
 
 
-def unexplained(t, a, b, d, positions):
+def unexplained(t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray) -> Unexplained:
     """Unexplained of TDOAs in order of their stamps: t (n,) s; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
-    return Unexplained.of(t, innovations(new_memory(positions), t, a, b, d, positions))
+    return Unexplained.of(t, innovations(new_state(positions), t, a, b, d, positions))
 
 
-def innovations(memory, t, a, b, d, positions):
-    """(n,) m of TDOAs as for `unexplained`, NaN where one is of no use, by the filter of a Memory, which goes on from there."""
+def innovations(
+    state: FilterState, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray
+) -> np.ndarray:
+    """(n,) m of TDOAs as for `unexplained`, NaN where one is of no use, by the filter of a FilterState, which goes on from there."""
     out, no_variance = np.full(len(t), np.nan), np.zeros(len(t))
     good = usable_all(a, b, d, no_variance, positions)
     measured = Measurements(_NO_IMU, structured(TDOA, t, a, b, d, no_variance)[good])
-    out[good] = feed(memory, CONFIG.tuning(), measured)[1]["innovation"]
+    out[good] = feed(state, CONFIG.parameters(), measured)[1]["innovation"]
     return out

@@ -1,5 +1,7 @@
 """Counters of the values of an inertial stream, and what they amount to over a window."""
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 
@@ -8,7 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.vibration import VIBRATION_CORNER, low_pass
 
-from .stamps import LAST, StampWindow, complete, new_stamps, note_stamp, restart_stamps, stamp_window
+from .stamps import LAST, StampWindow, complete, count_stamp, new_stamps, restart_stamps, stamp_window
 
 ABSURD = 1e9  # in any unit: no number that a sensor gives
 
@@ -46,7 +48,7 @@ class ImuWindow(NamedTuple):
     invalid: float
 
 
-def new_imu():
+def new_imu() -> ImuCounters:
     """ImuCounters of a stream of which nothing was received."""
     counters = ImuCounters(new_stamps(), np.zeros((6, 10)), np.zeros(3))
     counters.channels[:, :2] = np.nan
@@ -55,7 +57,7 @@ def new_imu():
 
 
 @compiled
-def restart_imu(counters):
+def restart_imu(counters: ImuCounters) -> None:
     """Begin a new window."""
     restart_stamps(counters.stamps)
     counters.channels[:, SUM:] = 0.0
@@ -64,17 +66,17 @@ def restart_imu(counters):
 
 
 @compiled
-def note_imu(counters, t, arrival, wx, wy, wz, fx, fy, fz, length):
+def count_imu(counters: ImuCounters, t: float, arrival: float, gyro: np.ndarray, force: np.ndarray) -> bool:
     """Take one sample: stamp and arrival, s (NaN: not known); rates and specific force as the message has them. Returns
-    whether the window is complete, `length` s long."""
+    whether the window is complete."""
     s, whole = counters.stamps, counters.whole
     dt = t - s[LAST]
-    note_stamp(s, t, arrival)
-    sample = (wx, wy, wz, fx, fy, fz)
+    count_stamp(s, t, arrival)
+    sample = (gyro[0], gyro[1], gyro[2], force[0], force[1], force[2])
     for k in range(6):
         if not abs(sample[k]) < ABSURD:
             whole[INVALID] += 1.0
-            return complete(s, length)
+            return complete(s)
     whole[TAKEN] += 1.0
     same = 0
     for k in range(6):
@@ -99,21 +101,22 @@ def note_imu(counters, t, arrival, wx, wy, wz, fx, fy, fz, length):
             c[HIGH_HITS] += 1.0
     if same == 6:
         whole[REPEATED] += 1.0
-    return complete(s, length)
+    return complete(s)
 
 
 @compiled
-def feed_imu(counters, t, arrival, gyro, force, first, length):
-    """`note_imu` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it
+def feed_imu(
+    counters: ImuCounters, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, force: np.ndarray, first: int
+) -> tuple[int, bool]:
+    """`count_imu` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it
     is)."""
     for i in range(first, len(t)):
-        w, f = gyro[i], force[i]
-        if note_imu(counters, t[i], arrival[i], w[0], w[1], w[2], f[0], f[1], f[2], length):
+        if count_imu(counters, t[i], arrival[i], gyro[i], force[i]):
             return i + 1, True
     return len(t), False
 
 
-def imu_window(counters):
+def imu_window(counters: ImuCounters) -> ImuWindow:
     """ImuWindow of what was counted since the window began."""
     c, whole = counters.channels, counters.whole
     n = max(whole[TAKEN], 1.0)

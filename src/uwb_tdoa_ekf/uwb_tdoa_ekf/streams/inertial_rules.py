@@ -1,9 +1,16 @@
 """Rules for the values of an inertial stream. A rule takes windows and returns a Finding or None."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .finding import ERROR, WARNING, Finding
 from .median import median
+
+if TYPE_CHECKING:
+    from .inertial import ImuWindow
 
 GRAVITY = 9.81
 FORCE_RANGE = 7.0, 14.0  # m/s^2, median length of the mean specific force; healthy 9.7 - 10.5
@@ -20,24 +27,24 @@ CLIPPED, FAR_FORCE, FAR_RATE = 8, 8.0, 2.0
 AXES = ("gyroscope x", "gyroscope y", "gyroscope z", "accelerometer x", "accelerometer y", "accelerometer z")
 
 
-def force_of(windows):
+def force_of(windows: list[ImuWindow]) -> np.ndarray:
     """Median of the mean specific force, (3,)."""
     return np.median([window.mean[3:] for window in windows], axis=0)
 
 
-def weight(windows):
+def weight(windows: list[ImuWindow]) -> float:
     """Median length of the mean specific force: gravity, whatever the tag does, as long as it does not fly away."""
-    return median(np.linalg.norm(window.mean[3:]) for window in windows)
+    return median(float(np.linalg.norm(window.mean[3:])) for window in windows)
 
 
-def steadiness(windows):
+def steadiness(windows: list[ImuWindow]) -> float:
     """Length of the mean of the windows' specific forces over the mean of their lengths: 1 where it always points one
     way."""
     forces = np.array([window.mean[3:] for window in windows])
     return float(np.linalg.norm(forces.mean(axis=0)) / max(np.linalg.norm(forces, axis=1).mean(), 1e-9))
 
 
-def silent(windows):
+def silent(windows: list[ImuWindow]) -> Finding | None:
     """Every sample the same: nobody measures."""
     share = median(window.repeated for window in windows)
     if share < DEAD:
@@ -47,7 +54,7 @@ def silent(windows):
     return Finding("imu_silent", ERROR, "the IMU is silent: its samples do not change", evidence, remedy, share)
 
 
-def repeated(windows):
+def repeated(windows: list[ImuWindow]) -> Finding | None:
     share = median(window.repeated for window in windows)
     if not REPEATS < share < DEAD:
         return None
@@ -58,7 +65,7 @@ def repeated(windows):
     return Finding("imu_repeated", WARNING, "inertial samples are published more than once", evidence, remedy, share)
 
 
-def dead_axis(windows):
+def dead_axis(windows: list[ImuWindow]) -> Finding | None:
     still = np.median([window.still for window in windows], axis=0)
     axes = [name for name, share in zip(AXES, still) if share > DEAD]
     if not axes or len(axes) == 6:
@@ -68,7 +75,7 @@ def dead_axis(windows):
     return Finding("imu_axis_dead", ERROR, f"{', '.join(axes)} does not change", evidence, remedy, float(len(axes)))
 
 
-def invalid(windows):
+def invalid(windows: list[ImuWindow]) -> Finding | None:
     share = float(np.mean([window.invalid for window in windows]))
     if share < 1e-3:
         return None
@@ -76,10 +83,10 @@ def invalid(windows):
     return Finding("imu_invalid", WARNING, "inertial samples are not finite", f"{100.0 * share:.1f} %", remedy, share)
 
 
-def no_gravity(windows):
+def no_gravity(windows: list[ImuWindow]) -> Finding | None:
     """Little mean, and what there is does not outweigh the motion: gravity was taken out."""
     length = weight(windows)
-    motion = median(np.linalg.norm(window.deviation[3:]) for window in windows)
+    motion = median(float(np.linalg.norm(window.deviation[3:])) for window in windows)
     if silent(windows) or length > FORCE_RANGE[0] or (motion < WEIGHTLESS * length and steadiness(windows) > STEADY):
         return None
     cause = "gravity was taken out of the acceleration; specific force, with gravity, is needed"
@@ -88,7 +95,7 @@ def no_gravity(windows):
     return Finding("imu_no_gravity", ERROR, cause, evidence, line, length)
 
 
-def force_unit(windows):
+def force_unit(windows: list[ImuWindow]) -> Finding | None:
     """Gravity is 9.81 m/s^2, in whatever direction."""
     length = weight(windows)
     if FORCE_RANGE[0] <= length <= FORCE_RANGE[1] or silent(windows) or no_gravity(windows):
@@ -106,7 +113,7 @@ def force_unit(windows):
     return Finding("imu_force_unit", ERROR, "the accelerometer is not in m/s^2", evidence, line, GRAVITY / length)
 
 
-def rate_unit(windows):
+def rate_unit(windows: list[ImuWindow]) -> Finding | None:
     """What turns about a horizontal axis turns gravity with it: a gyroscope that says otherwise is not in rad/s."""
     excess = turn_excess(windows)
     if not excess > TURN_EXCESS:
@@ -116,7 +123,7 @@ def rate_unit(windows):
     return Finding("imu_rate_unit", ERROR, "the gyroscope is in degrees/s, not in rad/s", evidence, line, excess)
 
 
-def turn_excess(windows):
+def turn_excess(windows: list[ImuWindow]) -> float:
     """Median, over pairs of windows that follow each other, of the turn rate about the horizontal, less what the
     direction of the specific force turned, rad/s; NaN where there are no such pairs."""
     values = []
@@ -130,7 +137,7 @@ def turn_excess(windows):
     return median(values)
 
 
-def upright(windows):
+def upright(windows: list[ImuWindow]) -> Finding | None:
     """At rest, and on average in the air, the accelerometer reads +9.81 m/s^2 upwards: on z."""
     force = force_of(windows)
     length = np.linalg.norm(force)
@@ -154,7 +161,7 @@ def upright(windows):
 TURNS = {"-z": "x, -y, -z", "+x": "-z, y, x", "-x": "z, y, -x", "+y": "x, -z, y", "-y": "x, z, -y"}
 
 
-def shaking(windows):
+def shaking(windows: list[ImuWindow]) -> Finding | None:
     """A vibrating accelerometer rectifies: it reads a mean that is not there."""
     rms = np.median([window.vibration[3:] for window in windows], axis=0)
     k = int(np.argmax(rms))
@@ -167,7 +174,7 @@ def shaking(windows):
     return Finding("imu_shaking", WARNING, cause, evidence, remedy, float(rms[k]))
 
 
-def clipped(windows):
+def clipped(windows: list[ImuWindow]) -> Finding | None:
     """Many samples at one far end of the range."""
     far = np.array([FAR_RATE] * 3 + [FAR_FORCE] * 3)
     hits = np.array([np.where(abs(w.limit - w.mean) > far, w.clipped * (1.0 - w.still), 0.0) for w in windows])

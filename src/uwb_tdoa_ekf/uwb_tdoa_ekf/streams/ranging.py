@@ -1,13 +1,18 @@
 """Counters of the values of a stream of TDOAs, and what they amount to over a window."""
 
+from __future__ import annotations
+
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from .stamps import StampWindow, complete, new_stamps, note_stamp, restart_stamps, stamp_window
+from .stamps import StampWindow, complete, count_stamp, new_stamps, restart_stamps, stamp_window
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
 ABSURD = 1e15  # in any unit: no number that a radio gives
 FOLLOWING = 0.1  # s between two TDOAs of a pair that count as successive
@@ -71,14 +76,15 @@ class TdoaWindow(NamedTuple):
     heard: np.ndarray
 
 
-def new_tdoa(anchors):
+def new_tdoa(anchors: Anchors) -> TdoaCounters:
     """TdoaCounters of a stream of which nothing was received; anchors : Anchors."""
-    pairs = np.full(PAIRS, -1), *(np.full(PAIRS, np.nan) for _ in range(3))
-    return TdoaCounters(new_stamps(), np.zeros(GRID + len(GRIDS)), np.zeros(len(anchors)), *pairs, np.array(anchors.positions))
+    d, before, t = np.full((3, PAIRS), np.nan)
+    counts, heard = np.zeros(GRID + len(GRIDS)), np.zeros(len(anchors))
+    return TdoaCounters(new_stamps(), counts, heard, np.full(PAIRS, -1), d, before, t, np.array(anchors.positions))
 
 
 @compiled
-def restart_tdoa(counters):
+def restart_tdoa(counters: TdoaCounters) -> None:
     """Begin a new window."""
     restart_stamps(counters.stamps)
     counters.counts[:] = 0.0
@@ -86,16 +92,16 @@ def restart_tdoa(counters):
 
 
 @compiled
-def note_tdoa(counters, t, arrival, a, b, d, length):
+def count_tdoa(counters: TdoaCounters, t: float, arrival: float, a: int, b: int, d: float) -> bool:
     """Take one TDOA: stamp and arrival, s (NaN: not known); a, b rows of its anchors, negative if unknown; d as
-    received. Returns whether the window is complete, `length` s long."""
-    note_stamp(counters.stamps, t, arrival)
+    received. Returns whether the window is complete."""
+    count_stamp(counters.stamps, t, arrival)
     _count(counters, t, a, b, d)
-    return complete(counters.stamps, length)
+    return complete(counters.stamps)
 
 
 @compiled
-def _count(counters, t, a, b, d):
+def _count(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None:
     c = counters.counts
     if a < 0 or b < 0:
         c[UNKNOWN] += 1.0
@@ -126,7 +132,7 @@ def _count(counters, t, a, b, d):
 
 
 @compiled
-def _compare(counters, t, a, b, d):
+def _compare(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None:
     """Against what was received of this pair before, and of the same in the other order."""
     c, pair, other = counters.counts, _place(counters, a, b), _find(counters, b, a)
     since = t - counters.t[pair]
@@ -150,12 +156,12 @@ def _compare(counters, t, a, b, d):
 
 
 @compiled
-def _slot(number, probe):
+def _slot(number: int, probe: int) -> int:
     return ((number * 2654435761) % 4294967296 // (4294967296 // PAIRS) + probe) % PAIRS
 
 
 @compiled
-def _find(counters, a, b):
+def _find(counters: TdoaCounters, a: int, b: int) -> int:
     """Place of a pair of rows, -1 if it is not remembered."""
     number = a * len(counters.heard) + b
     for probe in range(PROBES):
@@ -165,7 +171,7 @@ def _find(counters, a, b):
 
 
 @compiled
-def _place(counters, a, b):
+def _place(counters: TdoaCounters, a: int, b: int) -> int:
     """Place of a pair of rows; one that is not remembered takes that of the pair that was heard the longest ago."""
     place = _find(counters, a, b)
     if place >= 0:
@@ -185,23 +191,25 @@ def _place(counters, a, b):
 
 
 @compiled
-def feed_tdoa(counters, t, arrival, a, b, d, first, length):
-    """`note_tdoa` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it
+def feed_tdoa(
+    counters: TdoaCounters, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, first: int
+) -> tuple[int, bool]:
+    """`count_tdoa` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it
     is)."""
     for i in range(first, len(t)):
-        if note_tdoa(counters, t[i], arrival[i], a[i], b[i], d[i], length):
+        if count_tdoa(counters, t[i], arrival[i], a[i], b[i], d[i]):
             return i + 1, True
     return len(t), False
 
 
-def tdoa_window(counters):
+def tdoa_window(counters: TdoaCounters) -> TdoaWindow:
     """TdoaWindow of what was counted since the window began."""
     c = counters.counts
     known = max(c[KNOWN], 1.0)
-    whole = [int(value) for value in c[:SUM]]
+    whole = dict(zip(TdoaWindow._fields[1 : 1 + SUM], (int(value) for value in c[:SUM])))
     return TdoaWindow(
         stamp_window(counters.stamps),
-        *whole,
+        **whole,
         size=float(c[SUM] / known),
         ceiling=float(c[HIGH]),
         hits=int(c[HIGH_HITS]),

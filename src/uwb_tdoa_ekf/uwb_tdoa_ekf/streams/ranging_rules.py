@@ -1,10 +1,17 @@
 """Rules for the values of a stream of TDOAs. A rule takes windows and returns a Finding or None."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .finding import ERROR, NOTE, WARNING, Finding
 from .median import median
 from .ranging import GRIDS
+
+if TYPE_CHECKING:
+    from .ranging import TdoaWindow
 
 LARGE = 0.2  # share of TDOAs longer than their anchors are apart; healthy 0.008 at most
 OUTLIERS = 0.05
@@ -17,12 +24,12 @@ CLIPPED = 0.02  # share at the largest value
 FEW = 3.9  # anchors heard in a second, below which there is no position
 
 
-def share_of(windows, field, among="known"):
+def share_of(windows: list[TdoaWindow], field: str, among: str = "known") -> float:
     """Sum of one count over the windows divided by that of another."""
     return sum(getattr(w, field) for w in windows) / max(sum(getattr(w, among) for w in windows), 1)
 
 
-def impossible(windows):
+def impossible(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "impossible")
     size = median(w.size for w in windows)
     evidence = f"{100.0 * share:.1f} % are longer than their anchors are apart, mean size {size:.3g}"
@@ -39,31 +46,35 @@ def impossible(windows):
     if share > OUTLIERS:
         remedy = "keep radio and anchors clear of metal; drop TDOAs that the radio marks as doubtful"
         return Finding("tdoa_outliers", WARNING, "many TDOAs are outliers", evidence, remedy, share)
+    return None
 
 
-def of_one(windows):
+def of_one(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "of_one")
     if share > 1e-3:
         remedy = "message.anchor_a, message.anchor_b = ...  # the two anchors of the difference"
         return Finding("tdoa_of_one", ERROR, "TDOAs name one anchor twice", f"{100.0 * share:.1f} %", remedy, share)
+    return None
 
 
-def invalid(windows):
+def invalid(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "invalid")
     if share > 1e-3:
         remedy = "do not publish what is not finite"
         return Finding("tdoa_invalid", WARNING, "TDOAs are not finite", f"{100.0 * share:.1f} %", remedy, share)
+    return None
 
 
-def duplicates(windows):
+def duplicates(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of([w for w in windows if w.stamps.same < 0.9 * w.stamps.count], "duplicates")
     if share > DUPLICATES:
         evidence = f"{100.0 * share:.0f} % come twice with stamp and value"
         remedy = "ros2 topic info --verbose uwb/tdoa  # one publisher only"
         return Finding("tdoa_twice", ERROR, "TDOAs are published twice", evidence, remedy, share)
+    return None
 
 
-def repeated(windows):
+def repeated(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "repeated", "successive")
     if share > REPEATS and rounded(windows) is None and clipped(windows) is None:
         evidence = f"{100.0 * share:.0f} % have the value that their pair had before"
@@ -71,17 +82,19 @@ def repeated(windows):
         return Finding(
             "tdoa_repeated", WARNING, "TDOAs are sampled faster than they are measured", evidence, remedy, share
         )
+    return None
 
 
-def two_tags(windows):
+def two_tags(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "returns", "successive")
     if share > RETURNS:
         evidence = f"{100.0 * share:.0f} % leap by more than 0.5 m and back within 0.1 s"
         remedy = "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2"
         return Finding("two_tags", ERROR, "two tags share uwb/tdoa", evidence, remedy, share)
+    return None
 
 
-def one_sign(windows):
+def one_sign(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "even", "opposed")
     if share > EVEN and sum(w.opposed for w in windows) > 20:
         evidence = f"{100.0 * share:.0f} % of the pairs that come as (a, b) and (b, a) have the same sign"
@@ -94,9 +107,10 @@ def one_sign(windows):
             remedy,
             share,
         )
+    return None
 
 
-def rounded(windows):
+def rounded(windows: list[TdoaWindow]) -> Finding | None:
     shares = np.median([w.grids for w in windows], axis=0)
     on = np.flatnonzero(shares > ON_GRID)
     if not len(on) or sum(w.known for w in windows) < 100:
@@ -109,21 +123,23 @@ def rounded(windows):
     )
 
 
-def clipped(windows):
+def clipped(windows: list[TdoaWindow]) -> Finding | None:
     ceiling = max(w.ceiling for w in windows)
     share = sum(w.hits for w in windows if w.ceiling == ceiling) / max(sum(w.known for w in windows), 1)
     if share > CLIPPED and rounded(windows) is None and ceiling > 0.0:
         evidence = f"{100.0 * share:.0f} % are {ceiling:.3f} m or its negative"
         return Finding("tdoa_clipped", ERROR, "TDOAs are clipped", evidence, "widen the limit of the driver", ceiling)
+    return None
 
 
-def heard(windows):
+def heard(windows: list[TdoaWindow]) -> Finding | None:
     """Anchors heard in a window, on average."""
     count = median(np.count_nonzero(w.heard) for w in windows)
     if count < FEW:
         evidence = f"{count:.0f} anchors in a second; four are needed, five or more are good"
         remedy = "switch on more anchors, or bring the tag among them"
         return Finding("few_anchors", ERROR, "too few anchors are heard for a position", evidence, remedy, count)
+    return None
 
 
 RULES = (impossible, of_one, invalid, duplicates, repeated, two_tags, one_sign, rounded, clipped, heard)

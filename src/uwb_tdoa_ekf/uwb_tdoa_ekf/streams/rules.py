@@ -1,13 +1,22 @@
 """StreamRules: counters of both streams, their windows, and all rules over them."""
 
+from __future__ import annotations
+
 from collections import Counter
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from . import inertial, inertial_rules, ranging, ranging_rules, stamp_rules, stamps
 from .finding import ERROR, Finding, most_severe_first
 
-LENGTH = 1.0  # s of a window
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .inertial import ImuWindow
+    from .ranging import TdoaWindow
+
+Window = TypeVar("Window", "ImuWindow", "TdoaWindow")
+
 FULL = 20  # messages without which a window says little of values
 
 
@@ -18,59 +27,57 @@ class StreamRules:
     windows.
     """
 
-    def __init__(self, anchors, kept=None):
+    def __init__(self, anchors: Anchors, kept: int | None = None) -> None:
         """anchors : Anchors; kept : windows of each stream that are kept, the latest; None: all."""
-        self.anchors, self.imu, self.tdoa = anchors, [], []  # windows
-        self._kept = kept
-        self.unknown = Counter()  # ids that the survey does not have
+        self.anchors, self._kept = anchors, kept
+        self.imu: list[ImuWindow] = []
+        self.tdoa: list[TdoaWindow] = []
+        self.unknown: Counter[int] = Counter()  # ids that the survey does not have
         self._imu, self._tdoa = inertial.new_imu(), ranging.new_tdoa(anchors)
 
-    def feed_imu(self, t, arrival, gyro, force):
+    def feed_imu(self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, force: np.ndarray) -> None:
         """Take many samples in the order of their arrival: t, arrival (n,), gyro, force (n, 3)."""
-        columns = [np.ascontiguousarray(column, dtype=float) for column in (t, arrival, gyro, force)]
+        t, arrival, gyro, force = (np.ascontiguousarray(column, dtype=float) for column in (t, arrival, gyro, force))
         row = 0
         while row < len(t):
-            row, complete = inertial.feed_imu(self._imu, *columns, row, LENGTH)
+            row, complete = inertial.feed_imu(self._imu, t, arrival, gyro, force, row)
             if complete:
                 self._close_imu()
 
-    def feed_tdoa(self, t, arrival, a, b, d):
+    def feed_tdoa(self, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> None:
         """Take many TDOAs in the order of their arrival: all (n,), a and b ids."""
-        rows = [self.anchors.index(ids) for ids in (a, b)]
-        for ids, known in zip((a, b), rows):
+        row_a, row_b = self.anchors.index(a), self.anchors.index(b)
+        for ids, known in ((a, row_a), (b, row_b)):
             values, counts = np.unique(np.asarray(ids)[known < 0], return_counts=True)
             self.unknown.update(dict(zip(values.tolist(), counts.tolist())))
         t, arrival, d = (np.ascontiguousarray(column, dtype=float) for column in (t, arrival, d))
         row = 0
         while row < len(t):
-            row, complete = ranging.feed_tdoa(self._tdoa, t, arrival, *rows, d, row, LENGTH)
+            row, complete = ranging.feed_tdoa(self._tdoa, t, arrival, row_a, row_b, d, row)
             if complete:
                 self._close_tdoa()
 
-    def finish(self):
+    def finish(self) -> None:
         """Close the windows at the end of a recording, unless they hold next to nothing."""
         for counters, close in ((self._imu, self._close_imu), (self._tdoa, self._close_tdoa)):
             if counters.stamps[stamps.COUNT] >= FULL:
                 close()
 
-    def findings(self, latest=0):
+    def findings(self, latest: int = 0) -> list[Finding]:
         """What stands: a list of Finding, most severe first. latest : of how many windows of each stream; 0: of all."""
-        imu, tdoa, found = self.imu[-latest:], self.tdoa[-latest:], []
-        for name, windows, rules in (
-            ("imu/data", imu, inertial_rules.RULES),
-            ("uwb/tdoa", tdoa, ranging_rules.RULES),
-        ):
-            if windows:
-                stamped = [window.stamps for window in windows]
-                found += [rule(name, stamped) for rule in stamp_rules.OF_ONE]
-                found += [rule(windows) for rule in rules]
+        imu, tdoa = self.imu[-latest:], self.tdoa[-latest:]
+        of_imu, of_tdoa = [window.stamps for window in imu], [window.stamps for window in tdoa]
+        found: list[Finding | None] = []
+        if imu:
+            found += [rule("imu/data", of_imu) for rule in stamp_rules.OF_ONE] + [rule(imu) for rule in inertial_rules.RULES]
+        if tdoa:
+            found += [rule("uwb/tdoa", of_tdoa) for rule in stamp_rules.OF_ONE] + [rule(tdoa) for rule in ranging_rules.RULES]
         if imu and tdoa:
-            both = [window.stamps for window in imu], [window.stamps for window in tdoa]
-            found += [rule(*both) for rule in stamp_rules.OF_BOTH]
+            found += [rule(of_imu, of_tdoa) for rule in stamp_rules.OF_BOTH]
         found.append(self._unknown(tdoa))
         return most_severe_first(finding for finding in found if finding is not None)
 
-    def _unknown(self, windows):
+    def _unknown(self, windows: list[TdoaWindow]) -> Finding | None:
         count = sum(window.unknown for window in windows)
         if not count:
             return None
@@ -84,15 +91,15 @@ class StreamRules:
             "ids_unknown", ERROR, "the tag hears anchors that the survey does not have", evidence, line, share
         )
 
-    def _close_imu(self):
+    def _close_imu(self) -> None:
         self._keep(self.imu, inertial.imu_window(self._imu))
         inertial.restart_imu(self._imu)
 
-    def _close_tdoa(self):
+    def _close_tdoa(self) -> None:
         self._keep(self.tdoa, ranging.tdoa_window(self._tdoa))
         ranging.restart_tdoa(self._tdoa)
 
-    def _keep(self, windows, window):
+    def _keep(self, windows: list[Window], window: Window) -> None:
         windows.append(window)
         if self._kept is not None:
             del windows[: -self._kept]

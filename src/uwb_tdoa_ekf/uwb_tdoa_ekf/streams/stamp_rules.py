@@ -4,12 +4,18 @@ A rule takes (name of the topic, its windows) and returns a Finding or None. The
 the extremes of 37 measured recordings of a Crazyflie, all with one clock and without arrival times.
 """
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .finding import ERROR, NOTE, WARNING, Finding
 from .median import median
+
+if TYPE_CHECKING:
+    from .stamps import StampWindow
 
 STAMP_LINE = "message.header.stamp = ...  # when the sample was measured, ROS time, in seconds and nanoseconds"
 SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
@@ -24,17 +30,17 @@ LAG, REORDER = 0.25, 0.003  # s: what ekf_node waits for, as its parameters of t
 UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
-def total(windows, field):
+def total(windows: list[StampWindow], field: str) -> int:
     """Sum of a field of StampWindow over windows."""
     return sum(getattr(window, field) for window in windows)
 
 
-def usual(windows, field):
+def usual(windows: list[StampWindow], field: str) -> float:
     """Median of a field of StampWindow over windows, NaN left out; NaN if there is none."""
     return median(value for window in windows if math.isfinite(value := getattr(window, field)))
 
 
-def pace_of(windows):
+def pace_of(windows: list[StampWindow]) -> float:
     """Seconds of stamps per second of arrival; NaN where arrivals are not known.
 
     From the first to the last message of a window, which blocks upset, or by the smallest latencies of successive windows, which
@@ -48,21 +54,22 @@ def pace_of(windows):
     return min(ratios, key=lambda ratio: abs(ratio - 1.0) if math.isfinite(ratio) else math.inf)
 
 
-def orderly(windows):
+def orderly(windows: list[StampWindow]) -> bool:
     """False for stamps with which nothing else can be told: of 0, standing still, leaping, or of another unit."""
     count, ratio = total(windows, "count"), pace_of(windows)
     broken = total(windows, "zeros") > 0.01 * count or total(windows, "same") > 0.98 * count or total(windows, "jumps")
     return not broken and not abs(ratio - 1.0) > PACE
 
 
-def zeros(name, windows):
+def zeros(name: str, windows: list[StampWindow]) -> Finding | None:
     share = total(windows, "zeros") / total(windows, "count")
     if share > 0.01:
         evidence = f"{100.0 * share:.0f} % of the stamps are 0"
         return Finding("stamps_zero", ERROR, f"{name} is not stamped", evidence, STAMP_LINE, share)
+    return None
 
 
-def standing(name, windows):
+def standing(name: str, windows: list[StampWindow]) -> Finding | None:
     """One stamp for many messages, or many stamps in a short time and then none."""
     share = total(windows, "same") / total(windows, "count")
     if total(windows, "zeros") > 0.01 * total(windows, "count"):
@@ -86,7 +93,7 @@ def standing(name, windows):
     return Finding("stamps_coarse", severity, cause, evidence, STAMP_LINE, step)
 
 
-def falls(name, windows):
+def falls(name: str, windows: list[StampWindow]) -> Finding | None:
     share = total(windows, "falls") / total(windows, "count")
     depth = max(window.depth for window in windows)
     if share < 1e-3 or depth <= REORDER:
@@ -99,7 +106,7 @@ def falls(name, windows):
     return Finding("stamps_fall", severity, f"messages of {name} are out of order", evidence, remedy, depth)
 
 
-def jumps(name, windows):
+def jumps(name: str, windows: list[StampWindow]) -> Finding | None:
     count = total(windows, "jumps")
     if not count or abs(pace_of(windows) - 1.0) > PACE:
         return None
@@ -108,7 +115,7 @@ def jumps(name, windows):
     return Finding("stamps_jump", ERROR, f"the clock of {name} jumps", evidence, STAMP_LINE, farthest)
 
 
-def gaps(name, windows):
+def gaps(name: str, windows: list[StampWindow]) -> Finding | None:
     longest, limit = max(window.gap for window in windows), LONGEST_GAP[name]
     if (
         longest <= limit
@@ -123,7 +130,7 @@ def gaps(name, windows):
     return Finding("gap", WARNING, f"{name} falls silent in between", evidence, remedy, longest)
 
 
-def rate(name, windows):
+def rate(name: str, windows: list[StampWindow]) -> Finding | None:
     """Too few per second of stamps; far too few: the stamps are in another unit."""
     step = usual(windows, "step")
     if not step > 1.0 / SLOWEST[name]:
@@ -137,7 +144,7 @@ def rate(name, windows):
     return Finding("rate", WARNING, f"{name} is slow", evidence, "raise the rate of the driver", 1.0 / step)
 
 
-def pace(name, windows):
+def pace(name: str, windows: list[StampWindow]) -> Finding | None:
     """Seconds of stamps per second of arrival."""
     ratio = pace_of(windows)
     if (
@@ -151,7 +158,7 @@ def pace(name, windows):
     return Finding("stamps_unit", ERROR, cause, f"{ratio:.4g} s of stamps in 1 s", STAMP_LINE, ratio)
 
 
-def blocks(name, windows):
+def blocks(name: str, windows: list[StampWindow]) -> Finding | None:
     """Late by very different times: kept together and sent in blocks."""
     spread = usual(windows, "spread")
     if not spread > BLOCK or usual(windows, "scatter") > SCATTER or not orderly(windows):
@@ -169,7 +176,7 @@ def blocks(name, windows):
     )
 
 
-def drift(name, windows):
+def drift(name: str, windows: list[StampWindow]) -> Finding | None:
     """A clock that is slower or faster than that of the arrivals (Theil-Sen slope of the smallest latencies)."""
     known = [(window.begin, window.latency) for window in windows if math.isfinite(window.latency)]
     if len(known) < 10 or not orderly(windows):
@@ -194,7 +201,7 @@ def drift(name, windows):
 OF_ONE = (zeros, standing, falls, jumps, gaps, rate, pace, blocks, drift)
 
 
-def offset(imu, tdoa):
+def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
     """The streams against each other: by their latencies where arrivals are known, else by where they begin and end."""
     if not (orderly(imu) and orderly(tdoa)):
         return None
@@ -216,7 +223,7 @@ def offset(imu, tdoa):
     return Finding("stamps_apart", severity, cause, evidence, line, ahead)
 
 
-def other_clock(imu, tdoa):
+def other_clock(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
     """Both streams of one clock, but not of the recorder's."""
     latency = usual(tdoa, "latency")
     if not (orderly(imu) and orderly(tdoa)):

@@ -1,5 +1,7 @@
 """Counters of the stamps of one stream, and what they amount to over a window."""
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 
@@ -7,6 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
+LENGTH = 1.0  # s of a window
 JUMP_LIMIT = 1.0  # s by which a stamp is ahead of what the arrival allows, or behind the newest: no late packet
 ABSURD = 1e12  # s; no clock says that
 MINIMUM = 10  # messages of a window
@@ -28,7 +31,7 @@ class StampWindow(NamedTuple):
     pace : seconds of stamps per second of arrival.
     """
 
-    count: int
+    count: int  # type: ignore[assignment]  # hides tuple.count, which nobody asks for
     begin: float
     end: float
     falls: int
@@ -45,7 +48,7 @@ class StampWindow(NamedTuple):
     pace: float
 
 
-def new_stamps():
+def new_stamps() -> np.ndarray:
     """Counters (20,) of a stream of which nothing was received."""
     s = np.zeros(20)
     s[NEWEST], s[LAST], s[LAST_ARRIVAL] = -np.inf, np.nan, np.nan
@@ -54,7 +57,7 @@ def new_stamps():
 
 
 @compiled
-def restart_stamps(s):
+def restart_stamps(s: np.ndarray) -> None:
     """Begin a new window."""
     s[COUNT:] = 0.0
     s[BEGIN] = s[NOW] = np.nan
@@ -62,7 +65,7 @@ def restart_stamps(s):
 
 
 @compiled
-def note_stamp(s, t, arrival):
+def count_stamp(s: np.ndarray, t: float, arrival: float) -> None:
     """Take the stamp t of one message, s, and when it arrived, s, or NaN."""
     if not abs(arrival) < ABSURD:
         arrival = np.nan
@@ -104,12 +107,12 @@ def note_stamp(s, t, arrival):
 
 
 @compiled
-def complete(s, length):
-    """True if the window is `length` s long, and of some messages."""
-    return (s[COUNT] >= MINIMUM and abs(s[NOW] - s[BEGIN]) >= length) or s[COUNT] >= MAXIMUM
+def complete(s: np.ndarray) -> bool:
+    """True if the window is LENGTH long, and of some messages."""
+    return (s[COUNT] >= MINIMUM and abs(s[NOW] - s[BEGIN]) >= LENGTH) or s[COUNT] >= MAXIMUM
 
 
-def stamp_window(s):
+def stamp_window(s: np.ndarray) -> StampWindow:
     """StampWindow of what was counted since the window began."""
     steps = max(s[STEPS], 1.0)
     step = s[STEP_SUM] / steps

@@ -9,7 +9,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
 from uwb_tdoa_bias.foundation import ros  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_ekf.told_pose import told_pose  # noqa: E402
+from uwb_tdoa_ekf.pose_message import pose_from_message  # noqa: E402
 
 
 def message(variances=(0.25, 0.25, 0.0, 0.0, 0.0, 0.07), frame="map", second=5):
@@ -22,24 +22,24 @@ def message(variances=(0.25, 0.25, 0.0, 0.0, 0.0, 0.07), frame="map", second=5):
     return out
 
 
-def told(content, newest=3.0):
+def read(content, newest=3.0):
     epoch = ros.Epoch()
     epoch.seconds(ros.Time(sec=2))
-    return told_pose(content, "map", epoch, newest)
+    return pose_from_message(content, "map", epoch, newest)
 
 
 def test_what_has_a_variance_is_told():
-    t, p, covariance, yaw, std = told(message())
+    t, p, covariance, yaw, std = read(message())
     assert (t, p[:2].tolist(), yaw, std) == (3.0, [1.0, 2.0], pytest.approx(math.pi / 2), pytest.approx(math.sqrt(0.07)))
     assert math.isnan(p[2]) and covariance[0, 0] == 0.25
-    _, p, _, yaw, std = told(message((0.25, 0.25, 0.1, 0.0, 0.0, 0.0)))
+    _, p, _, yaw, std = read(message((0.25, 0.25, 0.1, 0.0, 0.0, 0.0)))
     assert p[2] == 0.0 and math.isnan(yaw) and math.isnan(std)
 
 
 def test_without_a_stamp_it_is_of_the_newest_measurement():
-    assert told(message(second=0), newest=7.5)[0] == 7.5
+    assert read(message(second=0), newest=7.5)[0] == 7.5
     with pytest.raises(InputError, match="no stamp"):
-        told(message(second=0), newest=-math.inf)
+        read(message(second=0), newest=-math.inf)
 
 
 @pytest.mark.parametrize(
@@ -52,4 +52,4 @@ def test_without_a_stamp_it_is_of_the_newest_measurement():
 )
 def test_nonsense_is_refused(content, named):
     with pytest.raises(InputError, match=named):
-        told(content)
+        read(content)

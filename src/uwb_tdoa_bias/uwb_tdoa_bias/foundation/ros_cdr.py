@@ -51,7 +51,7 @@ class Unreadable(ValueError):
     """A message cannot be read; the text says why."""
 
 
-class Wire:
+class CdrCodec:
     """Some fields of the messages of one type, which begin with a std_msgs/Header.
 
     dtype : of the rows: "sec" and "nanosec" of the stamp, then the fields by their names in the message, dots in between
@@ -163,9 +163,9 @@ class Wire:
 
 
 class Template:
-    """Messages that differ in the fields of a Wire and in nothing else."""
+    """Messages that differ in the fields of a CdrCodec and in nothing else."""
 
-    def __init__(self, wire: Wire, message: Any) -> None:
+    def __init__(self, wire: CdrCodec, message: Any) -> None:
         self._wire, self._message = wire, message
         data = serialize_message(message)
         if wire.fits:

@@ -1,4 +1,4 @@
-"""What an Estimator is told in flight: poses, a reset, another tuning, that an anchor has changed."""
+"""What an Estimator is told in flight: poses, a reset, another FilterConfig, that an anchor has changed."""
 
 from dataclasses import replace
 import math
@@ -18,16 +18,16 @@ from uwb_tdoa_ekf.offline import run_offline
 FIRST = int(corners().ids[0])
 
 
-def told(flight, t, offset=(0.0, 0.0, 0.0), std=0.1, yaw=math.nan, yaw_std=math.nan):
-    """Arguments of tell_pose: the true position of a flight at t, off by some metres."""
+def pose_at(flight, t, offset=(0.0, 0.0, 0.0), std=0.1, yaw=math.nan, yaw_std=math.nan):
+    """Arguments of set_pose: the true position of a flight at t, off by some metres."""
     return t, position_at(flight, np.array([t]))[0] + offset, std**2 * np.eye(3), yaw, yaw_std
 
 
-def test_a_told_pose_starts_the_filter_where_it_is_told_with_the_told_yaw():
+def test_a_pose_that_is_set_starts_the_filter_there_with_its_yaw():
     flight = fly(duration=1.0)
     yaw = Rotation.from_quat(flight.truth.q[0]).as_euler("ZYX")[0]
     estimator = Estimator(flight.anchors)
-    estimator.tell_pose(*told(flight, 0.05, yaw=yaw, yaw_std=0.1))
+    estimator.set_pose(*pose_at(flight, 0.05, yaw=yaw, yaw_std=0.1))
     odometry, residuals = feed(estimator, flight)
     assert odometry.t[0] < 0.06  # half a second of TDOAs would be needed
     error = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
@@ -44,12 +44,12 @@ def test_a_pose_takes_effect_at_its_stamp_whenever_it_comes_before(ahead):
     for when in (t - 0.05, t - 0.05 - ahead):
         estimator, sent = Estimator(flight.anchors), []
 
-        def tell_in_time(estimator=estimator, sent=sent, when=when):
+        def set_in_time(estimator=estimator, sent=sent, when=when):
             if not sent and estimator.newest >= when:
-                sent.append(estimator.tell_pose(*told(flight, t, (3.0, 0.0, 0.0), 0.2)))
+                sent.append(estimator.set_pose(*pose_at(flight, t, (3.0, 0.0, 0.0), 0.2)))
             return True
 
-        odometry, _ = feed(estimator, flight, advance=tell_in_time)
+        odometry, _ = feed(estimator, flight, advance=set_in_time)
         if expected is None:
             expected = odometry
     assert_same(odometry, expected)
@@ -61,25 +61,25 @@ def test_a_pose_that_comes_late_counts_from_the_next_measurement_and_another_tim
     flight = fly(duration=2.0)
     estimator = Estimator(flight.anchors)
     feed(estimator, flight)
-    estimator.tell_pose(*told(flight, 1.5, (0.0, 3.0, 0.0), 0.01))
+    estimator.set_pose(*pose_at(flight, 1.5, (0.0, 3.0, 0.0), 0.01))
     t = flight.imu.t[-1] + 0.005
     estimator.add_imu(t, flight.imu.gyro[-1], flight.imu.accel[-1])
     odometry, _ = estimator.finish()
     assert odometry.p[-1, 1] - position_at(flight, np.array([1.5]))[0, 1] == pytest.approx(3.0, abs=0.1)
     for stamp in (t - 5.0, t + 100.0):
         with pytest.raises(InputError, match="its stamp is"):
-            estimator.tell_pose(stamp, np.zeros(3), np.eye(3))
+            estimator.set_pose(stamp, np.zeros(3), np.eye(3))
 
 
 @pytest.mark.parametrize("stamp", [1.7e9, -500.0])
 def test_a_pose_of_another_clock_that_comes_before_the_first_measurement_is_dropped_and_said_to_be(stamp):
     flight = fly(duration=2.0)
     estimator = Estimator(flight.anchors)
-    estimator.tell_pose(stamp, np.zeros(3), np.eye(3))
+    estimator.set_pose(stamp, np.zeros(3), np.eye(3))
     odometry, _ = feed(estimator, flight)
     assert_same(odometry, run_offline(flight).odometry)
     assert odometry.t[-1] < 2.0 and "is not used" in estimator.refused_pose
-    estimator.tell_pose(*told(flight, 2.0))
+    estimator.set_pose(*pose_at(flight, 2.0))
     assert estimator.refused_pose is None
 
 
@@ -87,8 +87,8 @@ def test_coordinates_that_are_not_told_stay():
     flight = fly(duration=3.0)
     estimator, plain = Estimator(flight.anchors), Estimator(flight.anchors)
     undisturbed, _ = feed(plain, flight)
-    t, p, covariance, _, _ = told(flight, 2.0, (1.0, 0.0, 0.0), 0.01)
-    estimator.tell_pose(t, [p[0], math.nan, math.nan], covariance)
+    t, p, covariance, _, _ = pose_at(flight, 2.0, (1.0, 0.0, 0.0), 0.01)
+    estimator.set_pose(t, [p[0], math.nan, math.nan], covariance)
     odometry, _ = feed(estimator, flight)
     k = np.searchsorted(odometry.t, t, side="right")
     change = odometry.p[k] - undisturbed.p[k]
@@ -111,12 +111,12 @@ def test_another_tuning_counts_from_the_next_measurement_on():
     estimator, plain = Estimator(flight.anchors), Estimator(flight.anchors)
     undisturbed, _ = feed(plain, flight)
 
-    def retune():
+    def configure():
         if estimator.newest >= 2.0:
-            estimator.retune(FilterConfig(tdoa_std=5.0))
+            estimator.configure(FilterConfig(tdoa_std=5.0))
         return True
 
-    odometry, residuals = feed(estimator, flight, advance=retune)
+    odometry, residuals = feed(estimator, flight, advance=configure)
     before = odometry.t < 1.95
     np.testing.assert_array_equal(odometry.p[before], undisturbed.p[before])
     assert residuals.variance[-1] > 20.0

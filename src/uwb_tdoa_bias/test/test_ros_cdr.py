@@ -10,8 +10,8 @@ from geometry_msgs.msg import TwistWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry, Path  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from sensor_msgs.msg import FluidPressure, Imu, Range  # noqa: E402
-from uwb_tdoa_bias.foundation import ros_wire  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_wire import LONGEST_TEXT, MOST_ELEMENTS, Unreadable, Wire, decode  # noqa: E402
+from uwb_tdoa_bias.foundation import ros_cdr  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_cdr import LONGEST_TEXT, MOST_ELEMENTS, Unreadable, CdrCodec, decode  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual  # noqa: E402
 
 POSE = "pose.pose.position", "pose.pose.orientation", "pose.covariance"
@@ -21,7 +21,7 @@ POSE = "pose.pose.position", "pose.pose.orientation", "pose.covariance"
 def way(request, monkeypatch):
     """Both ways of reading and writing: by the definition, and by message objects where that does not fit."""
     if request.param == "objects":
-        monkeypatch.setattr(Wire, "_agrees", lambda self: False)
+        monkeypatch.setattr(CdrCodec, "_agrees", lambda self: False)
     return request.param
 
 
@@ -39,13 +39,13 @@ def test_the_definition_fits_the_types_of_our_topics():
         (FluidPressure, "fluid_pressure"), (TwistWithCovarianceStamped, "twist.twist.linear", "twist.covariance"),
         (Path,),
     ):  # fmt: skip
-        assert Wire(kind, *fields).fits, kind
+        assert CdrCodec(kind, *fields).fits, kind
 
 
 def test_messages_are_read_in_order_in_runs_of_one_frame(way):
     frames = ["tag", "tag", "gat", "longer", "longer", ""]
     messages = [corrected(k, frame, model="x" * (k % 2)) for k, frame in enumerate(frames)]
-    wire = Wire(TdoaCorrected, "corrected", "anchor_b", "status")
+    wire = CdrCodec(TdoaCorrected, "corrected", "anchor_b", "status")
     parts = wire.read([serialize_message(message) for message in messages])
     assert [frame for frame, rows, _ in parts for _ in rows] == frames
     assert [k for *_, some in parts for k in range(6)[some]] == list(range(6))
@@ -61,14 +61,14 @@ def test_vectors_and_arrays_are_columns(way):
     message = Odometry(child_frame_id="body")
     message.pose.pose.position.y, message.pose.pose.orientation.x = 2.0, 0.5
     message.pose.covariance = np.arange(36.0)
-    ((frame, rows, _),) = Wire(Odometry, *POSE).read([serialize_message(message)])
+    ((frame, rows, _),) = CdrCodec(Odometry, *POSE).read([serialize_message(message)])
     assert rows["pose.pose.position"].tolist() == [[0.0, 2.0, 0.0]]
     assert rows["pose.pose.orientation"].tolist() == [[0.5, 0.0, 0.0, 1.0]]
     assert rows["pose.covariance"].tolist() == [list(range(36))]
 
 
 def test_what_is_written_is_what_an_object_would_be(way):
-    wire = Wire(TdoaCorrected, "corrected", "anchor_b", "anchor_a", "raw")  # not in the order of the definition
+    wire = CdrCodec(TdoaCorrected, "corrected", "anchor_b", "anchor_a", "raw")  # not in the order of the definition
     template = wire.template(corrected(7, model="effects"))
     wanted = [corrected(k, model="effects") for k in (7, 8, 300)]
     rows = template.rows(3)
@@ -83,10 +83,10 @@ def test_what_is_written_is_what_an_object_would_be(way):
 
 
 def test_a_middleware_that_serializes_otherwise_is_noticed(monkeypatch):
-    monkeypatch.setattr(ros_wire, "serialize_message", lambda message: b"\0\0" + serialize_message(message)[2:])
-    assert not Wire(Tdoa, "distance_difference").fits
-    monkeypatch.setattr(ros_wire, "serialize_message", lambda message: serialize_message(message)[:4] + b"\0" * 90)
-    assert not Wire(Tdoa, "distance_difference").fits
+    monkeypatch.setattr(ros_cdr, "serialize_message", lambda message: b"\0\0" + serialize_message(message)[2:])
+    assert not CdrCodec(Tdoa, "distance_difference").fits
+    monkeypatch.setattr(ros_cdr, "serialize_message", lambda message: serialize_message(message)[:4] + b"\0" * 90)
+    assert not CdrCodec(Tdoa, "distance_difference").fits
 
 
 def tdoa_bytes(order="<", options=0, frame=b"tag", variance=True, more=b""):
@@ -102,7 +102,7 @@ def tdoa_bytes(order="<", options=0, frame=b"tag", variance=True, more=b""):
 @pytest.mark.parametrize("options", [0, 1, 3])
 @pytest.mark.parametrize("more", [b"", b"\0\0\0"])
 def test_every_encoding_that_means_something_is_read(way, order, options, more):
-    wire = Wire(Tdoa, "anchor_a", "anchor_b", "distance_difference", "variance")
+    wire = CdrCodec(Tdoa, "anchor_a", "anchor_b", "distance_difference", "variance")
     ((frame, rows, some),) = wire.read([tdoa_bytes(order, options, more=more)])
     assert (frame, some) == ("tag", slice(0, 1)) and rows[list(wire.dtype.names)].tolist() == [(1, 2, 3, 4, 0.5, 0.25)]
 
@@ -122,7 +122,7 @@ BAD = {
 
 @pytest.mark.parametrize("reason", BAD)
 def test_what_cannot_be_read_is_left_out_and_said(reason):
-    wire, refused = Wire(Tdoa, "anchor_a"), []
+    wire, refused = CdrCodec(Tdoa, "anchor_a"), []
     parts = wire.read([tdoa_bytes(), BAD[reason], tdoa_bytes(">"), BAD[reason], tdoa_bytes()], refused.append)
     assert [some.start for *_, some in parts] == [0, 2, 4] and [rows["anchor_a"].tolist() for _, rows, _ in parts] == [[3]] * 3
     assert len(refused) == 2
@@ -133,9 +133,9 @@ def test_what_cannot_be_read_is_left_out_and_said(reason):
 def test_a_wrong_version_in_another_encoding_is_none_either():
     for data in (tdoa_bytes(">", variance=False), tdoa_bytes(">", more=bytes(8)), tdoa_bytes("<", 1, variance=False)):
         with pytest.raises(Unreadable, match="another version|cannot be read as uwb_tdoa_msgs/Tdoa"):
-            Wire(Tdoa, "anchor_a").read([data])
+            CdrCodec(Tdoa, "anchor_a").read([data])
     with pytest.raises(Unreadable, match="no UTF-8"):
-        Wire(Tdoa, "anchor_a").read([tdoa_bytes(">", frame=b"t\xff")])
+        CdrCodec(Tdoa, "anchor_a").read([tdoa_bytes(">", frame=b"t\xff")])
 
 
 def test_lists_are_bounded_before_anything_is_allocated():
@@ -153,7 +153,7 @@ def test_lists_are_bounded_before_anything_is_allocated():
 
 
 def test_noise_is_refused_or_read_and_nothing_else(way):
-    rng, wire, refused, read = np.random.default_rng(1), Wire(TdoaCorrected, "corrected", "bias_slope"), [], 0
+    rng, wire, refused, read = np.random.default_rng(1), CdrCodec(TdoaCorrected, "corrected", "bias_slope"), [], 0
     whole = serialize_message(corrected(1))
     for _ in range(300):
         data = bytearray(whole[: rng.integers(len(whole) + 1)] if rng.random() < 0.3 else whole)

@@ -1,15 +1,24 @@
 """A pose that somebody tells, as RViz does, in the terms of the filter."""
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+if TYPE_CHECKING:
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+    from uwb_tdoa_bias.foundation.ros import Epoch
+
 LARGEST = 1e16  # the square of what is far for an anchor, m^2
 
 
-def told_pose(message, world, epoch, newest):
+def pose_from_message(
+    message: PoseWithCovarianceStamped, world: str, epoch: Epoch, newest: float
+) -> tuple[float, np.ndarray, np.ndarray, float, float]:
     """(t s, p (3,) m, covariance (3, 3) m^2, yaw rad, its standard deviation rad) of a PoseWithCovarianceStamped.
 
     world : name of the world frame; epoch : ros.Epoch; newest : s, stamp of the newest measurement, which a pose without

@@ -9,20 +9,20 @@ import numpy as np
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.core.verdicts import LATE
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.order import TRIAL, Order
+from uwb_tdoa_ekf.reorder_buffer import TRIAL, LatenessPolicy
 
 
 def late(stamps):
-    """Whether each of them is late, and the Order after them."""
-    order, newest, out = Order(), -math.inf, []
+    """Whether each of them is late, and the LatenessPolicy after them."""
+    policy, newest, out = LatenessPolicy(), -math.inf, []
     for t in stamps:
-        out.append(order.is_late(t, newest))
+        out.append(policy.is_late(t, newest))
         newest = max(newest, t)
-    return out, order.trusted(newest)
+    return out, policy.trusted(newest)
 
 
 def test_a_stream_is_trusted_when_it_has_been_in_order_for_a_while():
-    assert not Order().trusted(-math.inf)
+    assert not LatenessPolicy().trusted(-math.inf)
     assert late([5.0, 5.0, 5.0 + 0.9 * TRIAL]) == ([False] * 3, False)
     assert late([5.0, 5.0, 5.0 + TRIAL]) == late([5.0, 6.0, 5.0 + TRIAL]) == ([False] * 3, True)
 
@@ -46,13 +46,13 @@ def test_nothing_is_late_in_order(stamps):
 
 
 def test_a_stamp_that_has_never_come_twice_is_not_waited_for():
-    order, end = Order(), 2.0 * TRIAL
+    policy, end = LatenessPolicy(), 2.0 * TRIAL
     for t, newest in ((0.0, -math.inf), (end, 0.0)):
-        order.is_late(t, newest)
-    assert order.passed(end, 0.1) == end and Order().passed(end, 0.1) < end - 0.1
-    assert [order.is_late(end, end) for _ in range(2)] == [True, True]  # whatever has been used
-    assert end - 1e-9 < order.passed(end, 0.1) < end
-    assert not order.is_late(end + 1.0, end) and not order.is_late(end + 1.0, end + 1.0)
+        policy.is_late(t, newest)
+    assert policy.watermark(end, 0.1) == end and LatenessPolicy().watermark(end, 0.1) < end - 0.1
+    assert [policy.is_late(end, end) for _ in range(2)] == [True, True]  # whatever has been used
+    assert end - 1e-9 < policy.watermark(end, 0.1) < end
+    assert not policy.is_late(end + 1.0, end) and not policy.is_late(end + 1.0, end + 1.0)
 
 
 def test_where_stamps_come_twice_from_the_beginning_nothing_is_late():

@@ -1,0 +1,94 @@
+"""From measurements in the order of their stamps to odometry: the filter, and the watch for changes, live and off line."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, TYPE_CHECKING
+
+import numpy as np
+
+from .core.engine import feed, set_pose
+from .core.memory import ODOMETRY, RESIDUAL, TDOA, Floor, Measurements, joined, new_state
+from .monitoring.monitor import Monitor
+from .results import Odometry, Residuals
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from uwb_tdoa_bias.effects.sensor_function import SensorFunction
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from .core.config import FilterConfig
+    from .reorder_buffer import ReorderBuffer
+
+
+class Fed(NamedTuple):
+    """measured : Measurements that were used at once; odometry : (n,) of ODOMETRY that came of them; tdoas, aids : (k,) and (m,) of
+    RESIDUAL, what became of them."""
+
+    measured: Measurements
+    odometry: np.ndarray
+    tdoas: np.ndarray
+    aids: np.ndarray
+
+
+class Pipeline:
+    """Takes what a ReorderBuffer releases. state : FilterState; monitor : Monitor, or None, if nobody asks what has changed."""
+
+    def __init__(
+        self, anchors: Anchors, config: FilterConfig, functions: Sequence[SensorFunction] = (),
+        floor: Floor | None = None, watched: bool = True, records: list[np.ndarray] | None = None,
+    ) -> None:  # fmt: skip
+        """anchors : Anchors; config : FilterConfig; functions, floor : as of `new_state`; watched : have a Monitor in any case; records : list to
+        which the history is appended (see engine.feed), or None."""
+        self._anchors, self._records = anchors, records
+        self.state = new_state(anchors.positions, functions, floor)
+        self.monitor = Monitor(anchors) if watched or config.compensate_changes else None
+        self.configure(config)
+
+    def configure(self, config: FilterConfig) -> None:
+        """Go on with a FilterConfig."""
+        self._config, self._parameters = config, config.parameters()
+        if not config.compensate_changes:
+            self.state.anchors["delay"] = self.state.anchors["delay_variance"] = 0.0
+
+    def run(self, buffer: ReorderBuffer, until: float) -> list[Fed]:
+        """Use what a ReorderBuffer holds up to `until`, s; where delays are taken out, from the stamps on at which the monitor finds them."""
+        parts = []
+        while self._config.compensate_changes and self.monitor is not None and self.monitor.end <= until and len(buffer):
+            end = self.monitor.end
+            parts += self._feed(buffer.take(math.nextafter(end, -math.inf)))
+            self.monitor.judge(end)
+            self.state.anchors["delay"], self.state.anchors["delay_variance"] = self.monitor.delays
+        parts += self._feed(buffer.take(until))
+        if self.monitor is not None:
+            self.monitor.judge(buffer.used_until)
+        return parts
+
+    @property
+    def alarms(self) -> list[str]:
+        """Sentences on what has changed since the flight began."""
+        return [] if self.monitor is None else self.monitor.alarms
+
+    def set_pose(self, pose: np.ndarray) -> None:
+        """Put the filter at a pose, (1,) of POSE, that is not before what was used."""
+        set_pose(self.state, self._parameters, pose)
+
+    def _feed(self, measured: Measurements) -> list[Fed]:
+        if not any(map(len, measured)):
+            return []
+        used = measured if self._config.use_imu else measured._replace(imu=measured.imu[:0])
+        fed = Fed(measured, *feed(self.state, self._parameters, used, self._records))
+        if self.monitor is not None:
+            self.monitor.add(Odometry.from_rows(fed.odometry), self.residuals([fed]))
+        return [fed]
+
+    def residuals(self, parts: Sequence[Fed]) -> Residuals:
+        """What became of the TDOAs of several Fed, in the order in which they were used."""
+        tdoa, rows = joined(TDOA, [part.measured.tdoa for part in parts]), joined(RESIDUAL, [part.tdoas for part in parts])
+        ids = self._anchors.ids
+        return Residuals.from_rows(tdoa["t"], ids[tdoa["a"]], ids[tdoa["b"]], rows)
+
+
+def odometry_of(parts: Sequence[Fed]) -> Odometry:
+    """What came of several Fed."""
+    return Odometry.from_rows(joined(ODOMETRY, [part.odometry for part in parts]))
