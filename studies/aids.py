@@ -10,7 +10,7 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_bias.foundation.sensors import Velocity
 from uwb_tdoa_bias.foundation.sensors.pressure import altitude_of, pressure_at
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.estimator import VERDICTS
+from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_tools import options
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals

@@ -12,7 +12,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from known_effects import clean_flight  # noqa: E402
 
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
-from uwb_tdoa_ekf.estimator import VERDICTS  # noqa: E402
+from uwb_tdoa_ekf.results import VERDICTS  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import OK, WARN, Health  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_tools.scoring.metrics import airborne  # noqa: E402

@@ -71,7 +71,7 @@ def publish(stop):
 
 
 class Counted:
-    """Turns that only look at what take(), a list of bytes, gives."""
+    """RoundRobin that only look at what take(), a list of bytes, gives."""
 
     PERIOD = 0.001
 

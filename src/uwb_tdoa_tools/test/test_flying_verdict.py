@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.flight import Truth
-from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_tools.flying.mission import DONE, REFUSED
 from uwb_tdoa_tools.flying.report import summary, text
 from uwb_tdoa_tools.flying.verdict import judge

@@ -13,7 +13,7 @@ from sensor_msgs.msg import Imu, TimeReference  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.ekf_parameters import PARAMETERS  # noqa: E402
-from uwb_tdoa_ekf.estimator import OF_AIDS, SILENT  # noqa: E402
+from uwb_tdoa_ekf.reorder_buffer import OF_AIDS, SILENT  # noqa: E402
 from uwb_tdoa_tools.live import follow  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 from uwb_tdoa_tools.live.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402

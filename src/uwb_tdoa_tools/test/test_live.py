@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
-from uwb_tdoa_ekf.estimator import VERDICTS  # noqa: E402
+from uwb_tdoa_ekf.results import VERDICTS  # noqa: E402
 from uwb_tdoa_tools.live import run as live  # noqa: E402
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
-from uwb_tdoa_ekf.estimator import Residuals
+from uwb_tdoa_ekf.results import Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.localizing import belief, residuals

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_memory, structured
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.scoring.metrics import airborne
@@ -39,12 +39,12 @@ def cut(flight, low, high=np.inf):
     return replace(flight, imu=between(flight.imu, low, high), tdoa=between(flight.tdoa, low, high))
 
 
-def drive(flight, memory):
+def drive(flight, state):
     anchors, imu, tdoa = flight.anchors, flight.imu, flight.tdoa
     samples = structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
     rows = anchors.index(tdoa.a), anchors.index(tdoa.b)
     tdoas = structured(TDOA, tdoa.t, *rows, tdoa.d, np.zeros(len(tdoa)))
-    odometry, *_ = feed(memory, FilterConfig().tuning(), Measurements(samples, tdoas))
+    odometry, *_ = feed(state, FilterConfig().parameters(), Measurements(samples, tdoas))
     return odometry["t"], odometry["x"][:, :3]
 
 
@@ -66,11 +66,11 @@ def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(fl
         steady = rms(flight, usual.t, usual.p, first + 3.0, last)
         cells = []
         for at in TIMES:
-            memory = new_memory(flight.anchors.positions)
-            drive(cut(flight, -np.inf, first + at), memory)
-            memory.record.hypotheses["x"][:, :3] += 2.0 * np.array([2.0, -2.0, 1.0]) / 3.0
-            off = drive(cut(flight, first + at), memory)
-            anew = drive(cut(flight, first + at), new_memory(flight.anchors.positions))
+            state = new_state(flight.anchors.positions)
+            drive(cut(flight, -np.inf, first + at), state)
+            state.record.hypotheses["x"][:, :3] += 2.0 * np.array([2.0, -2.0, 1.0]) / 3.0
+            off = drive(cut(flight, first + at), state)
+            anew = drive(cut(flight, first + at), new_state(flight.anchors.positions))
             judged = first + at + AFTER, first + at + AFTER + WINDOW
             now, *found = (rms(flight, *path, *judged) for path in ((usual.t, usual.p), off, anew))
             assert max(found) < 2.0 * max(steady, now), flight.name

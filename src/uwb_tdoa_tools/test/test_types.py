@@ -21,7 +21,7 @@ def annotated():
 def test_annotations(monkeypatch):
     run = pytest.importorskip("mypy.api").run
     monkeypatch.chdir(ROOT)
-    assert {"uwb_tdoa_bias", "uwb_tdoa_tools"} <= set(annotated())
+    assert {"uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools"} <= set(annotated())
     packages = [word for name in annotated() for word in ("-p", name)]
     report, failure, code = run(["--config-file", ".ci/mypy.ini", *packages])
     assert code == 0, report + failure

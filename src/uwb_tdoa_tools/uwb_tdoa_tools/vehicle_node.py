@@ -21,7 +21,7 @@ from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
-from uwb_tdoa_bias.foundation.ros_streams import Turns
+from uwb_tdoa_bias.foundation.ros_streams import RoundRobin
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 
 from .flying.over_topics import OverTopics
@@ -76,7 +76,7 @@ class VehicleNode(ros.StreamNode):
         ]  # fmt: skip
         self._starts: float | None = None  # time.monotonic(), s, when it begins, once somebody listens
         say_unused([self], files_of(arguments))
-        self.turns = Turns([self])
+        self.turns = RoundRobin([self])
         self.get_logger().info("ready; waiting for who listens to imu/data and uwb/tdoa, and publishes odometry")
 
     def take(self) -> bool:

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Writer
     from rosbags.typesys.store import Typestore
-    from uwb_tdoa_ekf.estimator import Odometry
+    from uwb_tdoa_ekf.results import Odometry
     from .files import BagReader
 
     Topics = dict[str, tuple[str, Qos, Iterable[tuple[int, Any]]]]  # {topic: (type, QoS, (stamp ns, message) in order)}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from rosbags.typesys.store import Typestore
     from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_ekf.estimator import Odometry
+    from uwb_tdoa_ekf.results import Odometry
 
     # A message has no type here: rosbags makes the classes while it runs.
     RowOfMessage = Callable[[Any], tuple[float, ...]]

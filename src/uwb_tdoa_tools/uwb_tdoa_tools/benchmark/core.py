@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_ekf.aid_rows import rows_of
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, YAWS, Measurements, new_memory, structured
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, YAWS, Measurements, new_state, structured
+from uwb_tdoa_ekf.offline import loaded
 
 from .figures import Figure
 from .flights import make_flight
@@ -18,7 +19,7 @@ from .flights import make_flight
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from uwb_tdoa_bias.foundation.flight import Flight
-    from uwb_tdoa_ekf.core.memory import Memory
+    from uwb_tdoa_ekf.core.memory import FilterState
 
 ANCHORS = (4, 8, 16, 32, 64)
 BEFORE, MEASURED = 3.0, 4.0  # s of a flight: until it is measured, and measured
@@ -69,8 +70,8 @@ def per_event(anchors: int, robust: str, hypotheses: int, repeats: int) -> tuple
         robust=robust, initial_yaw_std=FilterConfig.initial_yaw_std if hypotheses > 1 else 0.5, odometry_rate=RARELY
     )
     core = Core(flight, config)
-    core.run(BEFORE, core.memory)
-    if not core.memory.record.running:
+    core.run(BEFORE, core.state)
+    if not core.state.record.running:
         raise RuntimeError("the filter has not started, so that there is nothing to measure")
     seconds = np.array([[core.timed(False), core.timed(True)] for _ in range(repeats + 1)])
     seconds = seconds[1:]  # the first fills caches
@@ -85,46 +86,46 @@ def per_aid(aid: str, repeats: int) -> np.ndarray:
     noise: dict[str, Any] = {f"{aid}_noise": NOISES[aid]}
     flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False, **noise)
     core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
-    core.run(BEFORE, core.memory)
-    if not core.memory.record.running:
+    core.run(BEFORE, core.state)
+    if not core.state.record.running:
         raise RuntimeError("the filter has not started, so that there is nothing to measure")
     seconds = np.array([[core.timed(True), core.timed(True, True)] for _ in range(repeats + 1)])[1:]
     return 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.aids
 
 
 class Core:
-    """engine.feed on a stretch of a flight, again and again from the same Memory."""
+    """engine.feed on a stretch of a flight, again and again from the same FilterState."""
 
     def __init__(self, flight: Flight, config: FilterConfig) -> None:
         assert flight.imu is not None
-        self.memory = self.last = new_memory(flight.anchors.positions)
-        self._tuning = config.tuning()
+        self.state = self.last = new_state(flight.anchors.positions)
+        self._parameters = config.parameters()
         imu, tdoa = flight.imu, flight.tdoa
         self._imu = structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
         # no prediction of their own: at the stamp of the inertial sample before
         stamps = imu.t[np.maximum(np.searchsorted(imu.t, tdoa.t, side="right") - 1, 0)]
         rows = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
         self._tdoa = structured(TDOA, stamps, *rows, tdoa.d, np.zeros(len(tdoa)))
-        self._aids = rows_of(flight, config)[0]
+        self._aids = loaded(flight, config)[0].take(math.inf).aids
         self._aids["t"] = imu.t[np.maximum(np.searchsorted(imu.t, self._aids["t"], side="right") - 1, 0)]
         self._begin = imu.t[0]
 
-    def run(self, until: float, memory: Memory) -> None:
+    def run(self, until: float, state: FilterState) -> None:
         """Feed the flight's first seconds; what is measured is the rest."""
         streams = self._imu, self._tdoa, self._aids
         ends = [int(np.searchsorted(stream["t"], self._begin + until)) for stream in streams]
-        self._feed(memory, *(stream[:end] for stream, end in zip(streams, ends)))
+        self._feed(state, *(stream[:end] for stream, end in zip(streams, ends)))
         self._imu, self._tdoa, self._aids = (stream[end:] for stream, end in zip(streams, ends))
         self.samples, self.tdoas, self.aids = len(self._imu), len(self._tdoa), len(self._aids)
 
     def timed(self, tdoa: bool, aids: bool = False) -> float:
         """s that the rest takes, with or without its TDOAs, and its heights, pressures and velocities."""
-        self.last = self.memory.copy()
+        self.last = self.state.copy()
         return self._feed(
             self.last, self._imu, self._tdoa if tdoa else self._tdoa[:0], self._aids if aids else self._aids[:0]
         )
 
-    def _feed(self, memory: Memory, *measured: np.ndarray) -> float:
+    def _feed(self, state: FilterState, *measured: np.ndarray) -> float:
         began = time.perf_counter()
-        feed(memory, self._tuning, Measurements(*measured))
+        feed(state, self._parameters, Measurements(*measured))
         return time.perf_counter() - began

@@ -12,7 +12,7 @@ import numpy as np
 
 from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.memory import TDOA, new_memory, structured
+from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.startup import locate
 from uwb_tdoa_ekf.streams.explain import SCALE
 
@@ -37,15 +37,15 @@ class SurveyFit:
         """t (n,) s, rising; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
         self.positions = positions
         self._windows, self._start = [], []
-        config, memory, box = FilterConfig(), new_memory(positions), np.empty((2, 3))
-        workspace.set_bounds(memory.record.extent, config.workspace_margin, box)
+        config, state, box = FilterConfig(), new_state(positions), np.empty((2, 3))
+        workspace.set_bounds(state.record.extent, config.workspace_margin, box)
         rows = structured(TDOA, t, a, b, d, np.zeros(len(t)))
         for begin in np.linspace(t[0], t[-1] - LENGTH, WINDOWS) if len(t) else ():
             first, end = np.searchsorted(t, [begin, begin + LENGTH])
             if end - first < FEWEST:
                 continue
             window, x = tuple(column[first:end] for column in (t, a, b, d)), np.empty((1, 6))
-            locate(rows[first:end], memory.anchors, box, config.tuning()[0], np.nan, np.nan, x, np.empty((1, 6, 6)), np.empty(1))
+            locate(rows[first:end], state.anchors, box, config.parameters()[0], np.nan, np.nan, x, np.empty((1, 6, 6)), np.empty(1))
             self._windows.append(window)
             self._start.append(x[0])
         self.before = self._loss(self._start, positions)

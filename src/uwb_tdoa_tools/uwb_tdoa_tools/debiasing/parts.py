@@ -19,7 +19,7 @@ from ..scoring.metrics import position_at
 from .evaluation import Estimator
 
 if TYPE_CHECKING:
-    from uwb_tdoa_ekf.estimator import Odometry
+    from uwb_tdoa_ekf.results import Odometry
     from ..scoring.metrics import Score
 
 LEAST = 10  # positions of flights, 5 ms apart, that make a marker

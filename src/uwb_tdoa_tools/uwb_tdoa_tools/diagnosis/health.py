@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_ekf.estimator import VERDICTS
+from uwb_tdoa_ekf.results import VERDICTS
 
 from .channels import CHANNELS
 

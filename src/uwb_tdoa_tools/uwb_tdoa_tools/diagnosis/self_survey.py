@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_bias.foundation.flight import Flight
-    from uwb_tdoa_ekf.estimator import Odometry
+    from uwb_tdoa_ekf.results import Odometry
     from ..parallel import MapFunction
     from .channels.tdoa import TdoaResidual
     from .constraints import Constraint

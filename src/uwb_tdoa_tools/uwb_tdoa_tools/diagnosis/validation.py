@@ -14,7 +14,7 @@ from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.estimator import VERDICTS
+from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_ekf.offline import poses_of, run_offline
 
 from ..scoring.by_phase import EVERYTHING

@@ -9,7 +9,8 @@ import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector, LabelCorrector
-from uwb_tdoa_ekf.estimator import Estimator, Odometry
+from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_ekf.offline import poses_of
 
 from ..benchmark.peer import EVENT, Peer
@@ -73,7 +74,7 @@ class OurFilter:
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
-        self._estimator.tell_pose(t, p, std**2 * np.eye(3), yaw, std)
+        self._estimator.set_pose(t, p, std**2 * np.eye(3), yaw, std)
 
     def take(self, measured: Measured) -> None:
         """Take what arrived: Measured."""

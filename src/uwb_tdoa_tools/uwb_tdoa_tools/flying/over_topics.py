@@ -18,9 +18,9 @@ from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS
 from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
-from uwb_tdoa_bias.foundation.ros_wire import Wire, message_class
+from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
 from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
@@ -30,7 +30,7 @@ from .vehicle import ATTITUDE, POSITION
 if TYPE_CHECKING:
     from collections.abc import Callable
     from builtin_interfaces.msg import Time
-    from uwb_tdoa_bias.foundation.ros_wire import Template
+    from uwb_tdoa_bias.foundation.ros_cdr import Template
     from .mission import Pose
     from .pace import Lockstep, RealTime
     from .simulator import Measured
@@ -66,7 +66,7 @@ class OverTopics:
         self._truth = _Output(node, *STREAMS["truth"], frame=self._anchors.frame)
         self._clock = node.create_publisher(Clock, "/clock", 10) if clock else None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, "initialpose", ros.OUTPUT_QOS)
-        self._wire = Wire(OdometryMessage, "pose", "twist")
+        self._wire = CdrCodec(OdometryMessage, "pose", "twist")
         self._odometry = ros.StreamInput(node, OdometryMessage, "odometry")
         self._status = ros.Input(node, EstimatorStatus, "status", self._on_status, ANCHORS_QOS)
         anchors = anchors_to_message(self._anchors)
@@ -207,7 +207,7 @@ class _Output:
         if self._template is None:
             blank = self._kind()
             blank.header.frame_id = self._frame
-            self._template = Wire(self._kind, *content).template(blank)
+            self._template = CdrCodec(self._kind, *content).template(blank)
         rows = self._template.rows(len(seconds))
         rows["sec"], rows["nanosec"] = seconds, nanoseconds
         for field, values in content.items():

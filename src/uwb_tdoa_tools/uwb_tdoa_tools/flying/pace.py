@@ -7,7 +7,7 @@ from statistics import median_low
 import time
 from typing import Any, TYPE_CHECKING
 
-from uwb_tdoa_ekf.order import TRIAL
+from uwb_tdoa_ekf.reorder_buffer import TRIAL
 
 from .simulator import DT
 

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_ekf.results import Odometry
 
 from .controller import FELT, Controller, Gains, turned
 from .estimates import OurFilter, TheirFilter

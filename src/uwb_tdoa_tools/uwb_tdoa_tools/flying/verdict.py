@@ -8,7 +8,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Truth
-from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_ekf.results import Odometry
 
 from ..scoring.metrics import nees, position_at
 from .mission import DONE, REFUSED

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN, load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_ekf.offline import Run, run_offline
 
 from .. import command_lines

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_ekf.estimator import VERDICTS
+from uwb_tdoa_ekf.results import VERDICTS
 
 from ..bags.files import open_bag
 from .processes import Diagnostics, Processes, own_domain, wait

@@ -9,7 +9,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.monitoring.status import YAW_KNOWN
 from uwb_tdoa_ekf.offline import Run

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_tdoa_ekf.estimator import Odometry
+from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_ekf.frames import rotation_std
 
 COLUMNS = (

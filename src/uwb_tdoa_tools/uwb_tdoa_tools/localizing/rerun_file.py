@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from types import ModuleType
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.core.config import FilterConfig
-    from uwb_tdoa_ekf.estimator import Odometry, Residuals
+    from uwb_tdoa_ekf.results import Odometry, Residuals
     from ..bags.bag import RecordedOdometry
     from ..diagnosis.diagnose import Diagnosis
 

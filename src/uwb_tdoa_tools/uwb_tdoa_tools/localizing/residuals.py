@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
-from uwb_tdoa_ekf.estimator import VERDICTS, Residuals
+from uwb_tdoa_ekf.results import VERDICTS, Residuals
 
 COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
 SHOWN, FEWEST = 20, 20  # pairs in the picture at most, those with the most TDOAs; TDOAs of a pair that is shown at least

@@ -26,7 +26,7 @@ from .tum import write_tum
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from uwb_tdoa_bias.foundation.flight import Flight
-    from uwb_tdoa_ekf.estimator import Odometry, Residuals
+    from uwb_tdoa_ekf.results import Odometry, Residuals
     from ..bags.bag import RecordedOdometry
     from ..readers.inputs import Recording
     from .alignment import Alignment

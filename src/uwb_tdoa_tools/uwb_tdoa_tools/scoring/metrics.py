@@ -21,7 +21,7 @@ from .phases import AIRBORNE, TITLES, in_the_air, motion, phases
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from uwb_tdoa_bias.foundation.flight import Truth
-    from uwb_tdoa_ekf.estimator import Residuals
+    from uwb_tdoa_ekf.results import Residuals
     from .by_phase import Spans
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
-    from uwb_tdoa_ekf.estimator import Odometry
+    from uwb_tdoa_ekf.results import Odometry
 
 MOST = 3000  # TDOAs of a flight that are used
 FEWEST = 200
