@@ -276,7 +276,7 @@ def typed(texts: dict[str, str]) -> dict[str, bool | str]:
     return {name: kinds.get(text, text) for name, text in texts.items() if text != ""}
 
 
-def _beside(path: Path, file: list | str) -> str:
+def _beside(path: str | Path, file: list | str) -> str:
     """A path that a file names, relative to that file. Raises InputError."""
     if not isinstance(file, str):
         raise InputError(f"{file!r} is no path; write a text.")
