@@ -12,10 +12,10 @@ from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import FluidPressure  # noqa: E402
 from uwb_tdoa_bias.foundation import ros, ros_spinning  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_streams import PERIOD, Streams, RoundRobin  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec  # noqa: E402
 
 MANY = 300
 DEEP = QoSProfile(depth=1000)

@@ -25,10 +25,10 @@ from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, C
 from .effects import EffectSet, LabelCorrector
 from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
+from .foundation.ros_cdr import CdrCodec
 from .foundation.ros_frames import FramesInput, unknown_frame
 from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
-from .foundation.ros_streams import StreamOutput, Streams, RoundRobin
-from .foundation.ros_cdr import CdrCodec
+from .foundation.ros_streams import RoundRobin, StreamOutput, Streams
 from .correction.pose_queue import PoseQueue
 from .correction.network import load_network
 from .correction.poses import parts_of

@@ -7,9 +7,10 @@ from live import IMU, TDOA, arriving, assert_same, assert_same_as_offline, feed,
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_ekf.core.verdicts import LATE
+from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE, TDOA as TDOA_ROW
+from uwb_tdoa_ekf.core.verdicts import INVALID, LATE
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.reorder_buffer import TRIAL, LatenessPolicy
+from uwb_tdoa_ekf.reorder_buffer import FIRST_AID, IMU_STREAM, SILENT, TDOA_STREAM, TRIAL, LatenessPolicy, ReorderBuffer
 
 
 def late(stamps):
@@ -90,3 +91,76 @@ def test_the_first_stamp_that_comes_twice_late_in_a_flight_is_late_however_the_s
     assert_same(told[0][0], told[1][0])
     became = [sorted(zip(residuals.t, residuals.a, residuals.b, residuals.verdict)) for _, residuals in told]
     assert became[0] == became[1] and sum(verdict == LATE for *_, verdict in became[0]) == 1
+
+
+def rows(kind, *stamps):
+    """(n,) of a structured type that are told apart by their stamps, and that all are usable."""
+    out = np.zeros(len(stamps), kind)
+    out["t"] = stamps
+    return out, np.ones(len(stamps), bool)
+
+
+def buffer_of(reorder=0.1, lag=1.0, use_imu=True):
+    """(ReorderBuffer, what it refuses: [(stream, stamp, verdict)], stamps of its restarts)."""
+    refused, restarts = [], []
+    buffer = ReorderBuffer(
+        reorder, lag, use_imu, lambda stream, gone, verdict: refused.extend((stream, t, verdict) for t in gone["t"].tolist()),
+        lambda: restarts.append(buffer.newest),
+    )  # fmt: skip
+    return buffer, refused, restarts
+
+
+def test_rows_leave_in_the_order_of_their_stamps_when_no_stream_can_precede_them():
+    buffer, refused, _ = buffer_of()
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 0.0, 0.3, 0.2))
+    assert buffer.watermark < 0.0  # there may be inertial samples
+    buffer.add(IMU_STREAM, *rows(IMU_SAMPLE, 0.0, 0.5))
+    assert 0.19 < buffer.watermark < 0.2 and buffer.waiting[:2] == (2, 3) and buffer.first == 0.0
+    imu, tdoa, _ = buffer.take(buffer.watermark)
+    assert (imu["t"].tolist(), tdoa["t"].tolist()) == ([0.0], [0.0]) and buffer.used_until == 0.0
+    assert [part["t"].tolist() for part in buffer.take(math.inf)[:2]] == [[0.5], [0.2, 0.3]]
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 0.4))
+    assert refused == [(TDOA_STREAM, 0.4, LATE)] and len(buffer) == 0
+
+
+def test_a_silent_stream_is_waited_for_no_longer_than_lag_and_a_sensor_only_where_it_was_there():
+    buffer, *_ = buffer_of(lag=1.0)
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, *np.arange(0.0, 3.0, 0.5)))
+    assert buffer.watermark == 2.5 - 1.0
+    buffer, *_ = buffer_of(use_imu=False, reorder=0.0)
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, *np.arange(0.0, 3.0, 0.5)))
+    assert buffer.watermark == 2.5
+    buffer.add(FIRST_AID, *rows(AID, 2.5 - 0.9 * SILENT))
+    assert buffer.watermark == 2.5 - 0.5  # half of lag
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 3.0))
+    assert buffer.watermark == 3.0
+
+
+def test_a_stamp_that_is_no_measurement_counts_and_a_lone_one_far_away_is_refused():
+    buffer, refused, restarts = buffer_of()
+    buffer.add(TDOA_STREAM, rows(TDOA_ROW, 1.0, 2.0)[0], np.array([True, False]))
+    assert buffer.newest == 2.0 and len(buffer) == 1 and not refused
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 100.0, 2.1))
+    assert refused == [(TDOA_STREAM, 100.0, INVALID)] and not restarts
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 200.0))
+    buffer.finish()
+    assert refused[1:] == [(TDOA_STREAM, 200.0, INVALID)]
+
+
+def test_a_stream_that_falls_back_starts_anew_and_what_waited_is_late():
+    buffer, refused, restarts = buffer_of()
+    buffer.add(IMU_STREAM, *rows(IMU_SAMPLE, 50.0))
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 50.0, 10.0, 10.1))
+    assert sorted(refused) == [(IMU_STREAM, 50.0, LATE), (TDOA_STREAM, 50.0, LATE)] and restarts == [10.1]
+    assert buffer.take(math.inf).tdoa["t"].tolist() == [10.0, 10.1]
+
+
+def test_of_a_recording_nothing_is_late():
+    buffer = ReorderBuffer.of_recording()
+    buffer.load(FIRST_AID + 1, rows(AID, 1.0, 2.0)[0])
+    buffer.load(FIRST_AID, rows(AID, 1.5, 2.0)[0])
+    buffer.load(TDOA_STREAM, rows(TDOA_ROW, 0.0, 3.0)[0])
+    assert buffer.take(1.0).aids["t"].tolist() == [1.0] and buffer.used_until == 1.0
+    buffer.load(TDOA_STREAM, rows(TDOA_ROW, 3.0, 4.0)[0])
+    imu, tdoa, aids = buffer.take(math.inf)
+    assert (len(imu), tdoa["t"].tolist(), aids["t"].tolist()) == (0, [3.0, 3.0, 4.0], [1.5, 2.0, 2.0])

@@ -27,10 +27,10 @@ from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
+from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
 from uwb_tdoa_bias.foundation.ros_frames import FramesInput, unknown_frame
 from uwb_tdoa_bias.foundation.ros_parameters import files_of, refuse_unknown, say_unused
-from uwb_tdoa_bias.foundation.ros_streams import Streams, RoundRobin
-from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
+from uwb_tdoa_bias.foundation.ros_streams import RoundRobin, Streams
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_msgs.msg import TdoaCorrected
 

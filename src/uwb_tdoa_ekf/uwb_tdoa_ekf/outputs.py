@@ -12,9 +12,9 @@ from nav_msgs.msg import Odometry
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation.later import rotations
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS as STATUS_QOS
+from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec
 from uwb_tdoa_bias.foundation.ros_frames import TF_QOS
 from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
-from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM

@@ -34,8 +34,8 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message
-from uwb_tdoa_bias.foundation.ros_frames import read_transforms
 from uwb_tdoa_bias.foundation.ros_cdr import Unreadable, decode
+from uwb_tdoa_bias.foundation.ros_frames import read_transforms
 from uwb_tdoa_msgs.msg import AnchorArray, EstimatorStatus, Tdoa, TdoaCorrected
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 from uwb_tdoa_tools.benchmark import nodes
