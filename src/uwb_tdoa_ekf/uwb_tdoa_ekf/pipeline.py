@@ -10,6 +10,7 @@ import numpy as np
 from .core.engine import feed, set_pose
 from .core.memory import ODOMETRY, RESIDUAL, TDOA, Floor, Measurements, joined, new_state
 from .monitoring.monitor import Monitor
+from .monitoring.slices import LENGTH
 from .results import Odometry, Residuals
 
 if TYPE_CHECKING:
@@ -54,8 +55,10 @@ class Pipeline:
     def run(self, buffer: ReorderBuffer, until: float) -> list[Fed]:
         """Use what a ReorderBuffer holds up to `until`, s; where delays are taken out, from the stamps on at which the monitor finds them."""
         parts = []
-        while self._config.compensate_changes and self.monitor is not None and self.monitor.end <= until and len(buffer):
-            end = self.monitor.end
+        while self._config.compensate_changes and self.monitor is not None and len(buffer):
+            end = min(self.monitor.end, (math.floor(buffer.first / LENGTH) + 1.0) * LENGTH)  # the first slice begins with the first TDOA
+            if end > until:
+                break
             parts += self._feed(buffer.take(math.nextafter(end, -math.inf)))
             self.monitor.judge(end)
             self.state.anchors["delay"], self.state.anchors["delay_variance"] = self.monitor.delays
