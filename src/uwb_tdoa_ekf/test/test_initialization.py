@@ -1,6 +1,6 @@
 from dataclasses import replace
 
-from driving import assert_sound, drive, errors, memory_for
+from driving import assert_sound, drive, errors, state_for
 from flights import fly
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_finds_a_tag_again_that_was_carried_away(robust):
     positions = far.anchors.positions
     d = tdoa(p, positions[far.anchors.index(far.tdoa.a)], positions[far.anchors.index(far.tdoa.b)])
     d += 0.1 * np.random.default_rng(0).standard_normal(len(d))
-    state = memory_for(far)
+    state = state_for(far)
     odometry, _ = drive(replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), state)
     assert state.record.recoveries <= 2
     assert np.linalg.norm(odometry.x[odometry.t > 8.0, :3] - there, axis=1).max() < 0.3
@@ -70,7 +70,7 @@ def test_finds_a_tag_again_that_was_carried_away(robust):
 def test_a_good_flight_needs_no_recovery():
     for seed in range(3):
         flight = fly(seed, 10.0, outliers=0.1)
-        state = memory_for(flight)
+        state = state_for(flight)
         drive(flight, state=state)
         assert state.record.recoveries == 0
 

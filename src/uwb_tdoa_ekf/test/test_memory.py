@@ -1,6 +1,6 @@
 from dataclasses import replace
 
-from driving import assert_equal, cut, drive, memory_for
+from driving import assert_equal, cut, drive, state_for
 from flights import fly
 import numpy as np
 
@@ -9,7 +9,7 @@ from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, new_state, structured
 
 def test_a_copy_of_the_memory_is_a_copy_of_the_filter():
     flight = fly(2, 4.0)
-    state = memory_for(flight)
+    state = state_for(flight)
     early = replace(flight, imu=cut(flight.imu, 0.0, 2.0), tdoa=cut(flight.tdoa, 0.0, 2.0))
     late = replace(flight, imu=cut(flight.imu, 2.0, 4.0), tdoa=cut(flight.tdoa, 2.0, 4.0))
     drive(early, state=state)
