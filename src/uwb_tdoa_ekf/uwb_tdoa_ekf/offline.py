@@ -80,7 +80,7 @@ def run_offline(
         variance = correction.std**2 + tdoa.variance[batch]
         rows = structured(TDOA, t, a, b, correction.corrected, variance, correction.slope, correction.state)
         usable = usable_tdoas(rows, anchors.positions)
-        buffer.load(TDOA_STREAM, rows[usable])
+        buffer.load(TDOA_STREAM, rows if usable.all() else rows[usable])
         of_tdoas.append(batch[usable])
         fed = pipeline.run(buffer, until)
         parts += fed
@@ -88,28 +88,32 @@ def run_offline(
             corrector.add_pose(*poses_of(odometry_of(fed)))
     outcome = _became(len(tdoa), np.concatenate(of_tdoas), [part.tdoas for part in parts])
     residuals = Residuals.from_rows(tdoa.t, tdoa.a, tdoa.b, outcome)
-    kinds, of_aids = joined(AID, [part.measured.aids for part in parts])["kind"], joined(RESIDUAL, [part.aids for part in parts])
-    aids = {name: _became(n, rows, [of_aids[kinds == AIDS.index(name)]]) for name, (n, rows) in places.items()}
+    of_aids = joined(RESIDUAL, [part.aids for part in parts])
+    aids = {name: _became(n, rows, [of_aids[ranks]]) for name, (n, rows, ranks) in places.items()}
     ekf = pipeline.state.record
     return Run(odometry_of(parts), residuals, bias, std, int(ekf.recoveries), yaw_offset(int(ekf.best)), aids)
 
 
-def loaded(flight: Flight, config: FilterConfig) -> tuple[ReorderBuffer, dict[str, tuple[int, np.ndarray]]]:
-    """ReorderBuffer with the inertial samples and the SENSORS of a Flight, and of each of these how many there are, and the places of those
-    that can be measurements, in the order of their stamps."""
-    buffer, places = ReorderBuffer.of_recording(), {}
+def loaded(flight: Flight, config: FilterConfig) -> tuple[ReorderBuffer, dict[str, tuple[int, np.ndarray, np.ndarray]]]:
+    """ReorderBuffer with the inertial samples and the SENSORS of a Flight, and of each of these how many there are, the places of those
+    that can be measurements, in the order of their stamps, and their ranks among all that leave the buffer."""
+    buffer = ReorderBuffer.of_recording()
     if flight.imu is not None and config.use_imu:
         rows, usable = imu_rows(flight.imu.t, flight.imu.gyro, flight.imu.accel)
         buffer.load(IMU_STREAM, rows[usable])
-    for place, name in enumerate(AIDS, FIRST_AID):
+    felt, kept_of = [], {}
+    for name in AIDS:
         stream = getattr(flight, name)
         if stream is not None and getattr(config, f"use_{name}"):
             rows, usable = aid_rows(name, stream, flight.anchors)
             (kept,) = np.nonzero(usable)
             kept = kept[np.argsort(rows["t"][kept], kind="stable")]
-            buffer.load(place, rows[kept])
-            places[name] = len(rows), kept
-    return buffer, places
+            felt.append(rows[kept])
+            kept_of[name] = len(rows), kept
+    together = joined(AID, felt)  # as one stream, whose order is found once
+    together = together[np.lexsort((together["kind"], together["t"]))]
+    buffer.load(FIRST_AID, together)
+    return buffer, {name: (*kept, np.flatnonzero(together["kind"] == AIDS.index(name))) for name, kept in kept_of.items()}
 
 
 def _became(n: int, places: np.ndarray, outcomes: list[np.ndarray]) -> np.ndarray:

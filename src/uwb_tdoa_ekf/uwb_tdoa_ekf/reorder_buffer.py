@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.sensors import LOCATING
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, StampGate
 
 from .core import aids
-from .core.memory import AID, IMU_SAMPLE, TDOA, Measurements
+from .core.memory import AID, IMU_SAMPLE, TDOA, Measurements, joined
 from .core.verdicts import INVALID, LATE
 
 if TYPE_CHECKING:
@@ -101,15 +101,19 @@ class ReorderBuffer:
                 self._streams[place].gate.pass_time(t)  # or whoever waits for our pose of this time waits for the next one
 
     def load(self, place: int, rows: np.ndarray) -> None:
-        """Take rows (n,) of a stream of a recording, in the order of their stamps and not before those that came before."""
+        """Take rows (n,) of a stream of a recording, in the order of their stamps and not before those that came before. Those of all SENSORS may
+        come as one, in the order of stamps and kinds."""
         self._streams[place].extend(rows)
 
     def take(self, until: float) -> Measurements:
         """Remove and return the rows stamped up to `until`, s; those of the SENSORS in the order of their stamps, then of STREAMS."""
         imu, tdoa, *parts = (stream.take(until) for stream in self._streams)
-        felt = np.concatenate(parts) if any(map(len, parts)) else NO_AIDS
-        felt = felt[np.lexsort((felt["kind"], felt["t"]))] if len(felt) > 1 else felt
-        self.used_until = max([self.used_until, *(float(part["t"][-1]) for part in (imu, tdoa, felt) if len(part))])
+        parts = [part for part in parts if len(part)]
+        felt = joined(AID, parts) if parts else NO_AIDS
+        felt = felt[np.lexsort((felt["kind"], felt["t"]))] if len(parts) > 1 else felt
+        for part in (imu, tdoa, felt):
+            if len(part):
+                self.used_until = max(self.used_until, float(part["t"][-1]))
         return Measurements(imu, tdoa, felt)
 
     def finish(self) -> None:
@@ -197,6 +201,7 @@ class _Stream:
     def __init__(self, kind: np.dtype) -> None:
         self.gate, self.policy = StampGate(), LatenessPolicy()
         self._room, self._first, self._end = np.empty(ROOM, kind), 0, 0
+        self._none = np.empty(0, kind)
 
     def __len__(self) -> int:
         return self._end - self._first
@@ -225,7 +230,10 @@ class _Stream:
         return True
 
     def extend(self, rows: np.ndarray) -> None:
-        """Append rows (k,) whatever their stamps are."""
+        """Append rows (k,) whatever their stamps are; where there are none they become the room."""
+        if self._first == self._end:
+            self._room, self._first, self._end = rows, 0, len(rows)
+            return
         self._make_room(len(rows))
         self._room[self._end : self._end + len(rows)] = rows
         self._end += len(rows)
@@ -239,10 +247,16 @@ class _Stream:
 
     def take(self, until: float) -> np.ndarray:
         """Remove and return the rows stamped up to `until`, s."""
-        n = _count(self._room, self._first, self._end, until) if len(self) else 0
-        taken = self._room[self._first : self._first + n].copy()
+        if self._first == self._end:
+            return self._none
+        stamps, n, step = self._room["t"][self._first : self._end], 0, ROOM
+        while n < len(stamps) and stamps[n] <= until:  # a few at a time: numpy copies what it searches
+            n += int(stamps[n : n + step].searchsorted(until, side="right"))
+            step *= 2
+        if not n:
+            return self._none
         self._first += n
-        return taken
+        return self._room[self._first - n : self._first]  # nothing is written there any more
 
     def _make_room(self, n: int) -> None:
         if self._end + n > len(self._room):
@@ -265,11 +279,3 @@ def _append(room: np.ndarray, first: int, end: int, rows: np.ndarray, newest: fl
     for k in range(len(rows)):
         room[end + k] = rows[k]
     return newest
-
-
-@compiled
-def _count(room: np.ndarray, first: int, end: int, until: float) -> int:
-    n = 0
-    while first + n < end and room[first + n].t <= until:
-        n += 1
-    return n
