@@ -117,7 +117,7 @@ def measure(progress: Callable[[str], object], peer: Peer, quick: bool = False) 
     flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False)
     assert flight.imu is not None and flight.truth is not None
     core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
-    core.run(BEFORE, core.memory)
+    core.run(BEFORE, core.state)
     begin, end, truth = flight.imu.t[0] + BEFORE, flight.imu.t[-1], flight.truth
     samples, both = events_of(flight, begin, np.inf)
     first = int(np.searchsorted(truth.t, begin))

@@ -70,7 +70,8 @@ def parser() -> ArgumentParser:
     add("--noise", metavar="M", **number, help="standard deviation of every reception, instead of the radio's")
     add("--link-noise", metavar="M", **number, default=0.0, help="error that every TDOA has of its own besides (default: 0)")
     add("--with", dest="aids", action="append", default=[], choices=["height"], help="what the tag measures besides: a range finder that looks down")
-    add("--height-std", metavar="M", **number, default=FilterConfig().height_std, help=f"of that height {default}")
+    height_std = FilterConfig().height_std  # type: ignore[attr-defined]  # parameters of SENSORS are known at run time
+    add("--height-std", metavar="M", **number, default=height_std, help=f"of that height {default}")
     unique = "one solution by every pairing alone or by a whole round (default: pairings; with --radio-reach: round)"
     add("--flyable", choices=FLYABLE, help=unique)
     add("--radio-reach", metavar="M", **number, help="a hall: the tag hears the anchors within that, not all; many more anchors are possible")

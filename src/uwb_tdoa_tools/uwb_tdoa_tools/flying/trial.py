@@ -187,7 +187,7 @@ def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OurFilter | TheirFi
     anchors = task.world.anchors
     if task.peer is not None:
         return TheirFilter(task.peer, anchors, yaw, place if task.told == "place" else None)
-    known = {"initial_yaw": yaw, "initial_yaw_std": TOLD_STD} if task.yaw == "known" else {}
+    known: dict[str, Any] = {"initial_yaw": yaw, "initial_yaw_std": TOLD_STD} if task.yaw == "known" else {}
     return OurFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from ..bags.bag import RecordedOdometry
     from ..readers.inputs import Reading
+    from ..scoring.metrics import Estimate
 
 SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # told nothing, as the nodes are
 
@@ -115,7 +116,7 @@ def fly(planned: DemoFlight, folder: Path, rate: float = 1.0, say: Callable[[str
     ekf = {"use_imu": flight.imu is not None}
     live = run_live(bag, folder, rate, bias, ekf, say)
     nodes, raw = read_odometry(live.recorded), run_offline(flight)
-    estimates = {"nodes": nodes, "without ROS": raw.odometry}
+    estimates: dict[str, Estimate] = {"nodes": nodes, "without ROS": raw.odometry}
     if correction:
         corrected = run_offline(flight, corrector=correction)
         estimates = {"raw": raw.odometry, "corrected": nodes, "corrected, without ROS": corrected.odometry}
