@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.ros import Refusals, Report
     from .core.config import FilterConfig
-    from .estimator import Odometry
+    from .results import Odometry
     from .streams.finding import Finding
 
 # Of each stream: topic, type and the fields of its messages that are read.
