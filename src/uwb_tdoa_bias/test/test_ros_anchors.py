@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -7,7 +9,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, ANY_QOS, anchors_to_message, same_anchors  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, ANY_QOS, anchors_to_message, in_words, same_anchors  # noqa: E402
 
 
 def test_anchors_survive_the_message():
@@ -22,6 +24,16 @@ def test_a_message_without_a_frame_is_in_the_map():
     message = anchors_to_message(Anchors.from_positions(np.eye(3)))
     message.header.frame_id = ""
     assert Anchors.from_message(message).frame == "map"
+
+
+def test_what_has_changed_is_said_in_words():
+    before = Anchors.from_positions(np.arange(12.0).reshape(4, 3), ids=[5, 6, 7, 8])
+    after = Anchors.from_positions(np.vstack([before.positions[1:3], before.positions[3] + 1.0, [1.0, 1.0, 1.0]]), ids=[6, 7, 8, 9])
+    assert in_words(before, after) == "new: 9; gone: 5; elsewhere: 8; going on with the 2 that stay"
+    assert in_words(before, before.at(before.positions + 1.0)) == "elsewhere: 5, 6, 7, 8; starting over"
+    assert in_words(before, replace(after, frame="hall")) == "they are in frame 'hall', and were in 'map': starting over"
+    many = Anchors.from_positions(np.arange(60.0).reshape(20, 3), ids=np.arange(5, 25))
+    assert in_words(before, many) == "new: 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, ...; going on with the 4 that stay"
 
 
 def test_same_anchors_notices_every_difference():

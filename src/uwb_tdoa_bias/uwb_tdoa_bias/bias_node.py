@@ -132,7 +132,10 @@ class BiasNode(ros.StreamNode):
         anchors: Any = self._anchors.anchors  # there are some when this is called
         self._corrector = Corrector(anchors, self._effects, self._network, self._lag)
 
-    def _on_anchors(self, _: Anchors) -> None:
+    def _on_anchors(self, anchors: Anchors) -> None:
+        if self._corrector is not None and self._corrector.anchors.frame == anchors.frame:
+            self._corrector.change_anchors(anchors)
+            return
         self._start_over()
         while self._early_poses:
             self._take_poses(*self._early_poses.popleft())

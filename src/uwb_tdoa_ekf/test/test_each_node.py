@@ -11,9 +11,10 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
-from flights import corners, with_aids  # noqa: E402
+from flights import corners, position_at, with_aids  # noqa: E402
 from rig import MODULES, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from sensor_msgs.msg import Imu  # noqa: E402
+import test_installed  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message  # noqa: E402
@@ -249,6 +250,23 @@ def test_other_anchors_start_the_filter_anew_and_the_same_do_not(make_rig, tmp_p
     counts = rig.counts("ekf_node", restarts=1, state="starting")
     assert counts["waiting"] == 0 and len(rig.residuals) == len(flight.tdoa)  # with the old anchors, to the last one
     assert counts["used"] + counts["rejected"] + counts["startup"] == len(flight.tdoa)
+
+
+def test_an_anchor_that_goes_one_that_moves_and_one_that_comes_do_not_stop_the_nodes(make_rig):
+    rig, flight = make_rig(), test_installed.flight_through()
+    processes = rig.start("bias_node", "ekf_node")
+    rig.send_anchors(test_installed.BOX)
+    rig.play(test_installed.cut(flight, -np.inf, test_installed.CHANGE))
+    before = rig.counts("ekf_node", state="running")
+    rig.send_anchors(test_installed.after())
+    rig.wait(lambda: all(any("the anchors have changed" in line for line in process.lines) for process in processes), "the change to arrive")
+    rig.play(test_installed.cut(flight, test_installed.CHANGE, np.inf))
+    counts = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa.t))
+    assert counts["restarts"] == counts["recoveries"] == 0 and counts["used"] > before["used"] + 500
+    t, p = (np.array([pick(m) for m in rig.odometry]) for pick in (lambda m: seconds_of(m.header.stamp), lambda m: [getattr(m.pose.pose.position, k) for k in "xyz"]))
+    assert np.diff(t).max() < 0.1  # it never stopped
+    late = t > test_installed.CHANGE
+    assert np.linalg.norm(p[late] - position_at(flight, t[late]), axis=1).max() < 0.3
 
 
 def test_bad_anchors_are_told(make_rig):

@@ -4,6 +4,7 @@ import pytest
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, structured
+from uwb_tdoa_ekf.installed import Installed
 from uwb_tdoa_ekf.offline import loaded
 from uwb_tdoa_ekf.pipeline import Pipeline, odometry_of
 from uwb_tdoa_ekf.reorder_buffer import TDOA_STREAM
@@ -23,7 +24,7 @@ def run(flight, config, row, ends):
     """(Odometry, Residuals, Pipeline) of all TDOAs, used up to each of `ends`, s."""
     buffer, _ = loaded(flight, config)
     buffer.load(TDOA_STREAM, delayed(flight, row))
-    pipeline = Pipeline(flight.anchors, config)
+    pipeline = Pipeline(Installed(flight.anchors), config)
     parts = [part for end in ends for part in pipeline.run(buffer, end)]
     assert len(buffer) == 0
     return odometry_of(parts), pipeline.residuals(parts), pipeline
@@ -43,6 +44,6 @@ def test_the_same_comes_out_whatever_is_used_at_once(compensating):
 
 def test_nobody_watches_unless_that_is_asked_for():
     flight = fly(5, 1.0)
-    assert Pipeline(flight.anchors, FilterConfig(), watched=False).alarms == []
-    assert Pipeline(flight.anchors, FilterConfig(), watched=False).monitor is None
-    assert Pipeline(flight.anchors, FilterConfig(compensate_changes=True), watched=False).monitor is not None
+    assert Pipeline(Installed(flight.anchors), FilterConfig(), watched=False).alarms == []
+    assert Pipeline(Installed(flight.anchors), FilterConfig(), watched=False).monitor is None
+    assert Pipeline(Installed(flight.anchors), FilterConfig(compensate_changes=True), watched=False).monitor is not None

@@ -2,11 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from flights import fly, with_aids
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, samples_at
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.sensitivity import record_innovations
+from uwb_tdoa_ekf.sensitivity import FORGOTTEN, record_innovations
 
 # Nothing that decides or learns, so that the filter is as linear as it can be.
 PLAIN = FilterConfig(robust="gate", gate=1e3, adapt_noise=False, recover=False, workspace_margin=1e3, initial_yaw_std=0.1)
@@ -57,3 +58,33 @@ def test_every_used_tdoa_is_found_in_the_history(aided):
     places = np.concatenate(found.of)
     assert sorted(places[places >= 0].tolist()) == list(range(len(found.rows)))
     assert np.all(np.diff(flight.tdoa.t[found.rows]) >= 0.0)
+
+
+def test_blocks_of_sparse_regressors_give_the_same():
+    flight = fly(seed=5, duration=8.0)
+    found = record_innovations(flight)
+    t = flight.tdoa.t[found.rows]
+    rng = np.random.default_rng(0)
+    regressors = rng.standard_normal((len(t), 5)) * (rng.random((len(t), 5)) < 0.4)
+    regressors[t < 4.0, 3] = 0.0  # one that is not heard before, and one that is not heard later
+    regressors[t > 2.0, 4] = 0.0
+    stamps = np.array([1.0, 5.0, 7.5])
+    whole, moved = found.and_positions(regressors, stamps)
+    out, positions = np.zeros_like(regressors), np.zeros((3, 3, 5))
+    for rows, columns, values in found.in_blocks(csr_array(regressors), ((t - t[0]) / 3.0).astype(int), stamps, positions):
+        out[rows, columns] = values
+    np.testing.assert_array_equal(out, whole)
+    np.testing.assert_array_equal(positions, moved)
+
+
+def test_what_is_not_heard_any_more_is_forgotten():
+    flight = fly(seed=5, duration=18.0)
+    found = record_innovations(flight)
+    t = flight.tdoa.t[found.rows]
+    regressors = np.where(t < 2.0, 1.0, 0.0)[:, None] * np.ones((1, 2))
+    regressors[:, 1] = 1.0
+    blocks = list(found.in_blocks(csr_array(regressors), ((t - t[0]) / 1.0).astype(int)))
+    assert blocks[0][1].tolist() == [0, 1] and blocks[-1][1].tolist() == [1]
+    whole = found.by_bias(regressors)[:, 0]
+    share = np.sqrt(np.mean(whole[t > 2.0 + FORGOTTEN] ** 2) / np.mean(whole[t < 2.0] ** 2))
+    assert share < 0.05  # of an error of all TDOAs at the start, which the bias of the accelerometer takes up: 0.04; a fit weighs squares

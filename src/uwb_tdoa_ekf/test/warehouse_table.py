@@ -1,17 +1,20 @@
 """The tables of docs/warehouse.md: starts in halls, slow tags, anchors in a plane, a walk of ten minutes.
 
-python src/uwb_tdoa_ekf/test/warehouse_table.py [--starts N] [--seeds N] [--only WORD]
+python src/uwb_tdoa_ekf/test/warehouse_table.py [--starts N] [--seeds N] [--only WORD] [--bound]
 """
 
 import argparse
 
 from driving import drive, state_for
 from flights import position_at
-from halls import HALLS, fly, hall, room
+from halls import DELAY, HALLS, HEIGHT, RATE, fly, hall, room, walk
 import numpy as np
+from scipy.spatial import cKDTree
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.verdicts import STARTUP
+
+LARGE = 0.5  # m
 
 
 def judge(flight, config):
@@ -52,6 +55,35 @@ def after_gaps(flight, found, within=1.0, gap=1.0):
     return out
 
 
+def bound(where, seed, duration=20.0):
+    """(3,) m, root mean square along the path from 10 s on of what delays of the anchors leave open at least, along each axis: they do not average out."""
+    rng = np.random.default_rng([seed, 5])  # as `fly` walks
+    places = walk(where.size, duration, rng, 1.5)[0][int(10.0 * RATE) :: int(0.5 * RATE)]
+    tree, out = cKDTree(where.anchors.positions), []
+    for p in np.column_stack([places, np.full(len(places), HEIGHT)]):
+        towards = where.anchors.positions[tree.query_ball_point(p, where.reach)] - p
+        towards /= np.linalg.norm(towards, axis=1)[:, None]
+        off = towards - towards.mean(axis=0)  # what they have in common is the clock's
+        out.append(np.diag(np.linalg.inv(off.T @ off)) * DELAY**2)
+    return np.sqrt(np.mean(out, axis=0))
+
+
+def say_bounds(starts, word):
+    """A row for each run in a hall whose bound is above LARGE: RMSE; errors, stated deviations and bounds along the axes; NEES."""
+    print("| hall, seed | RMSE | errors | stated | bound | NEES |\n|---|---:|---|---|---|---:|")
+    for name in (name for name in HALLS if word in name):
+        where = hall(name)
+        for seed in (seed for seed in range(starts) if np.linalg.norm(bound(where, seed)) > LARGE):
+            flight = fly(where, seed)
+            found = judge(flight, FilterConfig())
+            late = found["odometry"].t - flight.tdoa.t[0] >= 10.0
+            error = found["odometry"].x[late, :3] - position_at(flight, found["odometry"].t[late])
+            stated = np.diagonal(found["odometry"].covariance[late, :3, :3], axis1=1, axis2=2)
+            each = (np.sqrt(np.mean(error**2, axis=0)), np.sqrt(np.mean(stated, axis=0)), bound(where, seed))
+            columns = " | ".join(", ".join(f"{value:.2f}" for value in values) for values in each)
+            print(f"| {name}, {seed} | {found['rmse']:.2f} | {columns} | {found['nees']:.1f} |", flush=True)
+
+
 def say(name, runs):
     """A row: right within 1 m at 2 s; RMSE, median and largest; NEES, mean and largest; start, largest; TDOAs and stamps spent, most."""
     column = {key: np.array([run[key] for run in runs], float) for key in ("at_2", "rmse", "nees", "start", "spent", "stamps")}
@@ -69,7 +101,11 @@ def main():
     parser.add_argument("--starts", type=int, default=100, metavar="N", help="in each hall (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="of each row in the room (default: %(default)s)")
     parser.add_argument("--only", default="", metavar="WORD", help="rows with this in their name")
+    parser.add_argument("--bound", action="store_true", help="instead: errors along the axes of the runs in halls where no estimate can be good")
     args = parser.parse_args()
+    if args.bound:
+        say_bounds(args.starts, args.only)
+        return
     print("| where | started | right at 2 s | RMSE, m, median | largest | NEES, mean | largest | start, s, latest | TDOAs spent | stamps |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|")
     with_imu, without = FilterConfig(), FilterConfig(use_imu=False)

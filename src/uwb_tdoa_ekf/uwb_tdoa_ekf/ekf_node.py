@@ -140,18 +140,24 @@ class EkfNode(ros.StreamNode):
         return -math.inf if self._estimator is None else self._estimator.next_odometry + self._epoch.begin
 
     def _on_anchors(self, anchors: Anchors) -> None:
+        if self._estimator is not None and self._estimator.stay(anchors):
+            self._estimator.change_anchors(anchors, self._effects.on_floor(anchors))
+            self._watch = self._new_watch(anchors)
+            return
         if self._estimator is not None:
             self._publish(*self._estimator.finish())
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
         self._estimator = Estimator(anchors, self._config, self._reorder, self._lag, self._effects.sensor_functions, self._effects.on_floor(anchors))
         self._imu_corrector = ImuCorrector(self._effects.effects)
-        ignored = [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else []
-        self._watch, self._restarts = StreamWatch(anchors, self._lag, ignored), 0
+        self._watch, self._restarts = self._new_watch(anchors), 0
         self.outputs.set_world(self._world or anchors.frame)
         early, self._early = self._early, deque()
         for stream, part in early:
             self._takers[stream](*part)
         self._advance()
+
+    def _new_watch(self, anchors: Anchors) -> StreamWatch:
+        return StreamWatch(anchors, self._lag, [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else [])
 
     def _on_config(self, config: FilterConfig) -> None:
         self._config = config

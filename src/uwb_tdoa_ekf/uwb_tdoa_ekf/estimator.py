@@ -18,6 +18,7 @@ from .core.height import LONGEST_GAP
 from .core.memory import IMU_SAMPLE, ODOMETRY, POSE, TDOA, YAWS, joined, structured
 from .core.startup import APART
 from .core.verdicts import INVALID
+from .installed import MOST_ROWS, Installed
 from .monitoring.implausible import implausible
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer
@@ -52,7 +53,7 @@ class Estimator:
     ) -> None:  # fmt: skip
         """anchors : Anchors; config : FilterConfig; reorder, lag : s, see ReorderBuffer; functions : SensorFunctions that are known; floor :
         what is known of the anchors at a tag on the floor, see `EffectSet.on_floor`."""
-        self.anchors, self._known = anchors, (functions, floor)
+        self._installed, self._known = Installed(anchors), (functions, floor)
         self.config = config or FilterConfig()
         of_aids = [f"{stream}_{verdict}" for stream in aids.STREAMS for verdict in VERDICTS.values()]
         names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_aids]
@@ -63,10 +64,15 @@ class Estimator:
         self._clear()
 
     def _clear(self) -> None:
-        self._pipeline = Pipeline(self.anchors, self.config, *self._known)
+        self._pipeline = Pipeline(self._installed, self.config, *self._known)
         self._poses: list[np.ndarray] = []  # (1,) of POSE, set and not reached yet
         self._begun = False  # there was a measurement
         self.refused_pose: str | None = None  # sentence on a pose that was set before the first measurement, and is of another time
+
+    @property
+    def anchors(self) -> Anchors:
+        """Anchors that are there."""
+        return self._installed.anchors
 
     @property
     def _ekf(self) -> Record:
@@ -149,8 +155,8 @@ class Estimator:
         """Take corrected TDOAs in the order of their arrival: t (n,) s; a, b (n,) anchor ids; d (n,) m; variance (n,) m^2, of
         what is known beyond tdoa_std; slope, state (n, 6), as of a Correction. Or one: numbers."""
         t, a, b, d = map(np.atleast_1d, (t, a, b, d))
-        rows = structured(TDOA, t, self.anchors.index(a), self.anchors.index(b), d, variance, slope, state)
-        usable = usable_tdoas(rows, self.anchors.positions)
+        rows = structured(TDOA, t, self._installed.index(a), self._installed.index(b), d, variance, slope, state)
+        usable = usable_tdoas(rows, self._installed.positions)
         if not usable.all():
             self._refused.append(Residuals.refused(t[~usable], a[~usable], b[~usable], INVALID))
         self._buffer.add(TDOA_STREAM, rows, usable)
@@ -158,7 +164,7 @@ class Estimator:
     def add(self, name: str, stream: Stream) -> None:
         """Take a Stream of one of the SENSORS, its rows in the order of their arrival."""
         if getattr(self.config, f"use_{name}"):
-            self._add(STREAMS.index(name), *aid_rows(name, stream, self.anchors))
+            self._add(STREAMS.index(name), *aid_rows(name, stream, self._installed))
 
     def _add(self, stream: int, rows: np.ndarray, usable: np.ndarray) -> None:
         self.counts[f"{STREAMS[stream]}_invalid"] += len(usable) - int(usable.sum())
@@ -190,11 +196,24 @@ class Estimator:
         self.config = config
         self._pipeline.configure(config)
 
+    def stay(self, anchors: Anchors) -> bool:
+        """Whether it can go on among other Anchors: some of its own are there still, in the same frame."""
+        stay = self._installed.stay(anchors)
+        return anchors.frame == self.anchors.frame and bool(stay.any()) and len(self._installed) + int(np.sum(~stay)) <= MOST_ROWS
+
+    def change_anchors(self, anchors: Anchors, floor: Floor | None = None) -> None:
+        """Go on among other Anchors: those that are new are used from now on, those that are gone no more, and one that stands elsewhere as a
+        new one. Nothing is forgotten of those that stay. TDOAs that wait are used, as far as their anchors were there when they came. floor : as
+        of the start."""
+        self._known = (self._known[0], floor)
+        self._pipeline.change_anchors(self._installed.change(anchors), *self._known)
+
     def reset(self) -> tuple[Odometry, Residuals]:
         """Use everything that still waits, and forget it: what comes next starts the filter anew. Returns
         (Odometry, Residuals)."""
         out = self.finish()
         self._buffer.clear()
+        self._installed = Installed(self.anchors)  # no row waits any more
         self._start_anew()
         return out
 
@@ -218,7 +237,7 @@ class Estimator:
     def _refuse(self, stream: int, rows: np.ndarray, verdict: int) -> None:
         """Account for rows that will not be used."""
         if stream == TDOA_STREAM:
-            a, b = (self.anchors.ids[rows[side]] for side in "ab")
+            a, b = (self._installed.ids[rows[side]] for side in "ab")
             self._refused.append(Residuals.refused(rows["t"], a, b, verdict))
         else:
             self.counts[f"{STREAMS[stream]}_{VERDICTS[verdict]}"] += len(rows)

@@ -17,6 +17,7 @@ from .core.hypotheses import yaw_offset
 from .core.memory import AID, RESIDUAL, TDOA, joined, structured
 from .core.verdicts import INVALID
 from .frames import rotation_std
+from .installed import Installed
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals
@@ -68,7 +69,7 @@ def run_offline(
     tdoa, anchors = flight.tdoa, flight.anchors
     raw = tdoa.t, anchors.index(tdoa.a), anchors.index(tdoa.b), tdoa.d
     functions, floor = corrector.effects.sensor_functions, corrector.weighed.on_floor(anchors)
-    pipeline = Pipeline(anchors, config, functions, floor, watched=False, records=records)
+    pipeline = Pipeline(Installed(anchors), config, functions, floor, watched=False, records=records)
     buffer, places = loaded(flight, config)
     bias, std = np.zeros((2, len(tdoa)))
     parts: list[Fed] = []

@@ -8,7 +8,8 @@ from typing import NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from .core.engine import feed, set_pose
-from .core.memory import ODOMETRY, RESIDUAL, TDOA, Floor, Measurements, joined, new_state
+from .core.memory import ODOMETRY, RESIDUAL, TDOA, Floor, Measurements, joined
+from .installed import Installed, forget, new_state_of
 from .monitoring.monitor import Monitor
 from .monitoring.slices import LENGTH
 from .results import Odometry, Residuals
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from uwb_tdoa_bias.effects.sensor_function import SensorFunction
-    from uwb_tdoa_bias.foundation.anchors import Anchors
     from .core.config import FilterConfig
     from .reorder_buffer import ReorderBuffer
 
@@ -36,13 +36,13 @@ class Pipeline:
     """Takes what a ReorderBuffer releases. state : FilterState; monitor : Monitor, or None, if nobody asks what has changed."""
 
     def __init__(
-        self, anchors: Anchors, config: FilterConfig, functions: Sequence[SensorFunction] = (),
+        self, anchors: Installed, config: FilterConfig, functions: Sequence[SensorFunction] = (),
         floor: Floor | None = None, watched: bool = True, records: list[np.ndarray] | None = None,
     ) -> None:  # fmt: skip
-        """anchors : Anchors; config : FilterConfig; functions, floor : as of `new_state`; watched : have a Monitor in any case; records : list to
+        """anchors : Installed; config : FilterConfig; functions, floor : as of `new_state`, of the anchors that are there; watched : have a Monitor in any case; records : list to
         which the history is appended (see engine.feed), or None."""
         self._anchors, self._records = anchors, records
-        self.state = new_state(anchors.positions, functions, floor)
+        self.state = new_state_of(anchors, functions, floor)
         self.monitor = Monitor(anchors) if watched or config.compensate_changes else None
         self.configure(config)
 
@@ -51,6 +51,15 @@ class Pipeline:
         self._config, self._parameters = config, config.parameters()
         if not config.compensate_changes:
             self.state.anchors["delay"] = self.state.anchors["delay_variance"] = 0.0
+
+    def change_anchors(self, gone: np.ndarray, functions: Sequence[SensorFunction], floor: Floor | None) -> None:
+        """Go on after a change of the Installed: with what is known of its new rows, and without the rows `gone` (k,)."""
+        more, first = new_state_of(self._anchors, functions, floor), len(self.state.anchors)
+        self.state = self.state._replace(anchors=np.concatenate([self.state.anchors, more.anchors[first:]]))
+        self.state.record.extent[:] = more.record.extent
+        forget(self.state, gone)
+        if self.monitor is not None:
+            self.monitor.forget(gone)
 
     def run(self, buffer: ReorderBuffer, until: float) -> list[Fed]:
         """Use what a ReorderBuffer holds up to `until`, s; where delays are taken out, from the stamps on at which the monitor finds them."""

@@ -10,6 +10,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS, Stream
 from .core.aids import STREAMS
 from .core.memory import AID, IMU_SAMPLE, structured
 from .core.validity import usable_all, usable_imu, usable_slopes
+from .installed import Installed
 
 
 def imu_rows(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -24,7 +25,7 @@ def usable_tdoas(rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
     return usable & usable_slopes(rows["slope"], rows["state"])
 
 
-def aid_rows(name: str, stream: Stream, anchors: Anchors) -> tuple[np.ndarray, np.ndarray]:
+def aid_rows(name: str, stream: Stream, anchors: Anchors | Installed) -> tuple[np.ndarray, np.ndarray]:
     """(n,) of AID, and (n,) bool: usable; of the Stream of a sensor among Anchors."""
     columns, usable = SENSORS[name].measured(stream)
     rows = np.zeros(len(stream), AID)

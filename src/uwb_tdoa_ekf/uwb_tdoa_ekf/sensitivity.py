@@ -21,9 +21,14 @@ from .core.verdicts import USED
 from .offline import Run, run_offline
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from numpy.typing import ArrayLike
+    from scipy.sparse import csr_array
     from uwb_tdoa_bias.correction.corrector import Corrector
     from uwb_tdoa_bias.foundation.flight import Flight
+
+FORGOTTEN = 10.0  # s after which a parameter that no TDOA depends on any more has left the estimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +63,50 @@ class Innovations:
         for records, of in zip(self.records, self.of):
             passed = _through(records, of, regressors, states, out, stamps, passed, positions)
         return out, positions
+
+    def in_blocks(
+        self, regressors: csr_array, block: np.ndarray, stamps: ArrayLike = (), positions: np.ndarray | None = None
+    ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+        """What `by_bias` gives, a block of TDOAs at a time, at the cost of those parameters that matter there: yields (rows, a slice; columns (c,);
+        derivative (rows, c)).
+
+        regressors : sparse, in rows, (n, k); block (n,) int, rising: number of the block of each row. A parameter matters until FORGOTTEN s after
+        the last TDOA that depends on it. positions (m, 3, k) : filled with what `and_positions` gives at stamps (m,).
+        """
+        stamps, t = np.asarray(stamps, dtype=float), self.run.residuals.t[self.rows]
+        ends = np.append(np.flatnonzero(np.diff(block)) + 1, len(block))
+        state, last = np.zeros((ERROR_STATES, regressors.shape[1])), np.full(regressors.shape[1], -np.inf)
+        pieces, passed, first = _pieces(self.records, self.of, ends), 0, 0
+        for end, piece in zip(ends.tolist(), pieces):
+            rows = slice(first, end)
+            last[regressors.indices[regressors.indptr[first] : regressors.indptr[end]]] = t[end - 1]
+            columns = np.flatnonzero(last >= t[first] - FORGOTTEN)
+            states = np.zeros((2, ERROR_STATES, len(columns)))
+            states[0], state[:] = state[:, columns], 0.0
+            known, moved = regressors[rows][:, columns].toarray(), np.zeros((len(stamps), 3, len(columns)))
+            out, before = np.zeros_like(known), passed
+            for records, of in piece:
+                passed = _through(records, np.where(of >= 0, of - first, -1), known, states, out, stamps, passed, moved)
+            state[:, columns] = states[0]
+            if positions is not None and passed > before:
+                positions[before:passed, :, columns] = moved[before:passed]
+            yield rows, columns, out
+            first = end
+
+
+def _pieces(
+    records: Sequence[np.ndarray], of: Sequence[np.ndarray], ends: np.ndarray
+) -> list[list[tuple[np.ndarray, np.ndarray]]]:
+    """[[(records, of)]] of each block of rows, which end before `ends` (b,): whatever comes before the first TDOA of the next block."""
+    out: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in ends]
+    now = 0
+    for some, places in zip(records, of):
+        number = np.maximum.accumulate(np.where(places >= 0, np.searchsorted(ends, places, side="right"), now))
+        for k in np.unique(number):
+            first, last = np.searchsorted(number, [k, k + 1])
+            out[k].append((some[first:last], places[first:last]))
+        now = number[-1] if len(number) else now
+    return out
 
 
 def record_innovations(

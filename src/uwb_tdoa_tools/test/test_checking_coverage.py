@@ -55,6 +55,29 @@ def test_anchors_in_a_plane(axis):
     assert "anchors_flat" in said(positions=flat)
 
 
+@pytest.mark.parametrize(
+    ("axis", "at", "said_of"), [(2, 3.0, "tag_side:=below"), (2, 0.1, "tag_side:=above"), (0, 0.0, "tag_side:=+x or -p tag_side:=-x"), (1, 0.0, "tag_side:=+y")]
+)
+def test_anchors_in_a_plane_across_an_axis_need_a_side(axis, at, said_of):
+    flat = BOX.copy()
+    flat[:, axis] = at + 0.01 * np.arange(8)
+    assert said_of in said(positions=flat)["side_unknown"].remedy
+
+
+def test_of_a_hall_the_side_is_needed_where_those_that_are_heard_have_one_height():
+    hall = np.array([[4.0 * k, 3.0 * (k % 2), 3.0 if k < 12 else 6.0] for k in range(24)])
+    turn = lambda t, a, b: (a // 6 == np.floor(t / 5.0)) & (b // 6 == np.floor(t / 5.0))  # noqa: E731
+    assert "tag_side:=below" in said(positions=hall, heard=turn)["side_unknown"].remedy
+
+
+def test_where_something_measures_the_height_no_side_is_needed():
+    flat = BOX.copy()
+    flat[:, 2] = 3.0
+    anchors = Anchors.from_positions(flat)
+    view = coverage.CoverageView(anchors, windows(anchors, lambda t, a, b: t >= 0.0), PLACES, height_known=True)
+    assert not list(coverage.side(view))
+
+
 def test_anchors_with_z_down():
     assert "survey_z_down" in said(positions=BOX * [1.0, 1.0, -1.0], places=PLACES * [1.0, 1.0, -1.0])
 

@@ -8,10 +8,10 @@ import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
-from uwb_tdoa_ekf.results import Residuals
+from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
-from uwb_tdoa_tools.localizing import belief, residuals
+from uwb_tdoa_tools.localizing import belief, residuals, zones
 from uwb_tdoa_tools.localizing.estimate import Estimator
 from uwb_tdoa_tools.localizing.localize import check_names, name_of
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights
@@ -165,3 +165,38 @@ def test_a_recording_without_an_estimate_has_files_and_a_picture_too(flight, tmp
     assert told["verdict"] == "bad" and told["estimates"] == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(path.rpartition("/")[2] for path in told["files"])
     assert "flight: bad: there is no estimate" in capsys.readouterr().out
+
+
+# --- who is heard where ---
+
+
+def walked(n=600):
+    """(Odometry, Residuals) of a tag that goes from x = 0 to 40 m; anchor k is heard from 10 k to 10 k + 20 m, the last TDOAs are rejected."""
+    t = 0.1 * np.arange(n)
+    p = np.column_stack([40.0 * t / t[-1], np.full(n, 2.0), np.ones(n)])
+    covariance = np.broadcast_to(0.01 * np.eye(9), (n, 9, 9))
+    nothing = np.zeros((n, 3))
+    odometry = Odometry(t, p, nothing, np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), nothing, nothing, covariance, covariance[:, :3, :3])
+    first = np.clip(p[:, 0] // 10.0, 1, 4).astype(int)
+    verdict = np.where(p[:, 0] > 35.0, REJECTED, USED).astype(np.uint8)
+    return odometry, Residuals(t, first, first - 1, np.full(n, 0.05), np.full(n, 0.01), np.ones(n), verdict)
+
+
+def test_zones_say_who_is_heard_where_and_how_well():
+    found = zones.zones_of(*walked(), 10.0)
+    assert [(zone.x, zone.y) for zone in found[:4]] == [(5.0, 5.0), (15.0, 5.0), (25.0, 5.0), (35.0, 5.0)]
+    assert [dict(zone.anchors).keys() for zone in found[1:3]] == [{0, 1}, {1, 2}]
+    for zone in found[:3]:
+        assert zone.heard == 2.0 and zone.used == 1.0 and zone.left == pytest.approx(1.4826 * 0.05) and zone.std == pytest.approx(np.sqrt(0.03))
+        assert zone.seconds == pytest.approx(15.0, abs=0.2) and zone.tdoas_per_s == pytest.approx(10.0, rel=0.05)
+    assert found[3].used == pytest.approx(0.5, abs=0.05)
+    assert zones.zones_of(*(part for part in (walked()[0], Residuals(*(np.empty(0) for _ in range(7))))), 10.0) == []
+
+
+def test_zones_are_written_as_a_table_and_a_map(bags, tmp_path, capsys):
+    run([bags / "none" / "flight.bag", "--zones", "2", "--out", tmp_path])
+    lines = (tmp_path / "flight_zones.csv").read_text().splitlines()
+    assert lines[0] == ",".join(zones.COLUMNS) and len(lines) > 3 and all(len(line.split(",")) == len(zones.COLUMNS) for line in lines)
+    assert (tmp_path / "flight_zones.png").stat().st_size > 10_000
+    run([bags / "none" / "flight.bag", "--zones", "0", "--out", tmp_path], 2)
+    assert "--zones: 0 m is no size" in capsys.readouterr().err

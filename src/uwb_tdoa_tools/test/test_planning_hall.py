@@ -67,6 +67,15 @@ def test_the_command_writes_a_picture_and_says_who_hears_how_many(tmp_path, caps
     assert json.loads((tmp_path / "out" / "plan.json").read_text())["map"]["heard"]
 
 
+def test_a_hall_whose_anchors_all_hang_at_one_height_needs_a_side(tmp_path, capsys):
+    anchors = anchors_of(6, 5)
+    flat = anchors.at(np.column_stack([anchors.positions[:, :2], np.full(len(anchors), 5.0)]))
+    points = Grid.slice((4.0, 36.0), (4.0, 28.0), 1.2, 8.0).points
+    found = Hall(hall_of(anchors).goal, flat, REACH).side(points)
+    assert found["tag_side"] == ["below"] and found["share"] > 0.9
+    assert hall_of(anchors).side(points) is None
+
+
 def test_what_a_hall_does_not_have_is_refused(tmp_path, capsys):
     anchors_of(6, 5).to_yaml(tmp_path / "hall.yaml")
     command = [str(tmp_path / "hall.yaml"), "--radio-reach", "15", "--out", str(tmp_path / "out")]

@@ -80,6 +80,10 @@ class Corrector:
         self._first = math.nan  # stamp of the first TDOA, once there is one
         self._last: tuple[float, int] | None = None  # stamp and later anchor of the last one
 
+    def change_anchors(self, anchors: Anchors) -> None:
+        """Go on among other Anchors, with the poses that are known."""
+        self.anchors, self._latest, self._last = anchors, None, None
+
     @property
     def idle(self) -> bool:
         """True if there is nothing to correct with."""

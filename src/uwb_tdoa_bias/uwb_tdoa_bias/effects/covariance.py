@@ -30,14 +30,22 @@ class Covariance:
         rows = [known[keys[place]] for place in places]
         return np.array(places, dtype=int), self.matrix[np.ix_(rows, rows)]
 
+    def of_each_anchor(self) -> Covariance:
+        """What it says of the parameters of each anchor together, anchor by anchor; nothing of what different ones have in common."""
+        anchors = np.array([key[1].partition(".")[0] for key in self.keys])
+        order = np.argsort(np.unique(anchors, return_inverse=True)[1], kind="stable")
+        matrix = np.where(anchors[:, None] == anchors, self.matrix, 0.0)[np.ix_(order, order)]
+        return Covariance(tuple(self.keys[place] for place in order), matrix)
+
     def without(self, anchors: Collection[str]) -> Covariance:
         """The Covariance of what is not of anchors with these ids (text)."""
         kept = [key for key in self.keys if key[1].partition(".")[0] not in anchors]
         return Covariance(tuple(kept), self.of(kept)[1])
 
     def as_dict(self) -> dict[str, list[str] | list[list[float]]]:
-        """For YAML: the lower triangle, row by row."""
-        rows = [[float(f"{value:.6g}") for value in row[: k + 1]] for k, row in enumerate(self.matrix)]
+        """For YAML: the lower triangle, row by row, without the zeros that a row begins with."""
+        first = [min(int(np.argmax(row != 0.0)), k) for k, row in enumerate(self.matrix)]
+        rows = [[float(f"{value:.6g}") for value in row[begin : k + 1]] for k, (row, begin) in enumerate(zip(self.matrix, first))]
         return {"parameters": [f"{name} {key}" for name, key in self.keys], "matrix": rows}
 
     @classmethod
@@ -56,9 +64,9 @@ class Covariance:
         matrix = np.zeros((len(keys), len(keys)))
         for k, row in enumerate(rows):
             numeric = isinstance(row, list) and all(isinstance(value, (int, float)) for value in row)
-            if not numeric or len(row) != k + 1:
-                raise InputError(f"{where}: covariance: row {k + 1} must be {k + 1} numbers.")
-            matrix[k, : k + 1] = matrix[: k + 1, k] = row
+            if not numeric or not 1 <= len(row) <= k + 1:
+                raise InputError(f"{where}: covariance: row {k + 1} must be {k + 1} numbers, or fewer: those before it are 0.")
+            matrix[k, k + 1 - len(row) : k + 1] = matrix[k + 1 - len(row) : k + 1, k] = row
         scale = np.sqrt(np.diag(matrix).clip(min=1e-300))
         if not np.isfinite(matrix).all() or (len(keys) and np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] < -1e-3):
             raise InputError(f"{where}: covariance: the matrix is none; it must be finite and positive semidefinite.")

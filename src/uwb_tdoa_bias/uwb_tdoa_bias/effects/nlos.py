@@ -48,7 +48,7 @@ class Nlos(ArrivalEffect):
 
     @classmethod
     def bound_of(cls, key: str) -> float:
-        return 1e6 if key.endswith(("start", "end")) else cls.bound
+        return 1e6 if key.endswith(("start", "end", ".x", ".y", ".z")) else cls.bound
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
+MOST_NAMED = 10  # anchors that a sentence names
 ANY_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # gets from every publisher what is repeated
 ANCHORS_FILE = Parameter(
     "", 'survey of the anchors, as the tools read it (YAML, CSV, total station); "" for those of uwb/anchors'
@@ -49,6 +50,17 @@ def same_anchors(one: Anchors, other: Anchors) -> bool:
         and np.array_equal(one.positions, other.positions)
         and np.array_equal(one.orientations, other.orientations, equal_nan=True)
     )
+
+
+def in_words(before: Anchors, after: Anchors) -> str:
+    """What has changed between two Anchors: which are new, gone, or elsewhere, and what that means."""
+    if before.frame != after.frame:
+        return f"they are in frame '{after.frame}', and were in '{before.frame}': starting over"
+    places = before.index(after.ids)
+    stay = (places >= 0) & (before.positions[places] == after.positions).all(axis=1)
+    named = {"new": after.ids[places < 0], "gone": before.ids[after.index(before.ids) < 0], "elsewhere": after.ids[(places >= 0) & ~stay]}
+    parts = [f"{word}: {', '.join(map(str, ids[:MOST_NAMED]))}{', ...' if len(ids) > MOST_NAMED else ''}" for word, ids in named.items() if len(ids)]
+    return "; ".join([*parts, f"going on with the {stay.sum()} that stay" if stay.any() else "starting over"])
 
 
 class AnchorsInput:
@@ -103,6 +115,6 @@ class AnchorsInput:
         if self.anchors is not None:
             if same_anchors(anchors, self.anchors):
                 return
-            self._node.get_logger().warning("the anchors have changed: starting over")
+            self._node.get_logger().warning(f"the anchors have changed: {in_words(self.anchors, anchors)}")
         self.anchors = anchors
         self._on_change(anchors)

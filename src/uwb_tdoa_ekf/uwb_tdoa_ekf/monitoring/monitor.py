@@ -22,6 +22,7 @@ from .swap import swapped
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
+    from ..installed import Installed
     from ..results import Odometry, Residuals
     from .change import Change
 
@@ -57,13 +58,14 @@ class Heard(NamedTuple):
 class Monitor:
     """Feed it odometry and residuals, say until which stamp they are complete, ask for `alarms` and `delays`."""
 
-    def __init__(self, anchors: Anchors) -> None:
-        """anchors : Anchors."""
+    def __init__(self, anchors: Anchors | Installed) -> None:
+        """anchors : Anchors, or Installed, of which others may be there later."""
         self._anchors = anchors
         self._forget()
 
     def _forget(self) -> None:
-        self._odometry, self._residuals = [NO_ODOMETRY], [NO_RESIDUALS]  # of the present slice and later
+        self._odometry: list[list[np.ndarray]] = [NO_ODOMETRY]  # of the present slice and later
+        self._residuals: list[list[np.ndarray]] = [NO_RESIDUALS]
         self._end: float | None = None  # s, stamps: at which the present slice ends,
         self._last = -math.inf  # and of what was added last
         self._detector = ChangeDetector()
@@ -80,6 +82,19 @@ class Monitor:
         self._bias: np.ndarray | None = None
         self._bias_now: np.ndarray | None = None  # (6,): gyroscope, accelerometer; as calibrated, and the latest
         self._bias_calibration: list[np.ndarray] = []
+
+    def forget(self, gone: np.ndarray) -> None:
+        """Anchors, by their rows (k,), are not there any more: nothing is said of them, nor what their last TDOAs show used."""
+        rows, ids = set(gone.tolist()), self._anchors.ids[gone]
+        kept = [~(np.isin(part[1], ids) | np.isin(part[2], ids)) for part in self._residuals]
+        self._residuals = [[column[some] for column in part] for part, some in zip(self._residuals, kept)]
+        self._heard = {row: was for row, was in self._heard.items() if row not in rows}
+        self._changes = {row: found for row, found in self._changes.items() if row not in rows}
+        self._silent = tuple(row for row in self._silent if row not in rows)
+        if self._latest_change is not None and self._latest_change.row in rows:
+            self._latest_change = None
+        if rows & {*self._swapped, *self._instead[0]}:
+            self._swapped, self._instead, self._latest = (), ((), 0), []
 
     @property
     def end(self) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding
 
+from .sides import sides_of, to_copy
 from .survey_fit import SPREAD, spread
 
 if TYPE_CHECKING:
@@ -21,16 +22,19 @@ SILENT = 5.0  # s for which an anchor that is heard otherwise is not
 FLAT = 0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
 OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the box of the anchors
 SHORT = 10.0  # s
+FEWEST = 3  # anchors that tell no plane
+PART = 0.2  # of the seconds in which the side is not told, beyond which that is said
 
 
 @dataclass(frozen=True)
 class CoverageView:
     """anchors : Anchors; windows : [TdoaWindow]; places (k, 3) m, where the tag was located, none if that was not
-    tried."""
+    tried; height_known : whether something measures its height."""
 
     anchors: Anchors
     windows: list[TdoaWindow]
     places: np.ndarray
+    height_known: bool = False
 
 
 def missing(view: CoverageView) -> Iterator[Finding]:
@@ -88,6 +92,21 @@ def flat(view: CoverageView) -> Iterator[Finding]:
         )
 
 
+def side(view: CoverageView) -> Iterator[Finding]:
+    """Anchors in a plane across an axis of the world, all or those that are heard at once: the side of it that the tag is on must be told."""
+    heard = [view.anchors.positions[window.heard > 0] for window in view.windows]
+    sides = [sides_of(positions) for positions in heard or [view.anchors.positions] if len(positions) > FEWEST]
+    needed = [one for one in sides if one]
+    if len(needed) <= PART * len(sides):
+        return
+    most = max(sorted(set(needed)), key=needed.count)
+    if view.height_known and most[0] in ("below", "above"):
+        return
+    evidence = f"in {100.0 * len(needed) / len(sides):.0f} % of the seconds those that are heard have one {'height' if len(most) == 1 else most[0][1:]}"
+    remedy = to_copy(most)
+    yield Finding("side_unknown", WARNING, "TDOAs do not tell on which side of its anchors the tag is", evidence, remedy, len(needed) / len(sides))
+
+
 def below(view: CoverageView) -> Iterator[Finding]:
     """Everything below zero: z down."""
     z = view.anchors.positions[:, 2]
@@ -141,4 +160,4 @@ def still(view: CoverageView) -> Iterator[Finding]:
         )
 
 
-RULES = (missing, flat, below, outside, still)
+RULES = (missing, flat, side, below, outside, still)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
 
 AIRBORNE = 0.3  # m
+MANY = 64  # anchors, beyond which a tag hears a small part of them: a hall, most of which has nothing to do with any of them
 FEWEST = 40  # TDOAs of a pair in the air, of which something is said
 
 

@@ -13,9 +13,10 @@ import numpy as np
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
+from .known_path import MANY
+
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from numpy.typing import ArrayLike
+    from collections.abc import Iterator, Sequence
     from .known_path import KnownPath
 
     Fault = tuple[str, str, str, float]  # what the pair does, evidence, remedy, and the number that decided
@@ -28,6 +29,7 @@ BETWEEN = 0.2  # share of TDOAs on the line between their neighbours; healthy 0.
 REPEATED, FROZEN = 0.2, 8  # share of TDOAs that equal the one before, healthy 0.06; how many together with one value, healthy 5
 AT_END, HITS = 0.04, 5  # share of TDOAs at the largest or smallest value, healthy 0.03, and how many
 MOST = 0.5  # share of the pairs with the same fault, from which on it is one of all
+OFF = 3.0  # times the median error of most anchors, of one that may be exchanged with another
 EXCHANGES = 4  # pairs of anchors that are exchanged one after the other
 
 
@@ -145,9 +147,13 @@ def renamed(path: KnownPath) -> tuple[dict[int, int], float, float]:
     rows = np.arange(len(path.ids))
     table: dict[int, int] = {}
     errors: tuple[float, ...] = (0.0, 0.0)
+    doubtful: np.ndarray = rows
+    if len(rows) > MANY:  # only what is called by another's name is far off
+        each = np.array([_median_errors(path, [row], rows)[0] for row in rows.tolist()])
+        doubtful = np.flatnonzero(np.isfinite(each) & (each > OFF * np.median(each[np.isfinite(each)])))
     for _ in range(EXCHANGES):
         best = None
-        for one, two in combinations(range(len(rows)), 2):
+        for one, two in combinations(doubtful.tolist(), 2):
             trial = rows.copy()
             trial[[one, two]] = trial[[two, one]]
             before, after = _median_errors(path, (one, two), rows, trial)
@@ -163,11 +169,13 @@ def renamed(path: KnownPath) -> tuple[dict[int, int], float, float]:
     return table, before, after
 
 
-def _median_errors(path: KnownPath, anchors: ArrayLike, *tables: np.ndarray) -> tuple[float, ...]:
+def _median_errors(path: KnownPath, anchors: Sequence[int] | np.ndarray, *tables: np.ndarray) -> tuple[float, ...]:
     """Median |error| m of the TDOAs in the air with some anchors (rows), under each table of the rows of the anchors."""
     samples, flown = path.samples, path.flown
     a, b = samples.a[flown], samples.b[flown]
-    with_them = np.isin(a, anchors) | np.isin(b, anchors)
+    named = np.zeros(len(path.ids), bool)
+    named[list(anchors)] = True
+    with_them = named[a] | named[b]
     if with_them.sum() < 40:
         return tuple(np.inf for _ in tables)
     a, b, d, p = a[with_them], b[with_them], path.d[flown][with_them], samples.p[flown][with_them]

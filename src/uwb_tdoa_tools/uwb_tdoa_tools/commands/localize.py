@@ -6,6 +6,8 @@ from functools import partial
 import sys
 from typing import TYPE_CHECKING
 
+from uwb_tdoa_bias.foundation.errors import InputError
+
 from .. import cli, options, parallel
 from ..localizing.localize import Localizer, all_good, check_names
 
@@ -17,7 +19,8 @@ DESCRIPTION = """Where the tag was: trajectories of recordings, without ground t
 
 Runs bias correction and filter as the nodes would, or smooths. Writes for each recording to --out: NAME.tum (for evo), NAME.csv (with
 velocities and standard deviations) and NAME.png (from above, from the side, over time, with three standard deviations); with --bag
-NAME.bag (nav_msgs/Odometry), with --residuals what is left of each TDOA, as a table and as a picture per pair of anchors.
+NAME.bag (nav_msgs/Odometry), with --residuals what is left of each TDOA, as a table and as a picture per pair of anchors; with --zones which anchors were heard where, and how
+well: a table and a map.
 
 It says how far each trajectory is to be believed, and what would make it better. good: the position is within what is stated for 95 %
 of the time; doubtful: the filter was lost, or began anew, or many TDOAs speak against it; bad: check finds an error, or there is none.
@@ -40,12 +43,14 @@ def parser() -> ArgumentParser:
         "localize flights/ --survey calibrated/anchors.yaml --effects calibrated/effects.yaml --config calibrated/ekf_node.yaml --out out/",
         "localize flight.bag --bag --json located.json --out out/",
         "localize flight.bag --rerun flight.rrd --out out/",
+        "localize hall.bag --zones 20 --out out/",
     )
     options.add_recordings(made)
     options.add_estimator(made)
     add = made.add_argument
     add("--bag", action="store_true", help="write the odometry as a bag, too")
     add("--residuals", action="store_true", help="write what is left of each TDOA, too: a table, and a picture")
+    add("--zones", metavar="M", type=float, help="write who is heard in squares of that size, and how well, too: a table, and a map")
     options.add_rerun(made)
     add("--json", metavar="FILE", help="write all figures")
     parallel.add_options(made)
@@ -56,6 +61,8 @@ def parser() -> ArgumentParser:
 def _localize(args: Namespace) -> int:
     out = cli.output_folder(args.out)
     cli.check_folders(args.json)
+    if args.zones is not None and not args.zones > 0.0:
+        raise InputError(f"--zones: {args.zones:g} m is no size of a square; give one above 0, e.g. 20.")
     say = partial(cli.say, "localize")
     estimator = options.estimator_of(args, say)
     reading = options.reading_of(args, truth=False)
@@ -64,7 +71,7 @@ def _localize(args: Namespace) -> int:
     rerun = options.rerun_of(args, len(found), say)
     out.mkdir(parents=True, exist_ok=True)
     cli.show(f"correcting with: {estimator.correction}")
-    localizer, located = Localizer(reading, estimator, out.absolute() if args.dask else out, args.bag, args.residuals, rerun), []
+    localizer, located = Localizer(reading, estimator, out.absolute() if args.dask else out, args.bag, args.residuals, rerun, args.zones), []
     for one in parallel.over(localizer, found, args.jobs, args.dask):
         located.append(one)
         first, *others = one.belief.sentences()

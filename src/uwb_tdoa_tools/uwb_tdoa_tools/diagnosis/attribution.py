@@ -14,6 +14,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 
 from ..parallel import in_one_thread
 from .channels import CHANNELS, residuals
+from .channels.views import MOST_LINKS
 from .detectors import DETECTORS
 from .deviations import with_deviations
 from .domains import Seen
@@ -244,18 +245,19 @@ def _search(detectors: Sequence[Detector], table: Table, model: Fit, chosen: Seq
 
 
 def _installation(flights: Sequence[Flight]) -> tuple[Anchors, np.ndarray]:
-    """(Anchors with every id of the flights, each at the first of its places; (m, 2) ids of the pairs that were heard, the
+    """(Anchors with every id that the flights have heard, each at the first of its places; (m, 2) ids of the MOST_LINKS pairs that were heard most, the
     most frequent first)."""
     several = [flight.anchors for flight in flights]
     ids, positions, orientations = (
         np.concatenate([getattr(anchors, name) for anchors in several]) for name in ("ids", "positions", "orientations")
     )
-    first = np.unique(ids, return_index=True)[1]
-    anchors = Anchors(ids[first], positions[first], orientations[first], several[0].frame)
     heard = np.concatenate([np.column_stack([flight.tdoa.a, flight.tdoa.b]) for flight in flights])
     heard = heard[np.isin(heard, ids).all(axis=1) & (heard[:, 0] != heard[:, 1])]
     pairs, count = np.unique(heard, axis=0, return_counts=True)
-    return anchors, pairs[np.argsort(-count, kind="stable")]
+    first = np.unique(ids, return_index=True)[1]
+    first = first[np.isin(ids[first], heard)] if len(heard) else first
+    anchors = Anchors(ids[first], positions[first], orientations[first], several[0].frame)
+    return anchors, pairs[np.argsort(-count, kind="stable")[:MOST_LINKS]]
 
 
 def _declared(
@@ -311,7 +313,7 @@ def _is_large(candidate: Candidate, selection: Selection) -> bool:
 
 def _inflation(table: Table, declared: Sequence[Candidate], search: Search) -> np.ndarray:
     """(groups,) loss of independence, on the residual of a fit with all that is declared, and with what `search`, as of `select`, finds."""
-    known, model = list(declared), fit(table, columns_of(declared))
+    known, model = list(declared), fit(table, columns_of(declared), covariance=False)
     for _ in range(DISGUISED):
         alike = replace(model, inflation=np.ones_like(model.inflation))
         found = search(table, alike, known)
@@ -319,7 +321,7 @@ def _inflation(table: Table, declared: Sequence[Candidate], search: Search) -> n
             break
         known += found
         table = table.with_terms([term for candidate in found for term in candidate.terms])
-        model = fit(table, columns_of(known))
+        model = fit(table, columns_of(known), covariance=False)
     return model.inflation
 
 

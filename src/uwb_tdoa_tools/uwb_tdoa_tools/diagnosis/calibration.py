@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import Covariance, EffectSet
+from uwb_tdoa_bias.effects import EffectSet
 
 from .prior import DELAY, POSITION
 from .regression.fit import MIN_BLOCKS, fit
 from .regression.select import Selection
 from .regression.table import BLOCK, table_of
 from .regression.terms import columns_of
-from .self_survey import FEWEST, survey
+from .self_survey import FEWEST, survey, to_keep
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ..parallel import MapFunction
     from .attribution import Attribution
     from .constraints import Constraint
-    from .regression.table import Table
     from .self_survey import Change
 
 CALIBRATED = POSITION, DELAY
@@ -82,7 +81,7 @@ def calibrate(
     whole = {candidate.name: candidate for candidate in reversed(candidates)}  # the first of an effect is all of it
     chosen = tuple(whole[name] for name in CALIBRATED)
     table = table_of(attribution.residuals).with_terms([term for candidate in candidates for term in candidate.terms])
-    table = _rows(table, (table.channel == table.channels.index("tdoa")) & (table.count >= FEWEST))
+    table = table.rows((table.channel == table.channels.index("tdoa")) & (table.count >= FEWEST))
     anchors = flights[0].anchors
     found = survey(flights, np.full((len(anchors), 3), POSITION_STD), base, config, constraints, progress, map_function)
     columns = columns_of(chosen)
@@ -125,11 +124,4 @@ def merged(base: EffectSet, found: Sequence[Effect], selection: Selection) -> Ef
         return EffectSet(tuple(effects), base.covariance)
     places = [selection.fit.columns.index(column) for column in columns]
     keys = tuple((str(column.effect[0]), column.key) for column in columns)
-    return EffectSet(tuple(effects), Covariance(keys, selection.fit.cov[np.ix_(places, places)]))
-
-
-def _rows(table: Table, chosen: np.ndarray) -> Table:
-    """Table of some rows, (n,) bool, with the columns that it has."""
-    each = ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
-    arrays = {name: getattr(table, name)[chosen] for name in each}
-    return replace(table, **arrays, columns={column: values[chosen] for column, values in table.columns.items()})
+    return EffectSet(tuple(effects), to_keep(keys, selection.fit.cov[np.ix_(places, places)]))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .prior import DELAY, FUNCTION_STDS, POSITION, eliminated, posterior
+from .regression.algebra import beside_each_other, counts, each_times, product, weighted
 from .regression.fit import prior_sizes
 from .self_survey import features
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from .regression.fit import Fit
     from .regression.select import Selection
     from .regression.table import Table
+    from .regression.terms import Column
 
 LENGTH = 4.0  # m over which functions of the place change; the shift of an anchor makes errors that change as slowly
 UNSAID = 0.03  # m, that coordinates and delays may be off by, of which no anchor has any in the fit
@@ -46,20 +48,39 @@ def with_deviations(selection: Selection) -> Selection:
 
 def _beside_others(table: Table, model: Fit) -> tuple[np.ndarray, np.ndarray]:
     """(values (k,), standard deviations (k,)) of the columns of a Fit, with what can take the place of anchors integrated out."""
-    rows, known = table.rows_of("tdoa"), {column.effect for column in model.columns}
-    others = [column for column in table.columns if column.effect in ((POSITION,), (DELAY,)) and column not in model.columns]
+    rows, known, near = table.rows_of("tdoa"), {column.effect for column in model.columns}, _heard_with(table, model)
+    mine = table.matrix(model.columns, rows)
+    beside = [column for column in table.columns if column.effect in ((POSITION,), (DELAY,)) and _anchor(column) in near]
+    others = [column for column in beside if column not in model.columns]
     sizes = [column.typical if column.effect in known else UNSAID for column in others]
-    late = table.matrix([column for column in table.columns if column.effect == (DELAY,)], rows)
-    functions = (late[:, :, None] * features(table.place[rows], LENGTH)[:, None, :]).reshape(len(late), -1)
+    late = table.matrix([column for column in beside if column.effect == (DELAY,)], rows)
+    if table.sparse:  # other rows have nothing to do with these anchors
+        inside = np.flatnonzero(counts(late, 1) == 2)
+        rows, late, mine = rows.start + inside, late[inside], mine[inside]
+    functions = each_times(late, features(table.place[rows], LENGTH))
     lasting = 1.0 + LASTING * (model.inflation[table.group[rows]] - 1.0)
     weight = model.information(table)[rows] * (model.inflation[table.group[rows]] / lasting)
-    mine = table.matrix(model.columns, rows)
-    x = np.concatenate([mine, table.matrix(others, rows), functions], axis=1)
-    gram, vector, n = (x * weight[:, None]).T @ x, x.T @ (weight * table.y[rows]), mine.shape[1]
+    x = beside_each_other([mine, table.matrix(others, rows), functions])
+    gram, vector, n = product(weighted(x, weight), x), x.T @ (weight * table.y[rows]), mine.shape[1]
     prior = np.diag(prior_sizes(model.columns) ** 2.0)
 
-    def beside(size: float) -> Solution:
+    def solution(size: float) -> Solution:
         return posterior(*eliminated(gram, vector, n, np.append(sizes, np.full(functions.shape[1], size))), prior, np.zeros(n))
 
-    best = max(map(beside, FUNCTION_STDS), key=lambda one: one.evidence)
+    best = max(map(solution, FUNCTION_STDS), key=lambda one: one.evidence)
     return best.step, np.sqrt(np.diag(best.covariance))
+
+
+def _anchor(column: Column) -> str:
+    """Id of the anchor that a Column of a position or a delay is of: text."""
+    return column.key.partition(".")[0]
+
+
+def _heard_with(table: Table, model: Fit) -> set[str]:
+    """Ids of the anchors whose positions or delays a Fit tells, and of all that are heard in the same blocks as any of them: set of texts."""
+    known, rows = {_anchor(column) for column in model.columns if column.effect[0] in OF_ANCHORS}, table.rows_of("tdoa")
+    part = table.tdoa_parts[0]
+    ends, block = np.stack(part.arrivals(table.series[rows])), table.block[rows]
+    names = part.samples.anchors.ids.astype(str)
+    mine = np.isin(names, list(known))[ends].any(axis=0)
+    return known | set(names[np.unique(ends[:, np.isin(block, block[mine])])].tolist())

@@ -8,13 +8,16 @@ flights ODDS times less probable than larger ones, because delays take what noth
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import solve_triangular
+
+from ..checking.known_path import MANY
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
     from numpy.typing import ArrayLike
     from uwb_tdoa_bias.effects import Covariance
     from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -60,17 +63,19 @@ class Prior:
         return np.concatenate([std[: 3 * n], np.full(n, LOOSE)])
 
     def changes(self) -> dict[ChangeKey, tuple[np.ndarray, float]]:
-        """{(what, number of an anchor): (places, m, standard deviation)} of what may have changed."""
+        """{(what, number of an anchor): (places, m, standard deviation)} of what may have changed; of MANY anchors without a calibration too:
+        among so many there is one that does not stand where the tape says."""
         n, out = len(self.ids), {}
+        anything = n > MANY and not self.told.any()
         for k in range(n):
             for what, places, std in ((POSITION, np.arange(3 * k, 3 * k + 3), MOVED), (DELAY, np.array([3 * n + k]), LATER)):
-                if self.told[places].all():
+                if anything or self.told[places].all():
                     out[what, k] = places, std
         return out
 
-    def with_changes(self, changes: Iterable[tuple[np.ndarray, float]]) -> np.ndarray:
-        """(4N, 4N) m^2, the covariance after some of `changes`."""
-        out = self.covariance.copy()
+    def with_changes(self, changes: Iterable[tuple[np.ndarray, float]], covariance: np.ndarray | None = None) -> np.ndarray:
+        """(4N, 4N) m^2, the covariance, or another one, after some of `changes`."""
+        out = (self.covariance if covariance is None else covariance).copy()
         for places, std in changes:
             out[places, places] += std**2
         return out
@@ -107,40 +112,57 @@ def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray
     gram (k, k), vector (k,) : the first 4N columns those of a Prior, the others functions; offset (4N,) m: where the equations
     were made, from the mean of the prior.
     """
-    parts = [(eliminated(gram, vector, len(offset), std), std) for std in FUNCTION_STDS]
+    parts = _parts(gram, vector, prior, offset)
 
-    def best(covariance: np.ndarray) -> Solution:
-        return max((posterior(*part, covariance, offset, std) for part, std in parts), key=lambda one: one.evidence)
+    def best(covariance: np.ndarray) -> tuple[float, int]:
+        """(evidence, number of the part) with the largest evidence."""
+        known = np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]
+        return max((_evidence(*part[:3], *known, offset), k) for k, part in enumerate(parts))
 
+    covariance, delay_std = prior.covariance, DELAY_STD
     if not prior.told.any():
-        trials = [(best(prior.with_delays(std)), std) for std in DELAY_STDS]
-        enough = max(found.evidence for found, _ in trials) - np.log(ODDS)
-        found, std = next(trial for trial in trials if trial[0].evidence >= enough)
-        return Solution(found.evidence, found.step, found.covariance, found.function_std, std)
-    found, possible = best(prior.covariance), prior.changes()
+        evidences = [best(prior.with_delays(std))[0] for std in DELAY_STDS]
+        delay_std = next(std for std, evidence in zip(DELAY_STDS, evidences) if evidence >= max(evidences) - np.log(ODDS))
+        covariance = prior.with_delays(delay_std)
+    evidence, number = best(covariance)
+    possible = prior.changes()
     changed: dict[ChangeKey, list[ChangeKey]] = {}
     while len(changed) < len(possible):
-        known = [possible[key] for key in changed]
-        left = {key: change for key, change in possible.items() if key not in changed}
-        changing = {key: best(prior.with_changes([*known, change])) for key, change in left.items()}
-        key = max(changing, key=lambda key: changing[key].evidence)
-        if changing[key].evidence < found.evidence + np.log(ODDS):
+        trials = _with_each_change(parts, covariance, offset, {key: possible[key] for key in possible if key not in changed})
+        key = max(trials, key=trials.__getitem__)
+        if trials[key] < evidence + np.log(ODDS):
             break
-        found, doubt = changing[key], changing[key].evidence - np.log(ODDS)
-        rivals = [other for other in changing if other[1] == key[1] and other != key]
-        changed[key] = [other for other in rivals if changing[other].evidence > doubt]
-    return Solution(found.evidence, found.step, found.covariance, found.function_std, changed=changed)
+        doubt = trials[key] - np.log(ODDS)
+        changed[key] = [other for other in trials if other[1] == key[1] and other != key and trials[other] > doubt]
+        covariance = prior.with_changes([possible[one] for one in changed], covariance=None if prior.told.any() else prior.with_delays(delay_std))
+        evidence, number = best(covariance)
+    found = posterior(*parts[number][:3], covariance, offset, parts[number][3])
+    return replace(found, delay_std=delay_std, changed=changed)
+
+
+def _parts(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float, float]]:
+    """[(what `eliminated` leaves, standard deviation of functions)], for each of FUNCTION_STDS; of MANY anchors, where each takes seconds, only
+    up to those that make the flights ODDS times less probable than smaller ones."""
+    out, evidences = [], []
+    known = np.linalg.inv(prior.covariance), np.linalg.slogdet(prior.covariance)[1]
+    for std in FUNCTION_STDS:
+        out.append((*eliminated(gram, vector, len(offset), std), std))
+        evidences.append(_evidence(*out[-1][:3], *known, offset))
+        if len(prior.ids) > MANY and evidences[-1] < max(evidences) - np.log(ODDS):
+            break
+    return out
 
 
 def eliminated(gram: np.ndarray, vector: np.ndarray, n: int, sizes: ArrayLike) -> tuple[np.ndarray, np.ndarray, float]:
     """(gram (n, n), vector (n,), logarithm of the evidence of the rest): normal equations with what comes after the first n unknowns
     integrated out, whose standard deviations are `sizes`, a number or one for each."""
-    cross = gram[:n, n:]
-    sizes = np.broadcast_to(sizes, len(gram) - n)
-    rest = gram[n:, n:] + np.diag(sizes**-2.0)
-    solved = np.linalg.solve(rest, np.column_stack([cross.T, vector[n:]]))
-    evidence = vector[n:] @ solved[:, -1] - np.linalg.slogdet(rest)[1] - 2.0 * np.sum(np.log(sizes))
-    return gram[:n, :n] - cross @ solved[:, :-1], vector[:n] - cross @ solved[:, -1], 0.5 * evidence
+    told = n + np.flatnonzero(np.diagonal(gram)[n:] > 0.0)  # the others add nothing
+    sizes, cross = np.broadcast_to(sizes, len(gram) - n)[told - n], gram[:n, told]
+    root = np.linalg.cholesky(gram[np.ix_(told, told)] + np.diag(sizes**-2.0))
+    solved = solve_triangular(root, np.column_stack([cross.T, vector[told]]), lower=True, check_finite=False)
+    evidence = solved[:, -1] @ solved[:, -1] - 2.0 * np.sum(np.log(np.diagonal(root))) - 2.0 * np.sum(np.log(sizes))
+    less = solved[:, :-1].T @ solved
+    return gram[:n, :n] - less[:, :-1], vector[:n] - less[:, -1], 0.5 * evidence
 
 
 def posterior(
@@ -149,7 +171,33 @@ def posterior(
     """Solution of what `eliminated` leaves, with a prior of some covariance whose mean is `offset` before the equations; std : of what
     was integrated out, for the Solution."""
     prior = np.linalg.inv(covariance)
-    right, information = vector - prior @ offset, gram + prior
-    step = np.linalg.solve(information, right)
-    evidence += 0.5 * (right @ step - np.linalg.slogdet(information)[1] - np.linalg.slogdet(covariance)[1] - offset @ prior @ offset)
-    return Solution(evidence, step, np.linalg.inv(information), std)
+    inverse = np.linalg.inv(gram + prior)
+    evidence = _evidence(gram, vector, evidence, prior, np.linalg.slogdet(covariance)[1], offset)
+    return Solution(evidence, inverse @ (vector - prior @ offset), inverse, std)
+
+
+def _evidence(
+    gram: np.ndarray, vector: np.ndarray, evidence: float, prior: np.ndarray, size: float, offset: np.ndarray
+) -> float:
+    """Logarithm of the evidence of a `posterior`, whose prior has the inverse covariance `prior` and the logarithm of its determinant `size`."""
+    right, root = vector - prior @ offset, np.linalg.cholesky(gram + prior)
+    solved = solve_triangular(root, right, lower=True, check_finite=False)
+    return evidence + 0.5 * (solved @ solved - 2.0 * np.sum(np.log(np.diagonal(root))) - size - offset @ prior @ offset)
+
+
+def _with_each_change(
+    parts: Sequence[tuple[np.ndarray, np.ndarray, float, float]], covariance: np.ndarray, offset: np.ndarray,
+    changes: dict[ChangeKey, tuple[np.ndarray, float]],
+) -> dict[ChangeKey, float]:  # fmt: skip
+    """{key: the largest evidence with that change of `changes` more}: in closed form, by what the data say of a shift of the prior's mean."""
+    prior, size, out = np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1], dict.fromkeys(changes, -np.inf)
+    for gram, vector, rest, _ in parts:
+        evidence, inverse = _evidence(gram, vector, rest, prior, size, offset), np.linalg.inv(gram + prior)
+        slope = prior @ (offset + inverse @ (vector - prior @ offset))
+        told = prior - prior @ inverse @ prior
+        for key, (places, std) in changes.items():
+            some = told[np.ix_(places, places)]
+            more = slope[places] @ np.linalg.solve(some + np.eye(len(places)) / std**2, slope[places])
+            more -= np.linalg.slogdet(np.eye(len(places)) + std**2 * some)[1]
+            out[key] = max(out[key], evidence + 0.5 * more)
+    return out

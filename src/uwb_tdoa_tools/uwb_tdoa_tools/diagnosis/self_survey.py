@@ -14,6 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_array, hstack
 
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet
 from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
@@ -21,6 +22,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
+from ..checking.known_path import MANY
 from ..parallel import in_one_thread
 from ..scoring.metrics import AIRBORNE
 from .channels import CHANNELS, Comparison
@@ -31,7 +33,7 @@ from .regression.fit import NU, student_scale
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.effects import Effect, Samples
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.results import Odometry
     from ..parallel import MapFunction
@@ -47,6 +49,7 @@ PRELIMINARY = 20.0  # the same for the solution about which that is measured
 DETERMINED = 1e-4  # share of the largest eigenvalue that a direction must have to count there
 FEWEST = 4  # TDOAs in a cell; noise of fewer hides what is slow
 FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
+AT_ONCE = 32  # regressors that are made together
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,11 +266,10 @@ def _of_flight(
     """(_FlightEquations, span) of (Flight, span or None, marks of it)."""
     flight, known_span, marks = item
     part, span = _residual(base, reference, anchors, delays, flight, known_span)
-    grams, vectors, known = _equations(part, flight, marks)
+    gram, vector, blocks, known = _equations(part, flight, marks)
     n = len(loose)
-    inflation = _inflation(grams[:, :n, :n], vectors[:, :n], loose)
-    gram, vector = grams.sum(axis=0), vectors.sum(axis=0)
-    return _FlightEquations(gram, vector, known, _slow(part), inflation, BLOCK * len(grams)), span
+    inflation = _inflation(gram[:n, :n], vector[:n], blocks, loose)
+    return _FlightEquations(gram, vector, known, _slow(part), inflation, BLOCK * len(blocks)), span
 
 
 def _left_out(equations: _Equations, prior: Prior) -> tuple[float, float, float] | None:
@@ -307,7 +309,13 @@ def calibrated(
         values = {key: float(value) for (effect, key), value in found.items() if effect == name}
         known = {key: float(one) for (effect, key), one in zip(keys, std) if effect == name}
         effects.append(EFFECTS[name](values, known, "survey"))
-    return EffectSet(tuple(effects), Covariance(keys, covariance))
+    return EffectSet(tuple(effects), to_keep(keys, covariance))
+
+
+def to_keep(keys: tuple[tuple[str, ...], ...], matrix: np.ndarray) -> Covariance:
+    """Covariance to be the prior of the next calibration; of MANY anchors what it says of each of them, or no file could hold it."""
+    out = Covariance(keys, matrix)
+    return out.of_each_anchor() if len({key.partition(".")[0] for _, key in keys}) > MANY else out
 
 
 def delay_effect(anchors: Anchors, delays: np.ndarray) -> Effect:
@@ -323,28 +331,63 @@ def _slow(part: TdoaResidual) -> np.ndarray:
 
 def _equations(
     part: TdoaResidual, flight: Flight, constraints: Sequence[Mark]
-) -> tuple[np.ndarray, np.ndarray, list[_Mark]]:
-    """(grams (b, k, k), vectors (b, k)) of the normal equations that a TdoaResidual gives, block by block, and [_Mark] of
-    constraints of its Flight."""
-    samples, air, anchors, innovations = part.samples, part.airborne, part.samples.anchors, part.innovations
+) -> tuple[np.ndarray, np.ndarray, list[_Told], list[_Mark]]:
+    """(gram (k, k), vector (k,), [_Told] of each block) of the normal equations that a TdoaResidual gives, and [_Mark] of constraints of
+    its Flight."""
+    samples, air, innovations = part.samples, part.airborne, part.innovations
     assert innovations is not None  # as of a Reference that does not know the path
-    ids = [str(i) for i in anchors.ids]
-    positions = AnchorPosition().regressors(samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
-    late = AnchorDelay().regressors(samples, ids)
-    functions = (late[:, :, None] * features(samples.p)[:, None, :]).reshape(len(late), -1)
+    n, regressors = 4 * len(samples.anchors), _regressors(samples)
     stamps = [one.stamps(flight.tdoa.t[0]) for one in constraints]
-    regressors = np.nan_to_num(np.concatenate([positions, late, functions], axis=1))
-    columns, moved = innovations.and_positions(regressors, np.sort(np.concatenate([[], *stamps])))
-    columns = columns[air]
-    innovation, variance = innovations.value[air], innovations.variance[air]
-    error = innovation / np.sqrt(variance)
+    moved = np.zeros((sum(map(len, stamps)), 3, regressors.shape[1]))
+    error = innovations.value[air] / np.sqrt(innovations.variance[air])
     scale = max(1.4826 * np.median(np.abs(error)), 1e-3)
-    weight = (NU + 1.0) / (NU + (error / scale) ** 2) / variance
-    block = ((samples.t[air] - samples.t[air][0]) / BLOCK).astype(int)
-    parts = [(columns[block == k], weight[block == k], innovation[block == k]) for k in np.unique(block)]
-    grams = np.stack([(some * w[:, None]).T @ some for some, w, _ in parts])
-    vectors = np.stack([some.T @ (w * value) for some, w, value in parts])
-    return grams, vectors, _known(constraints, stamps, moved, innovations.run.odometry)
+    gram, vector, blocks = np.zeros((regressors.shape[1],) * 2), np.zeros(regressors.shape[1]), []
+    number = np.floor((samples.t - samples.t[air][0]) / BLOCK).astype(int)
+    for rows, columns, derivative in innovations.in_blocks(regressors, number, np.sort(np.concatenate([[], *stamps])), moved):
+        inside = air[rows]
+        if not inside.any():
+            continue
+        some, value, variance = derivative[inside], innovations.value[rows][inside], innovations.variance[rows][inside]
+        weight = (NU + 1.0) / (NU + (value / np.sqrt(variance) / scale) ** 2) / variance
+        own, right = (some * weight[:, None]).T @ some, some.T @ (weight * value)
+        gram[np.ix_(columns, columns)] += own
+        vector[columns] += right
+        last = np.searchsorted(columns, n)
+        blocks.append(_Told(columns[:last], own[:last, :last], right[:last]))
+    return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
+
+
+def _regressors(samples: Samples) -> csr_array:
+    """Derivatives of TDOAs by coordinates and delays of anchors, and functions of the place of each: sparse, in rows, (n, 24 N)."""
+    ids = [str(i) for i in samples.anchors.ids]
+    late = _sparse(AnchorDelay(), samples, ids)
+    functions = np.nan_to_num(features(samples.p))
+    n, times = late.shape[0], functions.shape[1]
+    each = csr_array(  # every entry of `late` times all functions: as many columns in the place of one
+        (
+            (late.data[:, None] * functions[np.repeat(np.arange(n), np.diff(late.indptr))]).ravel(),
+            (late.indices[:, None] * times + np.arange(times)).ravel(),
+            late.indptr * times,
+        ),
+        shape=(n, late.shape[1] * times),
+    )
+    positions = _sparse(AnchorPosition(), samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
+    return hstack([positions, late, each], format="csr")
+
+
+def _sparse(effect: Effect, samples: Samples, keys: list[str]) -> csr_array:
+    """Regressors of an Effect, sparse, in rows: (n, keys)."""
+    parts = [effect.regressors(samples, keys[first : first + AT_ONCE]) for first in range(0, len(keys), AT_ONCE)]
+    return hstack([csr_array(np.nan_to_num(part)) for part in parts], format="csr")
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """Normal equations of a block of TDOAs, of those coordinates and delays that matter there: columns (c,); gram (c, c); vector (c,)."""
+
+    columns: np.ndarray
+    gram: np.ndarray
+    vector: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,13 +418,14 @@ def _known(
     return out
 
 
-def _inflation(grams: np.ndarray, vectors: np.ndarray, sizes: np.ndarray) -> float:
-    """By how much sums of scores over blocks (b, k, k), (b, k) are larger than those of independent errors, averaged over the
-    directions that the data tell. sizes (k,): prior standard deviations."""
-    gram, vector = grams.sum(axis=0) / PRELIMINARY, vectors.sum(axis=0) / PRELIMINARY
-    step = np.linalg.solve(gram + np.diag(sizes**-2.0), vector)
-    scores = vectors - grams @ step
-    values, directions = np.linalg.eigh(grams.sum(axis=0))
+def _inflation(gram: np.ndarray, vector: np.ndarray, blocks: Sequence[_Told], sizes: np.ndarray) -> float:
+    """By how much sums of scores over blocks, [_Told], whose sums are gram (k, k) and vector (k,), are larger than those of independent errors,
+    averaged over the directions that the data tell. sizes (k,): prior standard deviations."""
+    step = np.linalg.solve(gram / PRELIMINARY + np.diag(sizes**-2.0), vector / PRELIMINARY)
+    scores = np.zeros((len(blocks), len(vector)))
+    for score, block in zip(scores, blocks):
+        score[block.columns] = block.vector - block.gram @ step[block.columns]
+    values, directions = np.linalg.eigh(gram)
     told = values > DETERMINED * values[-1]
     return float(np.mean(np.sum((scores @ directions[:, told]) ** 2, axis=0) / values[told]))
 

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..bags.bag import write_odometry
 from ..readers.inputs import Reading
 from ..scoring.tum import write_tum
-from . import files, pictures, rerun_file, residuals
+from . import files, pictures, rerun_file, residuals, zones
 from .belief import GOOD, Belief, believe
 from .estimate import Estimator
 
@@ -43,7 +43,7 @@ class Localizer:
     """localizer((path, survey)) is the Located of a recording, whose ground truth is not read. Can be pickled.
 
     reading : Reading; estimator : Estimator; folder : where to write; bag : write a bag, too; left : write residuals, too; rerun :
-    file for Rerun, or None. Raises InputError.
+    file for Rerun, or None; zones : m, write who is heard in squares of that size, or None. Raises InputError.
     """
 
     reading: Reading
@@ -52,6 +52,7 @@ class Localizer:
     bag: bool = False
     left: bool = False
     rerun: Path | None = None
+    zones: float | None = None
 
     def __call__(self, recording: tuple[Path, str | Path | None]) -> Located:
         flight, name = self.reading.read(recording), name_of(recording[0])
@@ -73,6 +74,9 @@ class Localizer:
         if self.left:
             residuals.write_csv(path("_residuals.csv"), run.residuals)
             residuals.picture(path("_residuals.png"), run.residuals, name)
+        if self.zones is not None and (found := zones.zones_of(odometry, run.residuals, self.zones)):
+            zones.write_csv(path("_zones.csv"), found)
+            zones.draw(path("_zones.png"), found, flight.anchors, self.zones, f"{name}: squares of {self.zones:g} m")
         if self.rerun is not None:
             rerun_file.write_rerun(self.rerun, flight, odometry, run.residuals, belief.sentences())
             written.append(self.rerun)

@@ -12,6 +12,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import parallel
+from ..checking.sides import sides_of, to_copy
 from ..scoring.plots import plt
 from .bifurcation import CLEAR, Subsets
 from .maps import Chart
@@ -86,6 +87,14 @@ class Hall:
         covariance = bound(information(points, installation))
         return covariance, np.linalg.norm(dilution(points, installation), axis=1), inside, ambiguous, inside & unique
 
+    def side(self, points: np.ndarray) -> dict[str, Any] | None:
+        """{"share": of points (n, 3) m, "tag_side": values}: where those that are heard lie in a plane, so that the side of it must be told; None where
+        nowhere, or where the height is known and they have one height."""
+        sides = [sides_of(self.anchors.positions[rows[:MOST_HEARD]]) for rows in self.heard(points) if len(rows) > self.goal.installation.unknowns]
+        needed = [one for one in sides if len(one) == 2 or one and self.goal.installation.unknowns == 3]
+        most = max(sorted(set(needed)), key=needed.count, default=None)
+        return None if most is None else {"share": needed.count(most) / len(points), "tag_side": list(most)}
+
     def addition(self, chart: Chart, floor: float) -> dict[str, Any] | None:
         """{"position": (3,) m, "gain": share of the cells} of the best place for one more anchor, None where nearly all can be flown. floor : m."""
         holes = np.flatnonzero(~chart.flyable)
@@ -132,8 +141,8 @@ def summary(chart: Chart, heard: np.ndarray) -> dict[str, Any]:
     }
 
 
-def say(about: dict[str, Any], addition: dict[str, Any] | None) -> None:
-    """Print what `summary` and `Hall.addition` found."""
+def say(about: dict[str, Any], addition: dict[str, Any] | None, side: dict[str, Any] | None) -> None:
+    """Print what `summary`, `Hall.addition` and `Hall.side` found."""
     print(f"{' x '.join(map(str, about['cells']))} cells of {about['step']:.3g} m")
     shares = {int(number): share for number, share in about["heard"].items()}
     for label, low, high in (("fewer than 4", 0, 3), ("4 or 5", 4, 5), ("6 or 7", 6, 7), ("8 or more", 8, 1 << 30)):
@@ -141,6 +150,8 @@ def say(about: dict[str, Any], addition: dict[str, Any] | None) -> None:
     print(f"{100.0 * about['flyable_share']:.0f} % of the cells can be flown; the others hear too few, are not among those they hear, or have two solutions")
     if about["bound_flyable"]:
         print("  bound of one round there, m: " + "  ".join(f"{name} {value:.2f}" for name, value in about["bound_flyable"].items()))
+    if side:
+        print(f"at {100.0 * side['share']:.0f} % of the cells the anchors that are heard lie in a plane: {to_copy(side['tag_side'])}")
     if addition and addition["position"] and addition["gain"] > WORTH:
         at = ", ".join(f"{x:.1f}" for x in addition["position"])
         print(f"one more anchor would help most near ({at}): {100.0 * (about['flyable_share'] + addition['gain']):.1f} % of the cells")

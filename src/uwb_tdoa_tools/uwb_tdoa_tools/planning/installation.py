@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 
+from ..checking.sides import sides_of, to_copy
 from .noise import RadioNoise
 from .pairing import Pairing, ring
 
@@ -93,10 +94,11 @@ def check_anchors(anchors: Anchors, dimensions: int) -> None:
         seen = "seen from above " if dimensions == 2 else ""
         raise InputError(f"anchors: all are on one line {seen}to {size[1]:.3f} m; move one of them out of it.")
     if dimensions == 3 and size[2] <= FLAT * size[0]:
+        sides = sides_of(anchors.positions)
         raise InputError(
             f"anchors: all are in one plane to {size[2]:.3f} m, so that its two sides cannot be told apart; move one "
-            "of them out of it, or plan for a tag of known height (--planar) or one that measures it (--with height). ekf_node can be told the side: "
-            "tag_side."
+            "of them out of it, or plan for a tag of known height (--planar) or one that measures it (--with height)"
+            f"{'; or ' + to_copy(sides) if sides else ''}."
         )
 
 

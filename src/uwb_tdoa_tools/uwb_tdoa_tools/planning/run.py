@@ -49,7 +49,8 @@ def plan_hall(
     figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args)}
     figures["map"] = hall.summary(found, heard)
     figures["addition"] = whole.addition(found, room.lower[2])
-    hall.say(figures["map"], figures["addition"])
+    figures["side"] = whole.side(grid.points)
+    hall.say(figures["map"], figures["addition"], figures["side"])
     hall.plot(anchors, found, heard, args.out / "hall.png")
     found.volume(anchors, installation.dimensions).save(args.out / "flyable.npz")
     outgoing = messages.messages(found, anchors)

@@ -10,6 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.elsewhere import elsewhere
 
+from ..checking.known_path import MANY
 from ..diagnosis.calibration import LEFT, why_marks_speak_against
 from ..diagnosis.self_survey import Surveyed, calibrated
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
 CLEARLY = 2.6  # slow innovations as given over those that are left, beyond which the tape was worse than what else is wrong
+SURE = 5.0  # standard deviations, and times what most others are off by, that an anchor must be off by to stand apart
 KNOWN_WELL = 0.02  # m, standard deviation as given that leaves nothing to wish for
 
 
@@ -70,6 +72,15 @@ class Result:
         """(N, 3) bool."""
         return self.surveyed.position_std < IMPROVED * self.given_std
 
+    @property
+    def apart(self) -> list[int]:
+        """Rows of those of MANY anchors that the flights put plainly elsewhere than given, while they leave the others about where they were."""
+        if len(self.given) <= MANY:
+            return []
+        off, told = np.abs(self.shifts), self.improved
+        others = np.array([1.4826 * np.median(column[known]) if known.any() else np.inf for column, known in zip(off.T, told.T)])
+        return np.flatnonzero((told & (off > SURE * self.surveyed.position_std) & (off > SURE * others)).any(axis=1)).tolist()
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         found = self.surveyed
@@ -91,6 +102,7 @@ class Result:
                 {"effect": one.effect, "anchor": one.anchor, "values": one.values.tolist(), "std": one.std.tolist(), "or": list(one.rivals)}
                 for one in found.changes
             ],
+            "apart": [str(self.given.ids[row]) for row in self.apart],
             "applied": self.why_not is None,
             "blocked": list(self.blocked),
             "marks_left_out": found.marks,
@@ -121,9 +133,13 @@ class Result:
         unseen = [str(i) for row, i in enumerate(found.anchors.ids) if rough[row] and not self.improved[row].any()]
         if unseen:
             lines.append(f"nothing new is told of anchors {', '.join(unseen)}: fly closer to them, on all sides, high and low")
+        since = "since the last calibration" if self.base.covariance is not None else "beyond what the tape may be off by"
+        lines += [f"{since}: {change.as_text()}" for change in found.changes]
         if self.base.covariance is not None:
-            lines += [f"since the last calibration: {change.as_text()}" for change in found.changes]
             lines += [] if found.changes else ["no anchor has changed clearly since the last calibration"]
+        for row in self.apart:
+            by = ", ".join(f"{100 * value:+.1f} +- {100 * std:.1f}" for value, std in zip(self.shifts[row], found.position_std[row]))
+            lines.append(f"anchor {self.given.ids[row]} does not stand where it was given, as the others do: off by {by} cm (x, y, z)")
         lines += self.blocked
         if found.marks:
             before, after, nearer = found.marks

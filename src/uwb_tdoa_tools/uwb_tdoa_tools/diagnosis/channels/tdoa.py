@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from uwb_tdoa_bias.effects import Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
@@ -18,6 +19,7 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 
 from uwb_tdoa_ekf.sensitivity import Innovations
 
+from ...checking.known_path import MANY
 from . import pairs
 from .base import Channel, ChannelResidual, Rows, covariate_of
 from .extra import extra_at, extra_names
@@ -35,6 +37,7 @@ CELL = 0.5  # s
 LOWEST, LEVEL = 0.02, 0.5  # m, and by how much the logarithm of a height may differ within a cell near the floor, where heights matter
 OUTLIER = 4.0  # spreads within a cell
 QUICK = ("interval", *CATEGORIES)  # covariates that change from one TDOA to the next
+OF_ANCHORS = "anchor_delay", "anchor_position", "anchor_clock_drift", "pair_offset"  # effects, each of whose parameters acts on TDOAs of one or two anchors
 WILD = 20.0  # m; a larger residual is no measurement
 FEWEST_ON_FLOOR = 50  # TDOAs
 
@@ -69,10 +72,16 @@ class TdoaResidual(ChannelResidual):
         return Rows(cells.mean(self.residual), np.zeros_like(cells.pair), cells.pair, cells.t - samples.start, cells.size, place)
 
     def columns(self, effect: Effect, keys: Sequence[str]) -> np.ndarray:
-        values = np.nan_to_num(effect.regressors(self.samples, list(keys)))
+        samples, rows = self.samples, None
+        if _many([self]) and self.innovations is None and effect.name in OF_ANCHORS:  # nothing else has to do with these anchors
+            named = np.isin(samples.anchors.ids, [int(i) for key in keys for i in key.partition(".")[0].split("-")])
+            rows = np.flatnonzero(named[samples.a] | named[samples.b])
+            t, a, b, p, q = (values[rows] for values in (samples.t, samples.a, samples.b, samples.p, samples.q))
+            samples = Samples(t, a, b, p, q, samples.anchors, samples.start)
+        values = np.nan_to_num(effect.regressors(samples, list(keys)))
         if self.innovations is not None:
             values = self.innovations.by_bias(values)
-        return np.stack([self.cells.mean(column) for column in values.T], axis=1)
+        return self.cells.means(values, rows)
 
     def covariate(self, name: str) -> np.ndarray | None:
         if name in OF_ARRIVAL:
@@ -119,6 +128,17 @@ class Cells:
         start = np.searchsorted(self.group, np.arange(len(self.size)))
         self.pair = samples.a[self.chosen][start] * n + samples.b[self.chosen][start]
 
+    def means(self, values: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """The same of several (n, k): (m, k). rows (r,) : the TDOAs that values (r, k) are of, the others being zero."""
+        if rows is None:
+            return np.stack([self.mean(column) for column in values.T], axis=1)
+        place = np.full(self.chosen.max(initial=-1) + 1, -1)
+        place[rows[rows < len(place)]] = np.flatnonzero(rows < len(place))
+        inside = np.flatnonzero(place[self.chosen] >= 0)
+        group = self.group[inside]
+        members = csr_array((1.0 / self.size[group], (group, place[self.chosen[inside]])), shape=(len(self.size), len(rows)))
+        return members @ values
+
     def mean(self, values: np.ndarray) -> np.ndarray:
         """Means of values of all TDOAs (n,) over the cells: (m,)."""
         return np.bincount(self.group, values[self.chosen]) / self.size
@@ -161,28 +181,30 @@ class Tdoa(Channel[TdoaResidual]):
         return TdoaResidual(samples, residual, airborne, airborne, comparison.reference.knows_floor, innovations)
 
     def smooth_terms(self, residuals: Sequence[TdoaResidual]) -> list[SmoothTerm]:
-        out = []
+        out, many = [], _many(residuals)
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
             values = covariate_of(name, residuals)
             knots = None if values is None else knots_of(values, name)
             if knots is not None:
                 out.append(SmoothTerm(covariate=name, form="common", knots=knots))
-                if name not in CATEGORIES and not name.startswith(EXTRA):
+                if name not in CATEGORIES and not name.startswith(EXTRA) and not many:
                     out.append(SmoothTerm(covariate=name, form="anchor", knots=knots))
         for name in OF_ARRIVAL:
             values = covariate_of(name, residuals)
             knots = None if values is None else knots_of(values, name)
             if knots is not None:
-                out += [SmoothTerm(covariate=name, form=form, knots=knots) for form in ("arrival", "anchor")]
+                out += [SmoothTerm(covariate=name, form=form, knots=knots) for form in ("arrival", "anchor")[: 1 if many else 2]]
         return out
 
     def views(self, residuals: Sequence[TdoaResidual]) -> list[CovariateView]:
         if any(part.innovations is not None for part in residuals):
             return []  # what the path follows is not left in them
-        cells = [part.cells for part in residuals]
+        cells, many = [part.cells for part in residuals], _many(residuals)
         ends = [np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)]) for part in residuals]
         of_tdoa, of_arrival, quick = {}, {}, {}
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
+            if many and name in CATEGORIES:
+                continue
             known = [v for v in (_covariate(name, part.samples) for part in residuals) if v is not None]
             if len(known) < len(residuals):
                 continue
@@ -195,13 +217,19 @@ class Tdoa(Channel[TdoaResidual]):
             means = [[cell.mean(v) for v in values] for cell, values in zip(cells, both)]
             of_arrival[name] = np.concatenate(means, axis=1)
         a, b = np.concatenate(ends, axis=1)
-        slow = views_of_pairs(a, b, of_tdoa, of_arrival)
+        slow = views_of_pairs(a, b, of_tdoa, of_arrival, many=many)
         first = np.cumsum([0, *(len(cell.size) for cell in cells)])
         cell = np.concatenate([part.group + start for part, start in zip(cells, first)])
-        return slow + views_of_pairs(a[cell], b[cell], quick, {}, cell)
+        return slow + views_of_pairs(a[cell], b[cell], quick, {}, cell, many)
 
     def health(self, residuals: Sequence[TdoaResidual]) -> Figures:
         return pairs.health(residuals)
+
+
+def _many(residuals: Sequence[TdoaResidual]) -> bool:
+    """Whether functions of each anchor of some TdoaResiduals are too many to be looked for: what a few parameters tell is found, and
+    those of all anchors alike."""
+    return any(len(part.samples.anchors) > MANY for part in residuals)
 
 
 def _covariate(name: str, samples: Samples) -> np.ndarray | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,14 +10,17 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+MOST_LINKS = 400  # pairs of anchors, in both directions, whose functions are looked for: those of 20 anchors
+OF_EACH = "time", "range"  # covariates of each of many anchors
+
 
 @dataclass(frozen=True, eq=False)
 class CovariateView:
     """A covariate of a subset of the rows of a channel.
 
-    channel, form, covariate : as of a SmoothTerm; key : "" or an anchor or a pair; sides : ((signs (n,), values (n,)), ...): a
-    function f of the covariate adds the sum of sign * f(value) to each row; cell (n,), if there is more than one value to a row: the
-    row, of which the sum is the mean.
+    channel, form, covariate : as of a SmoothTerm; key : "" or an anchor or a pair; sides : ((signs (m,), values (m,)), ...): a
+    function f of the covariate adds the sum of sign * f(value) to a row; rows (m,) : to which. Where there is more than one value to a
+    row, `means`, the sum is their mean.
     """
 
     channel: str
@@ -25,7 +28,8 @@ class CovariateView:
     key: str
     covariate: str
     sides: tuple[tuple[np.ndarray, np.ndarray], ...]
-    cell: np.ndarray | None = None
+    rows: np.ndarray
+    means: bool = False
 
 
 def views_of_axes(
@@ -34,45 +38,59 @@ def views_of_axes(
     """[CovariateView] of SmoothTerm channels such as "gyro.x", one for each axis; covariates : {name: (m,)}; axis (m,)
     number."""
     return [
-        CovariateView(channel, "common", "", name, ((1.0 * (axis == k), values),))
-        for k, channel in enumerate(channels)
+        CovariateView(channel, "common", "", name, ((np.ones(len(rows)), values[rows]),), rows)
+        for channel, rows in zip(channels, map(np.flatnonzero, axis == np.arange(len(channels))[:, None]))
         for name, values in covariates.items()
     ]
 
 
 def views_of_pairs(
     a: np.ndarray, b: np.ndarray, of_tdoa: Mapping[str, np.ndarray], of_arrival: Mapping[str, np.ndarray],
-    cell: np.ndarray | None = None,
+    cell: np.ndarray | None = None, many: bool = False,
 ) -> list[CovariateView]:  # fmt: skip
-    """[CovariateView] of TDOAs between anchors of ids a, b (n,). of_tdoa : {name: (n,)}; of_arrival : {name: (2, n)},
-    of a and of b; cell : see CovariateView."""
-    out, ones = [], np.ones(len(a))
+    """[CovariateView] of TDOAs between anchors of ids a, b (n,). of_tdoa : {name: (n,)}; of_arrival : {name: (2, n)}, of a and of b; cell (n,) : row
+    of each, where there are several to a row; many : whether there are so many anchors that single ones are looked at over OF_EACH alone."""
+    out: list[CovariateView] = []
+    n = len(a)
+    row = np.arange(n) if cell is None else cell
+
+    def add(form: str, key: str, name: str, chosen: np.ndarray, *sides: tuple[np.ndarray, np.ndarray]) -> None:
+        out.append(CovariateView("tdoa", form, key, name, tuple((signs, values[chosen]) for signs, values in sides), row[chosen], cell is not None))
+
+    everywhere, ones = np.arange(n), np.ones(n)
     for name, values in of_tdoa.items():
-        out.append(CovariateView("tdoa", "common", "", name, ((ones, values),)))
+        add("common", "", name, everywhere, (ones, values))
     for name, (at_a, at_b) in of_arrival.items():
-        out.append(CovariateView("tdoa", "arrival", "", name, ((-ones, at_a), (ones, at_b))))
+        add("arrival", "", name, everywhere, (-ones, at_a), (ones, at_b))
+    if many:
+        of_tdoa, of_arrival = ({name: values for name, values in some.items() if name in OF_EACH} for some in (of_tdoa, of_arrival))
+    for anchor, chosen in _members(a, b):
+        from_a, to_b = -1.0 * (a[chosen] == anchor), 1.0 * (b[chosen] == anchor)
+        for name, values in of_tdoa.items():
+            add("anchor", str(anchor), name, chosen, (from_a + to_b, values))
+        for name, (at_a, at_b) in of_arrival.items():
+            add("anchor", str(anchor), name, chosen, (from_a, at_a), (to_b, at_b))
+    for form, first, second, chosen, signs in _links(a, b):
+        for name, values in of_tdoa.items():
+            add(form, f"{first}-{second}", name, chosen, (signs, values))
+    return out
+
+
+def _members(a: np.ndarray, b: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """(anchor, rows (m,) that it is in) of every anchor."""
     for anchor in np.unique(np.concatenate([a, b])).tolist():
-        from_a, to_b = -1.0 * (a == anchor), 1.0 * (b == anchor)
-        out += [
-            CovariateView("tdoa", "anchor", str(anchor), name, ((from_a + to_b, values),))
-            for name, values in of_tdoa.items()
-        ]
-        out += [
-            CovariateView("tdoa", "anchor", str(anchor), name, ((from_a, at_a), (to_b, at_b)))
-            for name, (at_a, at_b) in of_arrival.items()
-        ]
-    for form, first, second, signs in _links(a, b):
-        key = f"{first}-{second}"
-        out += [CovariateView("tdoa", form, key, name, ((signs, values),)) for name, values in of_tdoa.items()]
-    return out if cell is None else [replace(view, cell=cell) for view in out]
+        yield anchor, np.flatnonzero((a == anchor) | (b == anchor))
 
 
-def _links(a: np.ndarray, b: np.ndarray) -> Iterator[tuple[str, int, int, np.ndarray]]:
-    """(form, a, b, signs (m,)) of every pair, and of its directions where both were heard."""
-    heard = np.unique(np.column_stack([a, b]), axis=0).tolist()
-    for first, second in heard:
-        forth, back = 1.0 * ((a == first) & (b == second)), 1.0 * ((a == second) & (b == first))
+def _links(a: np.ndarray, b: np.ndarray) -> Iterator[tuple[str, int, int, np.ndarray, np.ndarray]]:
+    """(form, a, b, rows, signs (m,)) of every pair, and of its directions where both were heard; of MOST_LINKS that were heard most."""
+    heard, count = np.unique(np.column_stack([a, b]), axis=0, return_counts=True)
+    most = np.sort(np.argsort(-count, kind="stable")[:MOST_LINKS])
+    for first, second in heard[most].tolist():
+        forth, back = (a == first) & (b == second), (a == second) & (b == first)
         if first < second or not back.any():
-            yield "pair", first, second, forth - back
+            both = np.flatnonzero(forth | back)
+            yield "pair", first, second, both, 1.0 * forth[both] - 1.0 * back[both]
         if back.any():
-            yield "direction", first, second, forth
+            rows = np.flatnonzero(forth)
+            yield "direction", first, second, rows, np.ones(len(rows))

@@ -18,31 +18,34 @@ if TYPE_CHECKING:
 BIN = 1.0  # s
 SHORTEST = 2  # bins
 LONGEST = 0.7  # share of a flight; what lasts longer is constant
+WHOLE = 0.95  # share of all that is known of an anchor, beyond which it is constant too
 LEAST_GAIN = 10.0  # twice a log-likelihood
 
 
 def best_interval(
-    t: np.ndarray, score: np.ndarray, power: np.ndarray, prior: float, signed: bool = False
+    t: np.ndarray, score: np.ndarray, power: np.ndarray, prior: float, signed: bool = False, rows: slice | np.ndarray = slice(None)
 ) -> tuple[float, dict[str, float], float]:
     """Best (gain, {limit: value}, price of the search) over intervals of t (n,), s.
 
-    score, power (n,): products with the residual and with itself of a regressor, both weighted; prior : information of what
-    sizes are plausible; signed : whether sizes below 0 are.
+    score, power (m,): products with the residual and with itself of a regressor, both weighted, at `rows` of t, the others zero; prior :
+    information of what sizes are plausible; signed : whether sizes below 0 are.
     """
     first = t.min()
-    bins = ((t - first) / BIN).astype(int)
-    n = bins.max() + 1
-    total = np.concatenate([[0.0], np.cumsum(np.bincount(bins, score, n))])
-    known = np.concatenate([[0.0], np.cumsum(np.bincount(bins, power, n))])
-    i, j = np.triu_indices(n + 1, SHORTEST)
-    short = (j - i) <= LONGEST * n
-    i, j = i[short], j[short]
+    bins = ((t[rows] - first) / BIN).astype(int)
+    n = int((t.max() - first) / BIN) + 1
+    taken, bins = np.unique(bins, return_inverse=True)  # of an anchor of a hall, those in which it is heard
+    total = np.concatenate([[0.0], np.cumsum(np.bincount(bins, score))])
+    known = np.concatenate([[0.0], np.cumsum(np.bincount(bins, power))])
+    i, j = np.triu_indices(len(taken) + 1, 1)
+    begin, end = taken[np.minimum(i, len(taken) - 1)], taken[j - 1] + 1
+    short = (end - begin >= SHORTEST) & (end - begin <= LONGEST * n) & (known[j] - known[i] <= WHOLE * known[-1])
+    i, j, begin, end = i[short], j[short], begin[short], end[short]
     inside = total[j] - total[i]
     gain = (inside if signed else np.maximum(inside, 0.0)) ** 2 / (known[j] - known[i] + prior)
     if not len(gain):
         return 0.0, {}, 0.0
     best = int(np.argmax(gain))
-    limits = {"start": float(first + i[best] * BIN), "end": float(first + j[best] * BIN)}
+    limits = {"start": float(first + begin[best] * BIN), "end": float(first + end[best] * BIN)}
     return gain[best], limits, 2.0 * np.log(len(gain))
 
 

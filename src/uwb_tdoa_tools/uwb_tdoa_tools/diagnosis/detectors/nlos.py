@@ -39,11 +39,14 @@ class NlosDetector(Detector):
             key = f"{anchor}.delay"
             if key in keys:
                 continue
-            x = 1.0 * (b == row) - 1.0 * (a == row)
-            score, power = x * information * residual, x * x * information
-            searches = [spheres.best(score, power)]
+            heard = np.flatnonzero((b == row) | (a == row))
+            if not len(heard):
+                continue
+            x = 1.0 * (b[heard] == row) - 1.0 * (a[heard] == row)
+            score, power = x * information[heard] * residual[heard], x * x * information[heard]
+            searches = [spheres.best(score, power, heard)]
             if table.flights == 1:  # only a flight alone has a time of its own
-                searches.append(best_interval(table.t[rows], score, power, PRIOR))
+                searches.append(best_interval(table.t[rows], score, power, PRIOR, rows=heard))
             for gain, limits, price in searches:
                 if gain > LEAST_GAIN:
                     values = {f"{anchor}.{name}": value for name, value in limits.items()}
@@ -60,9 +63,9 @@ class _Spheres:
         self._inside = np.concatenate([away <= radius for radius in RADII]).astype(float)  # all of a radius after the other
         self._constant = self._inside.mean(axis=1) > LONGEST
 
-    def best(self, score: np.ndarray, power: np.ndarray) -> tuple[float, dict[str, float], float]:
-        """Best (gain, {limit: value}, price of the search), as `best_interval`."""
-        score, power = (self._inside @ np.stack([score, power], axis=1)).T
+    def best(self, score: np.ndarray, power: np.ndarray, heard: np.ndarray) -> tuple[float, dict[str, float], float]:
+        """Best (gain, {limit: value}, price of the search), as `best_interval`. score, power (m,) : of the places at `heard` (m,)."""
+        score, power = (self._inside[:, heard] @ np.stack([score, power], axis=1)).T
         gain = np.where(self._constant, 0.0, np.maximum(score, 0.0) ** 2 / (power + PRIOR))
         best = int(np.argmax(gain))
         radius, centre = divmod(best, len(self._centres))

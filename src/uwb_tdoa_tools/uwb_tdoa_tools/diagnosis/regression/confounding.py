@@ -9,6 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
 
+from .algebra import dense, product, weighted
 from .fit import prior_sizes
 from .terms import columns_of
 
@@ -70,7 +71,7 @@ def _shares(selection: Selection, candidate: Candidate, candidates: Sequence[Can
     others = columns_of([one for one in selection.chosen if one is not candidate])
     basis = None
     if others:
-        rest = np.vstack([table.matrix(others) * root[:, None], np.diag(1.0 / prior_sizes(others))])
+        rest = np.vstack([dense(weighted(table.matrix(others), root)), np.diag(1.0 / prior_sizes(others))])
         basis = np.linalg.qr(rest)[0][: len(root)]
 
     def free(x: np.ndarray) -> np.ndarray:
@@ -83,11 +84,16 @@ def _shares(selection: Selection, candidate: Candidate, candidates: Sequence[Can
         columns = [column for column in columns if column not in others]
         if name == candidate.name or not columns or power == 0.0:
             continue
-        x, sizes = free(table.matrix(columns) * root[:, None]), prior_sizes(columns)
-        solution = np.linalg.solve(x.T @ x + np.diag(1.0 / sizes**2), x.T @ part)
-        share = 1.0 - float(np.sum((part - x @ solution) ** 2)) / power
+        x, sizes = weighted(table.matrix(columns), root), prior_sizes(columns)
+        gram, vector = product(x, x), x.T @ part
+        if basis is not None:  # of what the basis leaves of them, without making a dense matrix of it
+            held = x.T @ basis
+            gram = gram - held @ (2.0 * np.eye(len(held.T)) - basis.T @ basis) @ held.T
+            vector = vector - held @ (basis.T @ part)
+        solution = np.linalg.solve(gram + np.diag(1.0 / sizes**2), vector)
+        share = (2.0 * vector @ solution - solution @ gram @ solution) / power
         if share >= ALIKE:
-            out[name] = round(share, 3)
+            out[name] = round(float(share), 3)
     return out
 
 
@@ -106,7 +112,7 @@ def unobservable(selection: Selection, candidates: Sequence[Candidate]) -> list[
     root, whole = selection.fit.information(table), _whole(candidates)
     for name, columns in whole.items():
         x, sizes = table.matrix(columns), prior_sizes(columns)
-        information = (x * root[:, None]).T @ x * np.outer(sizes, sizes)
+        information = product(weighted(x, root), x) * np.outer(sizes, sizes)
         values, vectors = np.linalg.eigh(information)
         for value, vector in zip(values, vectors.T):
             if value < 1.0:

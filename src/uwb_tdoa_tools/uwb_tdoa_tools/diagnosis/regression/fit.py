@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
+from .algebra import counts, dense, product, sums_by, weighted
 from .table import AXES
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ NU = 4.0
 ITERATIONS = 12
 MIN_BLOCKS = 6
 LONGEST_MEMORY = 3.0  # s over which rows of a series may be alike
+LASTING = 0.1  # share of the rows in which a column must be, to tell what they have in common
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +70,18 @@ def solve(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> tuple[np.n
     return cov @ vector, cov, float(len(vector) - np.trace(inverse))
 
 
+def _solution(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The first of `solve`, in a third of the time."""
+    return sizes * cho_solve(cho_factor(gram * np.outer(sizes, sizes) + np.eye(len(vector)), overwrite_a=True, check_finite=False), sizes * vector)
+
+
 def prior_sizes(columns: Sequence[Column]) -> np.ndarray:
     """Plausible sizes of Columns: (k,)."""
     return np.array([column.typical for column in columns])
 
 
-def fit(table: Table, columns: Sequence[Column], inflation: np.ndarray | None = None) -> Fit:
-    """Fit of some Columns of a Table. inflation : (groups,), measured on this very fit if None."""
+def fit(table: Table, columns: Sequence[Column], inflation: np.ndarray | None = None, covariance: bool = True) -> Fit:
+    """Fit of some Columns of a Table. inflation : (groups,), measured on this very fit if None; covariance : whether somebody asks for it."""
     x, group, sizes = table.matrix(columns), table.group, prior_sizes(columns)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
     residual = table.y.copy()
@@ -86,7 +94,7 @@ def fit(table: Table, columns: Sequence[Column], inflation: np.ndarray | None = 
             continue
         root = weight / scale[group] ** 2
         root /= 1.0 if inflation is None else inflation[group]
-        beta, _, _ = solve((x * root[:, None]).T @ x, x.T @ (root * table.y), sizes)
+        beta = _solution(product(weighted(x, root), x), x.T @ (root * table.y), sizes)
         change = residual - (table.y - x @ beta)
         residual = residual - change
         if np.all(np.abs(change) < 0.01 * scale[group]):
@@ -94,7 +102,7 @@ def fit(table: Table, columns: Sequence[Column], inflation: np.ndarray | None = 
     if inflation is None:
         inflation = measure_inflation(table, residual, weight, scale, columns)
     root = weight / (scale[group] ** 2 * inflation[group])
-    cov = _covariance(table, x, residual, root, sizes) if columns else np.zeros((0, 0))
+    cov = _covariance(table, x, residual, root, sizes) if columns and covariance else np.zeros((0, 0))
     size = np.bincount(group, minlength=len(scale)) / inflation
     return Fit(tuple(columns), beta, cov, residual, weight, scale, inflation, np.maximum(size, 1.0))
 
@@ -104,8 +112,8 @@ def refit(table: Table, columns: Sequence[Column], model: Fit, rows: np.ndarray 
     covariance of the model."""
     x, sizes, root = table.matrix(columns), prior_sizes(columns), model.information(table)
     some = slice(None) if rows is None else rows
-    xw = x[some] * root[some, None]
-    beta, cov, _ = solve(xw.T @ x[some], xw.T @ table.y[some], sizes)
+    xw = weighted(x[some], root[some])
+    beta, cov, _ = solve(product(xw, x[some]), xw.T @ table.y[some], sizes)
     residual = table.y - x @ beta
     if rows is None and columns:
         cov = _covariance(table, x, residual, root, sizes)
@@ -136,16 +144,16 @@ def student_scale(r: np.ndarray) -> float:
 
 def _covariance(table: Table, x: np.ndarray, residual: np.ndarray, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Sandwich over blocks, at least the model's own."""
-    _, bread, _ = solve((x * root[:, None]).T @ x, np.zeros(x.shape[1]), sizes)
+    _, bread, _ = solve(product(weighted(x, root), x), np.zeros(x.shape[1]), sizes)
     blocks = int(table.block.max()) + 1
     if blocks < MIN_BLOCKS:
         return bread
-    score = x * (root * residual)[:, None]
-    sums = np.stack([np.bincount(table.block, column, blocks) for column in score.T], axis=1)
-    meat = sums.T @ sums * blocks / max(blocks - min(x.shape[1], blocks // 2), 1)
-    sandwich = bread @ meat @ bread
-    grow = np.sqrt(np.maximum(np.diag(bread) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
-    return sandwich * np.outer(grow, grow)
+    sums = sums_by(table.block, weighted(x, root * residual), blocks)
+    half = sums @ bread * np.sqrt(blocks / max(blocks - min(x.shape[1], blocks // 2), 1))
+    sandwich = half.T @ half  # squares, so that none of its diagonal is below zero
+    told = np.diag(sandwich) > 1e-300
+    grow = np.sqrt(np.maximum(np.diag(bread) / np.where(told, np.diag(sandwich), np.inf), 1.0))
+    return np.where(np.diag(~told), bread, sandwich * np.outer(grow, grow))
 
 
 def measure_inflation(
@@ -163,7 +171,7 @@ def measure_inflation(
     for k, rows in table.groups:
         r = weight[rows] * residual[rows] / scale[k]
         raw = max(1.0, _temporal(table, rows, r), _clustered(table.block[rows], x[rows], r))
-        spent = np.sum(np.any(x[rows] != 0.0, axis=0)) * raw / len(r)
+        spent = np.count_nonzero(counts(x[rows], 0)) * raw / len(r)
         raw = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw  # the fit has followed some of the noise
         out[k] = max(1.0, min(raw, len(r) / len(np.unique(table.block[rows]))))  # blocks are independent
     for name in table.present:
@@ -173,7 +181,7 @@ def measure_inflation(
 
 
 def _temporal(table: Table, rows: np.ndarray | slice, r: np.ndarray) -> float:
-    key, t = table.flight[rows] * 100000 + table.series[rows], table.t[rows]
+    key, t = table.flight[rows] * (table.series.max() + 1) + table.series[rows], table.t[rows]
     order, total = np.lexsort((t, key)), 1.0
     for lag in range(1, 13):
         first, second = order[:-lag], order[lag:]
@@ -193,10 +201,11 @@ def _clustered(blocks: np.ndarray, x: np.ndarray, r: np.ndarray) -> float:
     count, ratios = block.max() + 1, []
     if count < MIN_BLOCKS:
         return 1.0
-    for column in x.T:
+    lasting = np.flatnonzero(counts(x, 0) > LASTING * len(r))
+    for column in dense(x[:, lasting]).T:
         score = column * r
         alone = np.sum(score**2)
-        if alone > 0.0 and np.count_nonzero(score) > 0.1 * len(score):
+        if alone > 0.0 and np.count_nonzero(score) > LASTING * len(score):
             sums = np.bincount(block, score, count)
             ratios.append(np.sum((sums - sums.mean()) ** 2) / alone * count / (count - 1))
     return float(np.mean(ratios)) if len(ratios) else 1.0

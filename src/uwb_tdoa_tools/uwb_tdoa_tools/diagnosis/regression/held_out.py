@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .algebra import counts, product, weighted
 from .fit import NU, prior_sizes, solve
 from .terms import columns_of
 
@@ -40,7 +41,7 @@ def held_out(selection: Selection, by_flight: bool = False) -> list[HeldOut]:
     out = []
     for k, candidate in enumerate(chosen):
         rest = folds.residual(columns_of(chosen[:k] + chosen[k + 1 :]))
-        touched = np.any(table.matrix(candidate.columns) != 0.0, axis=1)
+        touched = counts(table.matrix(candidate.columns), 1) > 0
         gain = (_loss(table, model, rest) - _loss(table, model, whole)) / model.inflation[table.group]
         blocks, of_blocks = np.unique(table.block[touched]), np.bincount(table.block[touched], gain[touched])
         sums = of_blocks[blocks] if touched.any() else np.zeros(1)
@@ -56,11 +57,11 @@ class _Folds:
         self.table, self.folds = table, folds
         self._place = {column: k for k, column in enumerate(columns)}
         self._x, self._sizes = table.matrix(columns), prior_sizes(columns)
-        weighted = self._x * model.information(table)[:, None]
+        x = weighted(self._x, model.information(table))
         self._parts = {}
         for fold in np.unique(folds):
             rows = folds == fold
-            self._parts[fold] = weighted[rows].T @ self._x[rows], weighted[rows].T @ table.y[rows]
+            self._parts[fold] = product(x[rows], self._x[rows]), x[rows].T @ table.y[rows]
         self._gram, self._vector = (sum(part[k] for part in self._parts.values()) for k in range(2))
 
     def residual(self, columns: Sequence[Column]) -> np.ndarray:

@@ -17,6 +17,7 @@ from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
 from uwb_tdoa_bias.effects.shapes import SHAPES
 
+from .algebra import dense
 from .fit import prior_sizes, refit
 from .terms import Candidate, Term, columns_of
 
@@ -48,17 +49,16 @@ class _Shapes:
 
     def __init__(self, view: CovariateView, offset: int, edges: np.ndarray) -> None:
         """offset : first row of the channel."""
-        self.view, self.offset, self.edges = view, offset, edges
-        used = np.flatnonzero(np.any([(signs != 0.0) for signs, _ in view.sides], axis=0))
+        self.view, self.offset, self.edges, rows = view, offset, edges, view.rows
         x: np.ndarray = np.zeros(())
         for signs, values in view.sides:
-            known = np.where(np.isfinite(values[used]), signs[used], 0.0)
-            x = x + known[:, None] * _columns(np.nan_to_num(values[used]), edges, view.covariate)
-        if view.cell is not None:
-            used, cell = np.unique(view.cell[used], return_inverse=True)
+            known = np.where(np.isfinite(values), signs, 0.0)
+            x = x + known[:, None] * _columns(np.nan_to_num(values), edges, view.covariate)
+        if view.means:
+            rows, cell = np.unique(rows, return_inverse=True)
             x = np.stack([np.bincount(cell, column) for column in x.T], axis=1) / np.bincount(cell)[:, None]
         self.x = x.astype(np.float32)  # of all views together the most that a diagnosis holds
-        self.rows = used + offset
+        self.rows = rows + offset
 
 
 class Scan:
@@ -119,9 +119,8 @@ def _noise_of_series(table: Table) -> np.ndarray:
     which steps and trends are a small part."""
     order = np.lexsort((table.t, table.series, table.flight, table.channel))
     label = np.unique(np.stack([table.channel, table.flight, table.series]), axis=1, return_inverse=True)[1].reshape(-1)
-    step = np.abs(np.diff(table.y[order]))
-    same = label[order][1:] == label[order][:-1]
-    parts = (step[same & (label[order][1:] == k)] for k in range(label.max() + 1))
+    step, begins = np.abs(np.diff(table.y[order])), np.searchsorted(label[order], np.arange(label.max() + 1))
+    parts = (step[first:last] for first, last in zip(begins, [*begins[1:] - 1, len(step)]))
     scatter = np.array([np.median(part) if len(part) else 0.0 for part in parts])
     out = scatter[label]
     for _, rows in table.groups:
@@ -240,7 +239,7 @@ def _products(
 def _held(table: Table, model: Fit, chosen: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(orthonormal base, weighted, of what the chosen Candidates hold (n, k), information (n,), residual (n,))."""
     information, base = model.information(table), columns_of(chosen)
-    b = table.matrix(base)
+    b = dense(table.matrix(base))
     gram = (b * information[:, None]).T @ b + np.diag(1.0 / prior_sizes(base) ** 2)
     return b @ np.linalg.cholesky(np.linalg.inv(gram)) if base else b, information, model.residual
 

@@ -7,10 +7,11 @@ All that candidates need of the rows is computed for all of them at once: produc
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from .algebra import product, weighted
 from .fit import prior_sizes, solve
 from .table import AXES
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from .table import Table
     from .terms import Candidate, Column
 
+FEW, NOTHING = 3, 3.0  # columns, and what they gain together, each alone, twice a log-likelihood, that is worth no price
 AT_ONCE = 128  # columns whose products with the base are made together, so that a copy of all of them is never held
 
 
@@ -42,7 +44,8 @@ class Scorer:
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
         self._base = np.arange(len(base))
         columns, root = list(self._place), model.information(table)
-        self._parts = [self._part(table, columns, root, rows) for _, rows in table.groups]
+        whole = table.matrix(columns) if table.sparse else None
+        self._parts = [self._part(table, columns, root, rows) if whole is None else _sparse_part(table, whole, len(base), root, rows) for _, rows in table.groups]
         self._group_sizes = [model.size[group] for group, _ in table.groups]
         self._channels = [table.channels[group // AXES] for group, _ in table.groups]
         self._sizes = prior_sizes(list(self._place))
@@ -53,16 +56,33 @@ class Scorer:
         self._inverse = np.linalg.inv(gram * np.outer(sizes, sizes) + np.eye(len(sizes))) if len(sizes) else gram
         self._squares = [part.squares(beta, self._base) for part in self._parts]
         self._penalty = float(np.sum((beta / sizes) ** 2))
+        self._alone = self._gains_alone(beta) if table.sparse else None
 
     def _part(self, table: Table, columns: list[Column], root: np.ndarray, rows: np.ndarray | slice) -> _Part:
         root, y = root[rows], table.y[rows]
-        weighted = (table.matrix([columns[place] for place in self._base.tolist()], rows) * root[:, None]).T
+        base = weighted(table.matrix([columns[place] for place in self._base.tolist()], rows), root)
         cross, vector = np.empty((len(self._base), len(columns))), np.empty(len(columns))
         for first in range(0, len(columns), AT_ONCE):
             some = slice(first, first + AT_ONCE)
             x = table.matrix(columns[some], rows)
-            cross[:, some], vector[some] = weighted @ x, x.T @ (root * y)
+            cross[:, some], vector[some] = product(base, x), x.T @ (root * y)
         return _Part(table, columns, rows, root, cross, vector, float(root @ y**2))
+
+    def _gains_alone(self, beta: np.ndarray) -> np.ndarray:
+        """What every column would gain alone, by least squares: (columns,)."""
+        base, sizes = self._base, self._sizes
+        cross = sum((part.cross for part in self._parts), start=np.zeros(()))
+        left = (sum(part.vector for part in self._parts) - cross.T @ beta) * sizes
+        cross = cross * np.outer(sizes[base], sizes)
+        own = sum((np.diagonal(part.whole) for part in self._parts if part.whole is not None), start=np.zeros(()))
+        own = own * sizes**2 + 1.0 - np.sum(cross * (self._inverse @ cross), axis=0)
+        return left**2 / np.maximum(own, 1e-9)
+
+    def may_gain(self, columns: Sequence[Column]) -> bool:
+        """Whether to judge some Columns; of few parameters among thousands most gain nothing, which is seen at a glance."""
+        if self._alone is None or len(columns) > FEW:
+            return True
+        return float(sum(self._alone[self._place[column]] for column in columns)) > NOTHING
 
     def gain(self, columns: Sequence[Column]) -> Gain | None:
         """Gain of having some Columns too; None if all are there already."""
@@ -95,7 +115,7 @@ class Scorer:
 @dataclass(frozen=True, eq=False)
 class _Part:
     """One group: its rows in a Table of some columns, with weights root (n,); cross (base, k) and vector (k,): X' W X and X' W y;
-    power : y' W y."""
+    power : y' W y; whole (columns, columns) : X' W X of all, or None."""
 
     table: Table
     columns: list[Column]
@@ -104,8 +124,11 @@ class _Part:
     cross: np.ndarray
     vector: np.ndarray
     power: float
+    whole: np.ndarray | None = None
 
     def gram(self, places: np.ndarray) -> np.ndarray:
+        if self.whole is not None:
+            return self.whole[np.ix_(places, places)]
         x = self.table.matrix([self.columns[place] for place in places], self.rows)
         return x.T @ (x * self.root[:, None])
 
@@ -118,3 +141,11 @@ class _Part:
         if own is not None:
             out += 2.0 * first @ self.cross[:, places[base:]] @ last + last @ own @ last
         return max(float(out), 1e-12)
+
+
+def _sparse_part(table: Table, x: Any, base: int, root: np.ndarray, rows: np.ndarray | slice) -> _Part:
+    """The _Part of some rows of a sparse matrix x of all columns, the first `base` those of the base: products of all with all at once, which of so
+    few entries cost less than to look for those of each candidate."""
+    root, y, x = root[rows], table.y[rows], x[rows]
+    whole = product(x, weighted(x, root))
+    return _Part(table, [], rows, root, whole[:base], x.T @ (root * y), float(root @ y**2), whole)

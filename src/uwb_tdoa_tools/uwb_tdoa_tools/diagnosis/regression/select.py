@@ -157,7 +157,7 @@ def rank(
     """[(criterion, Candidate)], best first; without those that are far from worth it, of negligible or of impossible size."""
     scorer, out = Scorer(table, columns_of(chosen), model, columns_of(candidates)), []
     for candidate in candidates:
-        gained = scorer.gain(candidate.columns)
+        gained = scorer.gain(candidate.columns) if scorer.may_gain(candidate.columns) else None
         if gained is None or gained.determined < LEAST_DETERMINED:
             continue
         criterion = gained.gain - scorer.price(candidate, gained.determined, len(candidates))

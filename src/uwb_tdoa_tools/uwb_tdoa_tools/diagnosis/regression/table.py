@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from ...checking.known_path import MANY
 from ..channels import CHANNELS, TdoaResidual
+from .algebra import stacked
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Sequence
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
 BLOCK = 5.0  # s, taken as independent of each other
 AXES = 3  # of a channel at most
+AT_ONCE = 32  # columns that are made together, where they are sparse
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +30,8 @@ class Table:
     channels : names; y (n,); channel (n,) place in `channels`; group (n,) number of an axis of a channel, AXES of each, what is alike
     in noise; series (n,) int, different in every flight; block (n,) number of an independent
     block; flight (n,); t (n,) s since the start; count (n,) samples averaged; place (n, 3) m.
-    parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column: (n,)}, X, whose columns tables share.
+    parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column: (n,)}, X, whose columns tables share;
+    sparse : whether they are kept as (rows, values), because of MANY anchors few are heard at once.
     """
 
     channels: tuple[str, ...]
@@ -41,7 +45,8 @@ class Table:
     count: np.ndarray
     place: np.ndarray
     parts: tuple[tuple[int, str, int, ChannelResidual], ...]
-    columns: dict[Column, np.ndarray]
+    columns: dict[Column, Any]
+    sparse: bool = False
 
     @property
     def present(self) -> tuple[str, ...]:
@@ -74,8 +79,10 @@ class Table:
         place = self.channels.index(channel)
         return slice(*np.searchsorted(self.channel, [place, place + 1]))
 
-    def matrix(self, columns: Sequence[Column], rows: slice | np.ndarray = slice(None)) -> np.ndarray:
-        """X of some Columns, (n, k), or some of its rows."""
+    def matrix(self, columns: Sequence[Column], rows: slice | np.ndarray = slice(None)) -> Any:
+        """X of some Columns, (n, k), or some of its rows; a sparse one if the Table is."""
+        if self.sparse:
+            return stacked([self.columns[column] for column in columns], len(self.y))[rows]
         out = np.empty((len(self.y[rows]), len(columns)), order="F")
         for place, column in enumerate(columns):
             out[:, place] = self.columns[column][rows]
@@ -92,13 +99,30 @@ class Table:
             return self
         columns = dict(self.columns)
         for effect, keys in wanted.values():
-            x = np.zeros((len(self.y), len(keys)), order="F")
-            for _, channel, row, part in self.parts:
-                if channel in effect.channels:
-                    values = part.columns(effect, tuple(keys))
-                    x[row : row + len(values)] = np.nan_to_num(values)
-            columns.update(zip(keys.values(), x.T))
+            names = tuple(keys)
+            some = range(0, len(names), AT_ONCE if self.sparse else len(names))
+            values = (self._values(effect, names[first : first + some.step]) for first in some)
+            columns.update(zip(keys.values(), (column for x in values for column in x)))
         return replace(self, columns=columns)
+
+    def _values(self, effect: Effect, keys: tuple[str, ...]) -> Any:
+        """What `columns` hold of parameters of an Effect: iterable."""
+        x = np.zeros((len(self.y), len(keys)), order="F")
+        for _, channel, row, part in self.parts:
+            if channel in effect.channels:
+                values = part.columns(effect, keys)
+                x[row : row + len(values)] = np.nan_to_num(values)
+        return ((rows, column[rows]) for column in x.T for rows in [np.flatnonzero(column)]) if self.sparse else x.T
+
+    def rows(self, chosen: np.ndarray) -> Table:
+        """Table of some rows, (n,) bool, with the columns that it has."""
+        each = ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
+        arrays = {name: getattr(self, name)[chosen] for name in each}
+        if not self.sparse:
+            return replace(self, **arrays, columns={column: values[chosen] for column, values in self.columns.items()})
+        place = np.cumsum(chosen) - 1
+        kept = {column: (place[rows[chosen[rows]]], values[chosen[rows]]) for column, (rows, values) in self.columns.items()}
+        return replace(self, **arrays, columns=kept)
 
     def with_contribution(self, effects: Iterable[tuple[Effect, Sequence[Column]]]) -> Table:
         """A Table whose y also holds what Effects, at their values, contribute; it has their columns."""
@@ -133,4 +157,5 @@ def table_of(residuals: Sequence[ChannelResiduals]) -> Table:
             for key in ("y", "series", "t", "count", "place"):
                 pieces[key].append(getattr(part, key))
     merged = {key: np.concatenate(several) for key, several in pieces.items()}
-    return Table(channels, **merged, parts=tuple(parts), columns={})
+    many = any(len(part.samples.anchors) > MANY for *_, part in parts if isinstance(part, TdoaResidual))
+    return Table(channels, **merged, parts=tuple(parts), columns={}, sparse=many)

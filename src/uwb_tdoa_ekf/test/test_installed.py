@@ -1,0 +1,158 @@
+"""Anchors that come, go and move while a filter runs."""
+
+from dataclasses import replace
+
+from flights import corners, fly, position_at
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_ekf.core.verdicts import INVALID, USED
+from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.installed import Installed
+
+BOX = corners()
+CHANGE = 4.0  # s
+GONE, MOVED, ADDED = BOX.ids[0], BOX.ids[1], 99
+PLACE, NEW = BOX.positions[1] + [1.5, 0.0, -0.5], [3.5, 4.0, 3.0]
+
+
+def after(before=BOX):
+    """Anchors after the change: one is gone, one stands elsewhere, one is new."""
+    positions = before.positions.copy()
+    positions[1] = PLACE
+    return Anchors.from_positions(np.vstack([positions[1:], NEW]), np.append(before.ids[1:], ADDED))
+
+
+def flight_through(seed=3, seconds=8.0, everything=False):
+    """Flight among the anchors that there are at each time; everything : the one that is gone sends on."""
+    flight, rng = fly(seed, seconds), np.random.default_rng(seed)
+    t = flight.tdoa.t
+    parts = []
+    for anchors, rows in ((BOX, t < CHANGE), (after(), t >= CHANGE)):
+        if everything:
+            anchors = Anchors.from_positions(np.vstack([anchors.positions, BOX.positions[:1]]), np.append(anchors.ids[:], GONE)) if rows[-1] else anchors
+        a = rng.integers(0, len(anchors), rows.sum())
+        b = (a + rng.integers(1, len(anchors), rows.sum())) % len(anchors)
+        d = tdoa(position_at(flight, t[rows]), anchors.positions[a], anchors.positions[b]) + 0.05 * rng.standard_normal(rows.sum())
+        parts.append((t[rows], anchors.ids[a], anchors.ids[b], d))
+    return replace(flight, anchors=BOX, tdoa=Tdoas(*map(np.concatenate, zip(*parts))))
+
+
+def cut(flight, low, high):
+    def part(stream):
+        rows = (stream.t >= low) & (stream.t < high)
+        return type(stream)(*(getattr(stream, name)[rows] for name in stream.__dataclass_fields__))
+
+    return replace(flight, tdoa=part(flight.tdoa), imu=part(flight.imu))
+
+
+def fed(estimator, flight):
+    estimator.add_imu(flight.imu.t, flight.imu.gyro, flight.imu.accel)
+    estimator.add_tdoa(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
+    return estimator.finish()
+
+
+def flown(told=True, everything=False):
+    """(Estimator, odometry and residuals before, and after the change)."""
+    flight, estimator = flight_through(everything=everything), Estimator(BOX)
+    before = fed(estimator, cut(flight, -np.inf, CHANGE))
+    if told:
+        assert estimator.stay(after())
+        estimator.change_anchors(after())
+    return estimator, flight, before, fed(estimator, cut(flight, CHANGE, np.inf))
+
+
+def test_the_filter_goes_on_with_those_that_are_there():
+    estimator, flight, _, (odometry, residuals) = flown()
+    assert estimator.counts["restarts"] == 0 and estimator.recoveries == 0
+    off = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
+    assert odometry.t[0] < CHANGE + 0.05 and off.max() < 0.3
+    assert (residuals.verdict != INVALID).all()
+    for anchor in (MOVED, ADDED):
+        mine = (residuals.verdict == USED) & ((residuals.a == anchor) | (residuals.b == anchor))
+        assert mine.sum() > 50 and np.median(np.abs(residuals.innovation[mine])) < 0.1
+
+
+def test_untold_the_anchor_that_was_moved_contradicts():
+    *_, (_, residuals) = flown(told=False)
+    mine = np.isfinite(residuals.innovation) & ((residuals.a == MOVED) | (residuals.b == MOVED))
+    assert np.median(np.abs(residuals.innovation[mine])) > 0.2
+    assert ((residuals.a == ADDED) <= (residuals.verdict == INVALID)).all()
+
+
+def test_one_that_is_gone_is_used_no_more():
+    *_, (_, residuals) = flown(everything=True)
+    gone = (residuals.a == GONE) | (residuals.b == GONE)
+    assert gone.sum() > 50 and (residuals.verdict[gone] == INVALID).all() and (residuals.verdict[~gone] != INVALID).all()
+
+
+def test_what_was_learned_of_those_that_stay_is_kept_and_of_one_that_moved_forgotten():
+    flight, estimator = flight_through(), Estimator(BOX)
+    fed(estimator, cut(flight, -np.inf, CHANGE))
+    before = estimator._pipeline.state.anchors.copy()
+    before["excess_variance"] = estimator._pipeline.state.anchors["excess_variance"] = 0.01 * (1.0 + np.arange(len(BOX)))
+    estimator.change_anchors(after())
+    np.testing.assert_array_equal(estimator._pipeline.state.anchors["excess_variance"][: len(BOX)], before["excess_variance"])
+    moved, added = estimator._installed.index(np.array([MOVED, ADDED]))
+    assert estimator._pipeline.state.anchors["excess_variance"][[moved, added]].tolist() == [0.0, 0.0]
+    np.testing.assert_array_equal(estimator._pipeline.state.anchors["position"][[moved, added]], [PLACE, NEW])
+    np.testing.assert_array_equal(estimator._pipeline.state.record.extent, [after().positions.min(axis=0), after().positions.max(axis=0)])
+
+
+def test_a_reset_afterwards_and_an_anchor_that_comes_back():
+    estimator, flight, _, _ = flown()
+    estimator.reset()
+    assert len(estimator._installed) == len(after())
+    estimator.change_anchors(BOX)
+    odometry, residuals = fed(estimator, cut(flight, -np.inf, CHANGE))
+    off = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
+    assert off[-1] < 0.3 and (residuals.verdict != INVALID).all()
+
+
+def test_other_anchors_in_another_frame_or_all_elsewhere_are_no_change():
+    estimator = Estimator(BOX)
+    assert estimator.stay(BOX) and estimator.stay(after())
+    assert not estimator.stay(BOX.at(BOX.positions + 0.5))
+    assert not estimator.stay(replace(BOX, frame="hall"))
+
+
+def test_who_moves_anchors_again_and_again_fills_no_memory(monkeypatch):
+    monkeypatch.setattr("uwb_tdoa_ekf.estimator.MOST_ROWS", len(BOX) + 3)
+    estimator, moved = Estimator(BOX), 0
+    for k in range(10):
+        other = BOX.at(BOX.positions + [[0.1 * (k + 1), 0.0, 0.0]] * (np.arange(len(BOX)) == 0)[:, None])
+        if estimator.stay(other):
+            estimator.change_anchors(other)
+            moved += 1
+    assert moved == 3 and len(estimator._installed) == len(BOX) + 3
+
+
+def test_nothing_is_said_of_an_anchor_that_was_taken_away():
+    """It is not heard any more; as long as it should be there, the monitor says so."""
+    flight = fly(5, 16.0, tdoa_rate=400.0)
+    quiet = (flight.tdoa.t > 6.0) & ((flight.tdoa.a == GONE) | (flight.tdoa.b == GONE))
+    flight = replace(flight, tdoa=Tdoas(*(getattr(flight.tdoa, name)[~quiet] for name in ("t", "a", "b", "d"))))
+    for taken in (False, True):
+        estimator = Estimator(BOX)
+        fed(estimator, cut(flight, -np.inf, 6.0))
+        if taken:
+            estimator.change_anchors(BOX.only(range(1, len(BOX))))
+        fed(estimator, cut(flight, 6.0, np.inf))
+        assert any(f"anchor {GONE} is not heard" in alarm for alarm in estimator.alarms) == (not taken)
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_rows_stay_what_they_are(times):
+    installed = Installed(BOX)
+    for _ in range(times):
+        rows = installed.index(BOX.ids[2:])
+        gone = installed.change(after())
+        np.testing.assert_array_equal(installed.index(BOX.ids[2:]), rows)
+        assert installed.index(np.array([GONE]))[0] == -1 and len(gone) == 2
+        np.testing.assert_array_equal(installed.ids[installed.present], after().ids)
+        np.testing.assert_array_equal(installed.positions[installed.present], after().positions)
+        installed.change(BOX)
+    assert installed.index(np.array([1234])).tolist() == [-1]

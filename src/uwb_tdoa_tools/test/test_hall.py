@@ -1,0 +1,95 @@
+"""diagnose and survey in a hall, of whose anchors a tag hears a part."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_tools.checking import pair_rules
+from uwb_tdoa_tools.checking.known_path import MANY, KnownPath
+from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis.channels import residuals
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.self_survey import Surveyed
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.surveying.result import Result
+from uwb_tdoa_tools.surveying.survey import survey
+from uwb_tdoa_tools.surveying.tape import Tape
+
+LATE, MOVED, SHIFT = 38, 50, {"x": 0.2, "y": -0.2, "z": 0.1}
+
+
+def hall(nx=11, ny=7, spacing=9.0):
+    """A grid of Anchors, a third of them low."""
+    rng, n = np.random.default_rng(7), nx * ny
+    x, y = np.meshgrid((np.arange(nx) + 0.5) * spacing, (np.arange(ny) + 0.5) * spacing)
+    z = np.where(rng.random(n) < 1.0 / 3.0, rng.uniform(0.4, 1.2, n), rng.uniform(2.5, 6.0, n))
+    return Anchors.from_positions(np.column_stack([x.ravel(), y.ravel(), z]) + np.append(rng.uniform(-1.0, 1.0, (n, 2)), np.zeros((n, 1)), axis=1))
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return simulate(
+        SimulationConfig(anchors=hall(), radio_reach=18.0, bias=False, protocol="tdoa3", duration=180.0, speed=3.0, imu_rate=100.0, truth_rate=50.0, seed=2)
+    )
+
+
+@pytest.fixture(scope="module")
+def faulty(sound):
+    late = EFFECTS["anchor_delay"]({str(LATE): 0.3}).inject(sound, np.random.default_rng(0))
+    return EFFECTS["anchor_position"]({f"{MOVED}.{axis}": value for axis, value in SHIFT.items()}).inject(late, np.random.default_rng(0))
+
+
+@pytest.mark.slow
+def test_an_anchor_that_is_late_and_one_that_was_moved_are_named_and_nothing_else(faulty):
+    assert len(hall()) > MANY
+    of_tdoas = [finding.effect for finding in diagnose([faulty]).findings if "tdoa" in finding.effect.channels]  # the inertial sensor has errors of its own
+    found = {(effect.name, key): value for effect in of_tdoas for key, value in effect.values.items()}
+    assert found.pop(("anchor_delay", str(LATE))) == pytest.approx(0.3, abs=0.03)
+    shift = {key: found.pop(("anchor_position", f"{MOVED}.{key}"), 0.0) for key in "xyz"}
+    assert all(shift[axis] == pytest.approx(SHIFT[axis], abs=0.06) for axis in "xy")
+    assert not [key for key in found if key[0].startswith("anchor") or key[0] in ("pair_offset", "nlos", "smooth_term")]
+
+
+def test_columns_of_some_anchors_are_made_of_their_tdoas_alone(sound):
+    part = residuals(sound, GroundTruth(), EffectSet())["tdoa"]
+    for name, keys in (("anchor_delay", ("38", "40")), ("anchor_position", ("38.x", "50.z")), ("anchor_clock_drift", ("38",)), ("pair_offset", ("38-39",))):
+        effect = EFFECTS[name]()
+        whole = np.nan_to_num(effect.regressors(part.samples, list(keys)))
+        np.testing.assert_allclose(part.columns(effect, keys), part.cells.means(whole), atol=1e-12)
+        assert np.abs(part.columns(effect, keys)).max() > 0.1
+
+
+@pytest.mark.slow
+def test_a_survey_names_both_and_nothing_else(faulty):
+    found = survey([faulty], Tape(0.05))
+    named = {(change.effect, change.anchor): change.values for change in found.surveyed.changes}
+    assert set(named) == {("anchor_delay", str(LATE)), ("anchor_position", str(MOVED))}
+    np.testing.assert_allclose(named["anchor_delay", str(LATE)], 0.3, atol=0.05)
+    np.testing.assert_allclose(named["anchor_position", str(MOVED)], list(SHIFT.values()), atol=0.1)
+    assert "beyond what the tape may be off by: anchor" in found.as_text()
+    assert len(found.effects.covariance.keys) == 4 * len(hall())
+
+
+def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_allows_it():
+    given, rng = hall(), np.random.default_rng(0)
+    shifts = 0.005 * rng.standard_normal((len(given), 3))
+    shifts[MOVED, :2] = 0.2, -0.2
+    covariance = np.diag(np.full(4 * len(given), 0.01**2))
+    covariance[:3, :3] = 0.1**2 * np.eye(3)  # one that was never heard
+    surveyed = Surveyed(given.at(given.positions + shifts), np.zeros(len(given)), covariance, 100.0, 0.05, 0.02, 0.2, 0.02, 0.003)
+    found = Result(given, np.full((len(given), 3), 0.1), surveyed, ("flight",))
+    assert found.apart == [MOVED] and f"anchor {MOVED} does not stand where it was given" in found.as_text()
+    still = replace(surveyed, anchors=given.at(given.positions + np.delete(shifts, MOVED, axis=0)[[*range(MOVED), 0, *range(MOVED, len(given) - 1)]]))
+    assert not replace(found, surveyed=still).apart
+
+
+def test_ids_that_are_exchanged_in_a_hall_are_found(sound):
+    of = sound.tdoa
+    swap = {38: 49, 49: 38}
+    a, b = (np.array([swap.get(int(i), int(i)) for i in ids]) for ids in (of.a, of.b))
+    path = KnownPath(type(sound)(sound.name, sound.anchors, type(of)(of.t, a, b, of.d), truth=sound.truth))
+    assert pair_rules.renamed(path)[0] == swap
+    assert not pair_rules.renamed(KnownPath(sound))[0]

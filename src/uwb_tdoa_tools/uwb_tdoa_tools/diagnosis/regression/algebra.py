@@ -1,0 +1,61 @@
+"""Products of matrices of columns: dense, or scipy's sparse ones where most of what they hold is zero."""
+
+from __future__ import annotations
+
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array, hstack, issparse
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+Matrix = Any  # an array, or a sparse one of scipy
+
+
+def stacked(columns: Sequence[Any], n: int) -> Matrix:
+    """Sparse matrix (n, k) of columns, each a pair (rows, values) or an array (n,)."""
+    pairs = [column if isinstance(column, tuple) else (np.flatnonzero(column), column[column != 0.0]) for column in columns]
+    ends = np.cumsum([0, *(len(rows) for rows, _ in pairs)])
+    rows, values = (np.concatenate([np.empty(0, kind), *(pair[k] for pair in pairs)]) for k, kind in enumerate((np.int64, float)))
+    return csc_array((values, rows, ends), shape=(n, len(columns)))
+
+
+def dense(x: Matrix) -> np.ndarray:
+    """A matrix as an array."""
+    return x.toarray() if issparse(x) else x
+
+
+def weighted(x: Matrix, weights: np.ndarray) -> Matrix:
+    """Rows of x (n, k) times weights (n,)."""
+    return x.multiply(weights[:, None]).tocsc() if issparse(x) else x * weights[:, None]
+
+
+def product(x: Matrix, y: Matrix) -> np.ndarray:
+    """x' y of two matrices (n, k) and (n, m): array (k, m)."""
+    return dense(x.T @ y)
+
+
+def counts(x: Matrix, axis: int) -> np.ndarray:
+    """How many entries of x along an axis are not zero."""
+    return (x != 0.0).sum(axis=axis)
+
+
+def sums_by(label: np.ndarray, x: Matrix, labels: int) -> np.ndarray:
+    """Sums of the rows of x (n, k) that have each label (n,) of 0 ... labels - 1: (labels, k)."""
+    if issparse(x):
+        members = csr_array((np.ones(len(label)), (label, np.arange(len(label)))), shape=(labels, len(label)))
+        return dense(members @ x)
+    return np.stack([np.bincount(label, column, labels) for column in x.T], axis=1)
+
+
+def beside_each_other(several: Sequence[Matrix]) -> Matrix:
+    """One matrix of the columns of several."""
+    return hstack(several, format="csc") if any(map(issparse, several)) else np.concatenate(several, axis=1)
+
+
+def each_times(x: Matrix, functions: np.ndarray) -> Matrix:
+    """Every column of x (n, k) times every one of `functions` (n, m): (n, k m)."""
+    if issparse(x):
+        return beside_each_other([weighted(x, function) for function in functions.T])
+    return (x[:, :, None] * functions[:, None, :]).reshape(len(x), -1)
