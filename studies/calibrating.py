@@ -41,7 +41,9 @@ def add_options(add):
 
 def run(args):
     """Print a table, a row for each set."""
-    print("| set | draws | offered | before, m: mean | after | ratio: median | largest | largest, had all been offered |\n|---|" + 7 * "---:|")
+    print(
+        "| set | draws | offered | before, m: mean | after | ratio: median | largest | largest, had all been offered |\n|---|" + 7 * "---:|"
+    )
     every = {}
     for name in [args.only] if args.only else (*SETS, SIMULATED):
         flights, holdout, others = flights_of(name, args.data)

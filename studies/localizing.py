@@ -36,7 +36,10 @@ def run(args):
         if args.json:
             Path(args.json).write_text(json.dumps(rows, indent=1))
     print("| recordings | number | good | of these within what is stated | not good | of these within |\n|---|" + 5 * "---:|")
-    for what, some in (("as they are", [r for r in rows if r["mistake"] == NOTHING]), ("with a mistake", [r for r in rows if r["mistake"] != NOTHING])):
+    for what, some in (
+        ("as they are", [r for r in rows if r["mistake"] == NOTHING]),
+        ("with a mistake", [r for r in rows if r["mistake"] != NOTHING]),
+    ):
         if some:
             print(f"| {what} | {len(some)} | {summary(some)} |")
     for row in rows:

@@ -38,7 +38,9 @@ def run(args):
     """Print a table, a row for each split and calibration, and how many flights are honest."""
     if args.vary:
         return vary(args.data, args.split)
-    print("| split | calibrated | tdoa_std | IMU | NEES, as they are | as told | 3D RMSE, as they are | as told |\n|---|---|---:|---|---:|---:|---:|---:|")
+    print(
+        "| split | calibrated | tdoa_std | IMU | NEES, as they are | as told | 3D RMSE, as they are | as told |\n|---|---|---:|---|---:|---:|---:|---:|"
+    )
     honest = {}
     for name in args.split:
         flights, judged = (measured_flights(args.data, paths) for paths in SPLITS[name])
@@ -50,10 +52,16 @@ def run(args):
                 sides = [figures(some, FilterConfig(tdoa_std=std), effects) for std in (FilterConfig.tdoa_std, tdoa_std)]
                 honest.setdefault((how, imu), []).append([(HONEST[0] <= nees) & (nees <= HONEST[1]) for nees, _ in sides])
                 nees = " | ".join(f"{nees.mean():.1f} ({nees.min():.1f} - {nees.max():.1f})" for nees, _ in sides)
-                print(f"| {name} | {how} | {tdoa_std:.2f} | {imu} | {nees} | " + " | ".join(f"{error:.3f}" for _, error in sides) + " |", flush=True)
+                print(
+                    f"| {name} | {how} | {tdoa_std:.2f} | {imu} | {nees} | " + " | ".join(f"{error:.3f}" for _, error in sides) + " |",
+                    flush=True,
+                )
     for (how, imu), several in honest.items():
         counts = [np.concatenate([one[side] for one in several]) for side in (0, 1)]
-        print(f"{how}, {imu} IMU: NEES from 1.5 to 4.5 in " + ", ".join(f"{int(c.sum())} of {len(c)} {w}" for c, w in zip(counts, ("as they are", "as told"))))
+        print(
+            f"{how}, {imu} IMU: NEES from 1.5 to 4.5 in "
+            + ", ".join(f"{int(c.sum())} of {len(c)} {w}" for c, w in zip(counts, ("as they are", "as told")))
+        )
 
 
 def vary(data, splits):

@@ -111,7 +111,10 @@ def make_flights(count, anchors, folder):
 
 def table(results):
     """Markdown of {Case: figures}: a row for each case, with what each flight more costs beside the case with fewer."""
-    lines = ["| tool | flights | anchors | effects | CPU, s | s per flight more | peak memory, MB | MB per flight more |", "|---|" + 7 * "---:|"]
+    lines = [
+        "| tool | flights | anchors | effects | CPU, s | s per flight more | peak memory, MB | MB per flight more |",
+        "|---|" + 7 * "---:|",
+    ]
     for case, of in results.items():
         fewer = [(other.flights, each) for other, each in results.items() if _same_but_fewer(other, case)]
         slopes = ["", ""]

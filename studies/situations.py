@@ -1,8 +1,8 @@
 """situations: where a tag can be and what can happen to it, simulated over many seeds, and how right and how honest the filter is there.
 
 The filter is that of a user who configures nothing, switched on where the recording begins, without corrections. Anchors, if nothing else
-is said, are 8 in 7 x 8 x 3 m; noise, outliers, delays of anchors, received power and late arrivals near the floor are those of `simulate`. Half of
-the seeds use TDOA2, half TDOA3. Each row judges one stretch of its recordings, all seeds together."""
+is said, are 8 in 7 x 8 x 3 m; noise, outliers, delays of anchors, received power and late arrivals near the floor are those of `simulate`.
+Half of the seeds use TDOA2, half TDOA3. Each row judges one stretch of its recordings, all seeds together."""
 
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -59,7 +59,9 @@ def run(args):
     """Simulate what is missing, and print the table."""
     chosen = [one for one in SITUATIONS if any(word in one.name for word in args.only)]
     if not chosen:
-        raise InputError(f"--only: no situation has {' or '.join(args.only)} in its name; they are: {'; '.join(one.name for one in SITUATIONS)}.")
+        raise InputError(
+            f"--only: no situation has {' or '.join(args.only)} in its name; they are: {'; '.join(one.name for one in SITUATIONS)}."
+        )
     items = [(one.name, seed) for one in chosen for seed in range(args.seeds)]
     found = dict(zip(items, _results(items, args.resume, args.jobs)))
     together = {one.name: figures([found[one.name, seed] for seed in range(args.seeds)]) for one in chosen}
@@ -88,7 +90,8 @@ def _results(items, path, jobs):
 
 
 def measure(item):
-    """{"figures": of the judged stretch, as of `scoring.by_phase.Judged`, null where there are none; "again": s, null for never} of (name, seed)."""
+    """{"figures": of the judged stretch, as of `scoring.by_phase.Judged`, null where there are none; "again": s, null for never} of (name,
+    seed)."""
     name, seed = item
     (situation,) = [one for one in SITUATIONS if one.name == name]
     common = {"seed": seed, "imu_rate": 500.0, "truth_rate": 100.0, "protocol": "tdoa2" if seed % 2 else "tdoa3", "anchors": corners()}
@@ -281,7 +284,9 @@ def _fast(rng, common):
 
     def position(t):
         along = np.where(t < 2.0 * slow, t**2 / (4.0 * slow), t - slow)  # of full speed, reached after 8 s
-        return np.array([0.0, 0.0, 1.4]) + 0.85 * np.stack([np.cos(5.0 / 0.85 * along), np.sin(5.0 / 0.85 * along), np.zeros(len(t))], axis=1)
+        return np.array([0.0, 0.0, 1.4]) + 0.85 * np.stack(
+            [np.cos(5.0 / 0.85 * along), np.sin(5.0 / 0.85 * along), np.zeros(len(t))], axis=1
+        )
 
     return _flown(18.0, position, common)
 
@@ -339,13 +344,20 @@ SITUATIONS = (
     Situation("on the floor", _LAID, (2.0, 12.0)),
     Situation("on the floor, low anchors 3.2 m late", partial(_low_late, _LAID), (2.0, 12.0)),
     Situation("at rest, 1 m high", partial(_still, 12.0, 1.0), (2.0, 12.0)),
-    Situation("at rest, TDOAs for 1 s, then none for 10 s", partial(_without, ("tdoa",), 1.0, 12.0, partial(_still, 12.0, 1.0)), (2.0, 11.0)),
+    Situation(
+        "at rest, TDOAs for 1 s, then none for 10 s", partial(_without, ("tdoa",), 1.0, 12.0, partial(_still, 12.0, 1.0)), (2.0, 11.0)
+    ),
     Situation("lift-off, 3 s", _hop, (4.0, 7.0)),
     Situation("lift-off, low anchors 3.2 m late on the floor", partial(_low_late, _hop), (4.0, 7.0)),
     Situation("landing, 3 s, and 4 s at rest", _hop, (11.0, 18.0), 14.0),
     Situation("landing, low anchors 3.2 m late on the floor", partial(_low_late, _hop), (11.0, 18.0), 14.0),
     Situation("tumbling for 5 s", _tumbling, (10.0, 15.0), 15.0),
-    *(Situation(f"outside, {far:g} m beyond the workspace", partial(_outside, far), (10.0 + 0.3 * far, 20.0 + 0.3 * far), 10.0 + 0.3 * far) for far in (1.0, 3.0, 10.0)),
+    *(
+        Situation(
+            f"outside, {far:g} m beyond the workspace", partial(_outside, far), (10.0 + 0.3 * far, 20.0 + 0.3 * far), 10.0 + 0.3 * far
+        )
+        for far in (1.0, 3.0, 10.0)
+    ),
     Situation("all anchors on one side", _one_side, (5.0, 20.0)),
     *(Situation(f"{count} anchors heard for 10 s", partial(_few, count, partial(_flying, 20.0)), (10.0, 20.0), 10.0) for count in (3, 4)),
     Situation("all anchors in a plane", _in_a_plane, (5.0, 20.0)),

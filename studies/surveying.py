@@ -65,7 +65,9 @@ def run(args):
         flights, judged = _simulated() if name == "simulated" else _measured(args.data, *SETS[name])
         for std in args.tape:
             seeds = range(args.first, args.first + args.draws)
-            draws = list(parallel.over(partial(draw, flights, judged, std, plain=args.plain), seeds, args.jobs, unit=f"draw of {name} {std}"))
+            draws = list(
+                parallel.over(partial(draw, flights, judged, std, plain=args.plain), seeds, args.jobs, unit=f"draw of {name} {std}")
+            )
             every[f"{name} {std}"] = draws
             print(f"| {name} | {std} | {_summary(draws)} |", flush=True)
     if args.json:

@@ -153,7 +153,9 @@ def table(verdicts: dict[tuple[str, str, str], list[dict]]) -> Iterator[str]:
     yield "|---|" + "---:|" * len(ESTIMATORS)
     for where in (KNOWN, *UNSEEN):
         for path in TRAJECTORIES:
-            yield _row(f"{where}{', trained in' if where == KNOWN else ''}, {path}", [mean(verdicts, by, [where], [path]) for by in ESTIMATORS])
+            yield _row(
+                f"{where}{', trained in' if where == KNOWN else ''}, {path}", [mean(verdicts, by, [where], [path]) for by in ESTIMATORS]
+            )
     yield _row("not trained in, mean", [mean(verdicts, by, UNSEEN) for by in ESTIMATORS])
     yield _row("the same, off the path, m", [mean(verdicts, by, UNSEEN, figure="tracking") for by in ESTIMATORS])
     yield _row("NEES (3 is honest)", [mean(verdicts, by, UNSEEN, figure="nees") for by in ESTIMATORS], 1)

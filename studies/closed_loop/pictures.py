@@ -31,8 +31,11 @@ def draw_errors_by_kind(verdicts: dict[tuple[str, str, str], list[dict]], path: 
 
 
 def draw_paths(shown: dict[str, list], path: Path) -> None:
-    """Figure 8: where flights went from their start, from above and from the side, beside where they were to go. shown : {estimator: [Drawn]}."""
-    figure, axes = plt.subplots(2, len(shown), figsize=(3.2 * len(shown), 5.4), sharex=True, sharey="row", layout="constrained", height_ratios=(3, 1))
+    """Figure 8: where flights went from their start, from above and from the side, beside where they were to go. shown : {estimator:
+    [Drawn]}."""
+    figure, axes = plt.subplots(
+        2, len(shown), figsize=(3.2 * len(shown), 5.4), sharex=True, sharey="row", layout="constrained", height_ratios=(3, 1)
+    )
     for column, (name, flights), colour in zip(axes.T, shown.items(), COLOURS):
         for one in flights:
             start = np.array([*one.p[0, :2], 0.0])
@@ -40,7 +43,12 @@ def draw_paths(shown: dict[str, list], path: Path) -> None:
             for ax, k in zip(column, (1, 2)):
                 ax.plot(p[:, 0], p[:, k], color=colour, lw=0.8, alpha=0.8)
                 ax.plot(wanted[:, 0], wanted[:, k], "k--", lw=0.6)
-        column[0].set(title=f"{name}\n{sum(one.verdict['landed'] for one in flights)} of {len(flights)} landed", aspect="equal", xlim=(-2.7, 0.7), ylim=(-1.7, 1.7))
+        column[0].set(
+            title=f"{name}\n{sum(one.verdict['landed'] for one in flights)} of {len(flights)} landed",
+            aspect="equal",
+            xlim=(-2.7, 0.7),
+            ylim=(-1.7, 1.7),
+        )
         column[1].set(xlabel="x, m", ylim=(0, 2))
         for ax in column:
             ax.grid(alpha=0.3)
@@ -50,7 +58,8 @@ def draw_paths(shown: dict[str, list], path: Path) -> None:
 
 
 def draw_errors(shown: dict[str, list], path: Path) -> None:
-    """Figure 9: errors of the estimate of the first flight by each estimator, with three of its deviations. shown : {estimator: [Drawn]}."""
+    """Figure 9: errors of the estimate of the first flight by each estimator, with three of its deviations. shown : {estimator:
+    [Drawn]}."""
     figure, axes = plt.subplots(3, len(shown), figsize=(3.2 * len(shown), 5.4), sharex=True, sharey=True, layout="constrained")
     for column, (name, flights) in zip(axes.T, shown.items()):
         one = flights[0]

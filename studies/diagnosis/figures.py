@@ -33,8 +33,20 @@ def add_options(add):
     """The options of the study."""
     add("part", choices=PARTS, help="what to run")
     add("--out", metavar="DIR", type=Path, required=True, help="where to write")
-    add("--seeds", metavar="N", type=int, default=5, help="flights for each effect and size, cases of blind and several, or costly draws of each of the faults (default: 5)")
-    add("--first", metavar="SEED", type=int, default=blind.DEVELOPED_ON, help="first seed of blind, several, faults and no-truth (default: %(default)s)")
+    add(
+        "--seeds",
+        metavar="N",
+        type=int,
+        default=5,
+        help="flights for each effect and size, cases of blind and several, or costly draws of each of the faults (default: 5)",
+    )
+    add(
+        "--first",
+        metavar="SEED",
+        type=int,
+        default=blind.DEVELOPED_ON,
+        help="first seed of blind, several, faults and no-truth (default: %(default)s)",
+    )
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
     add("--jobs", metavar="N", type=whole_number, default=1, help="cases of blind and several at once (default: %(default)s)")
     add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")

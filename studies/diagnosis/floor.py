@@ -1,4 +1,5 @@
-"""What happens on the floor of the measured flights: found by the search alone and with the effect, and what one set of flights tells of another."""
+"""What happens on the floor of the measured flights: found by the search alone and with the effect, and what one set of flights tells of
+another."""
 
 import numpy as np
 from tqdm import tqdm

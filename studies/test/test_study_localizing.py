@@ -21,6 +21,9 @@ def test_verdicts_are_compared_with_what_is_true(tmp_path, monkeypatch):
 
 
 def test_ratios_of_draws():
-    draws = [{"offered": True, "before": 0.2, "after": 0.1, "had_it_been": 0.1}, {"offered": False, "before": 0.2, "after": 0.2, "had_it_been": 0.3}]
+    draws = [
+        {"offered": True, "before": 0.2, "after": 0.1, "had_it_been": 0.1},
+        {"offered": False, "before": 0.2, "after": 0.2, "had_it_been": 0.3},
+    ]
     assert calibrating.summary(draws) == "1 | 0.200 | 0.150 | 0.75 | 1.00 | 1.50"
     assert np.isfinite([len(some) for some in calibrating.SETS]).all()

@@ -30,7 +30,10 @@ def foreign(monkeypatch, *paths):
     for name in ("stat", "lstat"):
         plain = getattr(os, name)
         of_another = lambda found: os.stat_result((*found[:4], os.getuid() + 1, *found[5:]))  # noqa: E731
-        changed = lambda path, *a, plain=plain, **k: of_another(plain(path)) if str(path) in map(str, paths) else plain(path, *a, **k)  # noqa: E731
+
+        def changed(path, *a, plain=plain, **k):
+            return of_another(plain(path)) if str(path) in map(str, paths) else plain(path, *a, **k)
+
         monkeypatch.setattr(os, name, changed)
 
 

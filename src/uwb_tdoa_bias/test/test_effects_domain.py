@@ -35,7 +35,9 @@ def test_a_drift_is_taken_out_while_it_was_seen_and_not_for_an_hour():
 
 
 def test_a_function_fades_beyond_where_it_was_seen_and_its_slope_with_it():
-    height = SmoothTerm({"1.c0": 0.4, "1.c1": 0.4, "1.c2": 0.4}, covariate="height", form="anchor", knots=(1.0, 2.0), domain={"height": (1.0, 2.0)})
+    height = SmoothTerm(
+        {"1.c0": 0.4, "1.c1": 0.4, "1.c2": 0.4}, covariate="height", form="anchor", knots=(1.0, 2.0), domain={"height": (1.0, 2.0)}
+    )
     at = {z: corrected(height, 1.0, (3.0, 3.0, z))[0] for z in (0.0, 1.5, 2.0, 2.5, 5.0)}
     assert at[1.5].bias == pytest.approx(0.4) and at[1.5].std == pytest.approx(0.0, abs=1e-9)
     assert 0.0 < at[2.5].bias[0] < 0.4 and at[2.5].slope[0, 2] < 0.0
@@ -81,7 +83,9 @@ def test_a_domain_is_written_and_read_and_files_without_one_too(tmp_path):
     assert "domain" not in (tmp_path / "effects.yaml").read_text().partition("anchor_delay")[2]
 
 
-@pytest.mark.parametrize("domain", [{"time": [60.0, 0.0]}, {"time": 60.0}, {"weather": [0.0, 1.0]}, {"time": ["a", 2]}, {"time": [0.0, float("inf")]}])
+@pytest.mark.parametrize(
+    "domain", [{"time": [60.0, 0.0]}, {"time": 60.0}, {"weather": [0.0, 1.0]}, {"time": ["a", 2]}, {"time": [0.0, float("inf")]}]
+)
 def test_a_domain_that_is_none_is_refused(domain):
     with pytest.raises(InputError, match="domain"):
         AnchorClockDrift({"1": 0.01}, domain=domain)

@@ -44,7 +44,9 @@ def test_nothing_is_imported_before_it_is_called():
 
 
 def test_an_import_that_takes_long_is_said(write, monkeypatch, capsys):
-    waits = "import sys, time\nend = time.monotonic() + 30.0\nwhile 'starting' not in sys.stderr.getvalue() and time.monotonic() < end: pass\n"
+    waits = (
+        "import sys, time\nend = time.monotonic() + 30.0\nwhile 'starting' not in sys.stderr.getvalue() and time.monotonic() < end: pass\n"
+    )
     write("takes_long", waits + "def main(): return 0")
     monkeypatch.setattr(module, "SAID", 0.01)
     assert executable("takes_long")() == 0

@@ -63,7 +63,9 @@ def read_elsewhere_in_a_node():
 
 
 def recursive():
-    function = helper.make_function("own", "Twice", ["x"], ["y"], [NODE("Twice", ["x"], ["y"], domain="own")], [helper.make_opsetid("own", 1)])
+    function = helper.make_function(
+        "own", "Twice", ["x"], ["y"], [NODE("Twice", ["x"], ["y"], domain="own")], [helper.make_opsetid("own", 1)]
+    )
     return model(NODE("Twice", ["x"], ["y"], domain="own"), functions=[function])
 
 

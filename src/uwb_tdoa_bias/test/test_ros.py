@@ -83,7 +83,9 @@ def test_simulated_time_that_stands_still_or_is_missing_is_said():
 def test_the_log_says_each_kind_of_thing_once_in_a_while():
     """38 warnings in 38 s, because a percentage changed."""
     saying = ros.Saying()
-    lines = [saying.anew(f"{40 + second} % of the TDOAs of anchor 3 are late by {0.1 * second:.2f} s", 1.0 * second) for second in range(38)]
+    lines = [
+        saying.anew(f"{40 + second} % of the TDOAs of anchor 3 are late by {0.1 * second:.2f} s", 1.0 * second) for second in range(38)
+    ]
     assert lines == [True] + 37 * [False]
     assert saying.anew("40 % of the TDOAs of anchor 4 are late by 0.10 s", 38.0)  # another anchor is another thing
     flips = [saying.anew(("running", "anchors 1 and 2 are exchanged")[second % 2], 40.0 + second) for second in range(20)]

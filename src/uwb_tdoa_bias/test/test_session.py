@@ -112,4 +112,6 @@ def test_a_network_of_another_operator_predicts(tmp_path):
     network, samples = Network(path), random_samples(50)
     (column,) = [k for k, name in enumerate(NAMES) if name == "dx_a"]
     feature = everything(samples)[:, column]
-    np.testing.assert_allclose(network.predict(samples)[0], np.clip(np.where(feature > 0.0, feature, np.expm1(feature)), -1.0, 1.0), atol=1e-6)
+    np.testing.assert_allclose(
+        network.predict(samples)[0], np.clip(np.where(feature > 0.0, feature, np.expm1(feature)), -1.0, 1.0), atol=1e-6
+    )

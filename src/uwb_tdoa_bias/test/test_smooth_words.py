@@ -1,7 +1,7 @@
 import pytest
 
 from uwb_tdoa_bias.effects import SmoothTerm
-from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_IMU, OF_TDOA
+from uwb_tdoa_bias.effects.covariates import OF_AIDS, OF_ARRIVAL, OF_IMU, OF_TDOA
 from uwb_tdoa_bias.effects.smooth_words import causes, described
 
 
@@ -47,9 +47,8 @@ def test_every_function_has_causes_and_a_trial_that_tells(form):
 
 @pytest.mark.parametrize("channel", ["gyro.x", "accel.z"])
 def test_every_function_of_a_sensor_has_causes(channel):
-    for covariate in (*OF_IMU, *OF_TDOA):
-        if covariate not in ("interval", "previous_anchor"):
-            assert all(causes(SmoothTerm(channel=channel, covariate=covariate, knots=(0.0, 1.0))))
+    for covariate in (*OF_IMU, *OF_AIDS):
+        assert all(causes(SmoothTerm(channel=channel, covariate=covariate, knots=(0.0, 1.0))))
 
 
 def test_what_all_anchors_share_over_the_room_is_no_advice():

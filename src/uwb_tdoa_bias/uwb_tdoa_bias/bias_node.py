@@ -41,18 +41,13 @@ if TYPE_CHECKING:
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
     "anchors_file": ANCHORS_FILE,
-    "effects_file": Parameter(
-        "", 'path of an effects.yaml: which systematic effects to remove, with which values; "" for none'
-    ),
+    "effects_file": Parameter("", 'path of an effects.yaml: which systematic effects to remove, with which values; "" for none'),
     "model_file": Parameter(
-        "", 'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 modules, which helps some flights and harms others'
+        "",
+        'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 modules, which helps some flights and harms others',
     ),
-    "pose_lag": Parameter(
-        0.05, "s; a TDOA is corrected at the newest pose at least this much older than the TDOA before it", 0.001, 10.0
-    ),
-    "hold": Parameter(
-        0.225, "s of stamps; longest wait for that pose: above ekf_node's lag - pose_lag, below its lag", 0.001, 100.0
-    ),
+    "pose_lag": Parameter(0.05, "s; a TDOA is corrected at the newest pose at least this much older than the TDOA before it", 0.001, 10.0),
+    "hold": Parameter(0.225, "s of stamps; longest wait for that pose: above ekf_node's lag - pose_lag, below its lag", 0.001, 100.0),
     "body_frame": Parameter(
         "base_link", "frame of the odometry's body; TDOAs in another frame are of an antenna that /tf_static places in it"
     ),

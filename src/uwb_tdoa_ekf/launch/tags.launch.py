@@ -19,7 +19,10 @@ from uwb_tdoa_ekf.launching import FROZEN, NETWORK, RESPAWN, tags, typed
 from uwb_tdoa_ekf.launching_actions import actions
 
 OTHERS = {
-    "processes": ("", "localization_nodes that share the tags: a number, or auto, one for each core; default: as the file says, or two nodes for each tag"),
+    "processes": (
+        "",
+        "localization_nodes that share the tags: a number, or auto, one for each core; default: as the file says, or two nodes for each tag",
+    ),
     "host": ("", "start the tags of this host; default: the name of this machine"),
     "use_sim_time": ("", "true for bags that are played with --clock"),
     "frozen": ("", FROZEN),

@@ -1,4 +1,5 @@
-"""Simulated halls in which a tag hears the anchors within the radio's reach, and a room in which it hears few TDOAs, for tests and tables."""
+"""Simulated halls in which a tag hears the anchors within the radio's reach, and a room in which it hears few TDOAs, for tests and
+tables."""
 
 from dataclasses import dataclass
 

@@ -27,7 +27,15 @@ def fly(monitor, anchors, heard, slices, first=0, seed=0):
         one_of = rng.permutation(n) % heard
         a, b = near[one_of], near[(one_of + 1 + rng.integers(heard - 1, size=n)) % heard]
         one, zeros = np.ones(n), np.zeros((n, 3))
-        state = p, np.tile([1.0, 0.0, 0.0], (n, 1)), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), zeros, zeros, np.zeros((n, 9, 9)), np.zeros((n, 3, 3))
+        state = (
+            p,
+            np.tile([1.0, 0.0, 0.0], (n, 1)),
+            np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
+            zeros,
+            zeros,
+            np.zeros((n, 9, 9)),
+            np.zeros((n, 3, 3)),
+        )
         rows = anchors.ids[a], anchors.ids[b], 0.1 * rng.standard_normal(n), one, one, np.full(n, USED)
         monitor.add(Odometry(t, *state), Residuals(t, *rows))
         monitor.judge(t[-1])

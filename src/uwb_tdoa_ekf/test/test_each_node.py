@@ -259,11 +259,16 @@ def test_an_anchor_that_goes_one_that_moves_and_one_that_comes_do_not_stop_the_n
     rig.play(test_installed.cut(flight, -np.inf, test_installed.CHANGE))
     before = rig.counts("ekf_node", state="running")
     rig.send_anchors(test_installed.after())
-    rig.wait(lambda: all(any("the anchors have changed" in line for line in process.lines) for process in processes), "the change to arrive")
+    rig.wait(
+        lambda: all(any("the anchors have changed" in line for line in process.lines) for process in processes), "the change to arrive"
+    )
     rig.play(test_installed.cut(flight, test_installed.CHANGE, np.inf))
     counts = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa.t))
     assert counts["restarts"] == counts["recoveries"] == 0 and counts["used"] > before["used"] + 500
-    t, p = (np.array([pick(m) for m in rig.odometry]) for pick in (lambda m: seconds_of(m.header.stamp), lambda m: [getattr(m.pose.pose.position, k) for k in "xyz"]))
+    t, p = (
+        np.array([pick(m) for m in rig.odometry])
+        for pick in (lambda m: seconds_of(m.header.stamp), lambda m: [getattr(m.pose.pose.position, k) for k in "xyz"])
+    )
     assert np.diff(t).max() < 0.1  # it never stopped
     late = t > test_installed.CHANGE
     assert np.linalg.norm(p[late] - position_at(flight, t[late]), axis=1).max() < 0.3

@@ -7,7 +7,8 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import (
-    ALIKE, BLUR_STD, BLURRED, IN_TIME, KNOWN, MOST_PAIRS, NOT_USED, PAIR, blur, explain, find_lateness, find_pairs, in_time, is_still, may_be_late,
+    ALIKE, BLUR_STD, BLURRED, IN_TIME, KNOWN, MOST_PAIRS, NOT_USED, PAIR, blur, explain, find_lateness, find_pairs, in_time, is_still,
+    may_be_late,
 )  # fmt: skip
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.workspace import set_bounds
@@ -62,7 +63,14 @@ def test_anchors_may_be_late_where_both_antennas_are_low_and_far_apart():
 
 def test_tdoas_are_noisier_near_the_ground_and_nowhere_else():
     hypotheses = new_state(POSITIONS).ekf["hypotheses"][0]
-    for z, ground, share in ((-0.1, 0.0, 1.0), (0.0, 0.0, 1.0), (0.5 * BLURRED, 0.0, 0.5), (BLURRED, 0.0, 0.0), (3.0, 0.0, 0.0), (3.0, 3.0, 1.0)):
+    for z, ground, share in (
+        (-0.1, 0.0, 1.0),
+        (0.0, 0.0, 1.0),
+        (0.5 * BLURRED, 0.0, 0.5),
+        (BLURRED, 0.0, 0.0),
+        (3.0, 0.0, 0.0),
+        (3.0, 3.0, 1.0),
+    ):
         hypotheses["x"][0, 2] = z
         assert blurred(hypotheses, ground) == pytest.approx((share * BLUR_STD) ** 2)
 

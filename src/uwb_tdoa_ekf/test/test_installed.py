@@ -33,7 +33,11 @@ def flight_through(seed=3, seconds=8.0, everything=False):
     parts = []
     for anchors, rows in ((BOX, t < CHANGE), (after(), t >= CHANGE)):
         if everything:
-            anchors = Anchors.from_positions(np.vstack([anchors.positions, BOX.positions[:1]]), np.append(anchors.ids[:], GONE)) if rows[-1] else anchors
+            anchors = (
+                Anchors.from_positions(np.vstack([anchors.positions, BOX.positions[:1]]), np.append(anchors.ids[:], GONE))
+                if rows[-1]
+                else anchors
+            )
         a = rng.integers(0, len(anchors), rows.sum())
         b = (a + rng.integers(1, len(anchors), rows.sum())) % len(anchors)
         d = tdoa(position_at(flight, t[rows]), anchors.positions[a], anchors.positions[b]) + 0.05 * rng.standard_normal(rows.sum())

@@ -223,7 +223,9 @@ def test_arguments_are_listed(launch, file):
 
 def param(*words):
     """What `ros2 param ...` does: the CompletedProcess."""
-    return subprocess.run([*ros2(), "param", *words[:1], "--no-daemon", "--spin-time", "5", *words[1:]], capture_output=True, text=True, timeout=120)
+    return subprocess.run(
+        [*ros2(), "param", *words[:1], "--no-daemon", "--spin-time", "5", *words[1:]], capture_output=True, text=True, timeout=120
+    )
 
 
 def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(make_rig, launch, tmp_path):

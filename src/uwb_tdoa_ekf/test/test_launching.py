@@ -74,7 +74,10 @@ def test_what_ends_for_good_ends_all_if_it_is_to(on_exit, everything):
     ("given", "said"),
     [
         ({}, "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, ROS_DOMAIN_ID=0: heard by nodes on every machine that multicast reaches, any of which"),
-        ({"ROS_DOMAIN_ID": "7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, "LOCALHOST, ROS_DOMAIN_ID=7: heard by nodes on this machine, and"),
+        (
+            {"ROS_DOMAIN_ID": "7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
+            "LOCALHOST, ROS_DOMAIN_ID=7: heard by nodes on this machine, and",
+        ),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "robot"}, "this machine and of ROS_STATIC_PEERS=robot, and"),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_STATIC_PEERS": "robot"}, "OFF, ROS_DOMAIN_ID=0: heard by nobody"),
         ({"ROS_LOCALHOST_ONLY": "1", "ROS_STATIC_PEERS": "robot"}, "LOCALHOST, ROS_DOMAIN_ID=0: heard by nodes on this machine, and"),
@@ -262,7 +265,13 @@ def test_the_layout_of_rviz_is_yaml():
 
 def test_the_layout_of_foxglove_shows_what_the_nodes_publish():
     content = json.loads((ROOT / "foxglove" / "tdoa.json").read_text())
-    kinds = {"/odometry": Odometry, "/uwb/residual": TdoaResidual, "/uwb/anchors/markers": None, "/ground_truth/pose": None, "/diagnostics": None}
+    kinds = {
+        "/odometry": Odometry,
+        "/uwb/residual": TdoaResidual,
+        "/uwb/anchors/markers": None,
+        "/ground_truth/pose": None,
+        "/diagnostics": None,
+    }
     panels = content["configById"]
     assert panels["3D!room"]["topics"].keys() | {panels["DiagnosticSummary!all"]["topicToRender"]} <= kinds.keys()
     paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]

@@ -38,7 +38,9 @@ def test_in_a_hall_it_is_searched_within_reach_of_all_that_are_heard():
     np.testing.assert_allclose(bounds[:, 0], [10.0 - np.hypot(10.0, 2.0), np.hypot(10.0, 2.0)])
 
 
-@pytest.mark.parametrize(("name", "side", "axis", "sign"), [("ceiling, 4", "below", 2, -1), ("wall, 8", "+x", 0, 1), ("wall, 8", "-x", 0, -1)])
+@pytest.mark.parametrize(
+    ("name", "side", "axis", "sign"), [("ceiling, 4", "below", 2, -1), ("wall, 8", "+x", 0, 1), ("wall, 8", "-x", 0, -1)]
+)
 def test_a_side_that_is_told_bounds_the_search(name, side, axis, sign):
     positions = room(name).anchors.positions
     rows = np.arange(len(positions) - 1)

@@ -56,7 +56,8 @@ def after_gaps(flight, found, within=1.0, gap=1.0):
 
 
 def bound(where, seed, duration=20.0):
-    """(3,) m, root mean square along the path from 10 s on of what delays of the anchors leave open at least, along each axis: they do not average out."""
+    """(3,) m, root mean square along the path from 10 s on of what delays of the anchors leave open at least, along each axis: they do not
+    average out."""
     rng = np.random.default_rng([seed, 5])  # as `fly` walks
     places = walk(where.size, duration, rng, 1.5)[0][int(10.0 * RATE) :: int(0.5 * RATE)]
     tree, out = cKDTree(where.anchors.positions), []
@@ -101,7 +102,9 @@ def main():
     parser.add_argument("--starts", type=int, default=100, metavar="N", help="in each hall (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="of each row in the room (default: %(default)s)")
     parser.add_argument("--only", default="", metavar="WORD", help="rows with this in their name")
-    parser.add_argument("--bound", action="store_true", help="instead: errors along the axes of the runs in halls where no estimate can be good")
+    parser.add_argument(
+        "--bound", action="store_true", help="instead: errors along the axes of the runs in halls where no estimate can be good"
+    )
     args = parser.parse_args()
     if args.bound:
         say_bounds(args.starts, args.only)
@@ -135,7 +138,10 @@ def main():
                 found = judge(flight, config)
                 gaps = ", ".join(f"{wrong:.2f}" for wrong in after_gaps(flight, found))
                 worst = float(np.max(found["off"] / found["std"]))
-                print(f"{name}, seed {seed}: NEES {found['nees']:.2f}, largest error {worst:.1f} deviations, wrong after silences for {gaps} s", flush=True)
+                print(
+                    f"{name}, seed {seed}: NEES {found['nees']:.2f}, largest error {worst:.1f} deviations, wrong after silences for {gaps} s",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

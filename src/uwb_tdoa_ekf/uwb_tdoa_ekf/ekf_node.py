@@ -99,10 +99,14 @@ class EkfNode(ros.StreamNode):
         self._attitude: tuple[np.ndarray, np.ndarray] | None = None  # quaternion and covariance of the newest odometry
         self._last_tdoa = -math.inf  # of a TDOA or range, time.monotonic(), s
         self._received_before: dict[str, int] = {}  # messages by topic, by the last report
-        self._early: deque[tuple[str, tuple[Any, ...]]] = deque()  # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one message each
+        self._early: deque[tuple[str, tuple[Any, ...]]] = (
+            deque()
+        )  # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one message each
         self._past: Counter[str] = Counter()  # accounts of estimators that were replaced, and of messages that none received
         self._lately: list[str] = []  # frames of the IMU since the last report, and the last one before it
-        self._placed: dict[str, tuple[ImuMount | None, str | None]] = {}  # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of coming
+        self._placed: dict[
+            str, tuple[ImuMount | None, str | None]
+        ] = {}  # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of coming
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
         refuse_unknown(self, {*RENAMED, *(member or ())})
         self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute, unless compile_nodes has done so")
@@ -147,7 +151,9 @@ class EkfNode(ros.StreamNode):
         if self._estimator is not None:
             self._publish(*self._estimator.finish())
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
-        self._estimator = Estimator(anchors, self._config, self._reorder, self._lag, self._effects.sensor_functions, self._effects.on_floor(anchors))
+        self._estimator = Estimator(
+            anchors, self._config, self._reorder, self._lag, self._effects.sensor_functions, self._effects.on_floor(anchors)
+        )
         self._imu_corrector = ImuCorrector(self._effects.effects)
         self._watch, self._restarts = self._new_watch(anchors), 0
         self.outputs.set_world(self._world or anchors.frame)

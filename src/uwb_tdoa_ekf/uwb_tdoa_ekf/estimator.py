@@ -51,8 +51,8 @@ class Estimator:
         self, anchors: Anchors, config: FilterConfig | None = None, reorder: float = 0.003, lag: float = 0.25,
         functions: Sequence[SensorFunction] = (), floor: Floor | None = None,
     ) -> None:  # fmt: skip
-        """anchors : Anchors; config : FilterConfig; reorder, lag : s, see ReorderBuffer; functions : SensorFunctions that are known; floor :
-        what is known of the anchors at a tag on the floor, see `EffectSet.on_floor`."""
+        """anchors : Anchors; config : FilterConfig; reorder, lag : s, see ReorderBuffer; functions : SensorFunctions that are known; floor
+        : what is known of the anchors at a tag on the floor, see `EffectSet.on_floor`."""
         self._installed, self._known = Installed(anchors), (functions, floor)
         self.config = config or FilterConfig()
         of_aids = [f"{stream}_{verdict}" for stream in aids.STREAMS for verdict in VERDICTS.values()]
@@ -107,9 +107,7 @@ class Estimator:
         flat, variances = ekf["flat"], np.diagonal(ekf.hypotheses["P"][ekf.best])
         for axis, (sides, where) in enumerate((("-x or +x", "x"), ("-y or +y", "y"), ("below or above", "height"))):
             if flat[axis] and (len(places) > 1 or variances[axis] > APART**2) and not (axis == 2 and known):
-                return (
-                    f"the anchors that are heard have one {where}, so that TDOAs do not tell on which side of them the tag is: set tag_side to {sides}"
-                )
+                return f"the anchors that are heard have one {where}, so that TDOAs do not tell on which side of them the tag is: set tag_side to {sides}"
         return None
 
     @property
@@ -176,8 +174,8 @@ class Estimator:
         """Take a pose that is known from outside: t s; p (3,) m, NaN where it is not known; covariance (3, 3) m^2; yaw and yaw_std rad,
         or NaN. It holds from its stamp on; if the filter has passed that, from the next measurement on.
 
-        Raises InputError for a stamp that is not of the time of the streams, and when too many wait. One that is set before there is any measurement is
-        judged by the first, and dropped if it is not of its time: `refused_pose`.
+        Raises InputError for a stamp that is not of the time of the streams, and when too many wait. One that is set before there is any
+        measurement is judged by the first, and dropped if it is not of its time: `refused_pose`.
         """
         self.refused_pose = None
         newest = self.newest
@@ -202,9 +200,9 @@ class Estimator:
         return anchors.frame == self.anchors.frame and bool(stay.any()) and len(self._installed) + int(np.sum(~stay)) <= MOST_ROWS
 
     def change_anchors(self, anchors: Anchors, floor: Floor | None = None) -> None:
-        """Go on among other Anchors: those that are new are used from now on, those that are gone no more, and one that stands elsewhere as a
-        new one. Nothing is forgotten of those that stay. TDOAs that wait are used, as far as their anchors were there when they came. floor : as
-        of the start."""
+        """Go on among other Anchors: those that are new are used from now on, those that are gone no more, and one that stands elsewhere as
+        a new one. Nothing is forgotten of those that stay. TDOAs that wait are used, as far as their anchors were there when they came.
+        floor : as of the start."""
         self._known = (self._known[0], floor)
         self._pipeline.change_anchors(self._installed.change(anchors), *self._known)
 

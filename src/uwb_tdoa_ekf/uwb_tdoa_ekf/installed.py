@@ -21,7 +21,8 @@ MOST_ROWS = 20_000  # twice as many as a message may hold: after so many changes
 class Installed:
     """The anchors that a filter has had so far, by rows, and which of them are there now.
 
-    anchors : Anchors that are there; ids (M,), positions (M, 3) m: of all rows. An anchor that is moved gets another row, with nothing known of it.
+    anchors : Anchors that are there; ids (M,), positions (M, 3) m: of all rows. An anchor that is moved gets another row, with nothing
+    known of it.
     """
 
     def __init__(self, anchors: Anchors) -> None:
@@ -58,7 +59,8 @@ class Installed:
 
 
 def new_state_of(installed: Installed, functions: Sequence[SensorFunction], floor: Floor | None) -> FilterState:
-    """`new_state` with a row for each row of Installed; functions, floor : of the anchors that are there. No TDOA comes of the other rows."""
+    """`new_state` with a row for each row of Installed; functions, floor : of the anchors that are there. No TDOA comes of the other
+    rows."""
     state, places = new_state(installed.anchors.positions, functions, floor), np.zeros(len(installed), int)
     places[installed.present] = np.arange(len(installed.present))
     return state._replace(anchors=state.anchors[places])

@@ -163,8 +163,9 @@ def tag(
 
 @dataclass(frozen=True)
 class Fleet:
-    """What a YAML file of tags says: `tags: {NAMESPACE: {parameter: value, host: HOST}}`, and beside `tags` what all of them share. path : of the
-    file; tags : {namespace: {parameter: value}}; hosts : {namespace: name of the machine that runs its nodes, None where the file names none};
+    """What a YAML file of tags says: `tags: {NAMESPACE: {parameter: value, host: HOST}}`, and beside `tags` what all of them share. path :
+    of the file; tags : {namespace: {parameter: value}}; hosts : {namespace: name of the machine that runs its nodes, None where the file
+    names none};
     processes : text, "" where the file does not say."""
 
     path: str
@@ -219,10 +220,11 @@ class Fleet:
 
 
 def tags(path: str, values: Mapping, log_level: str = "info", processes: str = "", host: str = "") -> list[Start]:
-    """What this machine starts of a YAML file of tags (Fleet): their nodes, and anchors_node if all name the same anchors_file. Of a file that names
-    hosts, the host of the first tag alone starts anchors_node.
+    """What this machine starts of a YAML file of tags (Fleet): their nodes, and anchors_node if all name the same anchors_file. Of a file
+    that names hosts, the host of the first tag alone starts anchors_node.
 
-    values : override the file's; processes : overrides the file's, see `pooled`; host : what this machine is called, default: its name. Raises InputError.
+    values : override the file's; processes : overrides the file's, see `pooled`; host : what this machine is called, default: its name.
+    Raises InputError.
     """
     fleet = Fleet.read(path)
     here = fleet.at(host or socket.gethostname())
@@ -237,7 +239,8 @@ def tags(path: str, values: Mapping, log_level: str = "info", processes: str = "
 
 def pooled(starts: list[Start], processes: int | str) -> list[Start]:
     """The same of `tags` with so many localization_nodes instead of bias_nodes and ekf_nodes; what these are told is in a file that
-    is written for them. processes : number, or its text, or "auto": one for each core. Raises InputError if it is none, or a tag has a parameter file of its own."""
+    is written for them. processes : number, or its text, or "auto": one for each core. Raises InputError if it is none, or a tag has a
+    parameter file of its own."""
     if processes == AUTO:
         processes = len(os.sched_getaffinity(0))
     if not str(processes).isdecimal() or not int(processes):

@@ -129,8 +129,8 @@ def _became(n: int, places: np.ndarray, outcomes: list[np.ndarray]) -> np.ndarra
 def _batches(
     t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, corrector: Corrector, longest: int
 ) -> Iterator[tuple[np.ndarray, float]]:
-    """What can be corrected and used together, at most `longest` TDOAs: (their places, in the order of their stamps, and the stamp, s, up to
-    which everything may be used then), at least one.
+    """What can be corrected and used together, at most `longest` TDOAs: (their places, in the order of their stamps, and the stamp, s, up
+    to which everything may be used then), at least one.
 
     Corrections need poses that are `lag` old: measurements less than that apart can be corrected as one batch.
     """

@@ -39,8 +39,8 @@ class Pipeline:
         self, anchors: Installed, config: FilterConfig, functions: Sequence[SensorFunction] = (),
         floor: Floor | None = None, watched: bool = True, records: list[np.ndarray] | None = None,
     ) -> None:  # fmt: skip
-        """anchors : Installed; config : FilterConfig; functions, floor : as of `new_state`, of the anchors that are there; watched : have a Monitor in any case; records : list to
-        which the history is appended (see engine.feed), or None."""
+        """anchors : Installed; config : FilterConfig; functions, floor : as of `new_state`, of the anchors that are there; watched : have a
+        Monitor in any case; records : list to which the history is appended (see engine.feed), or None."""
         self._anchors, self._records = anchors, records
         self.state = new_state_of(anchors, functions, floor)
         self.monitor = Monitor(anchors) if watched or config.compensate_changes else None
@@ -62,7 +62,8 @@ class Pipeline:
             self.monitor.forget(gone)
 
     def run(self, buffer: ReorderBuffer, until: float) -> list[Fed]:
-        """Use what a ReorderBuffer holds up to `until`, s; where delays are taken out, from the stamps on at which the monitor finds them."""
+        """Use what a ReorderBuffer holds up to `until`, s; where delays are taken out, from the stamps on at which the monitor finds
+        them."""
         parts = []
         while self._config.compensate_changes and self.monitor is not None and len(buffer):
             end = min(self.monitor.end, (math.floor(buffer.first / LENGTH) + 1.0) * LENGTH)  # the first slice begins with the first TDOA

@@ -101,8 +101,8 @@ class ReorderBuffer:
                 self._streams[place].gate.pass_time(t)  # or whoever waits for our pose of this time waits for the next one
 
     def load(self, place: int, rows: np.ndarray) -> None:
-        """Take rows (n,) of a stream of a recording, in the order of their stamps and not before those that came before. Those of all SENSORS may
-        come as one, in the order of stamps and kinds."""
+        """Take rows (n,) of a stream of a recording, in the order of their stamps and not before those that came before. Those of all
+        SENSORS may come as one, in the order of stamps and kinds."""
         self._streams[place].extend(rows)
 
     def take(self, until: float) -> Measurements:

@@ -27,7 +27,9 @@ def warm_up() -> None:
         estimator.add_imu(t, none, none + (0.0, 0.0, 9.81))
         estimator.add_tdoa(t, some % 4, (some + 1) % 4, np.zeros(len(some)))
         for name, sensor in SENSORS.items():
-            estimator.add(name, sensor.read(t, {field: np.ones((len(some), k) if k > 1 else len(some)) for field, k in sensor.fields.items()}))
+            estimator.add(
+                name, sensor.read(t, {field: np.ones((len(some), k) if k > 1 else len(some)) for field, k in sensor.fields.items()})
+            )
         odometry, _ = estimator.advance()
     pose_and_twist(odometry, *estimator.rates_at(odometry.t))
     rotation_std(odometry.q[-1:], odometry.covariance[-1:])

@@ -28,8 +28,8 @@ KINDS = "anchor_position", "anchor_delay"
 
 
 def normalised(flight, std, seed):
-    """{effect: (errors over stated deviations (n,), over those of the fit alone (n,))} of what is found in a Flight whose anchors are put off
-    by std, m. What the survey and the delays should be is what came with the flight, and zero."""
+    """{effect: (errors over stated deviations (n,), over those of the fit alone (n,))} of what is found in a Flight whose anchors are put
+    off by std, m. What the survey and the delays should be is what came with the flight, and zero."""
     off = std * np.random.default_rng(seed).standard_normal((len(flight.anchors), 3))
     shaken = replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off))
     found = attribute([shaken], GroundTruth(), undeclared=False).selection
@@ -60,8 +60,16 @@ def main():
             told = [normalised(flight, std, FIRST + k) for k, flight in enumerate(flights)]
             stated, alone = ({kind: [one[kind][k] for one in told] for kind in KINDS} for k in range(2))
             each = [f"{root([one]):.2f}" for one in stated[KINDS[0]] if len(one)]
-            cells = [root(alone[KINDS[0]]), root(stated[KINDS[0]]), " - ".join(sorted({min(each), max(each)})), root(alone[KINDS[1]]), root(stated[KINDS[1]])]
-            print(f"| {name} | {std} | " + " | ".join(cell if isinstance(cell, str) else f"{cell:.2f}" for cell in cells) + " |", flush=True)
+            cells = [
+                root(alone[KINDS[0]]),
+                root(stated[KINDS[0]]),
+                " - ".join(sorted({min(each), max(each)})),
+                root(alone[KINDS[1]]),
+                root(stated[KINDS[1]]),
+            ]
+            print(
+                f"| {name} | {std} | " + " | ".join(cell if isinstance(cell, str) else f"{cell:.2f}" for cell in cells) + " |", flush=True
+            )
 
 
 if __name__ == "__main__":

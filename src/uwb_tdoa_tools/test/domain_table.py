@@ -1,5 +1,5 @@
-"""What an effect does to flights beyond where it was seen: a clock's drift, fitted to the first seconds of one flight, taken out of the others,
-without its domain and with it. The figures of docs/reliability.md.
+"""What an effect does to flights beyond where it was seen: a clock's drift, fitted to the first seconds of one flight, taken out of the
+others, without its domain and with it. The figures of docs/reliability.md.
 
 python src/uwb_tdoa_tools/test/domain_table.py DATA
 """
@@ -19,7 +19,8 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.scoring.metrics import Score
 
-FITTED = {"const1": ("const1-trial1-tdoa2", 40.0), "const3": ("const3-trial1-tdoa2", 60.0), "const4": ("const4-trial1-tdoa2-traj1", 40.0)}  # s
+# s
+FITTED = {"const1": ("const1-trial1-tdoa2", 40.0), "const3": ("const3-trial1-tdoa2", 60.0), "const4": ("const4-trial1-tdoa2-traj1", 40.0)}
 BLOCKED = "const4-trial3", "const4-trial5"  # their anchors change in flight
 
 

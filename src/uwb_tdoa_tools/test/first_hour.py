@@ -42,15 +42,16 @@ CALIBRATION = {"anchors": "anchors.yaml", "effects": "effects.yaml", "config": "
 
 @dataclass
 class Hall:
-    """Two Flights of an installation whose anchors are as they are, and another one that judges; tape : Anchors as somebody measured them."""
+    """Two Flights of an installation whose anchors are as they are, and another one that judges; tape : Anchors as somebody measured
+    them."""
 
     flights: list
     judge: Flight
     tape: object
 
     def error(self, folder=None, anchors=None, **files):
-        """m, 3D RMSE of the flight that judges, with the files of a calibration that are there in a folder. files : {"effects": name, ...}, in
-        place of CALIBRATION."""
+        """m, 3D RMSE of the flight that judges, with the files of a calibration that are there in a folder. files : {"effects": name, ...},
+        in place of CALIBRATION."""
         there = {name: Path(folder) / file for name, file in (files or CALIBRATION).items()} if folder else {}
         there = {name: file for name, file in there.items() if file.exists()}
         survey = read_survey(there["anchors"]) if "anchors" in there else anchors or self.tape

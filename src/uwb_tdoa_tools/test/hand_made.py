@@ -15,4 +15,11 @@ def truth_of(*legs, rate=100.0):
 def flown(floor=0.03, rest=5.0, after=4.0):
     """On the floor, a second up to 1 m above it, there, and a second down; departs at `rest`."""
     up, down = rest + 1.0, rest + 11.0
-    return truth_of((0, 0, 0, floor), (rest, 0, 0, floor), (up, 0, 0, floor + 1), (down, 3, 0, floor + 1), (down + 1, 3, 0, floor), (down + 1 + after, 3, 0, floor))
+    return truth_of(
+        (0, 0, 0, floor),
+        (rest, 0, 0, floor),
+        (up, 0, 0, floor + 1),
+        (down, 3, 0, floor + 1),
+        (down + 1, 3, 0, floor),
+        (down + 1 + after, 3, 0, floor),
+    )

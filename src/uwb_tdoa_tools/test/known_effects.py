@@ -1,5 +1,5 @@
-"""Simulated flights without any effect, every effect at a small and at a large size to put into them, places known on their paths, and what is
-found by name."""
+"""Simulated flights without any effect, every effect at a small and at a large size to put into them, places known on their paths, and what
+is found by name."""
 
 import numpy as np
 

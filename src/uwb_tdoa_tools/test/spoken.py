@@ -7,7 +7,18 @@ SRC = Path(__file__).resolve().parents[2]
 FOLDERS = ("uwb_tdoa_bias/uwb_tdoa_bias", "uwb_tdoa_ekf/uwb_tdoa_ekf")
 LEVELS = {"WARN", "ERROR"}
 # functions that give sentences
-SAYING = {"trouble", "unknown_frame", "several_publishers", "_sentence", "_silence", "_swap", "_axis_alarms", "judge", "lost", "side_unknown"}
+SAYING = {
+    "trouble",
+    "unknown_frame",
+    "several_publishers",
+    "_sentence",
+    "_silence",
+    "_swap",
+    "_axis_alarms",
+    "judge",
+    "lost",
+    "side_unknown",
+}
 LEAST = 7  # characters that tell one sentence from another
 
 

@@ -325,7 +325,17 @@ def test_corrected_tdoas_of_a_bag_from_before_fields_were_added(tmp_path, lackin
     store, msgtype = get_typestore(Stores.ROS2_JAZZY), "uwb_tdoa_msgs/msg/TdoaCorrected"
     constants, fields = typestore().fielddefs[msgtype]
     store.register({msgtype: (constants, [field for field in fields if field[0] not in lacking])})
-    values = {"anchor_a": 1, "anchor_b": 2, "raw": 0.5, "bias": 0.1, "bias_std": 0.2, "corrected": 0.4, "variance": 0.3, "status": 1, "model": "x"}
+    values = {
+        "anchor_a": 1,
+        "anchor_b": 2,
+        "raw": 0.5,
+        "bias": 0.1,
+        "bias_std": 0.2,
+        "corrected": 0.4,
+        "variance": 0.3,
+        "status": 1,
+        "model": "x",
+    }
     header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](1, 0), "map")
     with new_bag(tmp_path / "old", "mcap") as writer:
         connection = writer.add_connection("/uwb/tdoa_corrected", msgtype, typestore=store)

@@ -158,7 +158,10 @@ def with_bad_messages(path, storage, of, count=100, many=1, cut=5):
     """A bag of `count` TDOAs, and as many of others; `many` messages of each topic of `of` are cut."""
     plain = path.with_name("whole")
     write_bag(small_flight(count / 500.0), plain)
-    seen, writer = dict.fromkeys(of, 0), Writer(path, version=9, storage_plugin={"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage])
+    seen, writer = (
+        dict.fromkeys(of, 0),
+        Writer(path, version=9, storage_plugin={"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]),
+    )
     with open_bag(plain) as reader, writer:
         to = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=typestore()) for c in reader.connections}
         for connection, stamp, data in messages(plain, reader, reader.connections):
@@ -207,7 +210,10 @@ def test_recorded_odometry_says_what_is_missing(tmp_path):
     pose = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](0, 0, 0), types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1))
     twist = types["geometry_msgs/msg/Twist"](*(types["geometry_msgs/msg/Vector3"](0, 0, 0) for _ in range(2)))
     header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](1, 0), "map")
-    with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](pose, zeros), types["geometry_msgs/msg/TwistWithCovariance"](twist, zeros)
+    with_covariance = (
+        types["geometry_msgs/msg/PoseWithCovariance"](pose, zeros),
+        types["geometry_msgs/msg/TwistWithCovariance"](twist, zeros),
+    )
     data = store.serialize_cdr(types["nav_msgs/msg/Odometry"](header, "base_link", *with_covariance), "nav_msgs/msg/Odometry")
     with Writer(tmp_path / "bag", version=9) as writer:
         connection = writer.add_connection("/odometry", "nav_msgs/msg/Odometry", typestore=store)

@@ -123,7 +123,9 @@ def test_a_survey_of_another_room_is_not_blamed_on_ids_nor_on_the_gyroscope():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("log", "survey"), [("util/const1-trial2-tdoa2.csv.gz", "const4.csv"), ("flights/0425/TDOA2/0425-traj2", "const1.csv")])
+@pytest.mark.parametrize(
+    ("log", "survey"), [("util/const1-trial2-tdoa2.csv.gz", "const4.csv"), ("flights/0425/TDOA2/0425-traj2", "const1.csv")]
+)
 def test_a_measured_log_with_the_survey_of_another_room(log, survey, shared_data):
     """The first was said to have the sign of all TDOAs wrong."""
     (flight,) = inputs.Reading(str(shared_data / "surveys" / f"anchor_{survey}")).flights([str(shared_data / log)])

@@ -56,7 +56,8 @@ def test_anchors_in_a_plane(axis):
 
 
 @pytest.mark.parametrize(
-    ("axis", "at", "said_of"), [(2, 3.0, "tag_side:=below"), (2, 0.1, "tag_side:=above"), (0, 0.0, "tag_side:=+x or -p tag_side:=-x"), (1, 0.0, "tag_side:=+y")]
+    ("axis", "at", "said_of"),
+    [(2, 3.0, "tag_side:=below"), (2, 0.1, "tag_side:=above"), (0, 0.0, "tag_side:=+x or -p tag_side:=-x"), (1, 0.0, "tag_side:=+y")],
 )
 def test_anchors_in_a_plane_across_an_axis_need_a_side(axis, at, said_of):
     flat = BOX.copy()

@@ -82,7 +82,9 @@ def test_a_full_disk_is_one_sentence(error, capsys):
         raise error
 
     assert cli.run(command, make_parser(), ["7"]) == 2
-    assert capsys.readouterr().err == "weigh: error: the disk is full: what was being written is not whole; make room, or write elsewhere.\n"
+    assert (
+        capsys.readouterr().err == "weigh: error: the disk is full: what was being written is not whole; make room, or write elsewhere.\n"
+    )
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(tmp_path):

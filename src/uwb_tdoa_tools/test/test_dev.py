@@ -130,7 +130,9 @@ def test_what_is_not_what_was_locked_is_not_installed(workspace, machine):
     assert not (workspace / ".venv" / "steps.json").exists()
 
 
-@pytest.mark.parametrize(("asked", "lock"), [("requirements.txt", ".dev/requirements.lock"), (".ci/requirements.txt", ".ci/requirements.lock")])
+@pytest.mark.parametrize(
+    ("asked", "lock"), [("requirements.txt", ".dev/requirements.lock"), (".ci/requirements.txt", ".ci/requirements.lock")]
+)
 def test_all_that_is_installed_is_locked(asked, lock):
     entry = re.compile(r"^(\S+)==(\S+)((?: \\\n    --hash=sha256:[0-9a-f]{64})*)$", re.MULTILINE)
     locked = {(canonical(name), version): hashes for name, version, hashes in entry.findall((ROOT / lock).read_text())}

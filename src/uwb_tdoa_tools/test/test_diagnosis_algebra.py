@@ -46,7 +46,9 @@ def test_fits_and_selections_of_a_sparse_table_are_those_of_a_dense_one(both):
     assert [item[1].label for item in ranked[0]] == [item[1].label for item in ranked[1]]
     np.testing.assert_allclose(*([item[0] for item in some] for some in ranked), rtol=1e-6, atol=1e-6)
     found = [select(table, candidates, one.inflation) for table in (dense, sparse)]
-    assert [[c.label for c in each.chosen] for each in found] == [[named(candidates, "anchor_delay", found[0].chosen[0].terms[0].keys).label]] * 2
+    assert [[c.label for c in each.chosen] for each in found] == [
+        [named(candidates, "anchor_delay", found[0].chosen[0].terms[0].keys).label]
+    ] * 2
     for judge in (held_out, lambda each: alternatives(each, each.chosen[0], candidates), lambda each: unobservable(each, candidates)):
         assert len(judge(found[0])) == len(judge(found[1]))
     np.testing.assert_allclose(held_out(found[1])[0].gain, held_out(found[0])[0].gain, rtol=1e-6)

@@ -391,7 +391,10 @@ def test_values_of_many_anchors_are_a_table(result):
     assert "Calibrate the antenna delay of anchors 0, 1, 2, 3 and 4." in text and "4 +14 ± 1" in text and "[cm]" in text
     shifts = EFFECTS["anchor_position"]({f"{k}.{axis}": 0.2 for k in range(4) for axis in "xz"}, {f"{k}.x": 0.01 for k in range(4)})
     text = said(sections.to_do(result, entries(replace(result, findings=[finding(shifts)]))))
-    assert "Measure anchors 0, 1, 2 and 3 again before you move them. If the survey proves right" in text and "anchor x [cm] z [cm] 0 +20 ± 1 +20" in text
+    assert (
+        "Measure anchors 0, 1, 2 and 3 again before you move them. If the survey proves right" in text
+        and "anchor x [cm] z [cm] 0 +20 ± 1 +20" in text
+    )
 
 
 def test_angles_are_in_degrees(result):
@@ -424,7 +427,9 @@ def test_letters_of_pictures_can_be_read_on_a_phone_and_curves_are_as_wide_as_th
     assert letters * phone / (pictures.WIDTH * pictures.PIXELS) >= 10.0
     sources = [attributes for tag, attributes, _ in Tags(page).seen if tag == "source"]
     assert sources and all(item["media"] == "(max-width: 44rem)" for item in sources)
-    assert any(attributes.get("width") == str(round(pictures.FULL * pictures.PIXELS)) for tag, attributes, _ in Tags(page).seen if tag == "img")
+    assert any(
+        attributes.get("width") == str(round(pictures.FULL * pictures.PIXELS)) for tag, attributes, _ in Tags(page).seen if tag == "img"
+    )
 
 
 def test_a_blocked_region_is_on_the_map_and_in_the_list(result):

@@ -162,7 +162,12 @@ def test_what_was_kept_before_there_were_phases_is_refused(bag, tmp_path, capsys
     assert "its results were made with another version of the figures" in capsys.readouterr().err
 
 
-FORGED = ("5", "{}", '{"row": {}, "sums": {}, "distributions": {}, "phases": {}}', '{"row": [], "sums": 1, "distributions": {}, "phases": {}}')
+FORGED = (
+    "5",
+    "{}",
+    '{"row": {}, "sums": {}, "distributions": {}, "phases": {}}',
+    '{"row": [], "sums": 1, "distributions": {}, "phases": {}}',
+)
 
 
 def test_a_result_that_somebody_has_forged_is_refused(bag, tmp_path, capsys):

@@ -11,7 +11,12 @@ from uwb_tdoa_bias.foundation.survey import read_survey
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "name"),
-    [*(("simulated", name) for name in TRUTHS), ("measured", "late"), ("measured", "in another frame"), ("measured", "z down, on another epoch")],
+    [
+        *(("simulated", name) for name in TRUTHS),
+        ("measured", "late"),
+        ("measured", "in another frame"),
+        ("measured", "z down, on another epoch"),
+    ],
 )
 def test_from_csv_and_tape_to_a_diagnosed_flight(tmp_path, monkeypatch, capsys, shared_data, source, name):
     """convert, check, evaluate, diagnose, evaluate: docs/connect.md."""

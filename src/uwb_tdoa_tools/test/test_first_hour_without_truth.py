@@ -1,5 +1,5 @@
-"""The first hour of a new user without ground truth, and the steps of README.md, by the commands of the documentation word for word, and what
-came of it."""
+"""The first hour of a new user without ground truth, and the steps of README.md, by the commands of the documentation word for word, and
+what came of it."""
 
 from pathlib import Path
 import re

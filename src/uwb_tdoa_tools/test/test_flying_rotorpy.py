@@ -23,7 +23,14 @@ def flights(seed):
     hover = np.sqrt(ours.mass * 9.81 / (4.0 * ours.thrust))
     state[POSITION], state[VELOCITY], state[SPEED] = (0.0, 0.0, 50.0), rng.normal(0.0, 1.0, 3), hover
     wind, numbers, scratch = rng.normal(0.0, 1.0, 3), ours.numbers(), np.empty((2, 17))
-    theirs = {"x": state[POSITION], "v": state[VELOCITY], "q": state[ATTITUDE], "w": state[RATE], "wind": wind, "rotor_speeds": state[SPEED]}
+    theirs = {
+        "x": state[POSITION],
+        "v": state[VELOCITY],
+        "q": state[ATTITUDE],
+        "w": state[RATE],
+        "wind": wind,
+        "rotor_speeds": state[SPEED],
+    }
     theirs = {name: np.array(value) for name, value in theirs.items()}
     oracle = multirotor.Multirotor(quad_params, theirs, "cmd_motor_speeds", integrator_kwargs=PRECISE)
     out = []

@@ -48,8 +48,12 @@ def test_the_corpus_is_small():
     assert sum(path.stat().st_size for path in targets.CORPUS.rglob("*") if path.is_file()) < 200_000
 
 
-@pytest.mark.parametrize(("work", "code"), [("while True: pass", -signal.SIGPROF), ("bytearray(run.MEGABYTES + 50 << 20)", 1), ("bytearray(9 << 20)", 0)])
+@pytest.mark.parametrize(
+    ("work", "code"), [("while True: pass", -signal.SIGPROF), ("bytearray(run.MEGABYTES + 50 << 20)", 1), ("bytearray(9 << 20)", 0)]
+)
 def test_who_fuzzes_ends_what_takes_too_long_or_too_much(work, code):
-    program = f"import sys; sys.path.insert(0, {str(FUZZ)!r}); import run, signal; run.watch(); signal.setitimer(signal.ITIMER_PROF, 0.2)\n{work}"
+    program = (
+        f"import sys; sys.path.insert(0, {str(FUZZ)!r}); import run, signal; run.watch(); signal.setitimer(signal.ITIMER_PROF, 0.2)\n{work}"
+    )
     done = subprocess.run([sys.executable, "-c", program], cwd=FUZZ, capture_output=True, text=True)
     assert done.returncode == code and ("MemoryError" in done.stderr) == (code == 1)

@@ -26,13 +26,25 @@ def hall(nx=11, ny=7, spacing=9.0):
     rng, n = np.random.default_rng(7), nx * ny
     x, y = np.meshgrid((np.arange(nx) + 0.5) * spacing, (np.arange(ny) + 0.5) * spacing)
     z = np.where(rng.random(n) < 1.0 / 3.0, rng.uniform(0.4, 1.2, n), rng.uniform(2.5, 6.0, n))
-    return Anchors.from_positions(np.column_stack([x.ravel(), y.ravel(), z]) + np.append(rng.uniform(-1.0, 1.0, (n, 2)), np.zeros((n, 1)), axis=1))
+    return Anchors.from_positions(
+        np.column_stack([x.ravel(), y.ravel(), z]) + np.append(rng.uniform(-1.0, 1.0, (n, 2)), np.zeros((n, 1)), axis=1)
+    )
 
 
 @pytest.fixture(scope="module")
 def sound():
     return simulate(
-        SimulationConfig(anchors=hall(), radio_reach=18.0, bias=False, protocol="tdoa3", duration=180.0, speed=3.0, imu_rate=100.0, truth_rate=50.0, seed=2)
+        SimulationConfig(
+            anchors=hall(),
+            radio_reach=18.0,
+            bias=False,
+            protocol="tdoa3",
+            duration=180.0,
+            speed=3.0,
+            imu_rate=100.0,
+            truth_rate=50.0,
+            seed=2,
+        )
     )
 
 
@@ -45,7 +57,9 @@ def faulty(sound):
 @pytest.mark.slow
 def test_an_anchor_that_is_late_and_one_that_was_moved_are_named_and_nothing_else(faulty):
     assert len(hall()) > MANY
-    of_tdoas = [finding.effect for finding in diagnose([faulty]).findings if "tdoa" in finding.effect.channels]  # the inertial sensor has errors of its own
+    of_tdoas = [
+        finding.effect for finding in diagnose([faulty]).findings if "tdoa" in finding.effect.channels
+    ]  # the inertial sensor has errors of its own
     found = {(effect.name, key): value for effect in of_tdoas for key, value in effect.values.items()}
     assert found.pop(("anchor_delay", str(LATE))) == pytest.approx(0.3, abs=0.03)
     shift = {key: found.pop(("anchor_position", f"{MOVED}.{key}"), 0.0) for key in "xyz"}
@@ -55,7 +69,12 @@ def test_an_anchor_that_is_late_and_one_that_was_moved_are_named_and_nothing_els
 
 def test_columns_of_some_anchors_are_made_of_their_tdoas_alone(sound):
     part = residuals(sound, GroundTruth(), EffectSet())["tdoa"]
-    for name, keys in (("anchor_delay", ("38", "40")), ("anchor_position", ("38.x", "50.z")), ("anchor_clock_drift", ("38",)), ("pair_offset", ("38-39",))):
+    for name, keys in (
+        ("anchor_delay", ("38", "40")),
+        ("anchor_position", ("38.x", "50.z")),
+        ("anchor_clock_drift", ("38",)),
+        ("pair_offset", ("38-39",)),
+    ):
         effect = EFFECTS[name]()
         whole = np.nan_to_num(effect.regressors(part.samples, list(keys)))
         np.testing.assert_allclose(part.columns(effect, keys), part.cells.means(whole), atol=1e-12)
@@ -82,7 +101,9 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
     surveyed = Surveyed(given.at(given.positions + shifts), np.zeros(len(given)), covariance, 100.0, 0.05, 0.02, 0.2, 0.02, 0.003)
     found = Result(given, np.full((len(given), 3), 0.1), surveyed, ("flight",))
     assert found.apart == [MOVED] and f"anchor {MOVED} does not stand where it was given" in found.as_text()
-    still = replace(surveyed, anchors=given.at(given.positions + np.delete(shifts, MOVED, axis=0)[[*range(MOVED), 0, *range(MOVED, len(given) - 1)]]))
+    still = replace(
+        surveyed, anchors=given.at(given.positions + np.delete(shifts, MOVED, axis=0)[[*range(MOVED), 0, *range(MOVED, len(given) - 1)]])
+    )
     assert not replace(found, surveyed=still).apart
 
 

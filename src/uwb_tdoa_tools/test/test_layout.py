@@ -22,8 +22,8 @@ ROS = """
     uwb_tdoa_ekf.launching
     uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.localization_node uwb_tdoa_ekf.outputs
     uwb_tdoa_ekf.monitoring.health
-    uwb_tdoa_tools.benchmark.graph uwb_tdoa_tools.benchmark.load uwb_tdoa_tools.benchmark.nodes uwb_tdoa_tools.benchmark.rates uwb_tdoa_tools.benchmark.source
-    uwb_tdoa_tools.benchmark.suite uwb_tdoa_tools.commands.bench uwb_tdoa_tools.commands.demo
+    uwb_tdoa_tools.benchmark.graph uwb_tdoa_tools.benchmark.load uwb_tdoa_tools.benchmark.nodes uwb_tdoa_tools.benchmark.rates
+    uwb_tdoa_tools.benchmark.source uwb_tdoa_tools.benchmark.suite uwb_tdoa_tools.commands.bench uwb_tdoa_tools.commands.demo
     uwb_tdoa_tools.commands.record uwb_tdoa_tools.commands.replay uwb_tdoa_tools.live.demo uwb_tdoa_tools.live.follow
     uwb_tdoa_tools.live.followed_nodes uwb_tdoa_tools.live.listen
     uwb_tdoa_tools.live.player uwb_tdoa_tools.live.processes uwb_tdoa_tools.live.record uwb_tdoa_tools.live.replay
@@ -244,6 +244,8 @@ def test_commands_are_thin(module):
     body = ast.parse(text).body
     functions = {node.name for node in body if isinstance(node, ast.FunctionDef)}
     assert {"main", "parser"} <= functions and 'if __name__ == "__main__":\n    sys.exit(main())' in text
-    imported = [node for node in body if isinstance(node, (ast.Import, ast.ImportFrom)) or ast.unparse(node).startswith("if TYPE_CHECKING:")]
+    imported = [
+        node for node in body if isinstance(node, (ast.Import, ast.ImportFrom)) or ast.unparse(node).startswith("if TYPE_CHECKING:")
+    ]
     assert len(text.splitlines()) - sum(node.end_lineno - node.lineno + 1 for node in imported) <= 118
     assert not re.search(r"(?<!\w)print\(|tqdm\.write", text)  # cli.show and cli.say make text of others printable

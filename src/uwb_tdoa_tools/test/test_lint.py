@@ -6,9 +6,23 @@ import pytest
 
 from documented import ROOT
 
-SOURCES = [str(ROOT / name) for name in ("src/uwb_tdoa_bias/uwb_tdoa_bias", "src/uwb_tdoa_ekf/uwb_tdoa_ekf", "src/uwb_tdoa_tools/uwb_tdoa_tools", "studies")]
+SOURCES = [
+    str(ROOT / name)
+    for name in ("src/uwb_tdoa_bias/uwb_tdoa_bias", "src/uwb_tdoa_ekf/uwb_tdoa_ekf", "src/uwb_tdoa_tools/uwb_tdoa_tools", "studies")
+]
 # Module docstrings, blank lines, indentation, quotes. What a docstring says, and how it begins, is not for a linter.
 DOCSTRINGS = "D100 D104 D201 D202 D204 D207 D300 D301 D412 D414".split()
+
+
+LONGEST = 140  # characters of a line, as CONTRIBUTING.md says
+IN_QUOTES = re.compile(rf"^.{{{LONGEST - 40},}}[\"']")  # a text crosses that column, or ends near it
+
+
+def test_no_line_is_longer_than_contributing_says():
+    files = [path for folder in ("src", "studies") for path in (ROOT / folder).rglob("*.py")]
+    lines = [(path, number, line) for path in files for number, line in enumerate(path.read_text().splitlines(), 1)]
+    long = [f"{path.relative_to(ROOT)}:{number}" for path, number, line in lines if len(line) > LONGEST and not IN_QUOTES.match(line)]
+    assert len(files) > 500 and not long
 
 
 @pytest.mark.slow

@@ -171,7 +171,8 @@ def test_a_recording_without_an_estimate_has_files_and_a_picture_too(flight, tmp
 
 
 def walked(n=600):
-    """(Odometry, Residuals) of a tag that goes from x = 0 to 40 m; anchor k is heard from 10 k to 10 k + 20 m, the last TDOAs are rejected."""
+    """(Odometry, Residuals) of a tag that goes from x = 0 to 40 m; anchor k is heard from 10 k to 10 k + 20 m, the last TDOAs are
+    rejected."""
     t = 0.1 * np.arange(n)
     p = np.column_stack([40.0 * t / t[-1], np.full(n, 2.0), np.ones(n)])
     covariance = np.broadcast_to(0.01 * np.eye(9), (n, 9, 9))
@@ -187,7 +188,12 @@ def test_zones_say_who_is_heard_where_and_how_well():
     assert [(zone.x, zone.y) for zone in found[:4]] == [(5.0, 5.0), (15.0, 5.0), (25.0, 5.0), (35.0, 5.0)]
     assert [dict(zone.anchors).keys() for zone in found[1:3]] == [{0, 1}, {1, 2}]
     for zone in found[:3]:
-        assert zone.heard == 2.0 and zone.used == 1.0 and zone.left == pytest.approx(1.4826 * 0.05) and zone.std == pytest.approx(np.sqrt(0.03))
+        assert (
+            zone.heard == 2.0
+            and zone.used == 1.0
+            and zone.left == pytest.approx(1.4826 * 0.05)
+            and zone.std == pytest.approx(np.sqrt(0.03))
+        )
         assert zone.seconds == pytest.approx(15.0, abs=0.2) and zone.tdoas_per_s == pytest.approx(10.0, rel=0.05)
     assert found[3].used == pytest.approx(0.5, abs=0.05)
     assert zones.zones_of(*(part for part in (walked()[0], Residuals(*(np.empty(0) for _ in range(7))))), 10.0) == []

@@ -23,7 +23,9 @@ def test_no_message_ends_a_node_and_each_is_accounted_for(name, tmp_path):
     assert account.memory[-1] < account.memory[len(account.memory) // 2] + GROWTH
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "vehicle_node" else pytest.mark.slow) for name in odd_messages.SERVICES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "vehicle_node" else pytest.mark.slow) for name in odd_messages.SERVICES]
+)
 def test_no_request_ends_a_node_and_each_is_answered(name, tmp_path):
     answered, used = odd_messages.request_ordeal(name, FEW // 4, tmp_path)
     assert len(answered) == 6 + len(odd_messages.SERVICES[name]) and min(answered.values()) >= FEW // 4

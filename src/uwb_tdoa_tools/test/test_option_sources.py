@@ -76,7 +76,9 @@ def test_localize_takes_the_survey(desk):
 def test_every_tool_reads_the_recording_with_the_survey(desk, monkeypatch, command, words):
     """It says so, and whatever it then does it does with those anchors."""
     seen = []
-    module = {check: "uwb_tdoa_tools.checking.recording", debias: "uwb_tdoa_tools.readers.inputs"}.get(command, "uwb_tdoa_tools.readers.inputs")
+    module = {check: "uwb_tdoa_tools.checking.recording", debias: "uwb_tdoa_tools.readers.inputs"}.get(
+        command, "uwb_tdoa_tools.readers.inputs"
+    )
     name = "_read_bag" if command is check else "read_flight"
     monkeypatch.setattr(f"{module}.{name}", lambda *args: seen.append(args[2] if command is check else args[1]) or pytest.fail("enough"))
     with pytest.raises(BaseException, match="enough"):
@@ -108,7 +110,16 @@ def refused(command, words, sentence, capsys):
 
 
 @pytest.mark.parametrize(
-    "more", [("--effects", "e.yaml"), ("--config", "c.yaml"), ("--model", "default"), ("-p", "loss:=huber"), ("--without", "height"), ("--smooth",), ("--no-bias",)]
+    "more",
+    [
+        ("--effects", "e.yaml"),
+        ("--config", "c.yaml"),
+        ("--model", "default"),
+        ("-p", "loss:=huber"),
+        ("--without", "height"),
+        ("--smooth",),
+        ("--no-bias",),
+    ],
 )
 def test_no_option_of_the_estimate_goes_with_an_odometry_that_was_recorded(desk, capsys, more):
     sentence = f"{more[0]}: has no part in an odometry that was recorded"

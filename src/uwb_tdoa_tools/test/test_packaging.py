@@ -109,8 +109,14 @@ def test_the_container_runs_as_an_ordinary_user_beside_the_host_and_with_pins():
     after = steps[order.index("USER") + 1 :]
     assert [word for word, _ in after] == ["RUN", "CMD"] and "compile_nodes" in after[0][1]  # what is compiled belongs to the user
     assert "podman run" in first and "--net" not in first
-    chosen = next(re.search(r'grep -E "(.*?)" requirements.txt', rest)[1] for word, rest in steps if "pip_constraint.txt" in rest and word == "RUN")
-    assert [line.split("==")[0] for line in (ROOT / "requirements.txt").read_text().splitlines() if re.match(chosen, line)] == ["onnxruntime", "rosbags", "onnx"]
+    chosen = next(
+        re.search(r'grep -E "(.*?)" requirements.txt', rest)[1] for word, rest in steps if "pip_constraint.txt" in rest and word == "RUN"
+    )
+    assert [line.split("==")[0] for line in (ROOT / "requirements.txt").read_text().splitlines() if re.match(chosen, line)] == [
+        "onnxruntime",
+        "rosbags",
+        "onnx",
+    ]
 
 
 @pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)

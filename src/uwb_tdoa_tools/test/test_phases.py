@@ -65,7 +65,9 @@ def test_a_tag_that_never_moves_is_at_rest_all_the_time(height):
 
 
 def test_a_take_off_of_more_than_three_seconds_leaves_nothing_out():
-    truth = truth_of((0, 0, 0, 0), (5, 0, 0, 0), (6, 0, 0, 0.2), (16, 0, 0, 0.2), (17, 0, 0, 1), (27, 0, 0, 1), (28, 0, 0, 0), (30, 0, 0, 0))
+    truth = truth_of(
+        (0, 0, 0, 0), (5, 0, 0, 0), (6, 0, 0, 0.2), (16, 0, 0, 0.2), (17, 0, 0, 1), (27, 0, 0, 1), (28, 0, 0, 0), (30, 0, 0, 0)
+    )
     found = phases(truth)
     assert found["moving"] == motion(truth) and found["moving"][0] < found["first_3_s"][1] < found["in_the_air"][0]
 

@@ -26,7 +26,9 @@ def anchors_of(nx, ny, hole=None, spacing=8.0):
 
 
 def hall_of(anchors, reach=REACH):
-    goal = Goal(np.empty((0, 3)), Installation(anchors.only([0, 1, 2, len(anchors) // 2 + 1, len(anchors) - 1])), "all_pairs", criterion="round")
+    goal = Goal(
+        np.empty((0, 3)), Installation(anchors.only([0, 1, 2, len(anchors) // 2 + 1, len(anchors) - 1])), "all_pairs", criterion="round"
+    )
     return Hall(goal, anchors, reach)
 
 
@@ -60,7 +62,19 @@ def test_one_more_anchor_is_proposed_near_the_hole():
 
 def test_the_command_writes_a_picture_and_says_who_hears_how_many(tmp_path, capsys):
     anchors_of(6, 5).to_yaml(tmp_path / "hall.yaml")
-    command = [str(tmp_path / "hall.yaml"), "--radio-reach", "15", "--height", "1.2", "--step", "8", "--jobs", "1", "--out", str(tmp_path / "out")]
+    command = [
+        str(tmp_path / "hall.yaml"),
+        "--radio-reach",
+        "15",
+        "--height",
+        "1.2",
+        "--step",
+        "8",
+        "--jobs",
+        "1",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(command) == 0
     assert "anchors heard" in capsys.readouterr().out
     assert {"hall.png", "plan.json", "flyable.npz", "plan.bag"} <= {path.name for path in (tmp_path / "out").iterdir()}

@@ -82,7 +82,8 @@ def test_remedies_begin_as_the_user_began(monkeypatch):
 
 PACKAGES = [ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")]
 TOOLS = tuple(path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if path.stem != "__init__")
-PRINT = {"commands/calibrate.py", "commands/survey.py", "diagnosis/report/apply.py", "live/demo.py"}  # whose lines tests below, and test_demo.py, run
+# Whose lines tests below, and test_demo.py, run
+PRINT = {"commands/calibrate.py", "commands/survey.py", "diagnosis/report/apply.py", "live/demo.py"}
 
 
 def sources():
@@ -92,9 +93,11 @@ def sources():
 
 
 def texts(tree):
-    """Texts in a module that may be printed, with "value" where a value is put in: no docstrings, and no examples of --help, which begin as the
-    user began."""
-    passed = {id(part) for node in ast.walk(tree) if isinstance(node, ast.Call) and "parser" in ast.unparse(node.func) for part in ast.walk(node)}
+    """Texts in a module that may be printed, with "value" where a value is put in: no docstrings, and no examples of --help, which begin as
+    the user began."""
+    passed = {
+        id(part) for node in ast.walk(tree) if isinstance(node, ast.Call) and "parser" in ast.unparse(node.func) for part in ast.walk(node)
+    }
     inside = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
     for node in ast.walk(tree):
         if id(node) in passed | inside:
@@ -118,7 +121,9 @@ def test_no_text_is_a_command_that_does_not_run_as_it_stands():
     ros2 = module_from_spec(spec)
     spec.loader.exec_module(ros2)
     found = [(name, text) for name, tree in sources() for text in texts(tree)]
-    commands = [(name, text) for name, text in found if re.match(r"(ros2|\./dev) \w+ \S|(" + "|".join(TOOLS) + r") (?:\S*[./]\S* )*--\w", text)]
+    commands = [
+        (name, text) for name, text in found if re.match(r"(ros2|\./dev) \w+ \S|(" + "|".join(TOOLS) + r") (?:\S*[./]\S* )*--\w", text)
+    ]
     assert len(commands) >= 3
     for name, text in commands:
         line, *_ = text.split("  #")

@@ -71,7 +71,9 @@ def test_a_line_without_end_is_not_read(tmp_path, monkeypatch):
         fill(path, ["a"])
 
 
-@pytest.mark.parametrize("content", ["flight,rmse\n", "[1]\n", "not a result", '{"runs": []}\n', '{"asked": 1}\n', b"\xff\x00\n", "[" * 100_000 + "\n"])
+@pytest.mark.parametrize(
+    "content", ["flight,rmse\n", "[1]\n", "not a result", '{"runs": []}\n', '{"asked": 1}\n', b"\xff\x00\n", "[" * 100_000 + "\n"]
+)
 def test_another_file_is_left_alone(tmp_path, content):
     path = tmp_path / "other"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())

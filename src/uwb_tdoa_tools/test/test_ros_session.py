@@ -95,7 +95,15 @@ def test_no_package_is_imported_because_a_stranger_names_it(tmp_path, monkeypatc
     (tmp_path / "evil_msgs" / "__init__.py").write_text("")
     (tmp_path / "evil_msgs" / "msg.py").write_text("class Nice: pass")
     monkeypatch.syspath_prepend(tmp_path)
-    for name in ("evil_msgs/msg/Nice", "evil_msgs/Nice", "antigravity/msg/Nice", "sensor_msgs/msg/__doc__/x", "sensor_msgs", "", "../x/msg/Y"):
+    for name in (
+        "evil_msgs/msg/Nice",
+        "evil_msgs/Nice",
+        "antigravity/msg/Nice",
+        "sensor_msgs/msg/__doc__/x",
+        "sensor_msgs",
+        "",
+        "../x/msg/Y",
+    ):
         assert message_class(name) is None
     assert "evil_msgs" not in sys.modules and "antigravity" not in sys.modules
     assert message_class("evil_msgs/msg/Nice", ["evil_msgs"]).__name__ == "Nice"

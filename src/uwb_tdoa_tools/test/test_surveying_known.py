@@ -146,7 +146,9 @@ def test_marks_on_the_floor_tell_nothing_and_those_in_the_air_judge_each_other(f
     flight = at(flights[0], flights[0].anchors.positions + [0.0, 0.0, 0.2])
     results = [survey([flight], Tape(0.3), constraints=some) for some in ((), ends(flights[0]), marks_in_the_air(flights[0]))]
     np.testing.assert_array_equal(results[0].surveyed.anchors.positions, results[1].surveyed.anchors.positions)
-    assert results[1].surveyed.grounded == 2 and results[1].surveyed.marks is None and "left out: 2 marks on the floor" in results[1].as_text()
+    assert (
+        results[1].surveyed.grounded == 2 and results[1].surveyed.marks is None and "left out: 2 marks on the floor" in results[1].as_text()
+    )
     before, after, nearer = results[2].surveyed.marks
     assert after < 0.7 * before and nearer == 1.0 and results[2].why_not is None and "nearer at 100% of them" in results[2].as_text()
     for against in ((after, before, nearer), (before, after, 0.6)):

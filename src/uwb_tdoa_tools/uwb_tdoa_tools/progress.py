@@ -31,7 +31,8 @@ class Progress:
     def __init__(
         self, name: str = "", total: int | None = None, unit: str = "", stream: TextIO | None = None, what: str = ""
     ) -> None:
-        """name : what the lines begin with; total : of what is to be done, in `unit`, or None; stream : where to, default stderr; what : what is done first."""
+        """name : what the lines begin with; total : of what is to be done, in `unit`, or None; stream : where to, default stderr; what :
+        what is done first."""
         self._name, self._total, self._unit, self._stream = name, total, unit, stream
         self._what, self._done, self._ended = what, 0, Event()
 

@@ -39,7 +39,9 @@ if TYPE_CHECKING:
 PARAMETERS = {  # in the order of config/vehicle_node.yaml
     "world": Parameter("hall", "what it flies in (docs/flying.md)", choices=tuple(WORLDS)),
     "seed": Parameter(1, "of all that is random, as of fly", 0, 2**31 - 1),
-    "told": Parameter("place", "what it tells the filter at the start: its place and yaw, to 0.1 m and 0.1 rad", choices=("nothing", "place")),
+    "told": Parameter(
+        "place", "what it tells the filter at the start: its place and yaw, to 0.1 m and 0.1 rad", choices=("nothing", "place")
+    ),
     "aids": Parameter([""], f'what else it measures, of {", ".join(AIDS)}; [""] for nothing'),
     "mission": Parameter(False, "fly the standard mission, say what became of it, and end, with exit code 1 unless it has landed"),
     "simulated_time": Parameter(False, "publish /clock, and go on when the odometry is there; else in real time"),

@@ -61,7 +61,8 @@ class Corrector:
         self, anchors: Anchors, effects: EffectSet | None = None, network: Network | None = None, lag: float = POSE_LAG,
         history: int = 4096,
     ) -> None:  # fmt: skip
-        """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs stay in, as `weighed`; network : Network or None;
+        """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs stay in, as `weighed`; network : Network or
+        None;
         lag : s; history : poses kept."""
         self.anchors = anchors
         self.effects, self.weighed = (EffectSet(tuple(e for e in effects or () if e.weighed == weighed)) for weighed in (False, True))

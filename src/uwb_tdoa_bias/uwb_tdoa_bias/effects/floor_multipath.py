@@ -39,9 +39,7 @@ class FloorMultipath(ArrivalEffect):
     )
     confounded_with = ("nlos", "anchor_position", "truth_frame")
     distinguished_by = {"nlos": "the same place half a metre higher"}
-    reference = (
-        "two-ray model (Rappaport, Wireless Communications, ch. 4): path difference 2 h1 h2 / d; 3 m late on the floor in the measured flights"
-    )
+    reference = "two-ray model (Rappaport, Wireless Communications, ch. 4): path difference 2 h1 h2 / d; 3 m late on the floor in the measured flights"
     portable = False
     fitted = False
     weighed = True  # an estimate that is wrong there would be held by what is taken out for it

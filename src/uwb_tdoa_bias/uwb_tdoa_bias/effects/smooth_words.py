@@ -61,7 +61,9 @@ def described(term: SmoothTerm, part: str = "") -> str:
     if term.shape == "step":
         return _off(term, part, more[0], std, f" {_where(name, f'above {knots[1]}', f'after {knots[1]}')}{seen}")
     if term.shape == "interval":
-        return _off(term, part, more[0], std, f" {_where(name, f'between {knots[1]} and {knots[2]}', f'from {knots[1]} to {knots[2]}')}{seen}")
+        return _off(
+            term, part, more[0], std, f" {_where(name, f'between {knots[1]} and {knots[2]}', f'from {knots[1]} to {knots[2]}')}{seen}"
+        )
     if term.shape in ("line", "beyond", "below"):
         first, last = {"line": (0, 1), "beyond": (1, 2), "below": (1, 0)}[term.shape]
         slope = more[0] / (term.knots[last] - term.knots[first])

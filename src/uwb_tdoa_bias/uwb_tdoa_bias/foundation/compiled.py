@@ -69,8 +69,8 @@ def compiled(function: Function) -> Function:
 
 
 class _Listener(event.Listener):
-    """Says on stderr, every few seconds, how much is compiled: where nothing is in the cache that takes a minute or two. The share is of the
-    functions of all modules that are imported, nearly all of which the filter needs."""
+    """Says on stderr, every few seconds, how much is compiled: where nothing is in the cache that takes a minute or two. The share is of
+    the functions of all modules that are imported, nearly all of which the filter needs."""
 
     def __init__(self) -> None:
         self._compiled, self._depth, self._began = 0.0, 0, 0.0  # s

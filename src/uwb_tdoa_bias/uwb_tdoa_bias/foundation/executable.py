@@ -80,8 +80,8 @@ def _run_node(module: str, *arguments: Any) -> Any:
 
 
 def _imported(module: str) -> ModuleType:
-    """Import a module, and say that it takes its time where it does. Meanwhile SIGINT ends the process at once: some of what is imported answers a KeyboardInterrupt
-    with a traceback or not at all, and there is nothing yet to clean up."""
+    """Import a module, and say that it takes its time where it does. Meanwhile SIGINT ends the process at once: some of what is imported
+    answers a KeyboardInterrupt with a traceback or not at all, and there is nothing yet to clean up."""
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.SIG_IGN:  # as in a job that a shell script put in the background
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))

@@ -83,7 +83,9 @@ def arrival_bias(
     The sum of the chip's error over received power (APS011) and of the group delays of both antennas.
     """
     of_tag, of_anchor, distance = _gains(p_tag, q_tag, p_anchor, q_anchor, link)
-    return power_bias(link.received_dbm(of_anchor + of_tag, distance)) + (link.anchor_antenna.delay_at(of_anchor) + link.tag_antenna.delay_at(of_tag))
+    return power_bias(link.received_dbm(of_anchor + of_tag, distance)) + (
+        link.anchor_antenna.delay_at(of_anchor) + link.tag_antenna.delay_at(of_tag)
+    )
 
 
 def _gains(

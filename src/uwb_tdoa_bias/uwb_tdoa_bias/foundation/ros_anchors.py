@@ -59,7 +59,11 @@ def in_words(before: Anchors, after: Anchors) -> str:
     places = before.index(after.ids)
     stay = (places >= 0) & (before.positions[places] == after.positions).all(axis=1)
     named = {"new": after.ids[places < 0], "gone": before.ids[after.index(before.ids) < 0], "elsewhere": after.ids[(places >= 0) & ~stay]}
-    parts = [f"{word}: {', '.join(map(str, ids[:MOST_NAMED]))}{', ...' if len(ids) > MOST_NAMED else ''}" for word, ids in named.items() if len(ids)]
+    parts = [
+        f"{word}: {', '.join(map(str, ids[:MOST_NAMED]))}{', ...' if len(ids) > MOST_NAMED else ''}"
+        for word, ids in named.items()
+        if len(ids)
+    ]
     return "; ".join([*parts, f"going on with the {stay.sum()} that stay" if stay.any() else "starting over"])
 
 

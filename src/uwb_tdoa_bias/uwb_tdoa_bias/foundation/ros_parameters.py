@@ -60,7 +60,9 @@ class Parameter:
         return out
 
 
-FROZEN = Parameter(False, "refuse over ROS, once started, other parameters, anchors, static transforms and poses, and a reset (docs/security.md)")
+FROZEN = Parameter(
+    False, "refuse over ROS, once started, other parameters, anchors, static transforms and poses, and a reset (docs/security.md)"
+)
 
 
 class ParameterNode(Node):

@@ -66,7 +66,8 @@ class _Refused(Exception):
 
 
 class _WithLibyaml(Composer, SafeConstructor, Resolver):
-    """The events of libyaml, which reads 10 000 anchors in a second instead of four; nodes and values are made here, where they are checked."""
+    """The events of libyaml, which reads 10 000 anchors in a second instead of four; nodes and values are made here, where they are
+    checked."""
 
     def __init__(self, text: str) -> None:
         self._parser = yaml.cyaml.CParser(text)

@@ -69,9 +69,12 @@ class _FilterParameters:
         30.0, "m; a tag is looked for within that of each anchor it hears, or as far as these are apart, if that is more", high=10000.0
     )
     tag_side: str = parameter(
-        "unknown", "of anchors that lie in a plane: on which side of it the tag is, below, above, or along an axis of the world, -x, +x, -y, +y"
+        "unknown",
+        "of anchors that lie in a plane: on which side of it the tag is, below, above, or along an axis of the world, -x, +x, -y, +y",
     )
-    zero_velocity: bool = parameter(True, "a tag whose TDOAs stay what they are, or whose inertial sensors neither shake nor turn, stands still")
+    zero_velocity: bool = parameter(
+        True, "a tag whose TDOAs stay what they are, or whose inertial sensors neither shake nor turn, stands still"
+    )
     recover: bool = parameter(True, "find the tag anew, untold where it is, when the TDOAs agree on another place that it can have come to")
     compensate_changes: bool = parameter(False, "take out the delay of an anchor that is found to have changed in flight")
 

@@ -10,7 +10,24 @@ from uwb_tdoa_bias.effects.slope import N_STATES
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
-from . import aids, barometer, curvature, ground, height, history, hypotheses, inertial, initialization, noise, plausibility, ranges, rest, robust, systematic, workspace
+from . import (
+    aids,
+    barometer,
+    curvature,
+    ground,
+    height,
+    history,
+    hypotheses,
+    inertial,
+    initialization,
+    noise,
+    plausibility,
+    ranges,
+    rest,
+    robust,
+    systematic,
+    workspace,
+)
 from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, FilterState, Measurements, Output
 from .sensor_functions import take_out
 from .startup import INLIER
@@ -26,7 +43,8 @@ MAX_STEP = 0.05  # s, longest single prediction
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 LINEAR_RANGE = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
-RECORDS_OF_TDOA = 1 + 4 + 1 + 6 + 1 + 2  # in a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, starts or recoveries
+# In a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, starts or recoveries
+RECORDS_OF_TDOA = 1 + 4 + 1 + 6 + 1 + 2
 RECORDS_OF_REST = 3  # one per axis
 RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per component
 
@@ -35,8 +53,8 @@ RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per comp
 def run(state: FilterState, parameters: np.ndarray, measurements: Measurements, output: Output) -> int:
     """Feed Measurements in stamp order, neither before what was fed earlier.
 
-    state : FilterState, whose functions are taken out of the inertial samples where they lie; parameters : (1,) of config.PARAMETERS; output :
-    Output, which is filled. Returns the number of odometry
+    state : FilterState, whose functions are taken out of the inertial samples where they lie; parameters : (1,) of config.PARAMETERS;
+    output : Output, which is filled. Returns the number of odometry
     rows. Raises IndexError if a history has less room than `most_records`.
     """
     ekf, anchors, values = state.ekf[0], state.anchors, parameters[0]

@@ -34,7 +34,8 @@ STILL_SPEED = 0.3  # m/s; a velocity that is not known better than that may be n
 LIKELY_SPEED = 1.0  # m/s, of a tag of which nothing is known
 STILL_SCALE, STILL_SWEEPS = 2.5, 5  # standard deviations of a change from which on it is the lateness that has changed
 MOVES = 12.0  # normalised square of a velocity that is not zero
-EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5  # median normalised square of the changes at rest, and by how much one of n is larger, times sqrt(n)
+# Median normalised square of the changes at rest, and by how much one of n is larger, times sqrt(n)
+EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5
 
 GROUND_STD = 0.15  # m, of the height of the tag of a body that stands on the ground
 GROUND_HEIGHT = 0.05  # m, its mean
@@ -220,8 +221,8 @@ def explain(
     """Where a tag at rest is, by what (k,) of PAIR say, as far as anchors are alike.
 
     prior : (4, 3), position that is known before, m, and its information, 1/m^2; z, z_std : m, a height that is known and its standard
-    deviation, NaN for none; lateness : IN_TIME, ALIKE or KNOWN; x : (3,) m, where to begin, becomes the most probable position; covariance (3, 3) m^2 is filled. Returns minus the logarithm of its
-    probability, up to a constant.
+    deviation, NaN for none; lateness : IN_TIME, ALIKE or KNOWN; x : (3,) m, where to begin, becomes the most probable position; covariance
+    (3, 3) m^2 is filled. Returns minus the logarithm of its probability, up to a constant.
 
     An error of its own for each anchor, and one for each pair, rarely large (Student's distribution). ALIKE: of the anchors near the
     ground most are late by the same, as that is the way by what reflects, some by anything, and some in time (a mixture). KNOWN: the

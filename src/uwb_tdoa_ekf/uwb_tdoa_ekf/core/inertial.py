@@ -62,8 +62,8 @@ def weigh(imu: Record, quiet: bool, parameters: Record) -> None:
     """Fill in accel_weight and accel_psd of an IMU_STATE: how far each axis of the accelerometer counts against
     hovering, and the noise that is left.
 
-    A vibrating axis may rectify: its error then has vibration_gain times the variance of the vibration. Whether it does shows in its mean: a
-    vehicle that hovers and moves about feels gravity alone in the mean. The weight is that of
+    A vibrating axis may rectify: its error then has vibration_gain times the variance of the vibration. Whether it does shows in its mean:
+    a vehicle that hovers and moves about feels gravity alone in the mean. The weight is that of
     linear least squares of the measurement with this variance, and of hovering with accel_prior_std. What is carried, and lies on its
     side or upside down, does not hover; what is farther from hovering than both explain, hovers that much less.
     """

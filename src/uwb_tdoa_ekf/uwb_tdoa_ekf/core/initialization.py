@@ -143,8 +143,8 @@ def is_unsure(ekf: Record) -> bool:
 
 @compiled
 def relocate(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray) -> None:
-    """Of a tag that few TDOAs come from, and whose place is hardly known by now: go where its last TDOAs tell it is, if they tell that better
-    than the filter. So far from where the TDOAs are linearized these do together what each of them does not alone."""
+    """Of a tag that few TDOAs come from, and whose place is hardly known by now: go where its last TDOAs tell it is, if they tell that
+    better than the filter. So far from where the TDOAs are linearized these do together what each of them does not alone."""
     if not is_unsure(ekf) or len(recent(ekf, parameters.start_window)) >= MINIMUM:
         return
     best, window = ekf.hypotheses[ekf.best], _last(ekf, t)[0]
@@ -245,7 +245,8 @@ def _begin(
     ekf: Record, parameters: Record, t: float, x: np.ndarray, covariance: np.ndarray, cost: np.ndarray,
     yaw: float, yaw_std: float,
 ) -> None:  # fmt: skip
-    """Start hypotheses at positions and velocities x (k, 6), whose probabilities are exp(-cost) (k,), level, with the yaws that are possible."""
+    """Start hypotheses at positions and velocities x (k, 6), whose probabilities are exp(-cost) (k,), level, with the yaws that are
+    possible."""
     accel = _mean_accel(ekf.imu, parameters)
     unknown = parameters.use_imu and yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):
@@ -288,8 +289,8 @@ def recover(
 ) -> None:
     """If the window agrees on a position and the filter on another one, go there; attitude and biases stay.
 
-    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter was right, and no farther. One that may be
-    `anywhere` does, and to several places, if there are several.
+    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter was right, and no farther. One that may
+    be `anywhere` does, and to several places, if there are several.
     """
     window = recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:

@@ -236,7 +236,19 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
         state.anchors[stamp] = -np.inf
     ekf = state.record
     state.anchors["floor_delay"], state.anchors["floor_std"], ekf["floor_place"][:] = floor or (np.nan, 0.0, np.nan)
-    for stamp in ("t", "first_tdoa", "last_tdoa", "next_search", "next_odometry", "next_rest", "next_merge", "next_look", "next_bounds", "sure", "unsure_until"):
+    for stamp in (
+        "t",
+        "first_tdoa",
+        "last_tdoa",
+        "next_search",
+        "next_odometry",
+        "next_rest",
+        "next_merge",
+        "next_look",
+        "next_bounds",
+        "sure",
+        "unsure_until",
+    ):
         ekf[stamp] = -np.inf
     ekf.imu.t = ekf.plausibility.contradicted = -np.inf
     for stamp in ("heard", "changed", "used", "judged", "pulls_since", "ignored_until"):

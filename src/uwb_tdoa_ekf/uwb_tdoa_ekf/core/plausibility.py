@@ -14,7 +14,8 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.vibration import low_pass
 
-LIGHTEST, HEAVIEST = 2.5, 50.0  # m/s^2, mean specific force over VIBRATION_CORNER: upwards, and in all; a multirotor comes down with 3, turns with 30
+# m/s^2, mean specific force over VIBRATION_CORNER: upwards, and in all; a multirotor comes down with 3, turns with 30
+LIGHTEST, HEAVIEST = 2.5, 50.0
 TOO_LONG = 0.25  # s for which it may be beyond: falling, or landing
 DOWNWARDS = -2.0  # m/s^2, upwards, that nothing flies with
 FASTEST, TOO_FAR = 10.0, 4.0  # rad/s that a tag may turn, and rad beyond that for a moment

@@ -128,7 +128,8 @@ def _mix(cost: np.ndarray, position: np.ndarray, each: np.ndarray) -> int:
 
 @compiled
 def stop(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None:
-    """Position and velocity x (6,) and their covariance (6, 6) become those of a tag at rest, as far as of_velocity (3, 3) m^2/s^2 tells."""
+    """Position and velocity x (6,) and their covariance (6, 6) become those of a tag at rest, as far as of_velocity (3, 3) m^2/s^2
+    tells."""
     x[3:] = 0.0
     covariance[:, 3:] = 0.0
     covariance[3:, :] = 0.0

@@ -20,7 +20,8 @@ from .workspace import reflect, rows_heard, configured_side
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it,
 GRID_STARTS = 7  # and the best places of a grid over one that is larger than
 LARGE = 20.0  # m, along x or y
-GRID_STEP, GRID_POINTS, GRID_LEVEL = 2.0, 600, 4.0  # m, between its places at least; how many at a height at most; m between heights at most
+# m, between its places at least; how many at a height at most; m between heights at most
+GRID_STEP, GRID_POINTS, GRID_LEVEL = 2.0, 600, 4.0
 GRID_TDOAS = 60  # of the window, that it looks at
 GRID_LOSS, GRID_APART = 1.5, 2.5  # grid steps: scale of the loss, and between two of the best places
 SWEEPS = 14  # Gauss-Newton steps per start
@@ -111,7 +112,8 @@ def locate(
 def _hold_others(
     trials: np.ndarray, costs: np.ndarray, x: np.ndarray, covariance: np.ndarray, cost: np.ndarray
 ) -> None:
-    """Spread the last of the places x (k, 6) that is one over the others (m, 6) that are left, whose costs (m,) are inf where they are not."""
+    """Spread the last of the places x (k, 6) that is one over the others (m, 6) that are left, whose costs (m,) are inf where they are
+    not."""
     last = 0
     for place in range(len(x)):
         if cost[place] < np.inf:
@@ -230,7 +232,8 @@ def _normal_equations(
 ) -> float:  # fmt: skip
     """Weighted normal equations of the window at x (6,): information matrix and gradient to `system` (6, 7).
 
-    ageing : (n,) variance of where the tag was, per axis, beyond what x says, over that of a TDOA, by which its residual counts less. Returns the mean Geman-McClure loss, 0 to 1; writes the residuals (n,), m."""
+    ageing : (n,) variance of where the tag was, per axis, beyond what x says, over that of a TDOA, by which its residual counts less.
+    Returns the mean Geman-McClure loss, 0 to 1; writes the residuals (n,), m."""
     system[:, :] = 0.0
     loss, n = 0.0, len(window)
     p, row = np.empty(3), np.empty(6)

@@ -41,8 +41,8 @@ def observe(information: np.ndarray, a: Record, b: Record, innovation: Record, t
 
 @compiled
 def fill(information: np.ndarray, P: np.ndarray, correlation_length: float, covariance: np.ndarray) -> None:
-    """Fill in the covariance (3, 3), m^2, that errors which persist make of a position whose covariance in the filter is P (15, 15). Of white
-    noise, of correlation_length 1, nothing persists."""
+    """Fill in the covariance (3, 3), m^2, that errors which persist make of a position whose covariance in the filter is P (15, 15). Of
+    white noise, of correlation_length 1, nothing persists."""
     covariance[:, :] = 0.0
     share = SHARE * (1.0 - 1.0 / max(correlation_length, 1.0))
     both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)

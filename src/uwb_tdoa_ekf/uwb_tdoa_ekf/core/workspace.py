@@ -62,7 +62,8 @@ def configured_side(rows: np.ndarray, anchors: np.ndarray, tag_side: int) -> tup
 
 @compiled
 def reflect(x: np.ndarray, side: np.ndarray | tuple[float, float, float]) -> bool:
-    """Put position and velocity x (6,) at the mirrored place, if they are on the other side than `configured_side` says. Returns whether."""
+    """Put position and velocity x (6,) at the mirrored place, if they are on the other side than `configured_side` says. Returns
+    whether."""
     axis, sign, plane = int(side[0]), side[1], side[2]
     if (x[axis] - plane) * sign >= 0.0:
         return False
@@ -111,8 +112,8 @@ def listen(ekf: Record, window: np.ndarray, anchors: np.ndarray, reach: float, t
 
 @compiled
 def add_circle(ekf: Record, height_known: bool, x: np.ndarray, covariance: np.ndarray) -> None:
-    """Add to the (9, 9) covariance of a position x (3,), m, what anchors along one axis of the world leave open: the tag may be anywhere on a
-    circle about them. height_known : whether something else tells z."""
+    """Add to the (9, 9) covariance of a position x (3,), m, what anchors along one axis of the world leave open: the tag may be anywhere on
+    a circle about them. height_known : whether something else tells z."""
     square, across = 0.0, 0
     for k in range(3):
         if ekf.flat[k] > 0.0:

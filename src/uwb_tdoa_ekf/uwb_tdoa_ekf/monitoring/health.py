@@ -16,7 +16,6 @@ from ..streams import ERROR as SEVERE
 from .volume import VolumeCheck
 
 if TYPE_CHECKING:
-    import numpy as np
     from collections.abc import Mapping, Sequence
     from uwb_tdoa_bias.foundation.flyable import FlyableVolume
     from uwb_tdoa_bias.foundation.ros import Report

@@ -32,7 +32,8 @@ GAP = 30.0  # s without TDOAs after which a new flight begins
 LIMIT = 16.3  # ratio above which an anchor has changed: a tenth above the largest of sound flights of two days, see docs/reliability.md
 CLEARLY = 1.4  # how much larger it must be than that of any other anchor,
 MOST_LEFT = 1.0  # and of the errors since then, over those before, what it may leave: else something else has happened too, as on a floor
-FEWEST_ACCEPTED = 1 / 3  # share of the TDOAs of a slice; where the filter rejects more, as on a floor, it is no single anchor that has changed
+# Share of the TDOAs of a slice; where the filter rejects more, as on a floor, it is no single anchor that has changed
+FEWEST_ACCEPTED = 1 / 3
 SMALLEST_CHANGE = 0.15  # m; less does not matter, and what has come back to that has gone
 SILENT, FEWEST = 4, 40  # slices without an anchor, and the TDOAs of the others in them
 OFTEN = 0.5  # share of the slices in which it was heard before

@@ -50,5 +50,7 @@ def status_of(estimator: Estimator | None, yaw_std: float, tdoa_age: float) -> S
     if tdoa_age > SILENT:
         return Status(RUNNING, known, f"no TDOA has come for more than {SILENT:g} s: the position goes by the IMU alone and drifts")
     if not known:
-        return Status(RUNNING, False, "the yaw is not known yet: do not steer by it; it is once the tag has moved, or if it is told (initialpose)")
+        return Status(
+            RUNNING, False, "the yaw is not known yet: do not steer by it; it is once the tag has moved, or if it is told (initialpose)"
+        )
     return Status(RUNNING, True, "")

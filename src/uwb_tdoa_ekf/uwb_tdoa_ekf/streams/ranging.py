@@ -22,7 +22,8 @@ GRIDS = np.array(
     [1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01]
 )  # m, to which a driver might round; the radio's tick is 4.69 mm
 ON_GRID = 1e-6  # m
-PAIRS, PROBES = 4096, 16  # pairs that are remembered, of all that a tag hears in a minute; places that one may have, of which it takes the oldest
+# Pairs that are remembered, of all that a tag hears in a minute; places that one may have, of which it takes the oldest
+PAIRS, PROBES = 4096, 16
 
 # places in the counters; those of the grids come after
 (KNOWN, UNKNOWN, SELF, INVALID, IMPOSSIBLE, DUPLICATES, SUCCESSIVE, REPEATED, LEAPS, RETURNS, OPPOSED, EVEN, SUM, HIGH,

@@ -13,8 +13,44 @@ NUMBERS = (
     "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-0", "-1", "1e400", "9" * 400, "0x10", "65536", "4294967296", "18446744073709551616", "", " ",
     "true", "~", "1_0", "\u0661", "1.7976931348623157e308", "2147483648", "x" * 5000, "$\\frac$", "\x1b[2J", "<b>", "{", "[[[[", "&a", "*a", "!!int",
 )  # fmt: skip
-VALUES = (None, True, 0, -1, 2**63, 10**300, 1e308, -1e308, 1e-320, 65536, "", "x" * 5000, "nan", "\x1b", [], {}, [[]], {"": ""}, [0.0] * 50, {"x": {"y": 1}})
-WORDS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0x7FFFFFFFFFFFFFFF, 0xFFFFFFFFFFFFFFFF, 0x7FF0 << 48, 0x7FF8 << 48)
+VALUES = (
+    None,
+    True,
+    0,
+    -1,
+    2**63,
+    10**300,
+    1e308,
+    -1e308,
+    1e-320,
+    65536,
+    "",
+    "x" * 5000,
+    "nan",
+    "\x1b",
+    [],
+    {},
+    [[]],
+    {"": ""},
+    [0.0] * 50,
+    {"x": {"y": 1}},
+)
+WORDS = (
+    0,
+    1,
+    0x7F,
+    0x80,
+    0xFF,
+    0x7FFF,
+    0xFFFF,
+    0x7FFFFFFF,
+    0x80000000,
+    0xFFFFFFFF,
+    0x7FFFFFFFFFFFFFFF,
+    0xFFFFFFFFFFFFFFFF,
+    0x7FF0 << 48,
+    0x7FF8 << 48,
+)
 
 
 def changed(name, data, chance):
@@ -188,7 +224,22 @@ STATEMENTS = (
     "CREATE VIEW v AS SELECT * FROM {table}", "CREATE INDEX i ON {table}({column})", "CREATE TRIGGER t AFTER INSERT ON {table} BEGIN SELECT 1; END",
     "CREATE TABLE IF NOT EXISTS schema(schema_version)", "UPDATE messages SET data = substr(data, 1, {row})", "UPDATE messages SET data = zeroblob({row} * 1000)",
 )  # fmt: skip
-CELLS = ("NULL", "0", "-1", "1e300", "9223372036854775807", "''", "'x'", "x''", "x'00ff'", "zeroblob(100000)", "'/uwb/tdoa'", "'sensor_msgs/msg/Imu'", "'a/b'", "char(27)")
+CELLS = (
+    "NULL",
+    "0",
+    "-1",
+    "1e300",
+    "9223372036854775807",
+    "''",
+    "'x'",
+    "x''",
+    "x'00ff'",
+    "zeroblob(100000)",
+    "'/uwb/tdoa'",
+    "'sensor_msgs/msg/Imu'",
+    "'a/b'",
+    "char(27)",
+)
 TABLES = {
     "messages": ("id", "topic_id", "timestamp", "data"), "topics": ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash"),
     "message_definitions": ("topic_type", "encoding", "encoded_message_definition"), "schema": ("schema_version", "ros_distro"), "metadata": ("metadata",),

@@ -76,7 +76,20 @@ def parent(targets, args):
     for name in targets:
         until, count, seed = time.monotonic() + args.seconds, 0, random.randrange(2**32) if args.seed is None else args.seed
         while (left := until - time.monotonic()) > 1.0:
-            command = [sys.executable, "-W", "ignore", __file__, name, "--child", "--seconds", str(left), "--out", str(out), "--seed", str(seed)]
+            command = [
+                sys.executable,
+                "-W",
+                "ignore",
+                __file__,
+                name,
+                "--child",
+                "--seconds",
+                str(left),
+                "--out",
+                str(out),
+                "--seed",
+                str(seed),
+            ]
             done = subprocess.run(command + ["--blind"] * args.blind, capture_output=True, text=True, errors="replace")
             said, seed = done.stdout + done.stderr, seed + 1
             count += sum(map(int, re.findall(r"(?:number_of_executed_units:|executions:) +(\d+)", said)))
@@ -142,7 +155,10 @@ def blind(name, seconds, out, chance):
                 targets.run(name, data)
             except Exception as error:  # also a MemoryError
                 signal.setitimer(signal.ITIMER_PROF, 0.0)
-                place = [type(error).__name__, *(f"{frame.name}_{frame.lineno}" for frame in traceback.extract_tb(error.__traceback__)[-2:])]
+                place = [
+                    type(error).__name__,
+                    *(f"{frame.name}_{frame.lineno}" for frame in traceback.extract_tb(error.__traceback__)[-2:]),
+                ]
                 if (key := "-".join(place)) not in seen:
                     seen.add(key)
                     traceback.print_exc()

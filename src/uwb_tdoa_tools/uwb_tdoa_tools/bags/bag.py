@@ -138,7 +138,8 @@ def write_odometry(
 
 
 def _of_anchors(anchors: Anchors, first: int, store: Typestore, antenna: Sequence[float] | None = None) -> Topics:
-    """{topic: (type, QoS, [(stamp ns, message)])} of Anchors, to be written before anything else. first : ns, of the bag; antenna : (3,) m."""
+    """{topic: (type, QoS, [(stamp ns, message)])} of Anchors, to be written before anything else. first : ns, of the bag; antenna : (3,)
+    m."""
     array = bag_messages.anchors_message(anchors, first, store)  # at equal stamps this order holds: anchors before what needs them
     frames = bag_messages.transforms_message(anchors, first, store, antenna)
     return {

@@ -64,7 +64,8 @@ def convert(read: Callable[[], Flight], out: str | Path, storage: str = "mcap", 
 
 
 def shifted(flight: Flight, offsets: dict[str, float]) -> Flight:
-    """The Flight with offsets {of SENSORS: s} added to the stamps of what it holds. Raises InputError for a sensor that it does not hold."""
+    """The Flight with offsets {of SENSORS: s} added to the stamps of what it holds. Raises InputError for a sensor that it does not
+    hold."""
     changed = {}
     for sensor, offset in offsets.items():
         stream = getattr(flight, sensor)
@@ -75,8 +76,8 @@ def shifted(flight: Flight, offsets: dict[str, float]) -> Flight:
 
 
 def _from_zero_on(flight: Flight) -> Flight:
-    """The Flight without what its other sensors say before 0 s, where the TDOAs are not: a clock that was moved may begin there, and a bag has no
-    place for it."""
+    """The Flight without what its other sensors say before 0 s, where the TDOAs are not: a clock that was moved may begin there, and a bag
+    has no place for it."""
     changed, said = {}, list(flight.meta.get("remarks", ()))
     for name in _held(flight) if (flight.tdoa.t >= 0.0).all() else ():
         stream = getattr(flight, name)

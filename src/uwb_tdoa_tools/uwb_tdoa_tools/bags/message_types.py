@@ -101,7 +101,9 @@ def _recorded_hash(path: str | Path, connection: Connection) -> str:
     recorded = connection.digest
     if not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG:  # a data file without metadata.yaml
         if len(connection.msgdef.data) > DEFINITION_BYTES:
-            raise InputError(f"{path}: the definition of {connection.msgtype} in the bag has more than {DEFINITION_BYTES} bytes; record it again.")
+            raise InputError(
+                f"{path}: the definition of {connection.msgtype} in the bag has more than {DEFINITION_BYTES} bytes; record it again."
+            )
         try:
             recorded = _hash_of(connection.msgdef.data, connection.msgtype)
         except Exception as error:  # rosbags raises whatever its parsers run into

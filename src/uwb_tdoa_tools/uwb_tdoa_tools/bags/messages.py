@@ -113,7 +113,9 @@ def of_sensor(sensor: Sensor) -> tuple[RowOfMessage, StreamOfRows, Sound]:
     """(row of a message, Stream of stamps and rows, which numbers of rows may be there), as `read_bag` takes them, of a Sensor."""
 
     def row(message: Any) -> tuple[float, ...]:
-        return stamp_of(message.header), *(number for field in sensor.fields for number in _numbers(reduce(getattr, field.split("."), message)))
+        return stamp_of(message.header), *(
+            number for field in sensor.fields for number in _numbers(reduce(getattr, field.split("."), message))
+        )
 
     def sound_ones(rows: np.ndarray) -> np.ndarray:
         return np.column_stack(list(sensor.sound(sensor.split(rows)).values()))

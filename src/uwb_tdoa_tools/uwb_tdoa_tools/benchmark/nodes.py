@@ -34,7 +34,8 @@ NODES = "bias_node", "ekf_node"
 SHARED = ("imu/data", "uwb/tdoa", "uwb/anchors")  # published once for all tags, so that the source stays the same
 BLOCK = 3.0  # s over which CPU and latencies are taken: their median and quartiles are of blocks
 READY_LIMIT, MATCH_LIMIT, SETTLE_LIMIT = 300.0, 60.0, 60.0  # s; the very first start compiles the filter
-FLEETS = (1, 1000.0, 400.0), (2, 1000.0, 400.0), (4, 1000.0, 400.0), (8, 1000.0, 400.0), (30, 100.0, 100.0), (60, 100.0, 40.0)  # tags, Hz, Hz
+# Tags, Hz, Hz
+FLEETS = (1, 1000.0, 400.0), (2, 1000.0, 400.0), (4, 1000.0, 400.0), (8, 1000.0, 400.0), (30, 100.0, 100.0), (60, 100.0, 40.0)
 TARGET_CPU, TARGET_LATENCY, TARGET_READY = 25.0, 10.0, 0.5  # % of one core, ms, s
 TARGET_LATENCY_OF_FLEET = 30.0  # ms
 SECTION = "both nodes live at 1 kHz IMU + 400 Hz TDOA, default parameters and QoS"

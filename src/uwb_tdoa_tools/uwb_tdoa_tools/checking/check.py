@@ -164,7 +164,9 @@ def _tried(ordered: OrderedRecording, names: set[str], others: Sequence[Survey])
 
 def _other_room(mixed: Finding) -> Finding:
     """Many ids mixed up and a faulty inertial sensor at once: rather the survey of another room, of which both are what it looks like."""
-    cause = "the survey is of another room, or its ids are mixed up: with many ids exchanged it nearly fits, and the inertial sensor does not"
+    cause = (
+        "the survey is of another room, or its ids are mixed up: with many ids exchanged it nearly fits, and the inertial sensor does not"
+    )
     return Finding("survey_misfit", ERROR, cause, mixed.evidence, OTHER_SURVEY, mixed.value)
 
 

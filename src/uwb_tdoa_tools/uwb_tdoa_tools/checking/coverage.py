@@ -93,7 +93,8 @@ def flat(view: CoverageView) -> Iterator[Finding]:
 
 
 def side(view: CoverageView) -> Iterator[Finding]:
-    """Anchors in a plane across an axis of the world, all or those that are heard at once: the side of it that the tag is on must be told."""
+    """Anchors in a plane across an axis of the world, all or those that are heard at once: the side of it that the tag is on must be
+    told."""
     heard = [view.anchors.positions[window.heard > 0] for window in view.windows]
     sides = [sides_of(positions) for positions in heard or [view.anchors.positions] if len(positions) > FEWEST]
     needed = [one for one in sides if one]
@@ -104,7 +105,9 @@ def side(view: CoverageView) -> Iterator[Finding]:
         return
     evidence = f"in {100.0 * len(needed) / len(sides):.0f} % of the seconds those that are heard have one {'height' if len(most) == 1 else most[0][1:]}"
     remedy = to_copy(most)
-    yield Finding("side_unknown", WARNING, "TDOAs do not tell on which side of its anchors the tag is", evidence, remedy, len(needed) / len(sides))
+    yield Finding(
+        "side_unknown", WARNING, "TDOAs do not tell on which side of its anchors the tag is", evidence, remedy, len(needed) / len(sides)
+    )
 
 
 def below(view: CoverageView) -> Iterator[Finding]:

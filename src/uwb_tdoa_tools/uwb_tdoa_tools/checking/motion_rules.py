@@ -45,8 +45,8 @@ ATTITUDES = {
 
 
 class TrueMotion:
-    """measured {"gyro", "accel": (n, 3)}, means over cells at t (n,) s in the air, or of all of a rover; block (n,), of BLOCK seconds; smooth {sensor: bool},
-    whether it changes too evenly for a sensor that vibrates."""
+    """measured {"gyro", "accel": (n, 3)}, means over cells at t (n,) s in the air, or of all of a rover; block (n,), of BLOCK seconds;
+    smooth {sensor: bool}, whether it changes too evenly for a sensor that vibrates."""
 
     def __init__(self, flight: Flight) -> None:
         """flight : Flight with inertial samples and ground truth with attitudes."""

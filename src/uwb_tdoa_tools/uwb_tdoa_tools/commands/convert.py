@@ -28,8 +28,8 @@ DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
 IN is a Crazyflie micro-SD event log (versions 1 and 2), a UTIL CSV file (plain or gzip), a bag, or, with --columns, one
 CSV file or several of any other tool (cells divided by commas, semicolons or tabs; anchors by ids or by the names that
-the survey has for them; records with empty cells are left out and counted). The new bag has imu/data, uwb/tdoa, uwb/anchors, ground_truth/pose and /tf_static.
-It appears only when it is complete.
+the survey has for them; records with empty cells are left out and counted). The new bag has imu/data, uwb/tdoa,
+uwb/anchors, ground_truth/pose and /tf_static. It appears only when it is complete.
 """
 
 

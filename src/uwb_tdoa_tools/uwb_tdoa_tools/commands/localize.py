@@ -19,8 +19,8 @@ DESCRIPTION = """Where the tag was: trajectories of recordings, without ground t
 
 Runs bias correction and filter as the nodes would, or smooths. Writes for each recording to --out: NAME.tum (for evo), NAME.csv (with
 velocities and standard deviations) and NAME.png (from above, from the side, over time, with three standard deviations); with --bag
-NAME.bag (nav_msgs/Odometry), with --residuals what is left of each TDOA, as a table and as a picture per pair of anchors; with --zones which anchors were heard where, and how
-well: a table and a map.
+NAME.bag (nav_msgs/Odometry), with --residuals what is left of each TDOA, as a table and as a picture per pair of anchors; with --zones
+which anchors were heard where, and how well: a table and a map.
 
 It says how far each trajectory is to be believed, and what would make it better. good: the position is within what is stated for 95 %
 of the time; doubtful: the filter was lost, or began anew, or many TDOAs speak against it; bad: check finds an error, or there is none.
@@ -71,7 +71,8 @@ def _localize(args: Namespace) -> int:
     rerun = options.rerun_of(args, len(found), say)
     out.mkdir(parents=True, exist_ok=True)
     cli.show(f"correcting with: {estimator.correction}")
-    localizer, located = Localizer(reading, estimator, out.absolute() if args.dask else out, args.bag, args.residuals, rerun, args.zones), []
+    folder, located = out.absolute() if args.dask else out, []
+    localizer = Localizer(reading, estimator, folder, args.bag, args.residuals, rerun, args.zones)
     for one in parallel.over(localizer, found, args.jobs, args.dask):
         located.append(one)
         first, *others = one.belief.sentences()

@@ -114,7 +114,8 @@ def _plan(args: Namespace) -> None:
         found = chart(installation, grid, args.flyable)
     figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
     report.say_summary(figures["map"])
-    figures["addition"] = run.addition(found, anchors, options.goal_of(args, installation).installed, options.places_of(args, room), args.flyable)
+    installed, places = options.goal_of(args, installation).installed, options.places_of(args, room)
+    figures["addition"] = run.addition(found, anchors, installed, places, args.flyable)
     report.say_flyable(figures["map"], figures["addition"], args.flyable)
     outgoing = run.draw_map(found, installation, args.out)
     if args.check:

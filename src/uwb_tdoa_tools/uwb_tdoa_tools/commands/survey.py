@@ -27,8 +27,8 @@ With the anchors.yaml and effects.yaml (--effects) of last week it starts from w
 since, and makes the rest better.
 
 Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the
-anchors, and how well all is known), ekf_node.yaml (noise that the filter should assume with them), survey.json (covariance) and survey.png (before and after)
-to --out.
+anchors, and how well all is known), ekf_node.yaml (noise that the filter should assume with them), survey.json
+(covariance) and survey.png (before and after) to --out.
 
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
 

@@ -245,8 +245,8 @@ def _search(detectors: Sequence[Detector], table: Table, model: Fit, chosen: Seq
 
 
 def _installation(flights: Sequence[Flight]) -> tuple[Anchors, np.ndarray]:
-    """(Anchors with every id that the flights have heard, each at the first of its places; (m, 2) ids of the MOST_LINKS pairs that were heard most, the
-    most frequent first)."""
+    """(Anchors with every id that the flights have heard, each at the first of its places; (m, 2) ids of the MOST_LINKS pairs that were
+    heard most, the most frequent first)."""
     several = [flight.anchors for flight in flights]
     ids, positions, orientations = (
         np.concatenate([getattr(anchors, name) for anchors in several]) for name in ("ids", "positions", "orientations")

@@ -4,7 +4,8 @@ A fit states how well the data tell its values, if its model is the right one. P
 systematic errors leave unexplained, in the same way at every place, so that no scatter between blocks of time shows it. So they
 are fitted once more, with the information that errors leave which last as long as the flight, beside what can take their place: a
 smooth function of the place for every anchor, as large as the evidence says, as what an antenna adds in each direction is; and
-coordinates and delays of anchors that the fit takes for zero. All these are integrated out. What a value is away from that counts as its error.
+coordinates and delays of anchors that the fit takes for zero. All these are integrated out. What a value is away from that counts as its
+error.
 """
 
 from __future__ import annotations
@@ -77,7 +78,8 @@ def _anchor(column: Column) -> str:
 
 
 def _heard_with(table: Table, model: Fit) -> set[str]:
-    """Ids of the anchors whose positions or delays a Fit tells, and of all that are heard in the same blocks as any of them: set of texts."""
+    """Ids of the anchors whose positions or delays a Fit tells, and of all that are heard in the same blocks as any of them: set of
+    texts."""
     known, rows = {_anchor(column) for column in model.columns if column.effect[0] in OF_ANCHORS}, table.rows_of("tdoa")
     part = table.tdoa_parts[0]
     ends, block = np.stack(part.arrivals(table.series[rows])), table.block[rows]

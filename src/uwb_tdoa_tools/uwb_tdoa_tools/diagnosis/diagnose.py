@@ -44,7 +44,8 @@ class Diagnosis:
     flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [EffectFinding]; effects :
     EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
     `validation.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
-    ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes : sentences, what is not as in the last calibration;
+    ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes :
+    sentences, what is not as in the last calibration;
     applying : ((command line, what it does), ...), how the effects are put to use;
     of_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its ground truth.
     """

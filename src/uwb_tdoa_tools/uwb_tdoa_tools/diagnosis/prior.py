@@ -63,8 +63,8 @@ class Prior:
         return np.concatenate([std[: 3 * n], np.full(n, LOOSE)])
 
     def changes(self) -> dict[ChangeKey, tuple[np.ndarray, float]]:
-        """{(what, number of an anchor): (places, m, standard deviation)} of what may have changed; of MANY anchors without a calibration too:
-        among so many there is one that does not stand where the tape says."""
+        """{(what, number of an anchor): (places, m, standard deviation)} of what may have changed; of MANY anchors without a calibration
+        too: among so many there is one that does not stand where the tape says."""
         n, out = len(self.ids), {}
         anything = n > MANY and not self.told.any()
         for k in range(n):
@@ -134,15 +134,17 @@ def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray
             break
         doubt = trials[key] - np.log(ODDS)
         changed[key] = [other for other in trials if other[1] == key[1] and other != key and trials[other] > doubt]
-        covariance = prior.with_changes([possible[one] for one in changed], covariance=None if prior.told.any() else prior.with_delays(delay_std))
+        covariance = prior.with_changes(
+            [possible[one] for one in changed], covariance=None if prior.told.any() else prior.with_delays(delay_std)
+        )
         evidence, number = best(covariance)
     found = posterior(*parts[number][:3], covariance, offset, parts[number][3])
     return replace(found, delay_std=delay_std, changed=changed)
 
 
 def _parts(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float, float]]:
-    """[(what `eliminated` leaves, standard deviation of functions)], for each of FUNCTION_STDS; of MANY anchors, where each takes seconds, only
-    up to those that make the flights ODDS times less probable than smaller ones."""
+    """[(what `eliminated` leaves, standard deviation of functions)], for each of FUNCTION_STDS; of MANY anchors, where each takes seconds,
+    only up to those that make the flights ODDS times less probable than smaller ones."""
     out, evidences = [], []
     known = np.linalg.inv(prior.covariance), np.linalg.slogdet(prior.covariance)[1]
     for std in FUNCTION_STDS:
@@ -179,7 +181,8 @@ def posterior(
 def _evidence(
     gram: np.ndarray, vector: np.ndarray, evidence: float, prior: np.ndarray, size: float, offset: np.ndarray
 ) -> float:
-    """Logarithm of the evidence of a `posterior`, whose prior has the inverse covariance `prior` and the logarithm of its determinant `size`."""
+    """Logarithm of the evidence of a `posterior`, whose prior has the inverse covariance `prior` and the logarithm of its determinant
+    `size`."""
     right, root = vector - prior @ offset, np.linalg.cholesky(gram + prior)
     solved = solve_triangular(root, right, lower=True, check_finite=False)
     return evidence + 0.5 * (solved @ solved - 2.0 * np.sum(np.log(np.diagonal(root))) - size - offset @ prior @ offset)
@@ -189,7 +192,8 @@ def _with_each_change(
     parts: Sequence[tuple[np.ndarray, np.ndarray, float, float]], covariance: np.ndarray, offset: np.ndarray,
     changes: dict[ChangeKey, tuple[np.ndarray, float]],
 ) -> dict[ChangeKey, float]:  # fmt: skip
-    """{key: the largest evidence with that change of `changes` more}: in closed form, by what the data say of a shift of the prior's mean."""
+    """{key: the largest evidence with that change of `changes` more}: in closed form, by what the data say of a shift of the prior's
+    mean."""
     prior, size, out = np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1], dict.fromkeys(changes, -np.inf)
     for gram, vector, rest, _ in parts:
         evidence, inverse = _evidence(gram, vector, rest, prior, size, offset), np.linalg.inv(gram + prior)

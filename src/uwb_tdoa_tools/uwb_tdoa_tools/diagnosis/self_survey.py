@@ -55,11 +55,11 @@ AT_ONCE = 32  # regressors that are made together
 @dataclass(frozen=True, eq=False)
 class Surveyed:
     """anchors : Anchors; delays (N,) m; covariance (4N, 4N) m^2, of positions, anchor by anchor, and then of delays;
-    seconds : s in the air that tell; before, left : m, scale of the slow innovations with the anchors as given, and with these; tdoa_std : m, for the filter: so
-    that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of the
-    size of delays, and of functions of the place; changes : (Change, ...) since the last calibration; marks : (before, after, nearer),
-    root mean square of what estimates at marks in the air are off by, m, and share of marks that they come nearer to, each after a fit without it;
-    None where there are none;
+    seconds : s in the air that tell; before, left : m, scale of the slow innovations with the anchors as given, and with these; tdoa_std :
+    m, for the filter: so that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of
+    the size of delays, and of functions of the place; changes : (Change, ...) since the last calibration; marks : (before, after, nearer),
+    root mean square of what estimates at marks in the air are off by, m, and share of marks that they come nearer to, each after a fit
+    without it; None where there are none;
     grounded : how many marks were left out, because they are on the floor: estimates there are metres off and do not know it."""
 
     anchors: Anchors
@@ -419,8 +419,8 @@ def _known(
 
 
 def _inflation(gram: np.ndarray, vector: np.ndarray, blocks: Sequence[_Told], sizes: np.ndarray) -> float:
-    """By how much sums of scores over blocks, [_Told], whose sums are gram (k, k) and vector (k,), are larger than those of independent errors,
-    averaged over the directions that the data tell. sizes (k,): prior standard deviations."""
+    """By how much sums of scores over blocks, [_Told], whose sums are gram (k, k) and vector (k,), are larger than those of independent
+    errors, averaged over the directions that the data tell. sizes (k,): prior standard deviations."""
     step = np.linalg.solve(gram / PRELIMINARY + np.diag(sizes**-2.0), vector / PRELIMINARY)
     scores = np.zeros((len(blocks), len(vector)))
     for score, block in zip(scores, blocks):

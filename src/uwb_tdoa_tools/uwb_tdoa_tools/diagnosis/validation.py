@@ -73,8 +73,8 @@ class ValidationCase:
 @dataclass(frozen=True, eq=False)
 class ValidatedSelection:
     """What makes the filter no worse: selection : Selection; detections; refused : (Refused, ...) of the others; worth :
-    {candidate or detection: m by which the mean 3D RMSE is larger without it, of others when they were left out}; changes : sentences, what is not as in the
-    last calibration."""
+    {candidate or detection: m by which the mean 3D RMSE is larger without it, of others when they were left out}; changes : sentences, what
+    is not as in the last calibration."""
 
     selection: Selection
     detections: tuple[Detection, ...]

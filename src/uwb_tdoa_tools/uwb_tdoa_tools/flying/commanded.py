@@ -95,7 +95,9 @@ class Commanded:
         goal[3] = p[3] + math.remainder(goal[3] - p[3], 2.0 * math.pi)  # the shorter way around
         far = float(np.linalg.norm(goal[:3] - p[:3]))
         needed = max(
-            PEAK_SPEED * far / MOST_SPEED, math.sqrt(PEAK_ACCELERATION * far / MOST_ACCELERATION), PEAK_SPEED * abs(goal[3] - p[3]) / MOST_TURN
+            PEAK_SPEED * far / MOST_SPEED,
+            math.sqrt(PEAK_ACCELERATION * far / MOST_ACCELERATION),
+            PEAK_SPEED * abs(goal[3] - p[3]) / MOST_TURN,
         )
         if seconds < needed:
             raise InputError(f"duration: {seconds:g} s is too short for {far:.2f} m; give at least {math.ceil(10.0 * needed) / 10.0:g} s.")
@@ -105,6 +107,7 @@ class Commanded:
 
 
 def _way(begin: Sequence[np.ndarray], goal: np.ndarray, seconds: float) -> tuple[BPoly, BPoly, BPoly]:
-    """Functions of time, s, to (4,): from `begin`, value and derivatives, to a goal within so many s, and staying there; its derivatives."""
+    """Functions of time, s, to (4,): from `begin`, value and derivatives, to a goal within so many s, and staying there; its
+    derivatives."""
     value = BPoly.from_derivatives([0.0, seconds, seconds + 1.0], [begin, (goal, STILL, STILL), (goal, STILL, STILL)])
     return value, value.derivative(1), value.derivative(2)

@@ -51,7 +51,8 @@ NUMBERS = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
 
 
 class Controller:
-    """thrust : N, wanted of all rotors together; lift : N, what they have come to, as felt over FELT; rates : (3,) rad/s, wanted; integral : (3,) m/s^2, world."""
+    """thrust : N, wanted of all rotors together; lift : N, what they have come to, as felt over FELT; rates : (3,) rad/s, wanted; integral
+    : (3,) m/s^2, world."""
 
     def __init__(self, gains: Gains | None = None, vehicle: Vehicle | None = None) -> None:
         """gains : Gains; vehicle : Vehicle, as far as the controller knows it."""

@@ -62,7 +62,8 @@ class OurFilter:
     def __init__(
         self, anchors: Anchors, config: FilterConfig, effects: EffectSet | None = None, network: Network | None = None
     ) -> None:
-        """anchors : Anchors; config : FilterConfig; effects : EffectSet, and network : Network, to correct what was measured with, or None."""
+        """anchors : Anchors; config : FilterConfig; effects : EffectSet, and network : Network, to correct what was measured with, or
+        None."""
         effects = effects or EffectSet()
         self._anchors, self._corrector = anchors, Corrector(anchors, effects, network)
         self._labels, self._of_imu = LabelCorrector(effects.effects), ImuCorrector(effects.effects)

@@ -29,7 +29,8 @@ def interval(
 ) -> None:  # fmt: skip
     """Fly n samples of the inertial sensor long.
 
-    state (17,) and gyro (2, 3) rad/s, as felt last and before that, are updated; thrust : N, rates (3,) rad/s, wanted; gains, known : of the controller;
+    state (17,) and gyro (2, 3) rad/s, as felt last and before that, are updated; thrust : N, rates (3,) rad/s, wanted; gains, known : of
+    the controller;
     vehicle : NUMBERS, the true ones; wind (n, 3) m/s; errors (n, 6) what the sensor adds to rates, rad/s, and specific force, m/s^2;
     shaking (n, 3) m/s^2, what rotors add that turn. Written to: truth (n, 17), the states at the samples; samples (n, 6), rates and
     specific force as felt: means since the sample before; contact (n,): the number of feet on the ground.

@@ -55,8 +55,8 @@ class OverTopics:
     newest, or None."""
 
     def __init__(self, node: ros.StreamNode, world: World, pace: RealTime | Lockstep, clock: bool) -> None:
-        """node : ros.StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count stamps
-        from 0, not from now."""
+        """node : ros.StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count
+        stamps from 0, not from now."""
         self._node, self._pace, self._anchors = node, pace, world.anchors
         self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock
         self._now = 0.0
@@ -154,7 +154,8 @@ class OverTopics:
 
     @property
     def deviation(self) -> float:
-        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one, or where the filter says that it is lost."""
+        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one, or where the filter says that it is
+        lost."""
         if not self._rows or self.status is None or self.status.status != EstimatorStatus.STATUS_RUNNING:
             return math.inf
         return math.sqrt(np.diag(self._rows[-1][4]).max())

@@ -86,7 +86,8 @@ class Sines:
 
 
 class Reference:
-    """Position, velocity and acceleration, (n, 3, 3), m and s, wanted since the rotors started; at its end it sinks, and no height is wanted.
+    """Position, velocity and acceleration, (n, 3, 3), m and s, wanted since the rotors started; at its end it sinks, and no height is
+    wanted.
     duration : s until then; end (2,) m, where."""
 
     def __init__(self, p: np.ndarray, turning: float = 0.0) -> None:

@@ -40,7 +40,9 @@ class Pilot:
         if pose is None or now - pose[0] > rules.stale:
             raise InputError(f"there is no odometry to fly by: {source.why or 'none came lately'}.")
         if source.deviation > rules.arm:
-            raise InputError(f"it does not know where it is: {source.why or f'to {source.deviation:.1f} m, where {rules.arm:g} m is wanted'}.")
+            raise InputError(
+                f"it does not know where it is: {source.why or f'to {source.deviation:.1f} m, where {rules.arm:g} m is wanted'}."
+            )
         path = Commanded(pose[1], yaw_of(pose[3]), self._trial.task.world.size)
         path.take_off(height, seconds)
         self._path = path

@@ -51,10 +51,14 @@ class Radio:
         self._error = tdoa_noise(schedule, np.full(n, world.noise / math.sqrt(2.0)), False, random(seed, "tdoa noise"))
         self._error += _outliers(world, len(self.t), random(seed, "outliers"))
         # per anchor: constant delay; amplitude and phase of the bias over the bearing
-        self.constants = np.stack([world.delay * rng.standard_normal(n), world.bearing_bias * rng.random(n), 2.0 * np.pi * rng.random(n)], axis=1)
+        self.constants = np.stack(
+            [world.delay * rng.standard_normal(n), world.bearing_bias * rng.random(n), 2.0 * np.pi * rng.random(n)], axis=1
+        )
         late, height = rng.uniform(*world.floor_delay, n), rng.uniform(*world.floor_height, n)
         low = anchors.ids[self.positions[:, 2] < LOW].tolist() if world.floor_effect else ()
-        self.floor = FloorMultipath({f"{i}.{part}": of[anchors.index(i)] for i in low for part, of in (("delay", late), ("height", height))})
+        self.floor = FloorMultipath(
+            {f"{i}.{part}": of[anchors.index(i)] for i in low for part, of in (("delay", late), ("height", height))}
+        )
         self._link = tag_link(seed) if world.antennas else None
         self._anchors, self._at_times = anchors, random(seed, "floor").random((len(self.t), 2))
         self._way = _walk(world, duration, random(seed, "person")) if world.person else np.empty((0, 2))

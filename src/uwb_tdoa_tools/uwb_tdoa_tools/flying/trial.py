@@ -41,7 +41,8 @@ TOLD_AT, TOLD_STD = 0.3, 0.1  # s after switching on; m and rad, standard deviat
 @dataclass(frozen=True)
 class Task:
     """One flight. world : World; seed : of all that is random; told : "place" or "nothing"; yaw : "known", to 0.1 rad, or "unknown";
-    config : FilterConfig; effects : EffectSet, and model : path of a bias network, to correct what is measured with, or None; again : fly twice, carried by hand in between;
+    config : FilterConfig; effects : EffectSet, and model : path of a bias network, to correct what is measured with, or None; again : fly
+    twice, carried by hand in between;
     peer : path of a library to fly by instead of our filter, always with a known yaw; path, rules, gains : of the vehicle."""
 
     world: World

@@ -33,10 +33,11 @@ def judge(flown: Flown) -> dict[str, Any]:
     kept an earlier one from landing counts for all.
 
     landed : took off, and stood upright in the end within NEAR of the wanted place, having touched it at less than SLOW; why : what was
-    missing, "" where it landed; safe : it never left the ground, or came down upright at less than GENTLE, wherever; place : m, from the wanted one; touchdown : m/s; tracking : m, root mean square of the distance to the
-    wanted path in the air; armed_off : m, of the estimate when the rotors started, armed_deviations : the same of its coordinates in
-    their standard deviations, the largest; lost : s, first instant in the air at which the estimate is more than LOST off, and said_lost :
-    s, when it said so itself; phases : {phase: figures of the estimate}.
+    missing, "" where it landed; safe : it never left the ground, or came down upright at less than GENTLE, wherever; place : m, from the
+    wanted one; touchdown : m/s; tracking : m, root mean square of the distance to the wanted path in the air; armed_off : m, of the
+    estimate when the rotors started, armed_deviations : the same of its coordinates in their standard deviations, the largest; lost : s,
+    first instant in the air at which the estimate is more than LOST off, and said_lost : s, when it said so itself; phases : {phase:
+    figures of the estimate}.
     """
     ends = [(mission.ended or math.inf) + REST_AFTER for mission in flown.missions]
     verdicts = [_judge(flown, mission, end) for mission, end in zip(flown.missions, ends)]

@@ -134,8 +134,8 @@ def world_of(
     name: str, floor_effect: bool | None = None, aids: Iterable[str] = (), silence: str | None = None,
     injected: Iterable[Sequence[str]] = (), installation: int | None = None,
 ) -> World:  # fmt: skip
-    """The World `name`, with what options change: floor_effect bool or None; installation int or None; aids, names; silence "MOMENT:S" or None; injected [[effect,
-    "KEY=NUMBER", ...]]. Raises InputError."""
+    """The World `name`, with what options change: floor_effect bool or None; installation int or None; aids, names; silence "MOMENT:S" or
+    None; injected [[effect, "KEY=NUMBER", ...]]. Raises InputError."""
     changed: dict[str, Any] = {"aids": tuple(dict.fromkeys(aids)), "installation": installation}
     if floor_effect is not None:
         changed["floor_effect"] = floor_effect
@@ -157,5 +157,7 @@ def _moment(text: str) -> tuple[str, float]:
     except ValueError:
         length = math.nan
     if moment not in MOMENTS or not 0.0 < length <= LONGEST_SILENCE:
-        raise InputError(f"--silence: {text!r} is not MOMENT:S, where MOMENT is one of {', '.join(MOMENTS)}, and S at most {LONGEST_SILENCE:g} s.")
+        raise InputError(
+            f"--silence: {text!r} is not MOMENT:S, where MOMENT is one of {', '.join(MOMENTS)}, and S at most {LONGEST_SILENCE:g} s."
+        )
     return moment, length

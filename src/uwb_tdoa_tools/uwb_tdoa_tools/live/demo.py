@@ -87,9 +87,10 @@ def measured(
 
 @dataclass(frozen=True)
 class DemoResult:
-    """became : {what became of the messages: count}, see `accounts`; scores : [Score], of the filter without correction, of the nodes, and of
-    the filter with correction; or, if nothing corrects, of the nodes and of the filter; nodes : RecordedOdometry;
-    without_ros : Run of the filter with what the nodes correct with; raw : Odometry of the filter without correction, or None if nothing corrects."""
+    """became : {what became of the messages: count}, see `accounts`; scores : [Score], of the filter without correction, of the nodes, and
+    of the filter with correction; or, if nothing corrects, of the nodes and of the filter; nodes : RecordedOdometry;
+    without_ros : Run of the filter with what the nodes correct with; raw : Odometry of the filter without correction, or None if nothing
+    corrects."""
 
     became: dict[str, int]
     scores: list[Score]

@@ -76,7 +76,9 @@ def _plane(ax: Axes, odometry: Odometry, anchors: Anchors, lost: np.ndarray, pla
         ax.annotate(names, (place[0], place[1]), textcoords="offset points", xytext=(6, 5), fontsize=9)
     both = np.concatenate([anchors.positions, known])[:, (u, v)]
     lower, upper = both.min(axis=0) - MARGIN, both.max(axis=0) + MARGIN
-    ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal", title=name, xlabel=f"{'xyz'[u]} [m]", ylabel=f"{'xyz'[v]} [m]")
+    ax.set(
+        xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal", title=name, xlabel=f"{'xyz'[u]} [m]", ylabel=f"{'xyz'[v]} [m]"
+    )
     ax.grid(alpha=0.25)
     if v == 1:
         marks = [

@@ -1,4 +1,5 @@
-"""A flight and its estimate for the viewer Rerun (rerun.io): anchors, path, covariance, residuals per pair over time, verdict and findings."""
+"""A flight and its estimate for the viewer Rerun (rerun.io): anchors, path, covariance, residuals per pair over time, verdict and
+findings."""
 
 from __future__ import annotations
 

@@ -19,9 +19,9 @@ LEAST = 0.5  # s in a zone, of which less tells nothing
 
 @dataclass(frozen=True)
 class Zone:
-    """A square in which the tag was. x, y : m, of its middle; seconds in it; heard : anchors in a second, median; tdoas_per_s; used : share of
-    them; left : m, 1.48 times the median of what is left of those used, NaN without; std : m, of the position, median; anchors : ((id, share of the
-    seconds in which it was heard), ...), those heard most first."""
+    """A square in which the tag was. x, y : m, of its middle; seconds in it; heard : anchors in a second, median; tdoas_per_s; used : share
+    of them; left : m, 1.48 times the median of what is left of those used, NaN without; std : m, of the position, median; anchors : ((id,
+    share of the seconds in which it was heard), ...), those heard most first."""
 
     x: float
     y: float
@@ -86,7 +86,10 @@ def draw(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: st
     silent = np.array([anchor not in heard for anchor in anchors.ids.tolist()])
     x, y = (np.unique([getattr(zone, name) for zone in zones]) for name in "xy")
     x, y = (np.arange(some.min(), some.max() + 0.5 * size, size) for some in (x, y))
-    for ax, name, label, colours in ((axes[0], "heard", "anchors heard in a second", "viridis"), (axes[1], "std", "standard deviation, cm", "viridis_r")):
+    for ax, name, label, colours in (
+        (axes[0], "heard", "anchors heard in a second", "viridis"),
+        (axes[1], "std", "standard deviation, cm", "viridis_r"),
+    ):
         values = np.full((len(y), len(x)), np.nan)
         for zone in zones:
             value = getattr(zone, name)

@@ -74,7 +74,8 @@ class Hall:
         return [self.of_group(*item) for item in batch]
 
     def of_group(self, rows: Sequence[int], points: np.ndarray) -> OfGroup:
-        """Covariance, dop, hull, ambiguous and flyable of a Chart at points (n, 3) m that hear the anchors in rows; hull : seen from above."""
+        """Covariance, dop, hull, ambiguous and flyable of a Chart at points (n, 3) m that hear the anchors in rows; hull : seen from
+        above."""
         n = len(points)
         try:
             installation = self.goal.installed(self.anchors.only(np.array(rows)))
@@ -88,15 +89,20 @@ class Hall:
         return covariance, np.linalg.norm(dilution(points, installation), axis=1), inside, ambiguous, inside & unique
 
     def side(self, points: np.ndarray) -> dict[str, Any] | None:
-        """{"share": of points (n, 3) m, "tag_side": values}: where those that are heard lie in a plane, so that the side of it must be told; None where
-        nowhere, or where the height is known and they have one height."""
-        sides = [sides_of(self.anchors.positions[rows[:MOST_HEARD]]) for rows in self.heard(points) if len(rows) > self.goal.installation.unknowns]
+        """{"share": of points (n, 3) m, "tag_side": values}: where those that are heard lie in a plane, so that the side of it must be
+        told; None where nowhere, or where the height is known and they have one height."""
+        sides = [
+            sides_of(self.anchors.positions[rows[:MOST_HEARD]])
+            for rows in self.heard(points)
+            if len(rows) > self.goal.installation.unknowns
+        ]
         needed = [one for one in sides if len(one) == 2 or one and self.goal.installation.unknowns == 3]
         most = max(sorted(set(needed)), key=needed.count, default=None)
         return None if most is None else {"share": needed.count(most) / len(points), "tag_side": list(most)}
 
     def addition(self, chart: Chart, floor: float) -> dict[str, Any] | None:
-        """{"position": (3,) m, "gain": share of the cells} of the best place for one more anchor, None where nearly all can be flown. floor : m."""
+        """{"position": (3,) m, "gain": share of the cells} of the best place for one more anchor, None where nearly all can be flown. floor
+        : m."""
         holes = np.flatnonzero(~chart.flyable)
         if len(holes) < 0.02 * len(chart.flyable):
             return None
@@ -137,7 +143,9 @@ def summary(chart: Chart, heard: np.ndarray) -> dict[str, Any]:
         "heard": dict(zip(map(str, numbers.tolist()), (counts / len(heard)).tolist())),
         "flyable_share": float(chart.flyable.mean()),
         "too_few_share": float(np.mean(~np.isfinite(chart.error) & ~chart.hull)),
-        "bound_flyable": dict(zip(("best", "median", "95 %", "worst"), np.quantile(errors, [0.0, 0.5, 0.95, 1.0]).tolist())) if len(errors) else None,
+        "bound_flyable": dict(zip(("best", "median", "95 %", "worst"), np.quantile(errors, [0.0, 0.5, 0.95, 1.0]).tolist()))
+        if len(errors)
+        else None,
     }
 
 
@@ -147,7 +155,9 @@ def say(about: dict[str, Any], addition: dict[str, Any] | None, side: dict[str, 
     shares = {int(number): share for number, share in about["heard"].items()}
     for label, low, high in (("fewer than 4", 0, 3), ("4 or 5", 4, 5), ("6 or 7", 6, 7), ("8 or more", 8, 1 << 30)):
         print(f"  {label:14s} anchors heard: {100.0 * sum(s for n, s in shares.items() if low <= n <= high):5.1f} % of the cells")
-    print(f"{100.0 * about['flyable_share']:.0f} % of the cells can be flown; the others hear too few, are not among those they hear, or have two solutions")
+    print(
+        f"{100.0 * about['flyable_share']:.0f} % of the cells can be flown; the others hear too few, are not among those they hear, or have two solutions"
+    )
     if about["bound_flyable"]:
         print("  bound of one round there, m: " + "  ".join(f"{name} {value:.2f}" for name, value in about["bound_flyable"].items()))
     if side:

@@ -174,7 +174,8 @@ def named(better: Anchors, before: Anchors) -> Anchors:
 
 
 def rounded(better: Anchors, before: Anchors) -> Anchors:
-    """The same Anchors as somebody can put them up: to the centimetre and the degree; those that stay as they are `before` are not touched."""
+    """The same Anchors as somebody can put them up: to the centimetre and the degree; those that stay as they are `before` are not
+    touched."""
     moved = _moved(better, before)
     positions, orientations = better.positions.copy(), better.orientations.copy()
     positions[moved] = positions[moved].round(2)

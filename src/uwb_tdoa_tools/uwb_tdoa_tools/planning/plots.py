@@ -66,7 +66,11 @@ def plot_failure(installation: Installation, chart: Chart, path: str | Path) -> 
         for ax in row:
             _room(ax, installation, chart.grid, k)
     title = "Left: ambiguity. Right: flyable (yellow), curves (grey), envelope (green), hull of the anchors (magenta)"
-    _save(figure, f"{title}\n{100.0 * chart.flyable.mean():.0f} % of {'the slice' if chart.grid.shape[2] == 1 else 'the room'} is flyable", path)
+    _save(
+        figure,
+        f"{title}\n{100.0 * chart.flyable.mean():.0f} % of {'the slice' if chart.grid.shape[2] == 1 else 'the room'} is flyable",
+        path,
+    )
 
 
 def plot_flips(

@@ -71,7 +71,9 @@ def say_flyable(about: dict[str, Any], addition: dict[str, Any] | None, criterio
     )
     if addition and addition["gain"] >= WORTH:
         at = ", ".join(f"{x:.2f}" for x in addition["position"])
-        print(f"add an anchor at ({at}): {_percent(about['flyable_share'] + addition['gain'])}; --improve add looks closer, for precision too")
+        print(
+            f"add an anchor at ({at}): {_percent(about['flyable_share'] + addition['gain'])}; --improve add looks closer, for precision too"
+        )
     elif addition:
         ways = ["--improve move looks for better places of those there are"]
         ways += ["--flyable round asks less: that a whole round of TDOAs has one solution"] if criterion == "pairings" else []

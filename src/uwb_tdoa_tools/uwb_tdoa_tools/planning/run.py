@@ -35,8 +35,8 @@ LOOKED_AT, TRIED = 600, 60  # cells of the room, and places, that are tried for 
 def plan_hall(
     args: Namespace, anchors: Anchors, installation: Installation, room: Room, grid: Grid
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """All of plan with --radio-reach: (figures, messages). args : the options; anchors : Anchors of the hall; installation : Installation of
-    some of them; room : Room; grid : Grid. Raises InputError."""
+    """All of plan with --radio-reach: (figures, messages). args : the options; anchors : Anchors of the hall; installation : Installation
+    of some of them; room : Room; grid : Grid. Raises InputError."""
     for name in ("check", "flights", "improve"):
         if getattr(args, name):
             raise InputError(f"{name}: is for a room in which every anchor is heard; leave out --{name}, or --radio-reach.")
@@ -122,11 +122,14 @@ def addition(
     found: Chart, anchors: Anchors, installed: Callable[[Anchors], Installation], places: Places, criterion: str
 ) -> dict[str, Any] | None:
     """What the best of some places for one more anchor would add to what is flyable: {"position": (3,) m, "gain": share of the room}, to
-    the centimetre; None where nearly all is flyable. found : Chart of Anchors; installed(anchors) : Installation of others; places : Places."""
+    the centimetre; None where nearly all is flyable. found : Chart of Anchors; installed(anchors) : Installation of others; places :
+    Places."""
     if found.flyable.mean() > ENOUGH:
         return None
     grid = found.grid
-    coarse = Grid.box(grid.lower, grid.lower + grid.step * np.array(grid.shape), grid.step * (found.flyable.size / LOOKED_AT) ** (1.0 / _across(grid)))
+    coarse = Grid.box(
+        grid.lower, grid.lower + grid.step * np.array(grid.shape), grid.step * (found.flyable.size / LOOKED_AT) ** (1.0 / _across(grid))
+    )
     if grid.shape[2] == 1:
         x, y, z = grid.axes
         coarse = Grid.slice((x[0], x[-1]), (y[0], y[-1]), z[0], coarse.step)

@@ -86,8 +86,8 @@ def read_columns(
 ) -> Flight:
     """Flight of CSV files with a header line each; each stream is taken from the one file that has its columns.
 
-    A row counts for a stream if any of its cells is filled: rows of several sensors may be mixed in one file, and each may have a time column
-    of its own. A record with a cell that is empty or no number is left out and counted, in `meta["remarks"]`; if that is more than
+    A row counts for a stream if any of its cells is filled: rows of several sensors may be mixed in one file, and each may have a time
+    column of its own. A record with a cell that is empty or no number is left out and counted, in `meta["remarks"]`; if that is more than
     MOST_SKIPPED of the records, the file is refused. columns : see `parse_columns`; named : Named, the anchors; salvage : leave out
     records that are not finite, however many. Raises InputError, with the line of the first record that is left out.
     """

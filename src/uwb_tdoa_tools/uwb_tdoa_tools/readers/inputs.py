@@ -63,7 +63,9 @@ def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
     except InputError:
         _report_once(f"{path}: no survey in {survey} fits; the anchors that it holds count, as in other bags that none fits.")
         return None
-    _report_once(f"{path}: the anchors of {its_survey} count here, whatever anchors the bag holds; so in every bag that is read with it.", its_survey)
+    _report_once(
+        f"{path}: the anchors of {its_survey} count here, whatever anchors the bag holds; so in every bag that is read with it.", its_survey
+    )
     return its_survey
 
 

@@ -40,8 +40,8 @@ class Named:
 
 def read_named(path: str | Path) -> Named:
     """Named of a survey file that `read_survey` reads, or one like it with names of any text in place of the ids: a CSV file name,x,y,z or
-    id,x,y,z, or YAML. The id is the number that a name ends with, if all end with different ones; else the line of the survey, from 0 on. Raises
-    InputError."""
+    id,x,y,z, or YAML. The id is the number that a name ends with, if all end with different ones; else the line of the survey, from 0 on.
+    Raises InputError."""
     try:
         return Named(survey.read_survey(path))
     except InputError as refused:
@@ -49,7 +49,9 @@ def read_named(path: str | Path) -> Named:
         if not names:
             raise refused
     if len(set(names)) < len(names):
-        raise InputError(f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is there twice; every anchor needs its own name.")
+        raise InputError(
+            f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is there twice; every anchor needs its own name."
+        )
     ends = [re.search(r"(\d{1,5})$", name) for name in names]
     ids = [int(end[1]) for end in ends if end]
     if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:

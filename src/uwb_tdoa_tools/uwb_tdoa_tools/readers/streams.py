@@ -35,8 +35,9 @@ def make_flight(
     """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams left out.
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
-        "tdoa": a, b, d (m), and std (m) if the tag knows it; "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw.
-        "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow": x, y (pixel counts), which become a velocity where "tof" and IMU are.
+        "tdoa": a, b, d (m), and std (m) if the tag knows it; "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz,
+        qw. "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow": x, y (pixel counts),
+        which become a velocity where "tof" and IMU are.
     extra : the same of everything else, for `Flight.extra`.
     meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps
         of each stream fell before they were sorted), "imu_accel_interpolated" and "remarks" (list of sentences).
@@ -127,8 +128,8 @@ def protocol(tdoas: Tdoas) -> str:
     TDoA2 anchors send in turn in fixed slots, and the tag takes the difference of two that follow each other: the pairs are the sides of
     one ring, and others occur only where a packet was missed. In TDoA3 any pair occurs (Bitcraze documentation). Where all anchors are
     compared with the same one, neither says it. Measured, 37 recordings of eight anchors: 95 % and more are on one ring with the one, at
-    most 52 % on the eight most frequent pairs with the other. The sides of three anchors are all pairs there are: then it is a ring if the order of the
-    two never turns round.
+    most 52 % on the eight most frequent pairs with the other. The sides of three anchors are all pairs there are: then it is a ring if the
+    order of the two never turns round.
     """
     ids, rows = np.unique(np.concatenate([tdoas.a, tdoas.b]), return_inverse=True)
     n, (a, b) = len(ids), rows.reshape(2, -1)

@@ -36,7 +36,8 @@ CONTRAST = 0.9  # of the median power over all delays: what tells a delay leaves
 RATE = 20.0  # Hz at which paths are compared
 AXES = 0.5  # of the error that must be left with other axes; measured recordings: 0.8 at least
 LONGEST = 1.6  # s at either end of a path that is left out, because stamps are moved by that much
-YAW, TILT, LEVEL, HEIGHT = np.deg2rad(4.0), np.deg2rad(12.0), 0.25, 0.6  # rad and m that stand out; measured: 2.9, 8.2 degrees, 0.14, 0.35 m
+# rad and m that stand out; measured: 2.9, 8.2 degrees, 0.14, 0.35 m
+YAW, TILT, LEVEL, HEIGHT = np.deg2rad(4.0), np.deg2rad(12.0), 0.25, 0.6
 COMMON, ALIKE, APART = 0.6, 1.3, 2.0  # of the shorter path in common; error of the second best epoch over that of the best; s between them
 AS_WELL = 0.02  # share by which a turned frame and stamps that are late may differ in what they leave, to be as likely
 FITS = 0.6  # of the size of the path, that may be left where an epoch is found
@@ -98,8 +99,8 @@ class Alignment:
         return bool(abs(self.yaw) > YAW), bool(self.tilt > TILT), bool(np.hypot(x, y) > LEVEL), bool(z > HEIGHT)
 
     def least(self) -> Alignment:
-        """The Alignment with those parts alone of turn and shift that stand out, and what goes with a turn: the rest may be what the estimate
-        errs by."""
+        """The Alignment with those parts alone of turn and shift that stand out, and what goes with a turn: the rest may be what the
+        estimate errs by."""
         turned, tilted, level, height = self._stands_out
         level = level or turned or tilted
         turn = self.turn if tilted else Rotation.from_euler("z", -self.yaw if turned else 0.0).as_matrix()
@@ -324,8 +325,8 @@ def _epoch(flight: Flight, odometry: Poses) -> float:
 def _apart_by_lag(
     ours: np.ndarray, theirs: np.ndarray, lags: np.ndarray, arrangements: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """m, root mean square distance of two paths (n, 3), (m, 3) m at each lag (k,) of the second, with the best of some arrangements (3, 3) of its
-    axes; infinite where they have too little in common."""
+    """m, root mean square distance of two paths (n, 3), (m, 3) m at each lag (k,) of the second, with the best of some arrangements (3, 3)
+    of its axes; infinite where they have too little in common."""
     common = np.minimum(lags + len(theirs), len(ours)) - np.maximum(lags, 0)
     square = _over(np.sum(ours**2, axis=1), np.ones(len(theirs))) + _over(np.ones(len(ours)), np.sum(theirs**2, axis=1))
     products = np.array([[_over(mine, its) for its in theirs.T] for mine in ours.T])

@@ -48,7 +48,9 @@ def choose(errors: Errors) -> float:
     The mean alone takes all of a model that gains much on three flights and loses a little on the fourth; the flights to come
     are more varied than these.
     """
-    ratios = {share: np.array([of[share] / of[None] for of in errors.values()]) for share in SHARES if all(share in of for of in errors.values())}
+    ratios = {
+        share: np.array([of[share] / of[None] for of in errors.values()]) for share in SHARES if all(share in of for of in errors.values())
+    }
     return min(ratios, key=lambda share: ratios[share].mean() + _spread(ratios[share]))
 
 

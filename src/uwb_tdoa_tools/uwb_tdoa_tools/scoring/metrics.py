@@ -215,7 +215,13 @@ class Result:
         """For JSON, without loss."""
         parts = {name: part.as_list() for name, part in self.distributions.items()}
         of_phases = {name: _as_texts(figures) for name, figures in self.phases.items()}
-        return {"row": _as_texts(self.row), "sums": _as_texts(self.sums), "distributions": parts, "phases": of_phases, "aligned": as_json(self.aligned)}
+        return {
+            "row": _as_texts(self.row),
+            "sums": _as_texts(self.sums),
+            "distributions": parts,
+            "phases": of_phases,
+            "aligned": as_json(self.aligned),
+        }
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> Result:
@@ -269,7 +275,8 @@ class Pool:
         return {name: self._phases[name].figures() for name in TITLES if name in self._phases}
 
     def figures(self) -> dict[str, Any]:
-        """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE, phases. Medians are right to 1 %. Of one run at least."""
+        """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE, phases. Medians are right to 1 %. Of one run at
+        least."""
         distance, count = self._distributions["distance"], self._distributions["distance"].count
         shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
         out: dict[str, Any] = {"flight": f"{self._runs} pooled"}

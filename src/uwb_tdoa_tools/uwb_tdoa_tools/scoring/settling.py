@@ -36,7 +36,11 @@ def settled(
     assert flight.truth is not None
     effects = effects or EffectSet()
     found = _alignment(flight, effects, config)
-    said = [f"{words}: it is moved to judge by, and nothing of that goes to the nodes" for words in (found.of_clock(), found.of_frame()) if words]
+    said = [
+        f"{words}: it is moved to judge by, and nothing of that goes to the nodes"
+        for words in (found.of_clock(), found.of_frame())
+        if words
+    ]
     return replace(flight, truth=found.least().applied(flight.truth, FRAME if found.other_frame else TIME)), tuple(said)
 
 

@@ -73,7 +73,9 @@ def lines_of_alignment(aligned: dict[str, Any], means: dict[str, float]) -> Iter
 def lines_of_phases(phases: dict[str, dict[str, Any]]) -> list[str]:
     """Lines of the phases of one run, `Score.phases`, or of several, `Pool.phases`."""
     head, *rows = _table_of_phases(phases)
-    return [f"{row[0]:20s}" + "".join(f"{cell:>{max(8, len(title)) + 1}s}" for cell, title in zip(row[1:], head[1:])) for row in (head, *rows)]
+    return [
+        f"{row[0]:20s}" + "".join(f"{cell:>{max(8, len(title)) + 1}s}" for cell, title in zip(row[1:], head[1:])) for row in (head, *rows)
+    ]
 
 
 def markdown_of(results: Sequence[Result], pool: Pool, others: dict[str, dict[str, str]]) -> str:

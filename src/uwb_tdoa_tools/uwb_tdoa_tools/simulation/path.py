@@ -25,8 +25,8 @@ class Path:
     """What simulate() takes as a trajectory.
 
     duration : s; position : function of stamps (n,) s, 0 to duration, that gives (n, 3) m, with four derivatives; attitude :
-    function of stamps that gives a Rotation, body to world, or None for that of a multirotor, whose thrust carries it; running : (begin, end) s,
-    of its motors, or None.
+    function of stamps that gives a Rotation, body to world, or None for that of a multirotor, whose thrust carries it; running : (begin,
+    end) s, of its motors, or None.
     """
 
     def __init__(

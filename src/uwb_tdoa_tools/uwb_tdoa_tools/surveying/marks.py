@@ -42,7 +42,9 @@ def _mark(where: str, entry: Any, lengths: Mapping[str, float]) -> Mark:
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: {error}; write it as {EXAMPLE}.") from error
     if not 0.0 <= first < last <= lengths[flight]:
-        raise InputError(f"{where}: from {first:g} to {last:g} s must lie, one after the other, in the {lengths[flight]:.1f} s of {flight}.")
+        raise InputError(
+            f"{where}: from {first:g} to {last:g} s must lie, one after the other, in the {lengths[flight]:.1f} s of {flight}."
+        )
     if len(position) != 3 or not all(abs(value) < 1e6 for value in position) or not 0.0 < std < 10.0:
         raise InputError(f"{where}: position {list(position)} +- {std:g} must be three coordinates and a std above 0, in m.")
     return Mark(flight, first, last, position, std)

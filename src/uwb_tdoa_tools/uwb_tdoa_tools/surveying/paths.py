@@ -24,8 +24,8 @@ DRIFT = 0.02  # m per square root of a second: visual-inertial odometry that is 
 
 
 def read_paths(source: str, flights: Sequence[Flight], drift: float = DRIFT, namespace: str = "") -> list[OdometryPath]:
-    """[OdometryPath], one for each of some Flights that it has. source : a CSV file with the columns flight, t (s, clock of the recording), x, y, z (m), or
-    the name of a nav_msgs/Odometry topic of the bags; drift : m per square root of a second. Raises InputError."""
+    """[OdometryPath], one for each of some Flights that it has. source : a CSV file with the columns flight, t (s, clock of the recording),
+    x, y, z (m), or the name of a nav_msgs/Odometry topic of the bags; drift : m per square root of a second. Raises InputError."""
     if not 0.0 <= drift <= 10.0:
         raise InputError(f"--drift: {drift:g} must be from 0 to 10 m per square root of a second.")
     if Path(source).is_file():

@@ -74,7 +74,8 @@ class Result:
 
     @property
     def apart(self) -> list[int]:
-        """Rows of those of MANY anchors that the flights put plainly elsewhere than given, while they leave the others about where they were."""
+        """Rows of those of MANY anchors that the flights put plainly elsewhere than given, while they leave the others about where they
+        were."""
         if len(self.given) <= MANY:
             return []
         off, told = np.abs(self.shifts), self.improved
@@ -146,7 +147,9 @@ class Result:
             off = f"off by {100 * before:.1f} cm as given, {100 * after:.1f} cm with the others' survey"
             lines.append(f"marks, each left out once: the estimate there is {off}, and nearer at {nearer:.0%} of them")
         if found.grounded:
-            lines.append(f"left out: {found.grounded} marks on the floor, where estimates are metres off and do not know it; mark places in the air")
+            lines.append(
+                f"left out: {found.grounded} marks on the floor, where estimates are metres off and do not know it; mark places in the air"
+            )
         if self.why_not:
             lines.append(f"nothing is applied, anchors stay as given: {self.why_not}")
         return "\n".join(lines)

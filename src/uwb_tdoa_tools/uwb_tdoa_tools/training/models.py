@@ -137,8 +137,8 @@ def _structured(
     """(Structured, EffectSet, learning curve over numbers of training flights, what is left of the errors of each
     validation flight by a fit to the training flights). The model itself is then fitted to all flights.
 
-    growing : as `_growing` gives; free : linear effects to fit together with the maps; alone : the maps are only there so that the effects do not take
-    what belongs to a place; no model is returned.
+    growing : as `_growing` gives; free : linear effects to fit together with the maps; alone : the maps are only there so that the effects
+    do not take what belongs to a place; no model is returned.
     """
     thin = [labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation)]
 

@@ -138,7 +138,9 @@ class Sensor:
         return self.stream(t, *self.columns(fields))
 
 
-def parameter(default: float | str, text: str, high: float | None = None, low: float = 0.0, with_low: bool = False, fixed: bool = False) -> Any:
+def parameter(
+    default: float | str, text: str, high: float | None = None, low: float = 0.0, with_low: bool = False, fixed: bool = False
+) -> Any:
     """A field of FilterConfig. text : unit and meaning, as in ekf_node.yaml; a number must be above `low`, or may be
     that too, and at most `high`; fixed : cannot change while the filter runs."""
     limits = {"low": low, "high": high, "with_low": with_low}

@@ -1,7 +1,8 @@
 """TDOAs.
 
 Neighbouring TDOAs are alike, so that hundreds a second are not hundreds of facts. They are averaged, pair by pair, over
-cells of half a second, near the floor of half the height at most, without the outliers of the cell; what likeness is left between cells is counted in the fit.
+cells of half a second, near the floor of half the height at most, without the outliers of the cell; what likeness is left between cells is
+counted in the fit.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ CELL = 0.5  # s
 LOWEST, LEVEL = 0.02, 0.5  # m, and by how much the logarithm of a height may differ within a cell near the floor, where heights matter
 OUTLIER = 4.0  # spreads within a cell
 QUICK = ("interval", *CATEGORIES)  # covariates that change from one TDOA to the next
-OF_ANCHORS = "anchor_delay", "anchor_position", "anchor_clock_drift", "pair_offset"  # effects, each of whose parameters acts on TDOAs of one or two anchors
+# Effects, each of whose parameters acts on TDOAs of one or two anchors
+OF_ANCHORS = "anchor_delay", "anchor_position", "anchor_clock_drift", "pair_offset"
 WILD = 20.0  # m; a larger residual is no measurement
 FEWEST_ON_FLOOR = 50  # TDOAs
 

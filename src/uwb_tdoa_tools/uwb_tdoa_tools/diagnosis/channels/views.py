@@ -48,14 +48,17 @@ def views_of_pairs(
     a: np.ndarray, b: np.ndarray, of_tdoa: Mapping[str, np.ndarray], of_arrival: Mapping[str, np.ndarray],
     cell: np.ndarray | None = None, many: bool = False,
 ) -> list[CovariateView]:  # fmt: skip
-    """[CovariateView] of TDOAs between anchors of ids a, b (n,). of_tdoa : {name: (n,)}; of_arrival : {name: (2, n)}, of a and of b; cell (n,) : row
-    of each, where there are several to a row; many : whether there are so many anchors that single ones are looked at over OF_EACH alone."""
+    """[CovariateView] of TDOAs between anchors of ids a, b (n,). of_tdoa : {name: (n,)}; of_arrival : {name: (2, n)}, of a and of b; cell
+    (n,) : row of each, where there are several to a row; many : whether there are so many anchors that single ones are looked at over
+    OF_EACH alone."""
     out: list[CovariateView] = []
     n = len(a)
     row = np.arange(n) if cell is None else cell
 
     def add(form: str, key: str, name: str, chosen: np.ndarray, *sides: tuple[np.ndarray, np.ndarray]) -> None:
-        out.append(CovariateView("tdoa", form, key, name, tuple((signs, values[chosen]) for signs, values in sides), row[chosen], cell is not None))
+        out.append(
+            CovariateView("tdoa", form, key, name, tuple((signs, values[chosen]) for signs, values in sides), row[chosen], cell is not None)
+        )
 
     everywhere, ones = np.arange(n), np.ones(n)
     for name, values in of_tdoa.items():

@@ -28,7 +28,8 @@ class Mark:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The estimate, averaged over the mark, is off by what the parameters do to it.
 
-        t (m,) s: `stamps`; estimate (m, 3) m, covariance (m, 3, 3) m^2, moved (m, 3, k): its derivative by the parameters, all at the stamps.
+        t (m,) s: `stamps`; estimate (m, 3) m, covariance (m, 3, 3) m^2, moved (m, 3, k): its derivative by the parameters, all at the
+        stamps.
         """
         off, columns = self.off(estimate, moved)
         weight = 1.0 / (np.diag(covariance[WITHIN // 2]) + self.std**2)

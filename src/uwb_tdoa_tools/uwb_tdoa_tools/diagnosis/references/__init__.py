@@ -8,7 +8,8 @@ from .nothing import Nothing
 from .odometry import Odometry
 from .path import OdometryPath
 
-REFERENCES = {"truth": GroundTruth, "heights": Heights, "marks": Marks, "odometry": Odometry, "nothing": Nothing}  # made of a FilterConfig and constraints
+# Made of a FilterConfig and constraints
+REFERENCES = {"truth": GroundTruth, "heights": Heights, "marks": Marks, "odometry": Odometry, "nothing": Nothing}
 
 __all__ = [
     "REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "Odometry", "OdometryPath", "Reference",

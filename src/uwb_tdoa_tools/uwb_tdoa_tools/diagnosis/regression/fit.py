@@ -72,7 +72,9 @@ def solve(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> tuple[np.n
 
 def _solution(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """The first of `solve`, in a third of the time."""
-    return sizes * cho_solve(cho_factor(gram * np.outer(sizes, sizes) + np.eye(len(vector)), overwrite_a=True, check_finite=False), sizes * vector)
+    return sizes * cho_solve(
+        cho_factor(gram * np.outer(sizes, sizes) + np.eye(len(vector)), overwrite_a=True, check_finite=False), sizes * vector
+    )
 
 
 def prior_sizes(columns: Sequence[Column]) -> np.ndarray:
@@ -81,7 +83,8 @@ def prior_sizes(columns: Sequence[Column]) -> np.ndarray:
 
 
 def fit(table: Table, columns: Sequence[Column], inflation: np.ndarray | None = None, covariance: bool = True) -> Fit:
-    """Fit of some Columns of a Table. inflation : (groups,), measured on this very fit if None; covariance : whether somebody asks for it."""
+    """Fit of some Columns of a Table. inflation : (groups,), measured on this very fit if None; covariance : whether somebody asks for
+    it."""
     x, group, sizes = table.matrix(columns), table.group, prior_sizes(columns)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
     residual = table.y.copy()

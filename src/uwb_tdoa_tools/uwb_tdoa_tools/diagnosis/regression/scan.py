@@ -197,7 +197,9 @@ class _Group:
         last, beyond, below = j == n, *np.split(single[:, len(_ENDS) : len(_ENDS) + 2 * bends], 2, axis=1)
         if self._several[0].view.covariate in CATEGORIES:
             spans = np.where(j == i + 1, spans, 0.0)
-            return [*self._pick("interval", spans[:, ~last], lambda edges, k: (edges[0], edges[i[~last][k]], edges[j[~last][k]], edges[-1]))]
+            return [
+                *self._pick("interval", spans[:, ~last], lambda edges, k: (edges[0], edges[i[~last][k]], edges[j[~last][k]], edges[-1]))
+            ]
         return [
             *self._pick("line", single[:, : len(_ENDS)], lambda edges, k: edges[_ENDS[k]]),
             *self._pick("beyond", beyond, lambda edges, k: (edges[0], edges[2 + k], edges[-1])),

@@ -45,7 +45,10 @@ class Scorer:
         self._base = np.arange(len(base))
         columns, root = list(self._place), model.information(table)
         whole = table.matrix(columns) if table.sparse else None
-        self._parts = [self._part(table, columns, root, rows) if whole is None else _sparse_part(table, whole, len(base), root, rows) for _, rows in table.groups]
+        self._parts = [
+            self._part(table, columns, root, rows) if whole is None else _sparse_part(table, whole, len(base), root, rows)
+            for _, rows in table.groups
+        ]
         self._group_sizes = [model.size[group] for group, _ in table.groups]
         self._channels = [table.channels[group // AXES] for group, _ in table.groups]
         self._sizes = prior_sizes(list(self._place))
@@ -144,8 +147,8 @@ class _Part:
 
 
 def _sparse_part(table: Table, x: Any, base: int, root: np.ndarray, rows: np.ndarray | slice) -> _Part:
-    """The _Part of some rows of a sparse matrix x of all columns, the first `base` those of the base: products of all with all at once, which of so
-    few entries cost less than to look for those of each candidate."""
+    """The _Part of some rows of a sparse matrix x of all columns, the first `base` those of the base: products of all with all at once,
+    which of so few entries cost less than to look for those of each candidate."""
     root, y, x = root[rows], table.y[rows], x[rows]
     whole = product(x, weighted(x, root))
     return _Part(table, [], rows, root, whole[:base], x.T @ (root * y), float(root @ y**2), whole)

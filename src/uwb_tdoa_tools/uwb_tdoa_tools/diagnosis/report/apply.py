@@ -16,8 +16,8 @@ def applying(
     anchors: str | Path | None = None, parameters: bool = False, truth: bool = True,
 ) -> tuple[tuple[str, str], ...]:  # fmt: skip
     """((command line, what it does), ...) of the files in a folder. recordings : paths to judge on; survey, anchors : files of anchors
-    that were given, for evaluate and for the nodes, or None; parameters : whether there is an ekf_node.yaml; truth : whether the recordings hold
-    ground truth."""
+    that were given, for evaluate and for the nodes, or None; parameters : whether there is an ekf_node.yaml; truth : whether the recordings
+    hold ground truth."""
     effects, config = folder / "effects.yaml", folder / "ekf_node.yaml" if parameters else None
     bias, ekf = command_lines.nodes(anchors, effects, config)
     return (

@@ -69,7 +69,11 @@ def _drawn_errors(name: str, each: Sequence[_Curve], top: float, width: float) -
         ax.plot(t[k], distance[k], "o", color=colour, ms=5)
         peaks.append((t[k], distance[k], colour))
     for t, distance, colour in peaks:
-        near = [other for other in peaks if other[1] != distance and abs(other[0] - t) < 0.15 * each[0][2].t[-1] and abs(other[1] - distance) < 0.2 * top]
+        near = [
+            other
+            for other in peaks
+            if other[1] != distance and abs(other[0] - t) < 0.15 * each[0][2].t[-1] and abs(other[1] - distance) < 0.2 * top
+        ]
         below = any(other[1] > distance for other in near)  # of another label that would lie on it
         right = t > 0.5 * each[0][2].t[-1]
         place = {"xytext": (-6 if right else 6, -11 if below else 3), "textcoords": "offset points", "ha": "right" if right else "left"}

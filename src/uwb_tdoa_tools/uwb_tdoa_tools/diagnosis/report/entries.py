@@ -61,7 +61,9 @@ class Entry:
     @property
     def matters(self) -> bool:
         """Whether it is worth doing something about: a fault, or the position gains from taking it out, as far as anybody knows."""
-        fault = any(isinstance(finding.effect, LabelEffect) for finding in self.findings)  # a plain mistake, to be put right whatever it is worth
+        fault = any(
+            isinstance(finding.effect, LabelEffect) for finding in self.findings
+        )  # a plain mistake, to be put right whatever it is worth
         return self.added and (fault or self.worth is None or self.worth >= WORTH_DOING)
 
     @property
@@ -138,8 +140,8 @@ def for_people(unit: str, key: str = "") -> tuple[str, float]:
 
 
 def by_anchor(effect: Effect) -> dict[int, dict[str, tuple[float, float | None]]]:
-    """{anchor: {"x", "y", "z" or "": (value, std or None)}} of those values of an Effect that are significant, where each is of one anchor, in
-    the order of anchors; {} of other effects."""
+    """{anchor: {"x", "y", "z" or "": (value, std or None)}} of those values of an Effect that are significant, where each is of one anchor,
+    in the order of anchors; {} of other effects."""
     out: dict[int, dict[str, tuple[float, float | None]]] = {}
     for key in significant(effect):
         parts = re.fullmatch(r"(\d+)(?:\.([xyz]))?", key)
@@ -177,7 +179,11 @@ def _values(finding: EffectFinding) -> str:
     if not told and vague > SHOWN:
         return f"{vague} values, none twice its standard deviation"
     named = told or effect.values  # a few values are named, however uncertain they are
-    shown = [f"{key} = {measured(value * factors[key], (effect.std.get(key) or 0.0) * factors[key])}" for key, value in fitted_first if key in named]
+    shown = [
+        f"{key} = {measured(value * factors[key], (effect.std.get(key) or 0.0) * factors[key])}"
+        for key, value in fitted_first
+        if key in named
+    ]
     rest = shown[SHOWN:]
     words = ", ".join(shown[:SHOWN] + ([f"{len(rest)} more"] if rest else []))
     if not told:

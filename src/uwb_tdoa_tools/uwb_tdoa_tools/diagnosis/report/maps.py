@@ -166,7 +166,16 @@ def _arrows(ax: Axes, runs: Sequence[Flown], view: list[int], enlarged: int) -> 
     places, errors = mean_errors(runs, view)
     if not len(places):
         return None
-    how = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / enlarged, "width": 0.008, "headwidth": 4, "headlength": 4.5, "headaxislength": 4, "minlength": 0.1}
+    how = {
+        "angles": "xy",
+        "scale_units": "xy",
+        "scale": 1.0 / enlarged,
+        "width": 0.008,
+        "headwidth": 4,
+        "headlength": 4.5,
+        "headaxislength": 4,
+        "minlength": 0.1,
+    }
     return ax.quiver(*places.T, *errors.T, color="k", zorder=6, **how)
 
 

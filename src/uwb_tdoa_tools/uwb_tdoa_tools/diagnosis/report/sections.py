@@ -50,9 +50,7 @@ def to_do(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
     if nameless:
         parts += paragraphs([f"Leave to effects.yaml what has no known cause in the hall: {'; '.join(nameless)}."])
     if rest:
-        note = (
-            f"Nobody has seen the position gain {100.0 * WORTH_DOING:.1f} cm from taking it out of the measurements, or it cannot be taken out."
-        )
+        note = f"Nobody has seen the position gain {100.0 * WORTH_DOING:.1f} cm from taking it out of the measurements, or it cannot be taken out."
         parts.append(folded("Seen too, not worth a visit", paragraphs([note], "note"), listing([(_asked(entry), ()) for entry in rest])))
     return section("What to do in the hall", *parts, _apply(diagnosis.applying) if added and diagnosis.applying else "")
 

@@ -84,7 +84,14 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
     gain, interval = 1.0 - after["rmse_3d"] / before["rmse_3d"], after.get("rmse_3d_gain_ci")
     change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
     more = [_intervals(before, after, interval), f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}."]
-    more += [*_over_phases(diagnosis), *_shared(diagnosis), *_caveats(diagnosis), *_worse(diagnosis), *_diverged(diagnosis), *left_over(diagnosis)]
+    more += [
+        *_over_phases(diagnosis),
+        *_shared(diagnosis),
+        *_caveats(diagnosis),
+        *_worse(diagnosis),
+        *_diverged(diagnosis),
+        *left_over(diagnosis),
+    ]
     if all(finding.on_floor for finding in diagnosis.findings if finding.added):
         stays = f"{ERROR} stays {centimetres(after['rmse_3d'])}: what is added acts near the floor alone, where the filter weighs it."
         return Verdict(stays, tuple(more), "same")
