@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 DESCRIPTION = """From recordings to a calibrated tag: check, find what is wrong, judge that where it took no part, write it.
 
 With ground truth in every FLIGHT `diagnose` finds what is wrong; without it, or with --no-truth, which leaves it unread, `survey` finds
-better anchors and delays from the flights alone. It is judged on --holdout; else on the last of several flights, which then
-takes no part, or on parts of a single one. Stops where a step says so, and says why. A calibration that makes
-things worse where it took no part is not written.
+better anchors and delays from the flights alone. The judge is --holdout; else the last of several flights, or parts of a single one.
+It took no part then. Stops where a step says so, and says why. A calibration that makes things worse there is not written.
 
 Writes to --out: anchors.yaml, effects.yaml and ekf_node.yaml, for evaluate and for both nodes, and calibration.json; prints the two
 lines that start the nodes. --quick says within a minute what that is likely to bring, and writes nothing.
