@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import AnchorDelay
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import diagnose, evaluate, localize
 from uwb_tdoa_tools.localizing import rerun_file
@@ -15,6 +16,7 @@ from uwb_tdoa_tools.localizing.estimate import Estimator
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
+RESIDUAL_FIELDS = "t", "anchor_a", "anchor_b", "innovation", "innovation_variance", "weight", "verdict"
 ALWAYS = {"world/anchors", "world/path", "world/tag", "world/tag/3_sigma", "verdict", "deviation/x", "deviation/y", "deviation/z"}
 
 
@@ -72,10 +74,10 @@ def test_diagnose_writes_before_and_after_and_what_was_found(desk, viewer):
 
 def test_demo_writes_what_the_nodes_said(flight, viewer, tmp_path):
     pytest.importorskip("rclpy")
-    from uwb_tdoa_tools.live.demo import Flown
+    from uwb_tdoa_tools.live.demo import DemoResult
 
     run = Estimator()(flight)
-    Flown({}, [], run.odometry, run, run.odometry).show(tmp_path / "flight.rrd", flight, ["landed"])
+    DemoResult({}, [], run.odometry, run, run.odometry).show(tmp_path / "flight.rrd", flight, ["landed"])
     assert ALWAYS | {"world/truth", "world/before", "error", "error/before"} <= names(viewer) and verdict(viewer) == "landed"
 
 
@@ -98,6 +100,24 @@ def test_it_is_left_out_with_a_sentence_where_it_is_not_installed(desk, capsys, 
     except pytest.skip.Exception:
         pass
     assert capsys.readouterr().err.count("pip install rerun-sdk") == 1 and not (desk / "flight.rrd").exists()
+
+
+@pytest.mark.parametrize("residuals", [True, False])
+def test_what_nodes_said_is_written_as_it_was_recorded(desk, flight, viewer, monkeypatch, residuals):
+    run = Estimator()(flight)
+    said = dict(zip(RESIDUAL_FIELDS, (getattr(run.residuals, name) for name in ("t", "a", "b", "innovation", "variance", "weight", "verdict"))))
+
+    def read_fields(bag, topic):
+        if not residuals:
+            raise InputError(f"{bag}: has no topic {topic}; record it.")
+        return said
+
+    monkeypatch.setattr(rerun_file, "read_odometry", lambda bag: run.odometry)
+    monkeypatch.setattr(rerun_file, "read_fields", read_fields)
+    rerun_file.write_recorded("live.rrd", "flight.bag")
+    found = names(viewer)
+    assert ALWAYS | {"world/truth", "error"} <= found and any(name.startswith("residual/") for name in found) == residuals
+    assert f"{len(run.odometry.t)} odometry messages" in verdict(viewer)
 
 
 @pytest.mark.parametrize("name", ["localize", "evaluate", "diagnose"])

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli
+from .. import cli, options
 from ..bags.files import STORAGES
 from ..live.record import record
 from ..live.session import PACKAGE
+from ..localizing.rerun_file import write_recorded
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 DESCRIPTION = """Record ROS topics to a bag, like `ros2 bag record`, until SIGINT (Ctrl-C) or SIGTERM.
 
 Topics are found as they appear; each is subscribed to with the strongest QoS that all its publishers offer. Messages
-are stored as they come, with the time of their arrival. The bag appears when the recording ends.
+are stored as they come, with the time of their arrival. The bag appears when the recording ends. With --rerun, odometry,
+uwb/residual, uwb/anchors and uwb/tdoa, if they are recorded, are written for the viewer Rerun then, too.
 """
 
 
@@ -36,12 +38,14 @@ def parser() -> ArgumentParser:
         DESCRIPTION,
         "record -o run.bag odometry uwb/residual",
         "record -o everything.bag -a",
+        "record -o run.bag --rerun run.rrd odometry uwb/residual uwb/anchors uwb/tdoa",
     )
     made.add_argument("topics", nargs="*", metavar="TOPIC", help="topics to record")
     made.add_argument("-a", "--all", action="store_true", help="record all topics, except hidden ones")
     made.add_argument("-o", "--output", required=True, metavar="BAG", help="the bag to write, a new directory")
     made.add_argument("--package", **PACKAGE)
     made.add_argument("-s", "--storage", choices=STORAGES, default="mcap", help="default: mcap")
+    options.add_rerun(made)
     return made
 
 
@@ -49,12 +53,15 @@ def _record(args: Namespace) -> int:
     if bool(args.topics) == args.all:
         raise InputError("topics: name the topics to record, or give --all for all of them, not both.")
     say = partial(cli.say, "record")
+    rerun = options.rerun_of(args, 1, say)
     recorded = record(args.topics, args.output, args.storage, args.ros_arguments, say, args.package)
     for topic, count in sorted(recorded.counts.items()):
         cli.show(f"{topic}: {count} messages")
     cli.show(f"{sum(recorded.counts.values())} messages -> {args.output}")
     if recorded.error is not None:
         raise recorded.error
+    if rerun:
+        write_recorded(rerun, args.output)
     if recorded.missing:
         say(f"no message came on {', '.join(recorded.missing)}")
         return 1

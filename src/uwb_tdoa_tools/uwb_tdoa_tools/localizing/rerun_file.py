@@ -10,8 +10,11 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
+from uwb_tdoa_ekf.results import Residuals
 
+from ..bags.bag import read_bag, read_fields, read_odometry
 from ..scoring.metrics import position_at
 from .estimate import Estimator
 from .pictures import SIGMAS
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
     from types import ModuleType
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.core.config import FilterConfig
-    from uwb_tdoa_ekf.results import Odometry, Residuals
+    from uwb_tdoa_ekf.results import Odometry
     from ..bags.bag import RecordedOdometry
     from ..diagnosis.diagnose import Diagnosis
 
@@ -82,6 +85,20 @@ def write_diagnosis(path: Path, result: Diagnosis, base: EffectSet, config: Filt
     before, after = (Estimator(config, effects)(flight) for effects in (base, result.effects))
     truth = flight.truth if result.reference.tells_errors else None
     write_rerun(path, flight, after.odometry, after.residuals, result.as_text().splitlines(), truth, before.odometry)
+
+
+def write_recorded(path: Path, bag: str) -> None:
+    """Write what was recorded of running nodes: `odometry` among `uwb/anchors`, with `uwb/residual` and the ground truth where these were
+    recorded, too. Raises InputError for a bag without `odometry`, `uwb/tdoa` or `uwb/anchors`."""
+    flight, odometry = read_bag(bag), read_odometry(bag)
+    try:
+        said = read_fields(bag, "uwb/residual")
+    except InputError:  # not recorded
+        residuals = None
+    else:
+        columns = "t", "anchor_a", "anchor_b", "innovation", "innovation_variance", "weight", "verdict"
+        residuals = Residuals(*(said[name] for name in columns)) if len(said["t"]) else None
+    write_rerun(path, flight, odometry, residuals, [f"As the nodes said it: {len(odometry.t)} odometry messages"], flight.truth)
 
 
 def _write_poses(rerun: ModuleType, stream: Any, odometry: Odometry | RecordedOdometry, begin: float) -> None:
