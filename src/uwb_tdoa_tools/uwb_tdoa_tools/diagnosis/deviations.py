@@ -51,7 +51,7 @@ def _beside_others(table: Table, model: Fit) -> tuple[np.ndarray, np.ndarray]:
     """(values (k,), standard deviations (k,)) of the columns of a Fit, with what can take the place of anchors integrated out."""
     rows, known, near = table.rows_of("tdoa"), {column.effect for column in model.columns}, _heard_with(table, model)
     mine = table.matrix(model.columns, rows)
-    beside = [column for column in table.columns if column.effect in ((POSITION,), (DELAY,)) and _anchor(column) in near]
+    beside = [column for column in table.columns if column.effect in ((POSITION,), (DELAY,)) and (near is None or _anchor(column) in near)]
     others = [column for column in beside if column not in model.columns]
     sizes = [column.typical if column.effect in known else UNSAID for column in others]
     late = table.matrix([column for column in beside if column.effect == (DELAY,)], rows)
@@ -77,12 +77,14 @@ def _anchor(column: Column) -> str:
     return column.key.partition(".")[0]
 
 
-def _heard_with(table: Table, model: Fit) -> set[str]:
+def _heard_with(table: Table, model: Fit) -> set[str] | None:
     """Ids of the anchors whose positions or delays a Fit tells, and of all that are heard in the same blocks as any of them: set of
-    texts."""
+    texts. None for all anchors: of few, or of several installations."""
+    parts = table.tdoa_parts
+    ids = parts[0].samples.anchors.ids
+    if not table.sparse or not all(np.array_equal(part.samples.anchors.ids, ids) for part in parts):
+        return None
     known, rows = {_anchor(column) for column in model.columns if column.effect[0] in OF_ANCHORS}, table.rows_of("tdoa")
-    part = table.tdoa_parts[0]
-    ends, block = np.stack(part.arrivals(table.series[rows])), table.block[rows]
-    names = part.samples.anchors.ids.astype(str)
+    ends, block, names = np.stack(parts[0].arrivals(table.series[rows])), table.block[rows], ids.astype(str)
     mine = np.isin(names, list(known))[ends].any(axis=0)
     return known | set(names[np.unique(ends[:, np.isin(block, block[mine])])].tolist())
