@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import atexit
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 import json
@@ -129,7 +129,7 @@ def discovery(environment: Mapping[str, str], given: str = "") -> dict[str, str]
     return {RANGE: given or environment.get(RANGE) or "LOCALHOST"}
 
 
-def network(environment: dict) -> str:
+def network(environment: Mapping[str, str]) -> str:
     """Who can hear the nodes, and command them, in a sentence. environment : variables."""
     found, peers = environment.get(RANGE) or "SUBNET", environment.get("ROS_STATIC_PEERS")
     if environment.get("ROS_LOCALHOST_ONLY") == "1":  # old, and counts
@@ -141,7 +141,7 @@ def network(environment: dict) -> str:
 
 
 def start(
-    executable: str, namespace: str, values: dict, files: tuple | list[str] = (), log_level: str = "info"
+    executable: str, namespace: str, values: Mapping, files: Sequence[str] = (), log_level: str = "info"
 ) -> Start:
     """Start of an executable with those of {name: value} that it has, and with the parameter files."""
     package, names = NODES[executable]
@@ -163,10 +163,11 @@ def tag(
 
 @dataclass(frozen=True)
 class Fleet:
-    """What a YAML file of tags says: `tags: {NAMESPACE: {parameter: value, host: HOST}}`, and beside `tags` what all of them share. path :
-    of the file; tags : {namespace: {parameter: value}}; hosts : {namespace: name of the machine that runs its nodes, None where the file
-    names none};
-    processes : text, "" where the file does not say."""
+    """What a YAML file of tags says: `tags: {NAMESPACE: {parameter: value, host: HOST}}`, and beside `tags` what all of them share.
+
+    path : of the file; tags : {namespace: {parameter: value}}; hosts : {namespace: name of the machine that runs its nodes, None where the
+    file names none}; processes : text, "" where the file does not say.
+    """
 
     path: str
     tags: dict[str, dict]
@@ -184,10 +185,11 @@ class Fleet:
         for namespace, own in listed.items():
             if not isinstance(own or {}, dict):
                 raise InputError(f"{path}: tags: {namespace}: {own!r} must be a mapping of parameters, or {{}}.")
-            merged[str(namespace)] = {"body_frame": f"{namespace}/base_link", **content, **(own or {})}
-            hosts[str(namespace)] = merged[str(namespace)].pop("host", None)
-            if hosts[str(namespace)] is not None and not isinstance(hosts[str(namespace)], str):
-                raise InputError(f"{path}: tags: {namespace}: host: {hosts[str(namespace)]!r} is no name of a machine; write a text.")
+            parameters = {"body_frame": f"{namespace}/base_link", **content, **(own or {})}
+            host = parameters.pop("host", None)
+            if not isinstance(host, str | None):
+                raise InputError(f"{path}: tags: {namespace}: host: {host!r} is no name of a machine; write a text.")
+            merged[str(namespace)], hosts[str(namespace)] = parameters, host
         if None in hosts.values() and set(hosts.values()) != {None}:
             lacks = next(namespace for namespace, name in hosts.items() if name is None)
             raise InputError(f"{path}: tags: {lacks}: names no host, and other tags do; name it, or a host for all beside 'tags'.")
@@ -279,7 +281,7 @@ def typed(texts: dict[str, str]) -> dict[str, bool | str]:
     return {name: kinds.get(text, text) for name, text in texts.items() if text != ""}
 
 
-def _beside(path: str | Path, file: list | str) -> str:
+def _beside(path: str | Path, file: object) -> str:
     """A path that a file names, relative to that file. Raises InputError."""
     if not isinstance(file, str):
         raise InputError(f"{file!r} is no path; write a text.")

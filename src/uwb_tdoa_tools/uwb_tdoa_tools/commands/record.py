@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli, options
+from .. import cli
 from ..bags.files import STORAGES
 from ..live.record import record
 from ..live.session import PACKAGE
-from ..localizing.rerun_file import write_recorded
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
 
 DESCRIPTION = """Record ROS topics to a bag, like `ros2 bag record`, until SIGINT (Ctrl-C) or SIGTERM.
 
@@ -45,7 +45,7 @@ def parser() -> ArgumentParser:
     made.add_argument("-o", "--output", required=True, metavar="BAG", help="the bag to write, a new directory")
     made.add_argument("--package", **PACKAGE)
     made.add_argument("-s", "--storage", choices=STORAGES, default="mcap", help="default: mcap")
-    options.add_rerun(made)
+    made.add_argument("--rerun", metavar="FILE", help="write a recording for the viewer Rerun, too (.rrd; needs pip install rerun-sdk)")
     return made
 
 
@@ -53,7 +53,7 @@ def _record(args: Namespace) -> int:
     if bool(args.topics) == args.all:
         raise InputError("topics: name the topics to record, or give --all for all of them, not both.")
     say = partial(cli.say, "record")
-    rerun = options.rerun_of(args, 1, say)
+    rerun = _rerun_of(args, say)
     recorded = record(args.topics, args.output, args.storage, args.ros_arguments, say, args.package)
     for topic, count in sorted(recorded.counts.items()):
         cli.show(f"{topic}: {count} messages")
@@ -61,11 +61,22 @@ def _record(args: Namespace) -> int:
     if recorded.error is not None:
         raise recorded.error
     if rerun:
+        from ..localizing.rerun_file import write_recorded
+
         write_recorded(rerun, args.output)
     if recorded.missing:
         say(f"no message came on {', '.join(recorded.missing)}")
         return 1
     return 0
+
+
+def _rerun_of(args: Namespace, say: Callable[[str], object]) -> Path | None:
+    """See options.rerun_of. What it imports takes a third of a second, in which messages would pass."""
+    if not args.rerun:
+        return None
+    from .. import options
+
+    return options.rerun_of(args, 1, say)
 
 
 if __name__ == "__main__":

@@ -24,12 +24,6 @@ TERMS = {
     "YAML": "the text format of effects.yaml.",
     "JSON": "the text format of diagnosis.json.",
 }
-_ABBREVIATION = re.compile(r"\b(?:[A-Z]{2,}s?|3D)\b")
-
-
-def abbreviations(text: str) -> set[str]:
-    """Those of a text: set."""
-    return set(_ABBREVIATION.findall(text))
 
 
 def used(text: str) -> dict[str, str]:
