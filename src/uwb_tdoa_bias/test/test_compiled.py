@@ -1,12 +1,15 @@
 """Compiled code is read from no folder in which anybody else may have put it: what is there is run."""
 
+import ast
 import os
+from pathlib import Path
 import shutil
 
 import pytest
 
 from uwb_tdoa_bias.foundation import compiled
 
+SOURCES = Path(__file__).resolve().parents[2]
 NAME = "0123"  # of a state of the sources
 
 
@@ -100,3 +103,17 @@ def test_without_any_folder_of_ones_own_there_is_a_temporary_one(named, monkeypa
     shutil.rmtree(own)
     own.write_text("no folder")
     assert place() == found and "nothing can be kept" in capsys.readouterr().err
+
+
+def test_no_compiled_function_unpacks_an_argument_by_a_bare_name():
+    """numba 0.68 may lose what is changed in place of arrays in a tuple: `x, cost = places` and `x[0] -= step`. `places.x` is right."""
+    unpacked, looked = [], 0
+    for path in SOURCES.glob("uwb_tdoa_*/uwb_tdoa_*/**/*.py"):
+        for function in ast.walk(ast.parse(path.read_text())):
+            if isinstance(function, ast.FunctionDef) and any(ast.unparse(by) == "compiled" for by in function.decorator_list):
+                looked += 1
+                names = {argument.arg for argument in function.args.args}
+                for node in ast.walk(function):
+                    if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple) and ast.unparse(node.value) in names:
+                        unpacked.append(f"{path.relative_to(SOURCES)}:{node.lineno}")
+    assert looked > 200 and not unpacked

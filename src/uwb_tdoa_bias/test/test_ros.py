@@ -61,7 +61,7 @@ def test_simulated_time_that_stands_still_or_is_missing_is_said():
     try:
         wall = [0.0]
         clock, source = ros.SimulatedClock(node, lambda: wall[0]), other.create_publisher(Clock, "/clock", 10)
-        level, text = clock.judge()
+        level, text = clock.status()
         assert level == DiagnosticStatus.WARN and "nobody publishes /clock" in text
         paused = DiagnosticStatus.OK, "paused: /clock stands still"
         for wall[0], second, expected in (
@@ -73,7 +73,7 @@ def test_simulated_time_that_stands_still_or_is_missing_is_said():
                 rclpy.spin_once(node, timeout_sec=0.05)
                 if node.get_clock().now().nanoseconds == second * 10**9:
                     break
-            assert clock.judge() == expected, wall
+            assert clock.status() == expected, wall
     finally:
         for each in (node, other):
             each.destroy_node()

@@ -38,7 +38,7 @@ def fly(monitor, anchors, heard, slices, first=0, seed=0):
         )
         rows = anchors.ids[a], anchors.ids[b], 0.1 * rng.standard_normal(n), one, one, np.full(n, USED)
         monitor.add(Odometry(t, *state), Residuals(t, *rows))
-        monitor.judge(t[-1])
+        monitor.update(t[-1])
 
 
 def row_of(n):

@@ -30,7 +30,7 @@ def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=
         odometry = Odometry(t, p, v, np.tile([0, 0, 0, 1.0], (RATE, 1)), zeros, bias, np.zeros((RATE, 9, 9)), np.zeros((RATE, 3, 3)))
         verdict = np.where(rng.random(len(one)) < [rejected(x) for x in t[kept]], REJECTED, USED)
         monitor.add(odometry, Residuals(t[kept], IDS[a][kept], IDS[b][kept], innovation[kept], noise**2 * one, one, verdict))
-        monitor.judge(second + 1.0)
+        monitor.update(second + 1.0)
         said.append((second + 1.0, monitor.alarms))
     return said
 
@@ -119,7 +119,7 @@ def test_what_did_not_reach_the_filter_does_not_count():
     monitor, one = Monitor(ANCHORS), np.ones(1)
     nothing = Odometry(*(np.empty((0, *shape)) for shape in ((), (3,), (3,), (4,), (3,), (3,), (9, 9), (3, 3))))
     monitor.add(nothing, Residuals(one, 3 * one, 99 * one, np.nan * one, np.nan * one, 0 * one, np.full(1, INVALID)))
-    monitor.judge(np.inf)
+    monitor.update(np.inf)
     assert monitor.alarms == []
 
 
@@ -132,7 +132,7 @@ def test_remembers_no_more_of_odometry_without_tdoas_than_of_one_slice():
         odometry = Odometry(t, still, still, np.zeros((RATE, 4)), still, still, np.zeros((RATE, 9, 9)), np.zeros((RATE, 3, 3)))
         some = Residuals(t, IDS[[0] * RATE], IDS[[1] * RATE], 0 * t, 1 + 0 * t, 1 + 0 * t, np.full(RATE, USED))
         monitor.add(odometry, some if second == 10 else none)
-        monitor.judge(second + 1.0)
+        monitor.update(second + 1.0)
         held.append(sum(len(part[0]) for part in monitor._odometry))
     assert max(held[:10] + held[45:]) <= RATE
 
@@ -153,7 +153,7 @@ def test_does_not_depend_on_when_it_is_asked():
             state = p[part], np.ones((n, 3)), np.ones((n, 4)), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 9, 9)), np.zeros((n, 3, 3))
             rows = Residuals(t[part], IDS[a[part]], IDS[b[part]], innovation[part], np.ones(n), np.ones(n), np.full(n, USED))
             monitor.add(Odometry(t[part], *state), rows)
-            monitor.judge(t[part][-1])
+            monitor.update(t[part][-1])
         said.append((monitor.alarms, monitor.delays[0].tolist()))
     assert said[0][0] and said[0] == said[1] == said[2]
 

@@ -10,7 +10,7 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_STATE
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE
-from uwb_tdoa_ekf.core.sensor_functions import rows_of, take_out
+from uwb_tdoa_ekf.core.sensor_functions import rows_of, subtract
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -27,7 +27,7 @@ def function(channel="accel.z", covariate="height", shape="line", size=1.0):
 def taken(effect, x):
     """What is taken out of a sample at a nominal state."""
     samples = np.zeros(1, IMU_SAMPLE)
-    take_out(rows_of(EffectSet((effect,)).sensor_functions), x, samples[0])
+    subtract(rows_of(EffectSet((effect,)).sensor_functions), x, samples[0])
     return -samples["gyro"][0], -samples["accel"][0]
 
 
@@ -53,7 +53,7 @@ def test_a_step_is_one():
 def test_several_add_up_on_their_axes():
     samples, x = np.zeros(1, IMU_SAMPLE), np.ones(16)
     effects = [function("gyro.x", "x"), function("accel.y", "y"), function("accel.y", "height")]
-    take_out(rows_of(EffectSet(tuple(effects)).sensor_functions), x, samples[0])
+    subtract(rows_of(EffectSet(tuple(effects)).sensor_functions), x, samples[0])
     expected = [effect.curve(np.ones(1))[0] for effect in effects]
     np.testing.assert_allclose(samples["gyro"][0], [-expected[0], 0.0, 0.0], atol=1e-3)
     np.testing.assert_allclose(samples["accel"][0], [0.0, -expected[1] - expected[2], 0.0], atol=1e-3)

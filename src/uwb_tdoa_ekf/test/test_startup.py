@@ -7,8 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.ground import Height
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
-from uwb_tdoa_ekf.core.startup import APART, INLIER, level, locate, share_of_inliers, split
+from uwb_tdoa_ekf.core.startup import APART, INLIER, Places, level, locate, share_of_inliers, split
 from uwb_tdoa_ekf.core.workspace import set_bounds
 
 SIZE = np.array([7.0, 8.0, 3.0])
@@ -40,11 +41,11 @@ def window_of(t, a, b, d):
 
 def places(tdoas, positions, count=2, std=STD):
     """(x (count, 6), covariance (count, 6, 6), cost (count,), share) as of `locate`."""
-    x, covariance, cost, workspace = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count), np.empty((2, 3))
+    found, workspace = Places(np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count)), np.empty((2, 3))
     state, parameters = new_state(positions), FilterConfig(tdoa_std=std).parameters()[0]
     set_bounds(state.record.extent, 1.0, workspace)
-    share = locate(window_of(*tdoas), state.anchors, workspace, parameters, np.nan, np.nan, x, covariance, cost)
-    return x, covariance, cost, share
+    share = locate(window_of(*tdoas), state.anchors, workspace, parameters, Height(np.nan, np.nan), found)
+    return *found, share
 
 
 def located(tdoas, positions):
@@ -129,7 +130,7 @@ def test_a_place_that_is_hardly_known_is_split_and_its_mean_and_covariance_stay(
     root[3:, 3:] = np.eye(3)
     whole, mean = root @ root.T, rng.standard_normal(6)
     x, covariance, cost = np.array([mean, mean]), np.array([whole, whole]), np.array([0.0, np.inf])
-    split(x, covariance, cost)
+    split(Places(x, covariance, cost))
     assert cost[1] == cost[0] and np.linalg.norm(x[0, :3] - x[1, :3]) > APART
     np.testing.assert_allclose(x.mean(axis=0), mean, atol=1e-9)
     apart = x - mean
@@ -139,7 +140,7 @@ def test_a_place_that_is_hardly_known_is_split_and_its_mean_and_covariance_stay(
 
 def test_a_place_that_is_known_is_not_split():
     x, covariance, cost = np.zeros((2, 6)), np.array([np.eye(6) * 0.5] * 2), np.array([0.0, np.inf])
-    split(x, covariance, cost)
+    split(Places(x, covariance, cost))
     assert cost[1] == np.inf and not x.any()
 
 
@@ -231,7 +232,7 @@ def test_halves_of_a_place_whose_velocity_is_correlated_have_covariances():
     row = np.concatenate([np.eye(3), 0.9 * np.eye(3)], axis=1)
     covariance[0] = 9.0 * row.T @ row + 0.1 * np.eye(6) + np.diag([5.0, 0, 0, 0, 0, 0])
     whole = covariance[0].copy()
-    split(x, covariance, cost)
+    split(Places(x, covariance, cost))
     np.testing.assert_allclose(covariance[0] + np.outer(x[0], x[0]), whole)
     for each in covariance:
         assert_covariance(each)

@@ -113,13 +113,13 @@ class DebiasNode(ros.StreamNode):
         values |= {"publishers of odometry": self._input.subscription.get_publisher_count()}
         values |= {"subscribers of odometry/debiased": self._publisher.get_subscription_count()}
         values |= {"unreadable on odometry": self._input.refusals.count}
-        level, text = self._judge(recent, sum(recent.values()))
+        level, text = self._status(recent, sum(recent.values()))
         unreadable = self._input.refusals.trouble()
         if unreadable and level != DiagnosticStatus.ERROR:
             level, text = DiagnosticStatus.WARN, unreadable
         return level, text, values
 
-    def _judge(self, recent: dict[str, int], total: int) -> tuple[bytes, str]:
+    def _status(self, recent: dict[str, int], total: int) -> tuple[bytes, str]:
         if not total:
             return DiagnosticStatus.WARN, "no odometry: start ekf_node in this namespace"
         if recent["invalid"]:

@@ -80,14 +80,14 @@ def follow_changes(node: Node, config: Callable[[], FilterConfig], on_change: Ca
         names = {field.name for field in fields(FilterConfig)}
         return replace(config(), **{p.name: p.value for p in parameters if p.name in names})
 
-    def judge(parameters: list[RosParameter]) -> SetParametersResult:
+    def validate(parameters: list[RosParameter]) -> SetParametersResult:
         try:
             changed(parameters)
         except InputError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    node.add_on_set_parameters_callback(judge)
+    node.add_on_set_parameters_callback(validate)
     node.add_post_set_parameters_callback(lambda parameters: on_change(changed(parameters)))
 
 

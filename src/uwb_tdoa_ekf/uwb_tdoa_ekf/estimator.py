@@ -247,7 +247,7 @@ class Estimator:
 
     def _use(self, until: float) -> tuple[Odometry, Residuals]:
         """Use what is stamped up to `until`, s, and between it what poses were set."""
-        self._judge_early_poses()
+        self._check_early_poses()
         parts: list[Fed] = []
         while self._poses and self._poses[0]["t"][0] <= until and self._has_begun():
             pose = self._poses.pop(0)
@@ -271,7 +271,7 @@ class Estimator:
             self.counts[VERDICTS[verdict]] += 1
         return odometry_of(parts), residuals
 
-    def _judge_early_poses(self) -> None:
+    def _check_early_poses(self) -> None:
         """Drop what was set before the first measurement and is of another time than that."""
         if self._begun or not self._has_begun():
             return

@@ -87,18 +87,16 @@ def pose_and_twist(odometry: Odometry, rates: np.ndarray, rate_variances: np.nda
     """The numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST), of Odometry messages."""
     velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
     pose, twist = np.empty((len(odometry), POSE)), np.zeros((len(odometry), TWIST))
-    p, q = np.ascontiguousarray(odometry.p), np.ascontiguousarray(odometry.q)
-    _fill(p, q, velocity, covariance, rates, rate_variances, pose, twist)
+    pose[:, :3], pose[:, 3:7], twist[:, :3] = odometry.p, odometry.q, velocity
+    _fill(covariance, rates, rate_variances, pose, twist)
     return pose, twist
 
 
 @compiled
 def _fill(
-    p: np.ndarray, q: np.ndarray, velocity: np.ndarray, covariance: np.ndarray, rates: np.ndarray,
-    rate_variances: np.ndarray, pose: np.ndarray, twist: np.ndarray,
-) -> None:  # fmt: skip
-    for n in range(len(p)):
-        pose[n, :3], pose[n, 3:7], twist[n, :3] = p[n], q[n], velocity[n]
+    covariance: np.ndarray, rates: np.ndarray, rate_variances: np.ndarray, pose: np.ndarray, twist: np.ndarray
+) -> None:
+    for n in range(len(pose)):
         known = math.isfinite(rates[n, 0]) and math.isfinite(rate_variances[n])
         for i in range(6):
             for j in range(6):

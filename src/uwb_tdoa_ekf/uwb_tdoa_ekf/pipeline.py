@@ -70,11 +70,11 @@ class Pipeline:
             if end > until:
                 break
             parts += self._feed(buffer.take(math.nextafter(end, -math.inf)))
-            self.monitor.judge(end)
+            self.monitor.update(end)
             self.state.anchors["delay"], self.state.anchors["delay_variance"] = self.monitor.delays
         parts += self._feed(buffer.take(until))
         if self.monitor is not None:
-            self.monitor.judge(buffer.used_until)
+            self.monitor.update(buffer.used_until)
         return parts
 
     @property

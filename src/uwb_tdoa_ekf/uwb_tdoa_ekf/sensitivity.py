@@ -61,7 +61,7 @@ class Innovations:
         out, positions = np.zeros_like(regressors), np.zeros((len(stamps), 3, regressors.shape[1]))
         states, passed = np.zeros((2, ERROR_STATES, regressors.shape[1])), 0
         for records, of in zip(self.records, self.of):
-            passed = _through(records, of, regressors, states, out, stamps, passed, positions)
+            passed = _through(records, of, regressors, states, out, (stamps, positions), passed)
         return out, positions
 
     def in_blocks(
@@ -86,7 +86,7 @@ class Innovations:
             known, moved = regressors[rows][:, columns].toarray(), np.zeros((len(stamps), 3, len(columns)))
             out, before = np.zeros_like(known), passed
             for records, of in piece:
-                passed = _through(records, np.where(of >= 0, of - first, -1), known, states, out, stamps, passed, moved)
+                passed = _through(records, np.where(of >= 0, of - first, -1), known, states, out, (stamps, moved), passed)
             state[:, columns] = states[0]
             if positions is not None and passed > before:
                 positions[before:passed, :, columns] = moved[before:passed]
@@ -135,10 +135,11 @@ def record_innovations(
 @compiled
 def _through(
     records: np.ndarray, of: np.ndarray, regressors: np.ndarray, states: np.ndarray, out: np.ndarray,
-    stamps: np.ndarray, passed: int, positions: np.ndarray,
+    path: tuple[np.ndarray, np.ndarray], passed: int,
 ) -> int:  # fmt: skip
-    """states (2, 15, k): derivative of the error state by the parameters, and room for the next one. `passed` of the stamps
-    (m,) lie behind; returns how many do then, and fills their positions (m, 3, k)."""
+    """states (2, 15, k): derivative of the error state by the parameters, and room for the next one. path: stamps (m,) of which `passed`
+    lie behind, and positions (m, 3, k); returns how many do then, and fills their positions."""
+    stamps, positions = path[0], path[1]
     before, after = states[0], states[1]
     n = regressors.shape[1]
     for i in range(len(records)):

@@ -78,7 +78,7 @@ def run(flight, config):
     low = -np.inf
     for until in np.arange((np.floor(flight.tdoa.t[0] / STEP) + 1.0) * STEP, flight.tdoa.t[-1] + STEP, STEP):
         monitor.add(*(_between(part, low, until) for part in (odometry, residuals)))
-        monitor.judge(until)
+        monitor.update(until)
         said.append((until, monitor.alarms))
         low = until
     return said, (odometry.t, odometry.p)

@@ -26,7 +26,7 @@ def residual(flight, low, high):
     """A residual, looked at between two times after the first TDOA."""
     t = flight.tdoa.t
     a, b = (flight.anchors.index(side) for side in (flight.tdoa.a, flight.tdoa.b))
-    samples = samples_at(t, a, b, flight.truth, flight.anchors, t[0], motion=False)
+    samples = samples_at(t, a, b, flight.truth, flight.anchors, t[0], lag=None)
     fitted = (t >= t[0] + low) & (t <= t[0] + high)
     return {"tdoa": TdoaResidual(samples, np.zeros(len(t)), fitted, fitted)}
 

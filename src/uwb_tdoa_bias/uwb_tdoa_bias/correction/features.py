@@ -43,18 +43,9 @@ def everything(samples: Samples) -> np.ndarray:
     unknown."""
     out = np.empty((len(samples), len(NAMES)))
     anchors = samples.anchors
-    fill_all(samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, anchors.orientations, out)
+    _fill(samples.p, samples.q, samples.a, samples.b, anchors.positions, anchors.orientations, out)
+    _fill_place(samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, out[:, len(FEATURES) :])
     return out
-
-
-@compiled
-def fill_all(
-    p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray, ids: np.ndarray, positions: np.ndarray,
-    orientations: np.ndarray, out: np.ndarray,
-) -> None:  # fmt: skip
-    """`everything`, compiled, written to out (n, 29)."""
-    _fill(p, q, a, b, positions, orientations, out)
-    _fill_place(p, q, a, b, ids, positions, out[:, len(FEATURES) :])
 
 
 @compiled

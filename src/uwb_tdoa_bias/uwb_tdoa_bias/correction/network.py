@@ -22,7 +22,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
@@ -52,6 +52,16 @@ def load_network(name: str | Path | None) -> Network | None:
     if not name:
         return None
     return Network(MODELS / "default.onnx" if str(name) == SHIPPED else name)
+
+
+class Validity(NamedTuple):
+    """The features, columns (k,) of NAMES, that a network fades by: between lower and upper (k,) it is right, margin (k,) beyond it says
+    nothing."""
+
+    columns: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    margin: np.ndarray
 
 
 class Network:
@@ -109,11 +119,12 @@ class Network:
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
         self.share = float(json.loads(meta.get("share", "1.0")))
-        self._inputs, self._judged = (np.array([_COLUMN[name] for name in some], dtype=int) for some in (names, limits))
-        self._lower, self._upper, self._margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
-        if not ((self._margin > 0.0) & (self._upper >= self._lower)).all():
+        self._inputs, limited = (np.array([_COLUMN[name] for name in some], dtype=int) for some in (names, limits))
+        lower, upper, margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
+        self._validity = Validity(limited, lower, upper, margin)
+        if not ((margin > 0.0) & (upper >= lower)).all():
             raise ValueError("validity: every feature needs [lowest, highest, margin above 0]")
-        if not all(np.isfinite(values).all() for values in (self._offset, self._scale, self._margin)):
+        if not all(np.isfinite(values).all() for values in (self._offset, self._scale, margin)):
             raise ValueError("offset, scale and margins must be finite numbers")
         if not (self.clip > 0.0 and 0.0 <= self._fade_std < np.inf and self._largest_yaw_std >= 0.0):
             raise ValueError("clip must be above 0, fade_std and largest_yaw_std not below")
@@ -124,11 +135,10 @@ class Network:
         """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
         (n,) arrays. The first two are NaN where a feature that is needed is unknown."""
         yaw_std = NO_NUMBERS if samples.yaw_std is None else np.ascontiguousarray(samples.yaw_std, dtype=float)
-        limits = self.clip, self._fade_std, self.share, self._largest_yaw_std
-        judging, found = (self._judged, self._lower, self._upper, self._margin, limits, yaw_std), np.empty((3, len(samples)))
+        limits, found = (self.clip, self._fade_std, self.share, self._largest_yaw_std), np.empty((3, len(samples)))
         table, x = everything(samples), np.empty((len(samples), len(self._inputs)))
         _select(table, self._inputs, self._offset, self._scale, x)
-        _judge(self._model.run(x), table, *judging, found)
+        _limit(self._model.run(x), table, self._validity, limits, yaw_std, found)
         return found[0], found[1], found[2]
 
 
@@ -146,12 +156,13 @@ def _select(table: np.ndarray, columns: np.ndarray, offset: np.ndarray, scale: n
 
 
 @compiled
-def _judge(
-    out: np.ndarray, table: np.ndarray, judged: np.ndarray, lower: np.ndarray, upper: np.ndarray, margin: np.ndarray,
-    limits: tuple[float, float, float, float], yaw_std: np.ndarray, found: np.ndarray,
+def _limit(
+    out: np.ndarray, table: np.ndarray, validity: Validity, limits: tuple[float, float, float, float], yaw_std: np.ndarray,
+    found: np.ndarray,
 ) -> None:  # fmt: skip
     """What the network says, (n, 1 to 3), becomes bias, std and known, (3, n)."""
-    clip, fade_std, share, largest_yaw_std = limits
+    columns, lower, upper, margin = validity.columns, validity.lower, validity.upper, validity.margin
+    clip, fade_std, share, largest_yaw_std = limits[0], limits[1], limits[2], limits[3]
     for i in range(len(out)):
         bias, std, known = out[i, 0], 0.0, 1.0
         if abs(bias) > clip:
@@ -160,10 +171,10 @@ def _judge(
             std = out[i, 1]
         if out.shape[1] > 2:
             known = out[i, 2]
-        if len(judged):
+        if len(columns):
             beyond = 0.0
-            for k in range(len(judged)):
-                value = table[i, judged[k]]
+            for k in range(len(columns)):
+                value = table[i, columns[k]]
                 far = max(lower[k] - value, value - upper[k]) / margin[k]
                 beyond = far if far > beyond or value != value else beyond
             trust = 1.0 - min(beyond, 1.0) if beyond == beyond else np.nan

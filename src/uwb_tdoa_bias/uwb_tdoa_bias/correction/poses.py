@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
@@ -17,32 +17,43 @@ POSE_NUMBERS, TWIST_NUMBERS = 3 + 4 + 36, 6 + 36  # of PoseWithCovariance and Tw
 TILT = 0.5  # rad; a filter that does not know the tilt better estimates no attitude
 
 
+class Columns(NamedTuple):
+    """Stamps t (m,) s, positions p (m, 3) m, attitudes q (m, 4) x y z w, body to world, velocities v (m, 3) m/s, world, and standard
+    deviations of the yaw (m,) rad."""
+
+    t: np.ndarray
+    p: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    yaw_std: np.ndarray
+
+
 class Poses:
     """Poses in the order of their stamps, of which at least the last `history` are kept."""
 
     def __init__(self, history: int) -> None:
         self._history, self._count = history, 0
-        self._columns = [np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), (3,), ())]
+        self._columns = Columns(*(np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), (3,), ())))
 
     @property
     def t(self) -> np.ndarray:
         """Stamps, (m,) s."""
-        return self._columns[0][: self._count]
+        return self._columns.t[: self._count]
 
     @property
     def p(self) -> np.ndarray:
         """Positions, (m, 3) m."""
-        return self._columns[1][: self._count]
+        return self._columns.p[: self._count]
 
     @property
     def q(self) -> np.ndarray:
         """Attitudes, (m, 4) x y z w, body to world."""
-        return self._columns[2][: self._count]
+        return self._columns.q[: self._count]
 
     @property
     def v(self) -> np.ndarray:
         """Velocities, (m, 3) m/s, world, NaN where not known."""
-        return self._columns[3][: self._count]
+        return self._columns.v[: self._count]
 
     @property
     def newest(self) -> float:
@@ -53,51 +64,49 @@ class Poses:
         """Append one pose, or several: t (k,), p (k, 3), q (k, 4), v (k, 3), yaw_std (k,) rad. Those not later than all before
         them are ignored."""
         parts: Any = (t, p, q, v, yaw_std) if np.ndim(t) else ([t], [p], [q], [v], [yaw_std])
-        new = [np.ascontiguousarray(part, dtype=float) for part in parts]
-        self._count = _append(self._count, *self._columns, *new)
+        new = Columns(*(np.ascontiguousarray(part, dtype=float) for part in parts))
+        self._count = _append(self._count, self._columns, new)
 
     def before(self, t: np.ndarray, newest: float, lag: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of the newest poses stamped no later than `lag` s before the TDOA that precedes each of t (n,) s, as `preceding`
         says: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN where there is none."""
         n = len(t)
         out = np.empty(n, dtype=np.int64), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)
-        _look_up(t, newest, lag, self._count, *(*self._columns, *out))
+        _look_up(t, newest, lag, self._count, self._columns, out)
         return out
 
 
 @compiled
-def _append(
-    count: int, stamps: np.ndarray, p: np.ndarray, q: np.ndarray, v: np.ndarray, yaw_std: np.ndarray,
-    new_stamps: np.ndarray, new_p: np.ndarray, new_q: np.ndarray, new_v: np.ndarray, new_yaw_std: np.ndarray,
-) -> int:  # fmt: skip
+def _append(count: int, kept: Columns, new: Columns) -> int:
     """Append what is later than all before it, and returns how many there are. Once there is no room, only the last half is kept."""
-    history = len(stamps) // 2
-    for i in range(len(new_stamps)):
-        if not new_stamps[i] > (stamps[count - 1] if count else -np.inf):
+    history = len(kept.t) // 2
+    for i in range(len(new.t)):
+        if not new.t[i] > (kept.t[count - 1] if count else -np.inf):
             continue
         if count == 2 * history:
-            stamps[:history], yaw_std[:history] = stamps[history:], yaw_std[history:]
-            p[:history], q[:history], v[:history] = p[history:], q[history:], v[history:]
+            kept.t[:history], kept.yaw_std[:history] = kept.t[history:], kept.yaw_std[history:]
+            kept.p[:history], kept.q[:history], kept.v[:history] = kept.p[history:], kept.q[history:], kept.v[history:]
             count = history
-        stamps[count], p[count], q[count], v[count], yaw_std[count] = new_stamps[i], new_p[i], new_q[i], new_v[i], new_yaw_std[i]
+        kept.t[count], kept.yaw_std[count] = new.t[i], new.yaw_std[i]
+        kept.p[count], kept.q[count], kept.v[count] = new.p[i], new.q[i], new.v[i]
         count += 1
     return count
 
 
 @compiled
 def _look_up(
-    t: np.ndarray, newest: float, lag: float, count: int, stamps: np.ndarray, p: np.ndarray, q: np.ndarray,
-    v: np.ndarray, yaw_std: np.ndarray, places: np.ndarray, p_out: np.ndarray, q_out: np.ndarray,
-    yaw_std_out: np.ndarray,
+    t: np.ndarray, newest: float, lag: float, count: int, kept: Columns,
+    out: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:  # fmt: skip
-    precede(t, newest, yaw_std_out)
+    places, p, q, yaw_std = out[0], out[1], out[2], out[3]
+    precede(t, newest, yaw_std)
     for i in range(len(t)):
-        place = np.searchsorted(stamps[:count], yaw_std_out[i] - lag, side="right") - 1
+        place = np.searchsorted(kept.t[:count], yaw_std[i] - lag, side="right") - 1
         places[i] = place
         if place >= 0:
-            p_out[i], q_out[i], yaw_std_out[i] = p[place], q[place], yaw_std[place]
+            p[i], q[i], yaw_std[i] = kept.p[place], kept.q[place], kept.yaw_std[place]
         else:
-            p_out[i], q_out[i], yaw_std_out[i] = np.nan, np.nan, np.nan
+            p[i], q[i], yaw_std[i] = np.nan, np.nan, np.nan
 
 
 def known_yaw_std(std: np.ndarray) -> np.ndarray:

@@ -188,16 +188,15 @@ class Track:
 
 
 def samples_at(
-    t: np.ndarray, a: np.ndarray, b: np.ndarray, poses: Poses, anchors: Anchors, start: float = 0.0,
-    motion: bool = True, lag: float = POSE_LAG,
-) -> Samples:  # fmt: skip
+    t: np.ndarray, a: np.ndarray, b: np.ndarray, poses: Poses, anchors: Anchors, start: float = 0.0, lag: float | None = POSE_LAG
+) -> Samples:
     """Samples of TDOAs (t, a, b as in Samples, t in the order of arrival) at poses, as of a Track.
 
-    motion : give velocity and motion too, the latter up to the pose that a node would have, `lag` s old.
+    With velocity and motion, the latter up to the pose that a node would have, `lag` s old; without both where `lag` is None.
     """
     track = Track(poses)
     samples = Samples(t, a, b, track.positions(t), track.attitudes(t), anchors, start)
-    if not motion or not len(t):
+    if lag is None or not len(t):
         return samples
     return replace(samples, velocity=track.velocities(t), motion=track.motion(preceding(t) - lag))
 

@@ -311,21 +311,21 @@ class Diagnostics:
     def __init__(self, node: StreamNode, report: Callable[[], Report], look: Callable[[], None] = lambda: None) -> None:
         self._node, self._report, self._look, self._saying = node, report, look, Saying()
         self._clock, self._looks = SimulatedClock(node), 0
-        self._judgement: tuple[bytes, str] | None = None
+        self._clock_status: tuple[bytes, str] | None = None
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS_QOS)
         node.create_timer(REPORT_PERIOD / LOOKS, self._on_timer, clock=SteadyClock(clock_type=ClockType.STEADY_TIME))
 
     def _on_timer(self) -> None:
-        before, self._judgement = self._judgement, self._clock.judge()
+        before, self._clock_status = self._clock_status, self._clock.status()
         self._looks += 1
-        if self._looks % LOOKS == 0 or before != self._judgement:
+        if self._looks % LOOKS == 0 or before != self._clock_status:
             self.publish()
         self._look()
 
     @property
     def paused(self) -> bool:
         """Whether simulated time stands still."""
-        return self._judgement is not None
+        return self._clock_status is not None
 
     def publish(self) -> None:
         """Publish now."""
@@ -341,7 +341,7 @@ class Diagnostics:
         refused = self._node.refused_lately()
         if refused and level == DiagnosticStatus.OK:
             level, text = DiagnosticStatus.WARN, refused
-        level, text = self._judgement or (level, text)
+        level, text = self._clock_status or (level, text)
         if self._saying.anew(text, time.monotonic()):
             logger = self._node.get_logger()
             if level == DiagnosticStatus.OK:
@@ -382,7 +382,7 @@ class SimulatedClock:
         self._time: int | None = None  # the last one, ns
         self._since, self._period = now(), 0.0  # since when, s from one to the next lately
 
-    def judge(self) -> tuple[bytes, str] | None:
+    def status(self) -> tuple[bytes, str] | None:
         """(level, text) while nothing else can be said, because time stands still; None otherwise."""
         clock: ROSClock = self._node.get_clock()  # type: ignore[assignment]  # a node has such a clock
         now = self._now()

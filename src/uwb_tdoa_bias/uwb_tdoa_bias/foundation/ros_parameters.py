@@ -200,7 +200,7 @@ def files_of(arguments: Sequence[str]) -> list[str]:
 
 
 def _names(file: str) -> set[str]:
-    """Names of all parameters in a parameter file, of whatever node. rcl has read it before and judges it: here no value is looked
+    """Names of all parameters in a parameter file, of whatever node. rcl has read it before and validates it: here no value is looked
     at, nor the tag of one (launch_ros gives lists the tag !!python/tuple)."""
     if not Path(file).is_file():  # a pipe, which rcl has emptied
         return set()

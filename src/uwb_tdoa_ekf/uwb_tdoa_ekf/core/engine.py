@@ -29,7 +29,7 @@ from . import (
     workspace,
 )
 from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, FilterState, Measurements, Output
-from .sensor_functions import take_out
+from .sensor_functions import subtract
 from .startup import INLIER
 from .state import coast, predict
 from .update import project, update_state
@@ -67,7 +67,7 @@ def run(state: FilterState, parameters: np.ndarray, measurements: Measurements, 
         t = min(of_imu, of_tdoa, of_aid)
         if of_imu == t and i < len(imu):
             if len(state.functions) and ekf.running:
-                take_out(state.functions, ekf.hypotheses[ekf.best].x, imu[i])
+                subtract(state.functions, ekf.hypotheses[ekf.best].x, imu[i])
             _on_imu(ekf, values, imu[i], output.history)
             i += 1
         elif of_tdoa == t and k < len(tdoa):
@@ -110,7 +110,7 @@ def most_records(measurements: Measurements) -> int:
 @compiled
 def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray) -> None:
     continuous = inertial.observe(ekf.imu, sample, parameters.imu_timeout)
-    distrusted = plausibility.judge(ekf.plausibility, ekf.imu, sample, continuous, ekf.distrusted)
+    distrusted = plausibility.update(ekf.plausibility, ekf.imu, sample, continuous, ekf.distrusted)
     if distrusted != ekf.distrusted:
         ekf.distrusted = distrusted
         _switch(ekf, parameters, records)
@@ -333,7 +333,7 @@ def _update(
         _assimilate(ekf, h, parameters, tdoa.t, residual, records)
         if h == ekf.best:
             systematic.observe(ekf.information, a, b, innovation, tdoa.t, ekf.last_tdoa)
-            height.judge(ekf.height, parameters, innovation, tdoa.t)
+            height.update_pull(ekf.height, parameters, innovation, tdoa.t)
             if parameters.adapt_noise:
                 noise.learn(a, b, tdoa.t, innovation, parameters)
     if a.delay != 0.0 or b.delay != 0.0:

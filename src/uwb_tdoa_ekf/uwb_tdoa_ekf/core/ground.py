@@ -8,6 +8,7 @@ arrival for the first, metres late. By how much is not known; that it may be so 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,6 +58,24 @@ PAIR = np.dtype(
 )  # fmt: skip
 
 
+class Height(NamedTuple):
+    """A height of the tag that something else than TDOAs tells, and its standard deviation, m; NaN for none."""
+
+    z: float
+    std: float
+
+
+class Evidence(NamedTuple):
+    """What is known of a tag at rest: what pairs of anchors say, (k,) of PAIR; anchors (N,) of ANCHOR; workspace (2, 3) m; prior (4, 3),
+    position that is known before, m, and its information, 1/m^2; one of PARAMETERS."""
+
+    pairs: np.ndarray
+    anchors: np.ndarray
+    workspace: np.ndarray
+    prior: np.ndarray
+    parameters: Record
+
+
 @compiled
 def may_be_late(position: np.ndarray, x: np.ndarray, lower: float, ground: float) -> bool:
     """Whether an anchor at `position` (3,) may be late at a tag at x (3,), m, or up to `lower` m below it, over level ground."""
@@ -91,9 +110,9 @@ def _predict_lateness(anchor: Record, x: np.ndarray, lower: float, t: float, gro
     if not may_be_late(anchor.position, x, lower, ground):
         anchor.late = 0.0
     else:
-        step = min(1.0, max(0.0, t - anchor.judged) / CHANGE_TIME)
+        step = min(1.0, max(0.0, t - anchor.predicted) / CHANGE_TIME)
         anchor.late = min(max(anchor.late + step * (USUAL - anchor.late), RARE), 1.0 - RARE)
-    anchor.judged = t
+    anchor.predicted = t
 
 
 @compiled
@@ -214,21 +233,18 @@ def is_still(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: 
 
 
 @compiled
-def explain(
-    pairs: np.ndarray, anchors: np.ndarray, workspace: np.ndarray, prior: np.ndarray, parameters: Record,
-    z: float, z_std: float, lateness: int, x: np.ndarray, covariance: np.ndarray,
-) -> float:  # fmt: skip
-    """Where a tag at rest is, by what (k,) of PAIR say, as far as anchors are alike.
+def explain(evidence: Evidence, height: Height, lateness: int, x: np.ndarray, covariance: np.ndarray) -> float:
+    """Where a tag at rest is, by the evidence, as far as anchors are alike.
 
-    prior : (4, 3), position that is known before, m, and its information, 1/m^2; z, z_std : m, a height that is known and its standard
-    deviation, NaN for none; lateness : IN_TIME, ALIKE or KNOWN; x : (3,) m, where to begin, becomes the most probable position; covariance
-    (3, 3) m^2 is filled. Returns minus the logarithm of its probability, up to a constant.
+    lateness : IN_TIME, ALIKE or KNOWN; x : (3,) m, where to begin, becomes the most probable position; covariance (3, 3) m^2 is filled.
+    Returns minus the logarithm of its probability, up to a constant.
 
     An error of its own for each anchor, and one for each pair, rarely large (Student's distribution). ALIKE: of the anchors near the
     ground most are late by the same, as that is the way by what reflects, some by anything, and some in time (a mixture). KNOWN: the
     error of an anchor is about its floor_delay. Iteratively re-weighted least squares.
     """
-    rows, places = heard(pairs, anchors)
+    anchors, parameters = evidence.anchors, evidence.parameters
+    rows, places = heard(evidence.pairs)
     n = 3 + len(rows) + 1
     system, u = np.empty((n, n + 1)), np.zeros(n)
     u[:3] = x
@@ -245,14 +261,14 @@ def explain(
             late[i] = lateness == ALIKE and may_be_late(anchors[rows[i]].position, u, 0.0, parameters.ground_height)
             if sweep == 0 and late[i]:
                 u[3 + i] = USUAL_LATENESS
-        _equations(pairs, anchors, places, late, errors, workspace, prior, parameters, z, z_std, u, system)
+        _equations(evidence, height, places, late, errors, u, system)
         if not solve(system):
             return np.inf
         step = system[:, n]
         length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
         for j in range(n):
             u[j] += min(1.0, 2.0 / max(length, 1e-9)) * step[j]
-    cost = _equations(pairs, anchors, places, late, errors, workspace, prior, parameters, z, z_std, u, system)
+    cost = _equations(evidence, height, places, late, errors, u, system)
     x[:] = u[:3]
     both = np.concatenate((system[:, :n], np.eye(n)), axis=1)
     if not solve(both):
@@ -262,7 +278,7 @@ def explain(
 
 
 @compiled
-def heard(pairs: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def heard(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the anchors that are heard, and for each pair the places of its two anchors among these (k, 2)."""
     rows, places, count = np.empty(MOST_ANCHORS, np.int64), np.full((len(pairs), 2), -1), 0
     for k in range(len(pairs)):
@@ -280,12 +296,11 @@ def heard(pairs: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 @compiled
 def _equations(
-    pairs: np.ndarray, anchors: np.ndarray, places: np.ndarray, late: np.ndarray, errors: np.ndarray,
-    workspace: np.ndarray, prior: np.ndarray, parameters: Record, z: float, z_std: float, u: np.ndarray,
-    system: np.ndarray,
-) -> float:  # fmt: skip
+    evidence: Evidence, height: Height, places: np.ndarray, late: np.ndarray, errors: np.ndarray, u: np.ndarray, system: np.ndarray
+) -> float:
     """Normal equations of a step from u (n,): position, error of each anchor heard, what late ones have in common; (n, n + 1) is filled.
     errors : (k, 2) m, expected error of an anchor that is not late, and its standard deviation. Returns the cost."""
+    pairs, anchors, workspace, prior, parameters = evidence.pairs, evidence.anchors, evidence.workspace, evidence.prior, evidence.parameters
     n = len(u)
     system[:, :] = 0.0
     row, cost = np.empty(3), 0.0
@@ -335,10 +350,10 @@ def _equations(
         cost += 0.5 * (outside / std) ** 2
         if outside != 0.0:
             _add(system, states[:1], entries[:1], -outside, 1.0 / std**2)
-    if not math.isnan(z):
-        cost += 0.5 * ((u[2] - z) / z_std) ** 2 - math.log((workspace[1, 2] - workspace[0, 2]) / (2.5 * z_std))
+    if not math.isnan(height.z):
+        cost += 0.5 * ((u[2] - height.z) / height.std) ** 2 - math.log((workspace[1, 2] - workspace[0, 2]) / (2.5 * height.std))
         states[0] = 2
-        _add(system, states[:1], entries[:1], z - u[2], 1.0 / z_std**2)
+        _add(system, states[:1], entries[:1], height.z - u[2], 1.0 / height.std**2)
     return cost
 
 

@@ -32,7 +32,7 @@ STEP_TIME, STEP_COUNT = 0.25, 7  # s for which they must, and how many of them
 SETTLED = 1.0  # s of agreement that make the filter the one to be believed
 HIGHEST_STEP = 1.5  # m
 BEYOND = 1.0  # m beyond the workspace, up or down, where no tag is
-PULL_SCALE = 3.0  # m, of the loss that TDOAs are judged with
+PULL_SCALE = 3.0  # m, of the loss that TDOAs are weighed with
 PULL_TIME, PULL_LIMIT, PULL_DELAY = 1.0, 0.45, 3.0  # s, m, s: TDOAs averaged over the first disagree for the last
 IGNORE_TIME, LONGEST_IGNORED = 3.0, 60.0  # s for which a range finder is not used, the first time and at most
 
@@ -147,13 +147,13 @@ def _settle(
 
 
 @compiled
-def judge(height: Record, parameters: Record, innovation: Record, t: float) -> None:
+def update_pull(height: Record, parameters: Record, innovation: Record, t: float) -> None:
     """What one TDOA (INNOVATION of the best hypothesis) says of z beyond the filter, while a range finder holds that."""
     if t - height.used > LONGEST_GAP or t < height.ignored_until:
         height.pulls_since = t
         return
-    step = min(1.0, max(0.0, t - height.judged) / PULL_TIME)
-    height.judged = t
+    step = min(1.0, max(0.0, t - height.compared) / PULL_TIME)
+    height.compared = t
     row = innovation.row[2]
     w = weight(GEMAN_MCCLURE, innovation.value, PULL_SCALE)
     height.pull += step * (w * row * innovation.value - height.pull)

@@ -11,7 +11,8 @@ from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from . import ground, height, hypotheses, inertial, standing, systematic, workspace
 from .history import add_reset
 from .memory import HYPOTHESES, PLACES, WINDOW, YAWS
-from .startup import APART, SPEED, level, locate, share_of_inliers, split
+from .ground import Height
+from .startup import APART, SPEED, Places, level, locate, room_for, share_of_inliers, split
 from .state import GRAVITY
 
 MINIMUM = 12  # TDOAs a search needs
@@ -55,24 +56,23 @@ def is_repeat(ekf: Record, tdoa: Record, anchors: np.ndarray) -> bool:
 
 
 @compiled
-def _height_at_start(ekf: Record, parameters: Record, t: float) -> tuple[float, float]:
-    """(z, standard deviation), m, that other sensors tell at stamp t, s, of a tag whose attitude only the accelerometer tells; or NaN."""
+def _height_at_start(ekf: Record, parameters: Record, t: float) -> Height:
+    """What other sensors tell at stamp t, s, of a tag whose attitude only the accelerometer tells."""
     accel = _mean_accel(ekf.imu, parameters)
     return _known_height(ekf, parameters, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
 
 
 @compiled
 def _look_for_places(
-    ekf: Record, anchors: np.ndarray, parameters: Record, window: np.ndarray, z: float, z_std: float,
-    x: np.ndarray, covariance: np.ndarray, cost: np.ndarray, near: np.ndarray,
-) -> float:  # fmt: skip
+    ekf: Record, anchors: np.ndarray, parameters: Record, window: np.ndarray, known: Height, places: Places, near: np.ndarray
+) -> float:
     """`locate` in the surroundings of the anchors of a window; the most probable place first. near (2, 3) m: the box about these anchors is
     written to it. Returns the share of TDOAs that agree with the first place."""
     _find_surroundings(ekf, window, anchors, parameters)
-    share = locate(window, anchors, ekf.workspace, parameters, z, z_std, x, covariance, cost)
+    share = locate(window, anchors, ekf.workspace, parameters, known, places)
     workspace.surround(ekf, standing.NEAR, near)
     near[0, 2] = min(near[0, 2], parameters.ground_height)
-    standing.sort(x, covariance, cost, near)
+    standing.sort(places, near)
     return share
 
 
@@ -85,13 +85,13 @@ def start(
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    x, covariance, cost, near = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES), np.empty((2, 3))
-    z, z_std = _height_at_start(ekf, parameters, t)
-    share = _look_for_places(ekf, anchors, parameters, window, z, z_std, x, covariance, cost, near)
+    places, near, known = room_for(PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
+    share = _look_for_places(ekf, anchors, parameters, window, known, places, near)
+    x, covariance, cost = places.x, places.covariance, places.cost
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     at_rest, its = x[0].copy(), covariance[0].copy()
     wide = np.trace(its[:3, :3]) > APART**2  # before it holds other explanations
-    lead = standing.weigh(ekf, pairs, anchors, parameters, z, z_std, at_rest, its)
+    lead = standing.weigh(ekf, pairs, anchors, parameters, known, at_rest, its)
     still = ground.is_still(pairs, anchors, at_rest, ekf.still_covariance)
     on_ground = lead > (0.0 if still else standing.DECISIVE)
     good = still if on_ground else share >= AGREE and workspace.contains(ekf.workspace, x[0])
@@ -102,11 +102,11 @@ def start(
     if on_ground:
         cost[1] = np.inf
     elif wide:
-        split(x, covariance, cost)
-        standing.sort(x, covariance, cost, near)
+        split(places)
+        standing.sort(places, near)
     for place in range(PLACES if still else 0):
         standing.stop(x[place], covariance[place], ekf.still_covariance)
-    _begin(ekf, parameters, t, x, covariance, cost, parameters.initial_yaw, parameters.initial_yaw_std)
+    _begin(ekf, parameters, t, places, parameters.initial_yaw, parameters.initial_yaw_std)
     ekf.resting, ekf.rest_since = still and parameters.zero_velocity, t
     add_reset(ekf, t, history)
 
@@ -122,15 +122,14 @@ def start_slowly(ekf: Record, anchors: np.ndarray, parameters: Record, t: float,
         gap = max(gap, window[i].t - window[i - 1].t)
     if not (enough or len(window) >= MINIMUM) or span < parameters.start_window or gap > LONGEST_GAP * span:
         return
-    x, covariance, cost, near = np.empty((PLACES, 6)), np.empty((PLACES, 6, 6)), np.empty(PLACES), np.empty((2, 3))
-    z, z_std = _height_at_start(ekf, parameters, t)
-    share = _look_for_places(ekf, anchors, parameters, window, z, z_std, x, covariance, cost, near)
-    if not (enough or (share >= AGREE and workspace.contains(ekf.workspace, x[0]))):
+    places, near, known = room_for(PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
+    share = _look_for_places(ekf, anchors, parameters, window, known, places, near)
+    if not (enough or (share >= AGREE and workspace.contains(ekf.workspace, places.x[0]))):
         return
-    if np.trace(covariance[0, :3, :3]) > APART**2:
-        split(x, covariance, cost)
-        standing.sort(x, covariance, cost, near)
-    _begin(ekf, parameters, t, x, covariance, cost, parameters.initial_yaw, parameters.initial_yaw_std)
+    if np.trace(places.covariance[0, :3, :3]) > APART**2:
+        split(places)
+        standing.sort(places, near)
+    _begin(ekf, parameters, t, places, parameters.initial_yaw, parameters.initial_yaw_std)
     ekf.resting, ekf.rest_since = False, t
     add_reset(ekf, t, history)
 
@@ -148,15 +147,15 @@ def relocate(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, his
     if not is_unsure(ekf) or len(recent(ekf, parameters.start_window)) >= MINIMUM:
         return
     best, window = ekf.hypotheses[ekf.best], _last(ekf, t)[0]
-    x, covariance, cost = np.empty((2, 6)), np.empty((2, 6, 6)), np.empty(2)
-    q = best.x[6:10]
-    z, z_std = _known_height(ekf, parameters, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
+    places, q = room_for(2), best.x[6:10]
+    known = _known_height(ekf, parameters, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
     _find_surroundings(ekf, window, anchors, parameters)
-    share = locate(window, anchors, ekf.workspace, parameters, z, z_std, x, covariance, cost)
-    told = np.trace(covariance[0, :3, :3])
+    share = locate(window, anchors, ekf.workspace, parameters, known, places)
+    x, covariance, cost = places.x, places.covariance, places.cost
+    variance = np.trace(covariance[0, :3, :3])
     if cost[1] < np.inf:
-        told += np.sum((x[1, :3] - x[0, :3]) ** 2)
-    if share < AGREE or told > BETTER * np.trace(best.P[:3, :3]) or not workspace.contains(ekf.workspace, x[0]):
+        variance += np.sum((x[1, :3] - x[0, :3]) ** 2)
+    if share < AGREE or variance > BETTER * np.trace(best.P[:3, :3]) or not workspace.contains(ekf.workspace, x[0]):
         return
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -222,17 +221,17 @@ def place(
         for j in range(3):
             if not math.isnan(pose.p[j]):
                 covariance[k, j] = covariance[j, k] = pose.covariance[k, j]
-    told = not math.isnan(pose.yaw)
+    has_yaw = not math.isnan(pose.yaw)
     if not ekf.running:
-        yaw, std = (pose.yaw, pose.yaw_std) if told else (parameters.initial_yaw, parameters.initial_yaw_std)
-        _begin(ekf, parameters, t, x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1), yaw, std)
+        yaw, std = (pose.yaw, pose.yaw_std) if has_yaw else (parameters.initial_yaw, parameters.initial_yaw_std)
+        _begin(ekf, parameters, t, Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1)), yaw, std)
     else:
         for h in range(HYPOTHESES):
             hypothesis = ekf.hypotheses[h]
             hypothesis.P[:6, 6:] = 0.0
             hypothesis.P[6:, :6] = 0.0
             _put(hypothesis, x, covariance)
-            if told:
+            if has_yaw:
                 _turn(hypothesis, pose.yaw, pose.yaw_std)
                 if h != ekf.best:
                     hypothesis.log_weight = -np.inf
@@ -241,12 +240,9 @@ def place(
 
 
 @compiled
-def _begin(
-    ekf: Record, parameters: Record, t: float, x: np.ndarray, covariance: np.ndarray, cost: np.ndarray,
-    yaw: float, yaw_std: float,
-) -> None:  # fmt: skip
-    """Start hypotheses at positions and velocities x (k, 6), whose probabilities are exp(-cost) (k,), level, with the yaws that are
-    possible."""
+def _begin(ekf: Record, parameters: Record, t: float, places: Places, yaw: float, yaw_std: float) -> None:
+    """Start hypotheses at places, level, with the yaws that are possible."""
+    x, covariance, cost = places.x, places.covariance, places.cost
     accel = _mean_accel(ekf.imu, parameters)
     unknown = parameters.use_imu and yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):
@@ -296,16 +292,17 @@ def recover(
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    places = PLACES if anywhere else 1
-    x, covariance, cost = np.empty((places, 6)), np.empty((places, 6, 6)), np.empty(places)
+    count = PLACES if anywhere else 1
+    places = room_for(count)
     q = ekf.hypotheses[ekf.best].x[6:10]
-    z, z_std = _known_height(ekf, parameters, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
+    known = _known_height(ekf, parameters, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
     _find_surroundings(ekf, window, anchors, parameters)
-    share = locate(window, anchors, ekf.workspace, parameters, z, z_std, x, covariance, cost)
+    share = locate(window, anchors, ekf.workspace, parameters, known, places)
+    x, covariance, cost = places.x, places.covariance, places.cost
     explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
     if not workspace.contains(ekf.workspace, x[0]) or share < AGREE_ANYHOW:
         return
-    if anywhere and cost[places - 1] < np.inf:
+    if anywhere and cost[count - 1] < np.inf:
         _reopen(ekf, cost)
     elif share < CLEARLY_MORE + explained:
         return
@@ -316,7 +313,7 @@ def recover(
         if math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
             return
     for h in range(HYPOTHESES):
-        hypothesis, place = ekf.hypotheses[h], min(h // YAWS, places - 1)
+        hypothesis, place = ekf.hypotheses[h], min(h // YAWS, count - 1)
         if cost[place] == np.inf:
             place = 0
         hypothesis.P[:6, :] = 0.0
@@ -356,16 +353,16 @@ def level_anew(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     x, y, z, w = best.x[6], best.x[7], best.x[8], best.x[9]
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     x, covariance = best.x[:6].copy().reshape(1, 6), best.P[:6, :6].copy().reshape(1, 6, 6)
-    _begin(ekf, parameters, ekf.t, x, covariance, np.zeros(1), yaw, 2.0 * math.pi)
+    _begin(ekf, parameters, ekf.t, Places(x, covariance, np.zeros(1)), yaw, 2.0 * math.pi)
     add_reset(ekf, ekf.t, history)
 
 
 @compiled
-def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> tuple[float, float]:
-    """z (m) of a tag with cos(tilt) `up` and its standard deviation, as told by something else than TDOAs, or NaN."""
+def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> Height:
+    """Height of a tag with cos(tilt) `up`, as something else than TDOAs tells it."""
     if parameters.fixed_height_std > 0.0:
-        return parameters.fixed_height, parameters.fixed_height_std
-    return height.at_start(ekf, parameters, up, t), max(parameters.height_std, SMALLEST_STD)
+        return Height(parameters.fixed_height, parameters.fixed_height_std)
+    return Height(height.at_start(ekf, parameters, up, t), max(parameters.height_std, SMALLEST_STD))
 
 
 @compiled

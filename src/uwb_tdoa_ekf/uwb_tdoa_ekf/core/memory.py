@@ -93,7 +93,7 @@ ANCHOR = _record(
     ("delay", float),  # m, that it is found to have since it changed in flight,
     ("delay_variance", float),  # and its variance, m^2;
     ("late", float),  # probability that it is late because tag and anchor are near the ground, see ground.py, 0: it cannot be,
-    ("judged", float),  # s, and the stamp of the last TDOA that was asked;
+    ("predicted", float),  # s, stamp to which that was predicted;
     ("floor_delay", float),  # m, by which it was late at a tag on the ground, NaN: nobody knows,
     ("floor_std", float),  # m, and its standard deviation
 )
@@ -108,9 +108,9 @@ HEIGHT = _record(
     ("disagreeing", int),  # ranges in a row that do not, but with each other,
     ("disagreement", float),  # m, their mean innovation,
     ("disagrees_since", float),  # s, and the stamp of the first
-    ("pull", float),  # m and 1, what the TDOAs of late say of z, see height.judge,
+    ("pull", float),  # m and 1, what the TDOAs of late say of z, see height.update_pull,
     ("pull_information", float),
-    ("judged", float),  # s, stamps: of the last of them,
+    ("compared", float),  # s, stamps: of the last of them,
     ("pulls_since", float),  # and since when they disagree
     ("ignored_until", float),  # s, stamp until which no range is used, and
     ("ignore_time", float),  # s, for how long
@@ -232,7 +232,7 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
     state.anchors["position"] = positions
     state.record.extent[:] = np.min(positions, axis=0), np.max(positions, axis=0)
     state.record.within[:] = [[-np.inf] * 3, [np.inf] * 3]
-    for stamp in ("learned", "judged", "heard"):
+    for stamp in ("learned", "predicted", "heard"):
         state.anchors[stamp] = -np.inf
     ekf = state.record
     state.anchors["floor_delay"], state.anchors["floor_std"], ekf["floor_place"][:] = floor or (np.nan, 0.0, np.nan)
@@ -251,7 +251,7 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
     ):
         ekf[stamp] = -np.inf
     ekf.imu.t = ekf.plausibility.contradicted = -np.inf
-    for stamp in ("heard", "changed", "used", "judged", "pulls_since", "ignored_until"):
+    for stamp in ("heard", "changed", "used", "compared", "pulls_since", "ignored_until"):
         ekf.height[stamp] = -np.inf
     ekf.barometer.heard = ekf.barometer.agreed = ekf.velocity.heard = ekf.ranged["t"][0] = ekf.next_floor = -np.inf
     for name in ("accel", "slow_accel", "mean_accel"):

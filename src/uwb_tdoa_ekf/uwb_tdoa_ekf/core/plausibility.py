@@ -28,7 +28,7 @@ WEIGHT, TURN, RATE, TILT = range(1, 5)  # what is impossible
 
 
 @compiled
-def judge(check: Record, imu: Record, sample: Record, continuous: bool, distrusted: bool) -> bool:
+def update(check: Record, imu: Record, sample: Record, continuous: bool, distrusted: bool) -> bool:
     """Whether to go without inertial samples from this IMU_SAMPLE on. check : PLAUSIBILITY, which is updated; imu : IMU_STATE after
     `observe` of the sample and before `store`; continuous : what that returned; distrusted : what this returned before."""
     t, force, up = sample.t, imu.slow_accel, check.up
@@ -81,7 +81,7 @@ def _turn(vector: np.ndarray, rate: np.ndarray, dt: float) -> None:
     axis = rate * (-dt / angle)
     s, c = math.sin(angle), math.cos(angle)
     along = (1.0 - c) * (axis[0] * vector[0] + axis[1] * vector[1] + axis[2] * vector[2])
-    x, y, z = vector
+    x, y, z = vector[0], vector[1], vector[2]
     vector[0] = c * x + s * (axis[1] * z - axis[2] * y) + along * axis[0]
     vector[1] = c * y + s * (axis[2] * x - axis[0] * z) + along * axis[1]
     vector[2] = c * z + s * (axis[0] * y - axis[1] * x) + along * axis[2]

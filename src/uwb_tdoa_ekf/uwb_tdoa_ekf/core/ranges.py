@@ -20,12 +20,12 @@ APART = 0.2  # s; two ranges that are further apart are no TDOA
 def pair(ekf: Record, aid: Record) -> bool:
     """Make the TDOA of a range, one of AID, and the one before; returns whether they are one."""
     before, made = ekf.ranged[0], ekf.paired[0]
-    told = before.anchor != aid.anchor and aid.t - before.t < APART
+    apart = before.anchor != aid.anchor and aid.t - before.t < APART
     made.t, made.a, made.b, made.d = aid.t, before.anchor, aid.anchor, aid.value[0] - before.value[0]
     made.variance = aid.std[0] ** 2 + before.std[0] ** 2
     made.slope[:], made.state[:] = 0.0, 0.0
     ekf.ranged[0] = aid
-    return told
+    return apart
 
 
 @compiled

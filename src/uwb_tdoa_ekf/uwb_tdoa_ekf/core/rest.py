@@ -88,7 +88,14 @@ def look(
         ekf.doubts = 0
         ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
         stands = calm and (still or ekf.quiet)
-        landed = standing.land(ekf, ekf.pairs[:count], anchors, parameters, still, stands, t, records)
+        place, covariance = np.empty(3), np.empty((3, 3))
+        lateness = standing.find_landed(ekf, ekf.pairs[:count], anchors, parameters, still, place, covariance)
+        landed = lateness >= 0
+        if landed and stands:
+            ekf.late_as_known = lateness == ground.KNOWN
+            standing.put(ekf, place, covariance, t, records)
+        elif landed:
+            standing.hover(ekf, place, still, t, records)
         long = ekf.stills >= (LONG if t - ekf.rest_since > EARLY else LONG_ENOUGH)
         ekf.resting = stands and landed
         if not landed and long and not _moves(best, QUIET_STD):

@@ -35,7 +35,7 @@ def rows_of(functions: Sequence[SensorFunction]) -> np.ndarray:
 
 
 @compiled
-def take_out(functions: np.ndarray, x: np.ndarray, sample: Record) -> None:
+def subtract(functions: np.ndarray, x: np.ndarray, sample: Record) -> None:
     """Take (k,) of SENSOR_FUNCTION at a nominal state x out of an IMU_SAMPLE."""
     for k in range(len(functions)):
         function = functions[k]

@@ -16,7 +16,8 @@ from . import ground
 from .history import add_reset, add_update
 from .hypotheses import alive
 from .memory import HYPOTHESES
-from .startup import locate
+from .ground import Evidence, Height
+from .startup import Places, locate, room_for
 from .update import update_state
 from .workspace import surround
 
@@ -35,44 +36,47 @@ LANDING_STD = 0.2, 0.2, 0.5  # m, by which the filter may be wrong beyond what i
 
 @compiled
 def weigh(
-    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, z: float, z_std: float,
-    x: np.ndarray, covariance: np.ndarray,
-) -> float:  # fmt: skip
+    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, height: Height, x: np.ndarray, covariance: np.ndarray
+) -> float:
     """Weigh the explanations of (k,) of ground.PAIR by a tag at rest that may be anywhere in its workspace: position x (6,) with its
     covariance (6, 6), and the ground, with each lateness of ground.explain.
 
-    z, z_std : m, a height that is known and its standard deviation, NaN for none. The best one goes to x and covariance. Returns
-    the logarithm of how much more probable the ground is.
+    The best one goes to x and covariance. Returns the logarithm of how much more probable the ground is.
     """
     prior, bounds = np.zeros((4, 3)), ekf.workspace
     for k in range(3):
         prior[0, k], half = 0.5 * (bounds[0, k] + bounds[1, k]), 0.5 * (bounds[1, k] - bounds[0, k])
         prior[1 + k, k] = 1.0 / half**2
-    cost, position, each = np.empty(EXPLANATIONS), np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3))
-    position[0] = x[:3]
-    cost[0] = ground.explain(pairs, anchors, bounds, prior, parameters, z, z_std, ground.IN_TIME, position[0], each[0])
+    evidence, explained = Evidence(pairs, anchors, bounds, prior, parameters), _explanations()
+    explained.x[0] = x[:3]
+    explained.cost[0] = ground.explain(evidence, height, ground.IN_TIME, explained.x[0], explained.covariance[0])
     starts, near = np.empty((4, 2)), np.empty((2, 3))
     surround(ekf, NEAR, near)
     near[0, 2] = min(near[0, 2], parameters.ground_height)
-    cost[0] += _absurdity(near, x)
-    position[0], each[0] = x[:3], covariance[:3, :3]
+    explained.cost[0] += _absurdity(near, x)
+    explained.x[0], explained.covariance[0] = x[:3], covariance[:3, :3]
     for start in range(4):
         for k in range(2):
             starts[start, k] = near[0, k] + (near[1, k] - near[0, k]) * (0.75 if (start >> k) & 1 else 0.25)
-    _on_ground(ekf, pairs, anchors, prior, parameters, z, z_std, starts, cost, position, each)
-    best = _mix(cost, position, each)
+    _on_ground(ekf, evidence, height, starts, explained)
+    best = _mix(explained)
     ekf.late_as_known = best == 1 + ground.KNOWN
-    x[:3] = position[best]
-    covariance[:3, :3] = each[best]
+    x[:3] = explained.x[best]
+    covariance[:3, :3] = explained.covariance[best]
     covariance[:3, 3:] = 0.0
     covariance[3:, :3] = 0.0
-    return cost[0] - np.min(cost[1:])
+    return explained.cost[0] - np.min(explained.cost[1:])
 
 
 @compiled
-def sort(x: np.ndarray, covariance: np.ndarray, cost: np.ndarray, near: np.ndarray) -> None:
-    """Put the more probable of two places that explain TDOAs first: x (2, 6), covariance (2, 6, 6), cost (2,) as of `startup.locate`;
-    near : (2, 3) m, bounds of the anchors."""
+def _explanations() -> Places:
+    return Places(np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3)), np.empty(EXPLANATIONS))
+
+
+@compiled
+def sort(places: Places, near: np.ndarray) -> None:
+    """Put the more probable of two places that explain TDOAs first; near : (2, 3) m, bounds of the anchors."""
+    x, covariance, cost = places.x, places.covariance, places.cost
     for place in range(2):
         cost[place] += _absurdity(near, x[place])
     if cost[1] < cost[0]:
@@ -86,24 +90,21 @@ def _absurdity(near: np.ndarray, x: np.ndarray) -> float:
 
 
 @compiled
-def _on_ground(
-    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, prior: np.ndarray, parameters: Record, z: float,
-    z_std: float, starts: np.ndarray, cost: np.ndarray, position: np.ndarray, each: np.ndarray,
-) -> None:  # fmt: skip
-    """Fill in cost, position and its covariance of the explanations from 1 on: on the ground, with each lateness."""
-    floor, floor_std = parameters.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD
-    if not math.isnan(z):
-        floor, floor_std = z, z_std
+def _on_ground(ekf: Record, evidence: Evidence, height: Height, starts: np.ndarray, explained: Places) -> None:
+    """Fill in the explanations from 1 on: on the ground, with each lateness, by starts (k, 2) m."""
+    position, each, cost = explained.x, explained.covariance, explained.cost
+    if math.isnan(height.z):
+        height = Height(evidence.parameters.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD)
     trial, its = np.empty(3), np.empty((3, 3))
     known = False
-    for row in ground.heard(pairs, anchors)[0]:
-        known = known or not math.isnan(anchors[row].floor_delay)
+    for row in ground.heard(evidence.pairs)[0]:
+        known = known or not math.isnan(evidence.anchors[row].floor_delay)
     for lateness in range(EXPLANATIONS - 1):
         k = 1 + lateness
         cost[k] = np.inf
         for start in range(len(starts) if lateness != ground.KNOWN or known else 0):
-            trial[0], trial[1], trial[2] = starts[start, 0], starts[start, 1], floor
-            c = ground.explain(pairs, anchors, ekf.workspace, prior, parameters, floor, floor_std, lateness, trial, its)
+            trial[0], trial[1], trial[2] = starts[start, 0], starts[start, 1], height.z
+            c = ground.explain(evidence, height, lateness, trial, its)
             if c < cost[k]:
                 cost[k], position[k], each[k] = c, trial, its
     cost[1 + ground.ALIKE] += UNUSUAL
@@ -113,8 +114,9 @@ def _on_ground(
 
 
 @compiled
-def _mix(cost: np.ndarray, position: np.ndarray, each: np.ndarray) -> int:
+def _mix(explained: Places) -> int:
     """Place of the most probable explanation; its covariance becomes that of all of them about its position (spread of the means)."""
+    position, each, cost = explained.x, explained.covariance, explained.cost
     best = int(np.argmin(cost))
     weights = np.exp(cost[best] - cost)
     weights /= np.sum(weights)
@@ -150,55 +152,54 @@ def is_near_ground(hypothesis: Record, parameters: Record) -> bool:
 def _expected_late(pairs: np.ndarray, anchors: np.ndarray) -> float:
     """How many anchors of (k,) of PAIR are expected to be late because the tag is low."""
     late = 0.0
-    for row in ground.heard(pairs, anchors)[0]:
+    for row in ground.heard(pairs)[0]:
         late += anchors[row].late
     return late
 
 
 @compiled
-def land(
-    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, still: bool, stands: bool,
-    t: float, records: np.ndarray,
-) -> bool:  # fmt: skip
-    """If (k,) of PAIR tell at stamp t, s, that a tag is on the ground, go there. Returns whether.
-
-    still : TDOAs stay what they are; stands : it does not move. A tag that does not stand may hover low: its place is then told to
-    HOVER_STD, of one that is not still the height alone.
-    """
+def find_landed(
+    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, still: bool, place: np.ndarray, covariance: np.ndarray
+) -> int:
+    """Whether (k,) of PAIR tell that a tag is on the ground: its lateness, as of ground.explain, and -1 if not. Fills in place (3,) m and
+    covariance (3, 3) m^2. still : TDOAs stay what they are."""
     best = ekf.hypotheses[ekf.best]
     if not is_near_ground(best, parameters) or not (still or _expected_late(pairs, anchors) > FEWEST_LATE):
-        return False
+        return -1
     prior, wide = np.empty((4, 3)), best.P[:3, :3].copy()
     for k in range(3):
         wide[k, k] += LANDING_STD[k] ** 2
     prior[0], prior[1:] = best.x[:3], _inverse(wide)
-    cost, position, each = np.empty(EXPLANATIONS), np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3))
-    position[0] = best.x[:3]
-    cost[0] = ground.explain(pairs, anchors, ekf.workspace, prior, parameters, np.nan, np.nan, ground.IN_TIME, position[0], each[0])
+    evidence, nowhere, explained = Evidence(pairs, anchors, ekf.workspace, prior, parameters), Height(np.nan, np.nan), _explanations()
+    explained.x[0] = best.x[:3]
+    explained.cost[0] = ground.explain(evidence, nowhere, ground.IN_TIME, explained.x[0], explained.covariance[0])
     starts = np.empty((1, 2))
     starts[0, 0], starts[0, 1] = best.x[0], best.x[1]
-    _on_ground(ekf, pairs, anchors, prior, parameters, np.nan, np.nan, starts, cost, position, each)
-    k = 1 + int(np.argmin(cost[1:]))
-    if cost[k] + DECISIVE > cost[0]:
-        return False
-    if stands:
-        ekf.late_as_known = k == 1 + ground.KNOWN
-        _put(ekf, position[k], each[k], t, records)
-        return True
+    _on_ground(ekf, evidence, nowhere, starts, explained)
+    k = 1 + int(np.argmin(explained.cost[1:]))
+    if explained.cost[k] + DECISIVE > explained.cost[0]:
+        return -1
+    place[:], covariance[:, :] = explained.x[k], explained.covariance[k]
+    return k - 1
+
+
+@compiled
+def hover(ekf: Record, place: np.ndarray, still: bool, t: float, records: np.ndarray) -> None:
+    """A tag near the ground that does not stand may hover low: its place (3,) m counts to HOVER_STD, of a tag that is not still the height
+    alone."""
     for h in range(HYPOTHESES):
         if not alive(ekf.hypotheses[h]):
             continue
         for state in range(0 if still else 2, 6 if still else 3):
             value, std = 0.0, HOVER_STD
             if state < 3:
-                value, P = position[k, state], ekf.hypotheses[h].P
+                value, P = place[state], ekf.hypotheses[h].P
                 P[state, state] = max(P[state, state], HOVER_STD**2)  # a place that is told again tells nothing new
             else:
                 std = math.sqrt(ekf.still_covariance[state - 3, state - 3] + SPEED_STD**2)
             update_state(ekf.hypotheses[h], ekf.innovation, state, value, std)
             if h == ekf.best:
                 add_update(ekf, t, records)
-    return True
 
 
 @compiled
@@ -207,16 +208,16 @@ def find_again(
     records: np.ndarray,
 ) -> None:  # fmt: skip
     """A tag lies still at stamp t, s, but inertial samples have told that it moves: they were wrong, and it may be anywhere."""
-    x, covariance = np.empty((1, 6)), np.empty((1, 6, 6))
-    locate(window, anchors, ekf.workspace, parameters, np.nan, np.nan, x, covariance, np.empty(1))
-    weigh(ekf, pairs, anchors, parameters, np.nan, np.nan, x[0], covariance[0])
-    _put(ekf, x[0, :3], covariance[0, :3, :3], t, records)
+    places, nowhere = room_for(1), Height(np.nan, np.nan)
+    locate(window, anchors, ekf.workspace, parameters, nowhere, places)
+    weigh(ekf, pairs, anchors, parameters, nowhere, places.x[0], places.covariance[0])
+    put(ekf, places.x[0, :3], places.covariance[0, :3, :3], t, records)
     ekf.resting, ekf.rest_since = True, t
     ekf.recoveries += 1
 
 
 @compiled
-def _put(ekf: Record, position: np.ndarray, covariance: np.ndarray, t: float, records: np.ndarray) -> None:
+def put(ekf: Record, position: np.ndarray, covariance: np.ndarray, t: float, records: np.ndarray) -> None:
     """Every hypothesis to a position (3,), m, with its covariance (3, 3), at rest; attitude and biases stay."""
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]

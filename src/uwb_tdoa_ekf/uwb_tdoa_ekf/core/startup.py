@@ -7,6 +7,7 @@ begin. TDOAs that are older than a usual window, of a tag that hears few, tell l
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
-from .ground import solve
+from .ground import Height, solve
 from .workspace import reflect, rows_heard, configured_side
 
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it,
@@ -35,24 +36,38 @@ IMPROBABLE = 8.0  # minus the logarithm of the probability of a place beside ano
 SPLIT = 0.8  # standard deviations from the middle of a place to each of two that it becomes
 
 
+class Places(NamedTuple):
+    """Places where a tag may be: positions and velocities x (k, 6) m, m/s (or positions alone, (k, 3)), their covariance (k, 6, 6), and
+    minus the logarithm of the probability of each, up to a constant, cost (k,): inf for a place that is none."""
+
+    x: np.ndarray
+    covariance: np.ndarray
+    cost: np.ndarray
+
+
+@compiled
+def room_for(count: int) -> Places:
+    """Places to be filled in."""
+    return Places(np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count))
+
+
 @compiled
 def locate(
-    window: np.ndarray, anchors: np.ndarray, workspace: np.ndarray, parameters: Record, z: float, z_std: float,
-    x: np.ndarray, covariance: np.ndarray, cost: np.ndarray,
-) -> float:  # fmt: skip
+    window: np.ndarray, anchors: np.ndarray, workspace: np.ndarray, parameters: Record, height: Height, places: Places
+) -> float:
     """Robust multilateration over a window, with constant velocity.
 
     window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see workspace.py; parameters : one of
-    PARAMETERS; z, z_std : m, a height that is known otherwise and its standard deviation, or NaN. Writes position and velocity at the last
-    stamp to x (k, 6), their covariance to `covariance` (k, 6, 6), and minus the logarithm of the probability of each place, less that of
-    the first, to cost (k,): the most probable one first, then others that are APART, with inf where there are none. In a large workspace
-    the covariance of the last one holds those for which there is no room. Returns the share of TDOAs that agree with the first, 0 to 1.
+    PARAMETERS. Fills in places, at the last stamp, with costs less that of the first: the most probable one first, then others that are
+    APART. In a large workspace the covariance of the last one holds those for which there is no room. Returns the share of TDOAs that agree
+    with the first, 0 to 1.
 
     Graduated Geman-McClure: Gauss-Newton from several starts while the loss narrows; the start with the least final
     loss wins. A tag is in its workspace and slow until proven otherwise: without that prior, the late arrivals on a
     floor are explained best by a tag ten metres up. The covariance counts one independent error per anchor heard, not
     per TDOA, because errors persist over the window, and grows with the disagreement that is left.
     """
+    x, covariance, cost = places.x, places.covariance, places.cost
     std, ageing = parameters.tdoa_std, np.zeros(len(window))
     for i in range(len(window)):
         age = max(0.0, window[len(window) - 1].t - window[i].t - parameters.start_window)
@@ -60,8 +75,8 @@ def locate(
     mean, prior_std = np.zeros(6), np.full(6, SPEED)
     for k in range(3):
         mean[k], prior_std[k] = 0.5 * (workspace[0, k] + workspace[1, k]), 0.5 * (workspace[1, k] - workspace[0, k])
-    if not math.isnan(z):
-        mean[2], prior_std[2], prior_std[5] = z, z_std, SPEED
+    if not math.isnan(height.z):
+        mean[2], prior_std[2], prior_std[5] = height.z, height.std, SPEED
     prior_information = 1.0 / prior_std**2
     rows = rows_heard(window)
     correlation_length = max(1.0, len(window) / max(1.0, len(rows) - 1.0))
@@ -104,16 +119,14 @@ def locate(
             if np.sum((trials[other, :3] - x[place, :3]) ** 2) < APART**2:
                 losses[other] = np.inf
     if large:
-        _hold_others(trials, losses - least, x, covariance, cost)
+        _hold_others(trials, losses - least, places)
     return share
 
 
 @compiled
-def _hold_others(
-    trials: np.ndarray, costs: np.ndarray, x: np.ndarray, covariance: np.ndarray, cost: np.ndarray
-) -> None:
-    """Spread the last of the places x (k, 6) that is one over the others (m, 6) that are left, whose costs (m,) are inf where they are
-    not."""
+def _hold_others(trials: np.ndarray, costs: np.ndarray, places: Places) -> None:
+    """Spread the last of the places that is one over the others (m, 6) that are left, whose costs (m,) are inf where they are not."""
+    x, covariance, cost = places.x, places.covariance, places.cost
     last = 0
     for place in range(len(x)):
         if cost[place] < np.inf:
@@ -169,11 +182,10 @@ def _best_of_grid(
 
 
 @compiled
-def split(x: np.ndarray, covariance: np.ndarray, cost: np.ndarray) -> None:
-    """Where there is a single place, and it is less known than APART along any direction, fill in two of equal probability that have the
-    same mean and covariance together: TDOAs are as curved there as the anchors are far. x (2, 6), covariance (2, 6, 6), cost (2,) as of
-    `locate`.
-    """
+def split(places: Places) -> None:
+    """Where there is a single one of two places, and it is less known than APART along any direction, fill in two of equal probability that
+    have the same mean and covariance together: TDOAs are as curved there as the anchors are far."""
+    x, covariance, cost = places.x, places.covariance, places.cost
     axis, variance = np.ones(3), 0.0
     for _ in range(30):  # power iteration
         axis[:] = np.array([np.sum(covariance[0, i, :3] * axis) for i in range(3)])

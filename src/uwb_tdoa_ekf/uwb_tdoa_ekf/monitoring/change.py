@@ -60,7 +60,7 @@ class Change:
 
 
 class ChangeDetector:
-    """Takes Slices in the order of their stamps; `find` tests them; what it found is taken out by `take_out`."""
+    """Takes Slices in the order of their stamps; `find` tests them; what it found is subtracted by `compensate`."""
 
     def __init__(self) -> None:
         room = CAPACITY
@@ -141,7 +141,7 @@ class ChangeDetector:
         self._subtract(replace(change, size=more))
         return better
 
-    def take_out(self, change: Change) -> None:
+    def compensate(self, change: Change) -> None:
         """Go on as if an anchor had not changed; what it does beyond that is a Change again."""
         self._known.append(change)
         self._subtract(change)
@@ -187,7 +187,7 @@ class ChangeDetector:
 
     def _whiten(self, k: int) -> None:
         """Row k of the factor, and its whitened error."""
-        _whiten(k, self._t, self._p, self._delays, self._freedom, self._factor, self._white, self._squares)
+        _whiten(k, self._t, self._p, self._delays, self._freedom, (self._factor, self._white, self._squares))
 
     def _forget_oldest(self, n: int) -> None:
         for array in (self._t, self._p, self._delays, self._freedom):
@@ -204,9 +204,10 @@ class ChangeDetector:
 
 @compiled
 def _whiten(
-    k: int, t: np.ndarray, p: np.ndarray, delays: np.ndarray, freedom: np.ndarray, factor: np.ndarray,
-    white: np.ndarray, squares: np.ndarray,
-) -> None:  # fmt: skip
+    k: int, t: np.ndarray, p: np.ndarray, delays: np.ndarray, freedom: np.ndarray, whitened: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    """Row k of the Cholesky factor (m, m), of the whitened errors (m, N), and of their normalised squares (m,)."""
+    factor, white, squares = whitened[0], whitened[1], whitened[2]
     row, error = factor[k], delays[k].copy()
     variance = MEAN_STD**2 + PLACE_STD**2 + LOCAL_STD**2 + NOISE_STD**2
     for i in range(k):

@@ -34,7 +34,7 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 
 
 class Health:
-    """Judges once a second, by the wall clock."""
+    """Looks once a second, by the wall clock."""
 
     def __init__(self, config: FilterConfig, lag: float, volume: FlyableVolume | None = None) -> None:
         """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
@@ -69,39 +69,39 @@ class Health:
             self._starting = None
         elif self._starting is None:
             self._starting = now
-        judgement: tuple[bytes, str]
+        status: tuple[bytes, str]
         if refused:
-            judgement = ERROR, refused
+            status = ERROR, refused
         elif estimator is None:
-            judgement = ERROR, "no anchors yet: publish them on uwb/anchors, reliable and transient local"
+            status = ERROR, "no anchors yet: publish them on uwb/anchors, reliable and transient local"
         elif not located:
-            judgement = ERROR, "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the tag's driver"
+            status = ERROR, "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the tag's driver"
         elif self._use_imu and not imu_rate:
-            judgement = ERROR, "no samples on imu/data: check the IMU's driver, or set use_imu to false"
+            status = ERROR, "no samples on imu/data: check the IMU's driver, or set use_imu to false"
         elif wiring or findings:
-            judgement = _worst(wiring, findings)
+            status = _worst(wiring, findings)
         elif running:
-            judgement = self._judge_use(counts)
+            status = self._status_of_use(counts)
         elif estimator.lost:
-            judgement = WARN, estimator.lost
+            status = WARN, estimator.lost
         elif self._starting is not None and now - self._starting > START_TIMEOUT:
-            judgement = WARN, "no start position found: check ids and positions of the anchors, and that four are heard"
+            status = WARN, "no start position found: check ids and positions of the anchors, and that four are heard"
         else:
-            judgement = OK, "looking for the start position"
-        if judgement == (OK, "running"):
-            judgement = self._judge_aids(now, counts)
-        if judgement == (OK, "running") and estimator is not None and estimator.side_unknown:
-            judgement = WARN, estimator.side_unknown
+            status = OK, "looking for the start position"
+        if status == (OK, "running"):
+            status = self._status_of_aids(now, counts)
+        if status == (OK, "running") and estimator is not None and estimator.side_unknown:
+            status = WARN, estimator.side_unknown
         at_position: dict[str, str] = {}
         if estimator is not None and running and self.last_position is not None:
-            trouble, at_position = self._volume.judge(estimator.anchors, *self.last_position)
-            if trouble and judgement[0] == OK:
-                judgement = WARN, trouble
-        if running and self.behind is not None and BEHIND[0] < self.behind < BEHIND[1] and judgement[0] == OK:
+            trouble, at_position = self._volume.check(estimator.anchors, *self.last_position)
+            if trouble and status[0] == OK:
+                status = WARN, trouble
+        if running and self.behind is not None and BEHIND[0] < self.behind < BEHIND[1] and status[0] == OK:
             reason = "this machine is too slow for all it receives, or clocks differ"
-            judgement = WARN, f"the odometry is {self.behind:.1f} s behind: {reason}"
-        if running and self.behind is not None and -BEHIND[1] < self.behind < -BEHIND[0] and judgement[0] == OK:
-            judgement = WARN, f"the odometry is {-self.behind:.1f} s ahead of the clock: correct the stamps, or the clock"
+            status = WARN, f"the odometry is {self.behind:.1f} s behind: {reason}"
+        if running and self.behind is not None and -BEHIND[1] < self.behind < -BEHIND[0] and status[0] == OK:
+            status = WARN, f"the odometry is {-self.behind:.1f} s ahead of the clock: correct the stamps, or the clock"
         age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
         state = "running" if running else "lost" if estimator is not None and estimator.lost else "starting"
         values = {"state": state, "age of last odometry": age}
@@ -110,11 +110,11 @@ class Health:
         sentences = [*wiring, *(finding.sentence for finding in findings)]
         values |= {"wrong with the streams": "; ".join(sentences) or "nothing"}
         values |= {f"found {finding.rule}": f"{finding.value:.4g}" for finding in findings}
-        return *judgement, values | at_position
+        return *status, values | at_position
 
-    def _judge_aids(self, now: float, counts: Mapping[str, int]) -> tuple[bytes, str]:
+    def _status_of_aids(self, now: float, counts: Mapping[str, int]) -> tuple[bytes, str]:
         """Whether sensors that were there still are, and are used."""
-        judgement = OK, "running"
+        status = OK, "running"
         for aid, sensor in SENSORS.items():
             received = self.received[aid]
             heard, since = self._aids_heard.get(aid, (0, now))
@@ -131,16 +131,16 @@ class Health:
             recent = {name: total - before[name] for name, total in totals.items()}
             self._aids_before[aid] = totals
             if received and now - since > STOPPED:
-                judgement = WARN, f"no messages on {sensor.topics[0][0]} any more: done without; check the sensor and its driver"
+                status = WARN, f"no messages on {sensor.topics[0][0]} any more: done without; check the sensor and its driver"
                 continue
             for reason, words in reasons.items():
                 bad = recent[reason] > LARGEST_UNUSED * recent["received"]
                 repeats = self._aids_bad[aid, reason] = self._aids_bad.get((aid, reason), 0) + 1 if bad else 0
                 if repeats >= REPEATS:
-                    judgement = WARN, f"more than half of the messages on {sensor.topics[0][0]} {words}"
-        return judgement
+                    status = WARN, f"more than half of the messages on {sensor.topics[0][0]} {words}"
+        return status
 
-    def _judge_use(self, counts: Mapping[str, int]) -> tuple[bytes, str]:
+    def _status_of_use(self, counts: Mapping[str, int]) -> tuple[bytes, str]:
         """What became of the TDOAs since the last time."""
         reasons = {
             "late": (

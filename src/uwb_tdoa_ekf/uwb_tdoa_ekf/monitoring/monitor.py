@@ -133,8 +133,8 @@ class Monitor:
             begin = math.floor(odometry[0][-1] / LENGTH) * LENGTH if self._end is None else self._end - LENGTH
             self._odometry = [[column[odometry[0] >= begin] for column in odometry]]
 
-    def judge(self, until: float) -> None:
-        """Everything stamped before `until`, s, was added: judge the slices that end there or earlier."""
+    def update(self, until: float) -> None:
+        """Everything stamped before `until`, s, was added: test the slices that end there or earlier."""
         if self._end is None or until < self._end:
             return
         residuals, odometry = (
@@ -142,7 +142,7 @@ class Monitor:
         )
         while self._end <= min(until, self._last + GAP):
             now, of_now = residuals[0] < self._end, odometry[0] < self._end
-            self._judge(self._end, [column[now] for column in residuals], [column[of_now] for column in odometry])
+            self._test(self._end, [column[now] for column in residuals], [column[of_now] for column in odometry])
             residuals, odometry = [c[~now] for c in residuals], [c[~of_now] for c in odometry]
             self._end += LENGTH
         self._residuals, self._odometry = [residuals], [odometry]
@@ -151,7 +151,7 @@ class Monitor:
             self._odometry = [odometry]
             self._keep_one_slice()
 
-    def _judge(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
+    def _test(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
         """One slice that ends at `end`, s: its columns."""
         _, a, b, innovation, accepted = residuals
         a, b = self._anchors.index(a), self._anchors.index(b)
@@ -171,7 +171,7 @@ class Monitor:
     def _look_for_change(self, end: float) -> None:
         change = self._detector.find(self._moving_since + SETTLE)
         if change is not None and _is_clear(change) and abs(change.at(end)) > SMALLEST_CHANGE:
-            self._detector.take_out(change)
+            self._detector.compensate(change)
             self._changes[change.row] = [*self._changes.get(change.row, ()), change]
             self._latest_change = change
         elif self._latest_change is not None:

@@ -50,9 +50,9 @@ class SignWatch:
         self._stamps.append(t)
         for state, kept, sign in zip(self._states, self._innovations, (1.0, -1.0)):
             kept.append(innovations(state, t, a, b, sign * d, self._anchors.positions))
-        self._judge()
+        self._test()
 
-    def _judge(self) -> None:
+    def _test(self) -> None:
         t = np.concatenate(self._stamps)
         right, wrong = (Unexplained.of(t, np.concatenate(kept)) for kept in self._innovations)
         if _better(right, wrong):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from ..streams.finding import Finding
 
-KEPT = 4  # windows of a second that are judged together
+KEPT = 4  # windows of a second that are checked together
 FEWEST = 3  # of them, below which nothing is said
 LATEST = 2  # of them, which must say it too, or it is over
 # Said by `check`, and no warning in flight: the filter knows what a shaking accelerometer is worth.
@@ -26,7 +26,7 @@ ALIKE = 0.5  # share of the swing of one stream's latency that the other has too
 
 
 class StreamWatch:
-    """Keeps what arrives and judges it when it is asked, once a second."""
+    """Keeps what arrives and checks it when it is asked, once a second."""
 
     def __init__(self, anchors: Anchors, lag: float, ignored: Sequence[str] = ()) -> None:
         """anchors : Anchors; lag : s, what the node waits for; ignored : names of rules that do not hold for this tag."""

@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 
 class VolumeCheck:
-    """Judges positions by a FlyableVolume, or says nothing without one."""
+    """Checks positions against a FlyableVolume, or says nothing without one."""
 
     def __init__(self, volume: FlyableVolume | None = None) -> None:
         self._volume = volume
 
-    def judge(
+    def check(
         self, anchors: Anchors, position: np.ndarray, covariance: np.ndarray
     ) -> tuple[str | None, dict[str, str]]:
         """(what is wrong, or None; {key: text}). anchors : Anchors; position (3,) m; covariance (3, 3) m^2 of it.

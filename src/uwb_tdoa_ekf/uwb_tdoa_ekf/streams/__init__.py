@@ -1,4 +1,4 @@
-"""Streams judged by themselves: units, stamps, rates, repeats, several senders. Without a filter and without ROS.
+"""Streams checked by themselves: units, stamps, rates, repeats, several senders. Without a filter and without ROS.
 
 streams = StreamRules(anchors)
 streams.feed_imu(t, arrival, gyro, force)

@@ -21,7 +21,7 @@ FULL = 20  # messages without which a window says little of values
 
 
 class StreamRules:
-    """Judges the inertial samples and the TDOAs of one tag by themselves.
+    """Checks the inertial samples and the TDOAs of one tag by themselves.
 
     Windows of a second of arrival (of stamps, where the arrival is not known) are counted as they come; the rules judge
     windows.

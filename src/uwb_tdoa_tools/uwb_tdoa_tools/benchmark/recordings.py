@@ -80,7 +80,7 @@ def _per_prediction(flight: Flight, network: Network, repeats: int) -> np.ndarra
     truth, tdoa = flight.truth, flight.tdoa
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
     rows = [slice(k, k + 1) for k in range(400)]
-    alone = [samples_at(tdoa.t[k], a[k], b[k], truth, flight.anchors, motion=False) for k in rows]
+    alone = [samples_at(tdoa.t[k], a[k], b[k], truth, flight.anchors, lag=None) for k in rows]
 
     def predict() -> None:
         for samples in alone:

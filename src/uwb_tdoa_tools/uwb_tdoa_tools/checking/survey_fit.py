@@ -12,8 +12,9 @@ import numpy as np
 
 from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.ground import Height
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
-from uwb_tdoa_ekf.core.startup import locate
+from uwb_tdoa_ekf.core.startup import locate, room_for
 from uwb_tdoa_ekf.streams.explain import SCALE
 
 if TYPE_CHECKING:
@@ -44,10 +45,10 @@ class SurveyFit:
             first, end = np.searchsorted(t, [begin, begin + LENGTH])
             if end - first < FEWEST:
                 continue
-            window, x = tuple(column[first:end] for column in (t, a, b, d)), np.empty((1, 6))
-            locate(rows[first:end], state.anchors, box, config.parameters()[0], np.nan, np.nan, x, np.empty((1, 6, 6)), np.empty(1))
+            window, places = tuple(column[first:end] for column in (t, a, b, d)), room_for(1)
+            locate(rows[first:end], state.anchors, box, config.parameters()[0], Height(np.nan, np.nan), places)
             self._windows.append(window)
-            self._start.append(x[0])
+            self._start.append(places.x[0])
         self.before = self._loss(self._start, positions)
 
     def __len__(self) -> int:

@@ -76,7 +76,7 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
     if not np.isfinite(truth.p).all():
         raise InputError(f"{flight.name}: the ground truth has positions that are not finite; remove them.")
     a, b = anchors.index(data.a[chosen]), anchors.index(data.b[chosen])
-    samples = samples_at(data.t[chosen], a, b, truth, anchors, float(data.t[0]), motion=False)
+    samples = samples_at(data.t[chosen], a, b, truth, anchors, float(data.t[0]), lag=None)
     error = data.d[chosen] - tdoa(samples.p, samples.position_a, samples.position_b) - effects.bias(samples)
     kept = (np.abs(error) <= LARGEST) & (samples.p[:, 2] > AIRBORNE) & (a != b)
     if kept.sum() < FEWEST:
