@@ -14,7 +14,7 @@ from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.calibrating.calibrate import without_truth
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.surveying.tape import Tape
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape
 
 from .surveying import at, measured_flights, rmse
 

@@ -9,10 +9,9 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.diagnosis.self_survey import tdoa_std_of
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
+from uwb_tdoa_tools.diagnosis.self_calibration.equations import tdoa_std_of
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from uwb_tdoa_tools.surveying.survey import survey
-from uwb_tdoa_tools.surveying.tape import Tape
 
 from .diagnosis.measured import SPLITS
 from .surveying import KNOWN, at, measured_flights
@@ -88,8 +87,8 @@ def calibrations(name, flights, diagnosed, wanted=("survey", "survey with marks"
     bare, given, rng = [replace(flight, truth=None) for flight in flights], flights[0].anchors.positions, np.random.default_rng(0)
     marks = [mark for flight in flights for mark in KNOWN["marks"](flight, len(flights), rng)]
     for how, known in ((how, known) for how, known in (("survey", ()), ("survey with marks", marks)) if how in wanted):
-        result = survey(bare, Tape(), constraints=known)
-        yield how, result.anchors.positions, result.effects, result.surveyed.tdoa_std
+        result = self_calibrate(bare, Tape(), constraints=known)
+        yield how, result.anchors.positions, result.effects, result.tdoa_std
     path = diagnosed / name.replace(" ", "-") / "effects.yaml" if diagnosed else None
     if path is not None and path.is_file():
         effects = EffectSet.from_yaml(path)

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_tools.diagnosis.self_survey import calibrated
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
+from uwb_tdoa_tools.diagnosis.self_calibration.prior import with_calibration
 from uwb_tdoa_tools.surveying.blocked import with_blocked
-from uwb_tdoa_tools.surveying.survey import survey
-from uwb_tdoa_tools.surveying.tape import Tape
 
 from .surveying import at, measured_flights, rmse
 
@@ -42,18 +41,17 @@ def run(args):
     print("| set | what changed | last week's | surveyed anew | what it says |\n|---|---|---:|---:|---|")
     for name in [args.only] if args.only else SETS:
         first, second, judged = (measured_flights(args.data, [path])[0] for path in SETS[name])
-        week = survey([first], Tape(trusted=TRUSTED))
-        known, anchors = taken(week, week.base), week.surveyed.anchors
+        week = self_calibrate([first], Tape(trusted=TRUSTED))
+        known, anchors = taken(week, week.base), week.surveyed
         for words, change in CHANGES.items():
             flown = [at(change.inject(flight), anchors.positions) for flight in (second, judged)]
-            today = with_blocked(survey([replace(flown[0], truth=None)], Tape(), known), flown[:1])
-            errors = rmse(flown[1:], known), rmse([at(flown[1], today.surveyed.anchors.positions)], taken(today, known))
-            said = "; ".join(one.as_text() for one in today.surveyed.changes) or "no anchor has changed"
+            today = with_blocked(self_calibrate([replace(flown[0], truth=None)], Tape(), known), flown[:1])
+            errors = rmse(flown[1:], known), rmse([at(flown[1], today.surveyed.positions)], taken(today, known))
+            said = "; ".join(one.as_text() for one in today.changes) or "no anchor has changed"
             said = " ".join([said + ".", *today.blocked])
             print(f"| {name} | {words} | {errors[0]:.3f} | {errors[1]:.3f} | {said} |", flush=True)
 
 
 def taken(result, base):
-    """The EffectSet of a Result, whether it would be applied or not."""
-    found = result.surveyed
-    return calibrated(base, found.anchors, np.zeros_like(result.shifts), found.delays, found.covariance)
+    """The EffectSet of a SelfCalibration, whether it would be applied or not."""
+    return with_calibration(base, result.found(np.zeros_like(result.shifts)), result.covariance)

@@ -15,12 +15,11 @@ from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.constraints import Mark
 from uwb_tdoa_tools.diagnosis.references import Odometry, OdometryPath
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.surveying.paths import DRIFT
-from uwb_tdoa_tools.surveying.survey import survey
-from uwb_tdoa_tools.surveying.tape import Tape
 
 from .diagnosis.measured import SPLITS
 
@@ -86,7 +85,7 @@ def with_known(data, kind, splits, seed):
             effects, positions = diagnose(bare, reference=Odometry(None, known)).effects, flights[0].anchors.positions
         else:
             known = [one for flight in flights for one in KNOWN[kind](flight, len(flights), rng)]
-            result = survey(bare, Tape(), constraints=known)
+            result = self_calibrate(bare, Tape(), constraints=known)
             effects, positions = result.effects, result.anchors.positions
         before = np.array([rmse([flight]) for flight in judged])
         after = np.array([rmse([at(flight, positions)], effects) for flight in judged])
@@ -132,19 +131,19 @@ def draw(flights, judged, std, seed, plain=False):
     free = tape.position_std(true) > tape.trusted_std
     noise = np.random.default_rng(seed).standard_normal(true.positions.shape)
     rough = true.positions + np.where(free, std, tape.trusted_std) * noise
-    result = survey([at(flight, rough) for flight in flights], tape)
-    error = result.surveyed.anchors.positions - true.positions
+    result = self_calibrate([at(flight, rough) for flight in flights], tape)
+    error = result.surveyed.positions - true.positions
     return {
         "true": rmse(judged),
         "shaken": rmse([at(flight, rough) for flight in judged]),
         "surveyed": rmse([at(flight, result.anchors.positions) for flight in judged], result.effects),
         "applied": result.why_not is None,
-        "slow_before": result.surveyed.before,
-        "slow_left": result.surveyed.left,
-        "delay_std": result.surveyed.delay_std,
+        "slow_before": result.before,
+        "slow_left": result.left,
+        "delay_std": result.solution.delay_std,
         "anchors_shaken": _root((rough - true.positions)[free]),
         "anchors_surveyed": _root(error[free]),
-        "normalised": _root((error / result.surveyed.position_std)[free]),
+        "normalised": _root((error / result.position_std)[free]),
     }
 
 

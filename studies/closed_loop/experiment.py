@@ -141,7 +141,7 @@ def _train(parts: list[list[Flight]], some: list[Flight], folder: Path, name: st
     """Write one of NETWORKS, trained and validated on parts, or EFFECTS, found in some flights, to a folder. Returns the name."""
     (folder / name if name in NETWORKS else folder).mkdir(parents=True, exist_ok=True)
     if name in NETWORKS:
-        models.save(models.train(name, *parts, 0, name), folder / name)
+        models.save(models.train(models.Recipe(name, 0), *parts, name), folder / name)
     else:
         physics.find(some).effects.to_yaml(folder / name)
     return name

@@ -14,12 +14,11 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.parallel import over, whole_number
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.surveying.blocked import with_blocked
-from uwb_tdoa_tools.surveying.survey import survey
-from uwb_tdoa_tools.surveying.tape import Tape
 
 from . import bank, blind, faults, floor, measured, referenced, undeclared
 
@@ -204,12 +203,12 @@ def _speed(args):
     bare = [one.without(*AIDS) for one in two]
     calls = {
         "120 s of flight": lambda: diagnose([flight]),
-        "survey, two of a minute": lambda: with_blocked(survey(bare, Tape()), bare),
+        "survey, two of a minute": lambda: with_blocked(self_calibrate(bare, Tape()), bare),
         "diagnose --no-truth, two of a minute": lambda: diagnose(bare, reference=Nothing()),
         "diagnose --reference heights, two of a minute": lambda: diagnose(two, reference=Heights()),
     }
     short = bank.clean_flight(501, 40.0, aided=True)
-    diagnose([short], reference=Heights()), survey([short.without(*AIDS)], Tape())  # compiles
+    diagnose([short], reference=Heights()), self_calibrate([short.without(*AIDS)], Tape())  # compiles
     figures = {}
     for name, call in calls.items():
         started = time.process_time()

@@ -7,7 +7,7 @@ from known_effects import MARK_STD, clean_flight, marks_of
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.surveying.tape import Tape
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape
 
 from studies.surveying import END_STD, add_options, draw, ends_of, odometry_of, third
 

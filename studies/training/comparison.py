@@ -72,7 +72,7 @@ def _trained(train, kinds, out, seed, validation):
             tqdm.write(f"{kind}: {text}")
 
         try:
-            trained = models.train(kind, *parts, seed, kind, progress=say, found=effects_found)
+            trained = models.train(models.Recipe(kind, seed), *parts, kind, progress=say, found=effects_found)
         except InputError as error:
             skipped[kind] = str(error)
             tqdm.write(f"{kind}: left out: {error}")

@@ -51,9 +51,9 @@ def split(flights, plain, seed, fit, kinds):
     found = physics.find(chosen) if any(kind.startswith("physics") for kind in kinds) else None
     for kind in kinds:
         known = found if kind.startswith("physics") else None
-        borne_out = shrinking.bear_out(kind, chosen, plain, seed, found=known)
+        borne_out = shrinking.bear_out(models.Recipe(kind, seed), chosen, plain, known)
         with TemporaryDirectory() as folder:
-            trained = models.train(kind, chosen[:-1], chosen[-1:], seed, kind, found=known, curve=False)
+            trained = models.train(models.Recipe(kind, seed), chosen[:-1], chosen[-1:], kind, found=known, curve=False)
             model, _ = models.save(trained, Path(folder))
             network = Network(model) if model else None
             shares = sorted({borne_out.share, 1.0})

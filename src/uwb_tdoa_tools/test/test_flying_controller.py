@@ -21,8 +21,8 @@ def flown(wanted, yaw, seconds, turn=0.0, believed=None):
         rows = slice(k, k + TICK)
         controller.fly(state[POSITION], state[VELOCITY], state[ATTITUDE], wanted, yaw, TICK / IMU_RATE)
         interval(
-            state, gyro, controller.thrust, controller.rates, controller.numbers, controller.vehicle.numbers(), vehicle.numbers(),
-            still[rows, :3], still[rows], still[rows, :3], states[rows], samples[rows], contact[rows],
+            state, gyro, (controller.thrust, controller.rates), (controller.numbers, controller.vehicle.numbers()), vehicle.numbers(),
+            (still[rows, :3], still[rows], still[rows, :3]), (states[rows], samples[rows], contact[rows]),
         )  # fmt: skip
     return states
 

@@ -12,11 +12,10 @@ from uwb_tdoa_tools.checking.known_path import MANY, KnownPath
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.diagnosis.self_survey import Surveyed
+from uwb_tdoa_tools.diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
+from uwb_tdoa_tools.diagnosis.self_calibration.prior import Prior, Solution
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.surveying.result import Result
-from uwb_tdoa_tools.surveying.survey import survey
-from uwb_tdoa_tools.surveying.tape import Tape
+from uwb_tdoa_tools.surveying.report import apart, as_text
 
 LATE, MOVED, SHIFT = 38, 50, {"x": 0.2, "y": -0.2, "z": 0.1}
 
@@ -83,12 +82,12 @@ def test_columns_of_some_anchors_are_made_of_their_tdoas_alone(sound):
 
 @pytest.mark.slow
 def test_a_survey_names_both_and_nothing_else(faulty):
-    found = survey([faulty], Tape(0.05))
-    named = {(change.effect, change.anchor): change.values for change in found.surveyed.changes}
+    found = self_calibrate([faulty], Tape(0.05))
+    named = {(change.effect, change.anchor): change.values for change in found.changes}
     assert set(named) == {("anchor_delay", str(LATE)), ("anchor_position", str(MOVED))}
     np.testing.assert_allclose(named["anchor_delay", str(LATE)], 0.3, atol=0.05)
     np.testing.assert_allclose(named["anchor_position", str(MOVED)], list(SHIFT.values()), atol=0.1)
-    assert "beyond what the tape may be off by: anchor" in found.as_text()
+    assert "beyond what the tape may be off by: anchor" in as_text(found)
     assert len(found.effects.covariance.keys) == 4 * len(hall())
 
 
@@ -98,13 +97,13 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
     shifts[MOVED, :2] = 0.2, -0.2
     covariance = np.diag(np.full(4 * len(given), 0.01**2))
     covariance[:3, :3] = 0.1**2 * np.eye(3)  # one that was never heard
-    surveyed = Surveyed(given.at(given.positions + shifts), np.zeros(len(given)), covariance, 100.0, 0.05, 0.02, 0.2, 0.02, 0.003)
-    found = Result(given, np.full((len(given), 3), 0.1), surveyed, ("flight",))
-    assert found.apart == [MOVED] and f"anchor {MOVED} does not stand where it was given" in found.as_text()
-    still = replace(
-        surveyed, anchors=given.at(given.positions + np.delete(shifts, MOVED, axis=0)[[*range(MOVED), 0, *range(MOVED, len(given) - 1)]])
-    )
-    assert not replace(found, surveyed=still).apart
+    found = SelfCalibration(
+        given, Prior.of(given, np.full((len(given), 3), 0.1)), ("flight",), EffectSet(), given.at(given.positions + shifts),
+        np.zeros(len(given)), Solution(0.0, np.zeros(len(covariance)), covariance, 0.003), 100.0, 0.05, 0.02, 0.2, (), None, 0, {},
+    )  # fmt: skip
+    assert apart(found) == [MOVED] and f"anchor {MOVED} does not stand where it was given" in as_text(found)
+    still = np.delete(shifts, MOVED, axis=0)[[*range(MOVED), 0, *range(MOVED, len(given) - 1)]]
+    assert not apart(replace(found, surveyed=given.at(given.positions + still)))
 
 
 def test_ids_that_are_exchanged_in_a_hall_are_found(sound):

@@ -1,5 +1,7 @@
 """The linters of ament, where they are installed: flake8 as .ci/flake8.ini says, and the form of docstrings."""
 
+import ast
+from pathlib import Path
 import re
 
 import pytest
@@ -23,6 +25,29 @@ def test_no_line_is_longer_than_contributing_says():
     lines = [(path, number, line) for path in files for number, line in enumerate(path.read_text().splitlines(), 1)]
     long = [f"{path.relative_to(ROOT)}:{number}" for path, number, line in lines if len(line) > LONGEST and not IN_QUOTES.match(line)]
     assert len(files) > 500 and not long
+
+
+MOST_ARGUMENTS = 7  # of a function, as CONTRIBUTING.md says; self and cls are none
+CORE = "src/uwb_tdoa_ekf/uwb_tdoa_ekf/core"
+COMPILED = {  # functions of the core that have more: compiled code takes arrays one by one
+    "ground.py": {"explain", "_equations"},
+    "initialization.py": {"_look_for_places", "_begin"},
+    "standing.py": {"weigh", "_on_ground", "land"},
+    "startup.py": {"locate"},
+}
+
+
+def arguments(function):
+    named = [one.arg for one in (*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs)]
+    return named[1:] if named[:1] in (["self"], ["cls"]) else named
+
+
+def test_no_function_has_more_arguments_than_contributing_says():
+    files = [path for source in SOURCES for path in Path(source).rglob("*.py")]
+    functions = [(path, node) for path in files for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
+    assert len(functions) > 2500
+    many = {(str(path.relative_to(ROOT)), node.name) for path, node in functions if len(arguments(node)) > MOST_ARGUMENTS}
+    assert many == {(f"{CORE}/{name}", function) for name, some in COMPILED.items() for function in some}
 
 
 @pytest.mark.slow

@@ -13,13 +13,13 @@ from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
-from uwb_tdoa_tools.diagnosis.self_survey import delay_effect, tdoa_std_of
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
+from uwb_tdoa_tools.diagnosis.self_calibration.equations import delay_effect, tdoa_std_of
+from uwb_tdoa_tools.diagnosis.self_calibration.placing import place
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from known_effects import clean_flight
 from uwb_tdoa_tools.surveying.marks import read_marks
-from uwb_tdoa_tools.surveying.placing import place
-from uwb_tdoa_tools.surveying.survey import survey
-from uwb_tdoa_tools.surveying.tape import Tape
+from uwb_tdoa_tools.surveying.report import as_dict, as_text
 
 TRUSTED = ("0", "6", "1.z", "2.z")
 
@@ -47,24 +47,24 @@ def flights():
 @pytest.fixture(scope="module")
 def result(flights):
     measured = shaken(flights[0].anchors, 0.2, 0)
-    return survey([at(flight, measured) for flight in flights[:2]], Tape(0.2, trusted=TRUSTED))
+    return self_calibrate([at(flight, measured) for flight in flights[:2]], Tape(0.2, trusted=TRUSTED))
 
 
 def test_anchors_come_nearer_to_where_they_are_and_say_how_near(flights, result):
-    true, found = flights[0].anchors.positions, result.surveyed
+    true, found = flights[0].anchors.positions, result
     free = result.given_std > 0.1
-    off, before = (found.anchors.positions - true)[free], (result.given.positions - true)[free]
+    off, before = (found.surveyed.positions - true)[free], (result.given.positions - true)[free]
     assert np.sqrt(np.mean(off**2)) < 0.5 * np.sqrt(np.mean(before**2))
     assert 0.3 < np.sqrt(np.mean((off / found.position_std[free]) ** 2)) < 1.5
     assert result.improved[free].mean() > 0.5 and not result.improved[~free].any()
-    assert np.abs((found.anchors.positions - true)[~free]).max() < 0.02
+    assert np.abs((found.surveyed.positions - true)[~free]).max() < 0.02
 
 
 def test_a_flight_that_took_no_part_gains(flights, result):
-    other, found = flights[2], result.surveyed
+    other, found = flights[2], result
     before = error(at(other, result.given.positions))
-    effects, config = EffectSet((delay_effect(found.anchors, found.delays),)), FilterConfig(tdoa_std=found.tdoa_std)
-    after = evaluate(at(other, found.anchors.positions), config, effects=effects)[0].row()
+    effects, config = EffectSet((delay_effect(found.surveyed, found.delays),)), FilterConfig(tdoa_std=found.tdoa_std)
+    after = evaluate(at(other, found.surveyed.positions), config, effects=effects)[0].row()
     assert after["rmse_3d"] < 0.5 * before and after["rmse_3d"] < 1.2 * error(other)
     assert found.tdoa_std < 0.25 and 0.5 < after["nees_mean"] < 6.0  # of white noise of 0.05 m
 
@@ -77,8 +77,8 @@ def test_the_noise_beside_a_calibration_is_that_of_the_flights_without_their_gro
 
 def test_ground_truth_is_not_looked_at(flights, result):
     wrong = [replace(flight, truth=replace(flight.truth, p=flight.truth.p + 1.0)) for flight in flights[:2]]
-    again = survey([at(flight, result.given.positions) for flight in wrong], Tape(0.2, trusted=TRUSTED))
-    np.testing.assert_array_equal(again.surveyed.anchors.positions, result.surveyed.anchors.positions)
+    again = self_calibrate([at(flight, result.given.positions) for flight in wrong], Tape(0.2, trusted=TRUSTED))
+    np.testing.assert_array_equal(again.surveyed.positions, result.surveyed.positions)
 
 
 def test_an_anchor_of_which_nothing_is_known_is_placed(flights):
@@ -116,7 +116,7 @@ def test_nothing_is_applied_where_something_else_is_wrong_too(flights, tmp_path,
 
 def test_flights_that_are_too_short_are_refused():
     with pytest.raises(InputError, match="s in the air together; 30 s are needed"):
-        survey([clean_flight(203, 20.0)], Tape())
+        self_calibrate([clean_flight(203, 20.0)], Tape())
 
 
 def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
@@ -124,7 +124,7 @@ def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
     away = flight.anchors.positions + [0.2, -0.15, 0.1]  # all alike: nothing in the TDOAs tells
     moved = [at(flight, away)]
     marks = read_marks(marks_file(tmp_path / "marks.yaml", flight, 6), moved)
-    with_marks, without = (survey(moved, Tape(0.3), constraints=some).surveyed.anchors.positions for some in (marks, ()))
+    with_marks, without = (self_calibrate(moved, Tape(0.3), constraints=some).surveyed.positions for some in (marks, ()))
     off = [np.abs((found - flight.anchors.positions).mean(axis=0)).max() for found in (with_marks, without)]
     assert off[0] < 0.05 < 0.1 < off[1]
 
@@ -147,9 +147,9 @@ def test_marks_that_cannot_be_are_refused(flights, tmp_path, changes, words):
 
 
 def test_words_name_what_is_better_and_what_is_not(result):
-    text = result.as_text()
+    text = as_text(result)
     assert text.count("\n") >= 9 and "coordinates are known better than before" in text
-    assert json.loads(json.dumps(result.as_dict(), allow_nan=False))["anchors"]["0"]["improved"] == [False] * 3
+    assert json.loads(json.dumps(as_dict(result), allow_nan=False))["anchors"]["0"]["improved"] == [False] * 3
 
 
 @pytest.mark.parametrize(

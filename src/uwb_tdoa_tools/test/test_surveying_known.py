@@ -14,11 +14,11 @@ from uwb_tdoa_tools.commands.survey import main
 from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark
 from uwb_tdoa_tools.diagnosis.references import Odometry, OdometryPath
 from known_effects import clean_flight
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.surveying.blocked import large, with_blocked
 from uwb_tdoa_tools.surveying.distances import read_distances
 from uwb_tdoa_tools.surveying.paths import read_paths
-from uwb_tdoa_tools.surveying.survey import survey
-from uwb_tdoa_tools.surveying.tape import Tape
+from uwb_tdoa_tools.surveying.report import as_text
 
 LATE = EFFECTS["anchor_delay"]({"3": 0.15})
 
@@ -30,7 +30,7 @@ def flights():
 
 @pytest.fixture(scope="module")
 def last_week(flights):
-    return survey(flights[:1], Tape(0.05))
+    return self_calibrate(flights[:1], Tape(0.05))
 
 
 def at(flight, positions):
@@ -39,9 +39,9 @@ def at(flight, positions):
 
 @pytest.mark.slow
 def test_nothing_has_changed_since_last_week(flights, last_week):
-    again = survey([at(flights[1], last_week.anchors.positions)], Tape(), last_week.effects)
-    assert not again.surveyed.changes and "no anchor has changed clearly" in again.as_text()
-    assert (again.surveyed.position_std <= last_week.surveyed.position_std + 0.005).all()
+    again = self_calibrate([at(flights[1], last_week.anchors.positions)], Tape(), last_week.effects)
+    assert not again.changes and "no anchor has changed clearly" in as_text(again)
+    assert (again.position_std <= last_week.position_std + 0.005).all()
     before, after = (next(e for e in one.effects.effects if e.name == "anchor_delay") for one in (last_week, again))
     assert all(abs(after.values[key] - value) < 3.0 * before.std[key] for key, value in before.values.items())
     assert len(again.effects) == 2 and again.effects.covariance.matrix.shape == (32, 32)
@@ -57,7 +57,7 @@ def test_nothing_has_changed_since_last_week(flights, last_week):
 )
 def test_what_has_changed_is_named_with_its_size(flights, last_week, effect, shown):
     today = at(effect.inject(flights[1], np.random.default_rng(0)), last_week.anchors.positions)
-    changes = survey([today], Tape(), last_week.effects).surveyed.changes
+    changes = self_calibrate([today], Tape(), last_week.effects).changes
     assert [(one.effect, one.anchor) for one in changes] == [shown]
     away = changes[0].values - list(effect.values.values())
     assert (np.abs(away) < 4.0 * changes[0].std + 0.05).all() and (changes[0].std < 0.15).all()
@@ -86,8 +86,8 @@ def test_distances_tell_of_anchors_what_flights_do_not(flights):
     rough = true.positions + 0.1 * np.random.default_rng(5).standard_normal((8, 3))
     ids, k = true.ids, [(a, b) for a in range(8) for b in range(a)]
     laser = [Distance(int(ids[a]), int(ids[b]), float(np.linalg.norm(true.positions[a] - true.positions[b])), 0.005) for a, b in k]
-    results = [survey([at(flights[0], rough)], Tape(0.1), constraints=some).surveyed for some in ((), laser)]
-    lengths = [np.array([np.linalg.norm(one.anchors.positions[a] - one.anchors.positions[b]) for a, b in k]) for one in results]
+    results = [self_calibrate([at(flights[0], rough)], Tape(0.1), constraints=some) for some in ((), laser)]
+    lengths = [np.array([np.linalg.norm(one.surveyed.positions[a] - one.surveyed.positions[b]) for a, b in k]) for one in results]
     off = [np.sqrt(np.mean((some - [one.distance for one in laser]) ** 2)) for some in lengths]
     assert off[1] < 0.01 < off[0] and results[1].position_std.mean() < 0.8 * results[0].position_std.mean()
 
@@ -144,15 +144,13 @@ def test_a_path_laid_beside_the_filters_is_where_the_tag_was_and_takes_its_shift
 
 def test_marks_on_the_floor_tell_nothing_and_those_in_the_air_judge_each_other(flights):
     flight = at(flights[0], flights[0].anchors.positions + [0.0, 0.0, 0.2])
-    results = [survey([flight], Tape(0.3), constraints=some) for some in ((), ends(flights[0]), marks_in_the_air(flights[0]))]
-    np.testing.assert_array_equal(results[0].surveyed.anchors.positions, results[1].surveyed.anchors.positions)
-    assert (
-        results[1].surveyed.grounded == 2 and results[1].surveyed.marks is None and "left out: 2 marks on the floor" in results[1].as_text()
-    )
-    before, after, nearer = results[2].surveyed.marks
-    assert after < 0.7 * before and nearer == 1.0 and results[2].why_not is None and "nearer at 100% of them" in results[2].as_text()
+    results = [self_calibrate([flight], Tape(0.3), constraints=some) for some in ((), ends(flights[0]), marks_in_the_air(flights[0]))]
+    np.testing.assert_array_equal(results[0].surveyed.positions, results[1].surveyed.positions)
+    assert results[1].grounded == 2 and results[1].marks is None and "left out: 2 marks on the floor" in as_text(results[1])
+    before, after, nearer = results[2].marks
+    assert after < 0.7 * before and nearer == 1.0 and results[2].why_not is None and "nearer at 100% of them" in as_text(results[2])
     for against in ((after, before, nearer), (before, after, 0.6)):
-        assert "the position would suffer" in replace(results[2], surveyed=replace(results[2].surveyed, marks=against)).why_not
+        assert "the position would suffer" in replace(results[2], marks=against).why_not
 
 
 def marks_in_the_air(flight):

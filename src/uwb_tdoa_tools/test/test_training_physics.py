@@ -53,7 +53,7 @@ def test_network_learns_what_the_effects_leave(one_place):
     kinds = ("physics", "physics+structured")
     found = physics.find(one_place)
     options = Options(centres=40)
-    alone, both = (models.train(kind, one_place[:2], one_place[2:], 0, kind, options, found=found) for kind in kinds)
+    alone, both = (models.train(models.Recipe(kind, 0, options), one_place[:2], one_place[2:], kind, found=found) for kind in kinds)
     assert alone.model is None and alone.onnx() is None and both.onnx() is not None
     assert alone.effects == both.effects == found.effects
     for trained in (alone, both):

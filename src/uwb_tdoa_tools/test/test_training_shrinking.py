@@ -8,9 +8,9 @@ from training_flights import flight
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.scoring.borne_out import SHARES, BorneOut, choose
-from uwb_tdoa_tools.training import shrinking, structured
+from uwb_tdoa_tools.training import models, shrinking, structured
 
-OPTIONS = structured.Options(centres=10, link_centres=10)
+RECIPE = models.Recipe("structured", 0, structured.Options(centres=10, link_centres=10))
 
 
 def errors(*ratios):
@@ -38,7 +38,7 @@ def test_effects_alone_are_taken_as_they_are():
 def test_a_flight_is_judged_by_what_it_took_no_part_in():
     late = EFFECTS["anchor_delay"]({"3": 0.4, "5": -0.4})
     flights = [late.inject(flight(seed)) for seed in range(2)] + [flight(2)]
-    told = shrinking.bear_out("structured", flights, shrinking.uncorrected(flights), 0, OPTIONS)
+    told = shrinking.bear_out(RECIPE, flights, shrinking.uncorrected(flights))
     assert set(told.errors) == {one.name for one in flights}
     alike, other = (told.errors[flights[k].name] for k in (0, 2))
     assert alike[1.0] < 0.95 * alike[None] and other[1.0] > 1.05 * other[None]
@@ -51,5 +51,5 @@ def test_two_processes_give_the_same_to_the_bit():
     for jobs in (1, 2):
         over = partial(parallel.over, jobs=jobs)
         plain = shrinking.uncorrected(flights, over)
-        told.append(shrinking.bear_out("structured", flights, plain, 0, OPTIONS, map_function=over))
+        told.append(shrinking.bear_out(RECIPE, flights, plain, map_function=over))
     assert told[0] == told[1] and set(told[0].errors) == {one.name for one in flights}

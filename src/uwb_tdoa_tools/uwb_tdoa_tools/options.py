@@ -25,6 +25,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
 from . import cli
+from .diagnosis.self_calibration import Tape
 from .localizing import rerun_file
 from .localizing.estimate import Estimator
 from .parallel import whole_number
@@ -32,7 +33,6 @@ from .readers import inputs
 from .scoring.alignment import ALIGN, NONE
 from .surveying.distances import read_distances
 from .surveying.marks import read_marks
-from .surveying.tape import Tape
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

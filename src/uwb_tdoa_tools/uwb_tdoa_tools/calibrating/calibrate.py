@@ -10,7 +10,6 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.streams import ERROR
 
@@ -18,12 +17,12 @@ from ..checking.ordered import OrderedRecording
 from ..checking.survey_fit import displacement
 from ..checking.tdoa_rules import survey_fit
 from ..diagnosis import diagnose
-from ..diagnosis.calibration import LEFT
-from ..diagnosis.self_survey import slow_innovations, tdoa_std_of
+from ..diagnosis.self_calibration import Tape, self_calibrate
+from ..diagnosis.self_calibration.equations import measured_noise, slow_innovations
+from ..diagnosis.self_calibration.solve import LEFT
 from ..localizing.estimate import Estimator
 from ..scoring.evaluation import score_of
-from ..surveying.survey import survey
-from ..surveying.tape import Tape
+from ..surveying.report import as_text
 from .parts import split
 
 if TYPE_CHECKING:
@@ -84,7 +83,7 @@ def with_truth(
     """Calibration of Flights with ground truth, by `diagnose`, judged on Flights of `holdout`, or on halves of a single flight."""
     found = diagnose(flights, holdout, base, config, None, progress)
     progress("measuring the noise")
-    std = _noise(found.flights, found.effects, config)
+    std = measured_noise(found.flights, found.effects, config)
     calibration = Calibration(
         flights[0].anchors, found.effects, std, "3D RMSE", found.before["pooled"]["rmse_3d"], found.after["pooled"]["rmse_3d"],
         found.judged_on, None, found.as_text(),
@@ -100,22 +99,23 @@ def without_truth(
     flights: Sequence[Flight], holdout: Sequence[Flight], tape: Tape = Tape(), base: EffectSet = EffectSet(),
     config: FilterConfig | None = None, progress: Callable[[str], object] = lambda what: None,
 ) -> Calibration:  # fmt: skip
-    """Calibration of Flights, whose ground truth is not used, by `survey`, judged on Flights of `holdout`, or on the end of a single
-    flight: by how much of the innovations is slow, as anchors that are wrong make them."""
+    """Calibration of Flights, whose ground truth is not used, by `self_calibrate`, judged on Flights of `holdout`, or on the end of
+    a single flight: by how much of the innovations is slow, as anchors that are wrong make them."""
     judges, fitted, on = holdout, flights, _names(holdout)
     if not holdout:
         *fitted, last = flights
         first, rest = split(last, FITTED)
         judges, fitted, on = [rest], [*fitted, first], f"the last third of {last.name}"
     said = partial(progress, "solving")
-    found = survey(fitted, tape, base, config, (), said)
+    found = self_calibrate(fitted, tape, base, config, (), said)
     progress("judging")
     before = slow_innovations(judges, base, config)
     after = slow_innovations([replace(one, anchors=found.anchors) for one in judges], found.effects, config)
     if not holdout and found.why_not is None and after <= before:
-        found = survey(flights, tape, base, config, (), said)  # what was judged, of all of it
-    std = found.surveyed.tdoa_std
-    calibration = Calibration(found.anchors, found.effects, std, "slow innovations", before, after, on, found.why_not, found.as_text())
+        found = self_calibrate(flights, tape, base, config, (), said)  # what was judged, of all of it
+    calibration = Calibration(
+        found.anchors, found.effects, found.tdoa_std, "slow innovations", before, after, on, found.why_not, as_text(found)
+    )  # fmt: skip
     calibration = _assessed(calibration, True)
     return calibration if calibration.why_not else replace(calibration, why_not=_why_not_blindly(calibration))
 
@@ -154,14 +154,6 @@ def _with_noise(config: FilterConfig | None, std: float | None) -> FilterConfig:
     config = config or FilterConfig()
     changed: dict[str, Any] = {} if std is None else {"tdoa_std": round(std, 3)}
     return replace(config, **changed) if changed else config
-
-
-def _noise(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None) -> float | None:
-    """tdoa_std, m; None where the flights are too short to tell."""
-    try:
-        return tdoa_std_of(flights, effects, config)
-    except InputError:
-        return None
 
 
 def _names(flights: Sequence[Flight]) -> str:

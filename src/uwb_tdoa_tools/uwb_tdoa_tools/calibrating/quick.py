@@ -10,19 +10,15 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.wording import listed
 
-from ..diagnosis.prior import Prior
+from ..diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
+from ..diagnosis.self_calibration.solve import IMPROVED
 from ..localizing.estimate import Estimator
-from ..surveying.result import IMPROVED
-from ..surveying.survey import survey
-from ..surveying.tape import Tape
 from .parts import between
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
-    from ..surveying.result import Result
 
 SECONDS = 60.0  # of a flight that are looked at
 MOVES = 0.25  # of the extent of the anchors that a path must have along an axis to tell much of them
@@ -84,21 +80,21 @@ def prospect(
     longest = max(flights, key=lambda one: np.ptp(one.tdoa.t))
     middle = 0.5 * float(longest.tdoa.t[0] + longest.tdoa.t[-1])
     part = between(longest, middle - 0.5 * SECONDS, middle + 0.5 * SECONDS)
-    found = survey([part], tape, base, config, (), progress)
-    seconds = found.surveyed.seconds
+    found = self_calibrate([part], tape, base, config, (), progress)
+    seconds = found.seconds
     total = max(seconds, sum(float(np.ptp(one.tdoa.t)) for one in flights) * seconds / max(float(np.ptp(part.tdoa.t)), 1e-9))
     path = np.quantile(Estimator(config, base)(part).odometry.p, [0.02, 0.98], axis=0)
     anchors = longest.anchors
     return Prospect(
-        seconds, total, found.given_std, _expected(anchors, found, base, total / seconds), found.surveyed.before, found.surveyed.left,
+        seconds, total, found.given_std, _expected(found, total / seconds), found.before, found.left,
         np.ptp(path, axis=0), np.ptp(anchors.positions, axis=0), tuple(anchors.ids.tolist()), found.why_not,
     )  # fmt: skip
 
 
-def _expected(anchors: Anchors, found: Result, base: EffectSet, more: float) -> np.ndarray:
-    """(N, 3) m: standard deviations after `more` times what was looked at for a survey, as its information adds up."""
-    prior = np.linalg.inv(Prior.of(anchors, found.given_std, base.covariance).covariance)
-    values, vectors = np.linalg.eigh(np.linalg.inv(found.surveyed.covariance) - prior)
+def _expected(found: SelfCalibration, more: float) -> np.ndarray:
+    """(N, 3) m: standard deviations after `more` times what was looked at for a SelfCalibration, as its information adds up."""
+    prior = np.linalg.inv(found.prior.covariance)
+    values, vectors = np.linalg.eigh(np.linalg.inv(found.solution.covariance) - prior)
     told = (vectors * np.maximum(values, 0.0)) @ vectors.T
     covariance = np.linalg.inv(prior + more * told)
-    return np.sqrt(np.diag(covariance))[: 3 * len(anchors)].reshape(-1, 3)
+    return np.sqrt(np.diag(covariance))[: 3 * len(found.given)].reshape(-1, 3)

@@ -16,7 +16,7 @@ from ..diagnosis import diagnose
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
 from ..diagnosis.report.apply import applying
-from ..diagnosis.self_survey import noise_of
+from ..diagnosis.self_calibration.equations import measured_noise
 from ..localizing.rerun_file import write_diagnosis
 from ..progress import Progress
 from ..surveying.paths import DRIFT, read_paths
@@ -113,7 +113,7 @@ def _diagnose(args: Namespace) -> None:
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress, over)
         progress("measuring the noise")
-        tdoa_std = noise_of(result, config, over, partial(cli.say, "diagnose"))
+        tdoa_std = measured_noise(result.flights, result.effects, config, over, partial(cli.say, "diagnose"))
     out.mkdir(parents=True, exist_ok=True)
     (_, its_survey), *_ = found
     truth = all(flight.truth is not None for flight in holdout or flights)

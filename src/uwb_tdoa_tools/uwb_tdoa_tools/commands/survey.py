@@ -9,9 +9,10 @@ from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, command_lines, options
 from ..diagnosis.noise import write_parameters
+from ..diagnosis.self_calibration import self_calibrate
 from ..progress import Progress
 from ..surveying.blocked import with_blocked
-from ..surveying.survey import survey
+from ..surveying.report import as_dict, as_text, picture
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -65,7 +66,7 @@ def _survey(args: Namespace) -> int:
     flights = options.reading_of(args).flights(args.flights)
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
-        result = survey(flights, tape, base, config, known, lambda: progress("solving"))
+        result = self_calibrate(flights, tape, base, config, known, lambda: progress("solving"))
         result = with_blocked(result, flights, config, lambda: progress("looking for what blocks anchors"))
     out.mkdir(parents=True, exist_ok=True)
     anchors = result.anchors
@@ -73,10 +74,10 @@ def _survey(args: Namespace) -> int:
     rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
     (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
     result.effects.to_yaml(out / "effects.yaml")
-    write_parameters(out / "ekf_node.yaml", result.surveyed.tdoa_std)
-    cli.write_json(out / "survey.json", result.as_dict())
-    result.picture(out / "survey.png")
-    cli.show(result.as_text())
+    write_parameters(out / "ekf_node.yaml", result.tdoa_std)
+    cli.write_json(out / "survey.json", as_dict(result))
+    picture(result, out / "survey.png")
+    cli.show(as_text(result))
     cli.show(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")
     if result.why_not is None:
         files = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"

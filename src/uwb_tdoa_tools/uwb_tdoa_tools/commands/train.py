@@ -97,9 +97,8 @@ def _write(args: Namespace, several: Sequence[Flight], over: MapFunction, progre
     training, validation = ([flights[name] for name in some] for some in names)
     name = args.name or args.model
     progress(f"training on {len(training)} flights, then without each")
-    result, borne_out = shrinking.train(
-        args.model, training, validation, args.seed, name, progress=cli.show, map_function=over
-    )
+    recipe = models.Recipe(args.model, args.seed)
+    result, borne_out = shrinking.train(recipe, training, validation, name, progress=cli.show, map_function=over)
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
     label, x, of_training, of_validation = result.curve

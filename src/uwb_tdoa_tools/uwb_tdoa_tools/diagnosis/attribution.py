@@ -27,10 +27,11 @@ from .regression.scan import Scan
 from .regression.select import Selection, select, with_rivals, worth
 from .regression.table import table_of
 from .regression.terms import Candidate, Term, candidates_of, columns_of
+from .self_calibration.prior import OF_ANCHORS, to_keep
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Hashable, Sequence
-    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.effects import Covariance, Effect
     from uwb_tdoa_bias.foundation.flight import Flight
     from ..parallel import MapFunction
     from .channels.views import CovariateView
@@ -85,6 +86,15 @@ class Attribution:
     def of_floor(self) -> tuple[Effect, ...]:
         """Effects found near the floor that the filter may be told: tuple. Functions without a name would go on in the air."""
         return tuple(effect for effect in effects_of(self.floor) if effect.weighed) if self.floor else ()
+
+    @property
+    def covariance(self) -> Covariance | None:
+        """Of the positions and delays of anchors in the selection: the prior of the next calibration; None without any."""
+        columns = [column for candidate in self.selection.chosen if candidate.name in OF_ANCHORS for column in candidate.columns]
+        if not columns:
+            return None
+        places = [self.selection.fit.columns.index(column) for column in columns]
+        return to_keep(tuple((str(column.effect[0]), column.key) for column in columns), self.selection.fit.cov[np.ix_(places, places)])
 
     def of(self, validated: ValidatedSelection) -> Attribution:
         """The Attribution of a ValidatedSelection."""

@@ -15,22 +15,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .prior import DELAY, FUNCTION_STDS, POSITION, eliminated, posterior
 from .regression.algebra import beside_each_other, counts, each_times, product, weighted
 from .regression.fit import prior_sizes
-from .self_survey import features
+from .self_calibration.equations import features
+from .self_calibration.prior import DELAY, FUNCTION_STDS, OF_ANCHORS, POSITION, eliminated, posterior
 
 if TYPE_CHECKING:
-    from .prior import Solution
     from .regression.fit import Fit
     from .regression.select import Selection
     from .regression.table import Table
     from .regression.terms import Column
+    from .self_calibration.prior import Solution
 
 LENGTH = 4.0  # m over which functions of the place change; the shift of an anchor makes errors that change as slowly
 UNSAID = 0.03  # m, that coordinates and delays may be off by, of which no anchor has any in the fit
 LASTING = 14.0  # by which errors that are alike for a while are alike for longer than blocks tell
-OF_ANCHORS = POSITION, DELAY
 
 
 def with_deviations(selection: Selection) -> Selection:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
@@ -16,11 +16,13 @@ from ..parallel import in_one_thread
 from ..scoring.metrics import Score
 from . import output, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
-from .calibration import merged
-from .findings import Refused, usable
+from .findings import EffectFinding, Refused, usable
 from .health import health
 from .references import GroundTruth, Reference
 from .regression.confounding import unobservable
+from .self_calibration import Tape, self_calibrate
+from .self_calibration.prior import OF_ANCHORS, with_calibration
+from .self_calibration.solve import same_anchors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,11 +32,15 @@ if TYPE_CHECKING:
     from ..parallel import MapFunction
     from .channels import ChannelResiduals
     from .channels.base import Figures
-    from .findings import EffectFinding
-    from .validation import ValidatedSelection
+    from .detectors import Detection
     from .regression.confounding import Unobservable
+    from .regression.terms import Candidate
+    from .self_calibration import SelfCalibration
 
-SAME_PLACE = 0.05  # m by which an anchor may differ between flights of one installation
+    Flights = tuple[Flight, ...]
+
+EXPLAINED = 0.1  # share of the slow innovations that a self-calibration must explain, to be a finding
+NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +105,8 @@ def diagnose(
     same_anchors([*flights, *holdout])
     prepared = [reference.prepare(flight) for flight in (*flights, *holdout)]
 
-    def saying(what: str) -> Callable[[], object]:
-        return lambda: progress(what)
-
-    looking = saying(f"looking at {reference.words}")
+    work = _Work(reference, base, config, progress, map_function)
+    looking = work.saying(f"looking at {reference.words}")
     settled = []
     for one in map_function(partial(_settled, reference, base, config), prepared):
         settled.append(one)
@@ -111,59 +115,144 @@ def diagnose(
     count = len(flights)
     fitted, held_out = (tuple(flight for flight, _ in some) for some in (settled[:count], settled[count:]))
 
-    tells_errors = reference.tells_errors
-    repairs = repairing.repaired(fitted, base, config, saying("looking at ids and signs")) if tells_errors else {}
+    repairs = repairing.repaired(fitted, base, config, work.saying("looking at ids and signs")) if reference.tells_errors else {}
     sound, rest = repairing.sound(fitted, base, repairs)
-    tracing = saying("tracing residuals to effects")
-    found = attribute(sound, reference, rest, progress=tracing, map_function=map_function)
-    # A finding stays one even if the filter does without it; it is only not added.
-    trying = saying("running the filter without each")
-    baseline = validation.Baseline(base, config)
-    if tells_errors:
-        selected = validation.select_by_error(found, sound, validation.Baseline(rest, config), trying, map_function)
+    found = attribute(sound, reference, rest, progress=work.saying("tracing residuals to effects"), map_function=map_function)
+    if reference.tells_errors:
+        outcome = _by_error(work, found, (fitted, sound), held_out, rest, repairs)
     else:
-        known = reference.constraints
-        selected = validation.select_calibration(found, sound, rest, config, known, trying, map_function)
-    attribution, validated = repairing.before_others(found, selected, repairs)
-    tried = attribution.of(validated)
-    tried_effects = merged(base, usable(tried.effects).effects, tried.selection)
-    progress("judging")
-    cases, judged_on = validation.validation_cases(tried, fitted, held_out, base, tried_effects, reference)
-    before, with_tried = validation.validate(cases, baseline, reference, saying("judging"), map_function)
-    refused = [*attribution.refused, *validated.refused]
-    shift_std = max(reference.shift_std(flight.name).max() for flight in fitted) if tells_errors else 0.0
-    why_not = validation.why_not(before, with_tried, shift_std) if tells_errors else None
-    model, effects, after, applied = tried, tried_effects, with_tried, validated
-    if why_not and len(tried_effects) > len(base) + len(attribution.of_floor):  # of those it tells nothing
-        refused.append(Refused("all", why_not))
-        applied = replace(validation.empty_selection(attribution), worth=validated.worth)
-        model, after = attribution.of(applied), before
-        effects = merged(base, attribution.of_floor, model.selection)
-    remaining = residuals_of(fitted, reference, effects, saying("judging"), map_function)
-    baseline.prepare(fitted, saying("judging"), map_function)
-    runs = [baseline.run(flight) for flight in fitted]
+        outcome = _by_self_calibration(work, found, (fitted, sound), held_out, rest)
+    judging = work.saying("judging")
+    remaining = residuals_of(fitted, reference, outcome.effects, judging, map_function)
+    outcome.baseline.prepare(fitted, judging, map_function)
+    runs = [outcome.baseline.run(flight) for flight in fitted]
     scores = [
         Score(flight.name, run.odometry, flight.truth, run.residuals)
         for flight, run in zip(fitted, runs)
-        if tells_errors and flight.truth is not None
+        if reference.tells_errors and flight.truth is not None
     ]
     return Diagnosis(
         fitted,
         reference,
-        _findings(attribution, model, applied),
-        effects,
-        refused,
-        unobservable(attribution.selection, attribution.candidates),
-        before,
-        after,
-        judged_on,
-        health(attribution.residuals, runs, scores),
-        attribution,
+        outcome.findings,
+        outcome.effects,
+        [*outcome.attribution.refused, *outcome.refused],
+        unobservable(found.selection, found.candidates),
+        *outcome.sides,
+        outcome.judged_on,
+        health(found.residuals, runs, scores),
+        outcome.attribution,
         remaining,
         {flight.name: faults for faults, flight in zip(map_function(numbers, fitted), fitted) if faults},
-        applied.changes,
+        outcome.changes,
         of_truth=of_truth,
     )
+
+
+class _Work(NamedTuple):
+    """What a diagnosis was asked for, as `diagnose` takes it."""
+
+    reference: Reference
+    base: EffectSet
+    config: FilterConfig | None
+    progress: Callable[[str], object]
+    map_function: MapFunction
+
+    def saying(self, what: str) -> Callable[[], object]:
+        """A function that tells `progress` what goes on."""
+        return lambda: self.progress(what)
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    """What becomes of an Attribution: findings : [EffectFinding]; effects : EffectSet, the base and what is added; refused : [Refused];
+    sides : (before, after), as of Diagnosis; judged_on; attribution : with what was known beside; baseline : Baseline; changes."""
+
+    findings: list[EffectFinding]
+    effects: EffectSet
+    refused: list[Refused]
+    sides: tuple[dict[str, Any], dict[str, Any]]
+    judged_on: str
+    attribution: Attribution
+    baseline: validation.Baseline
+    changes: tuple[str, ...] = ()
+
+
+def _by_error(
+    work: _Work, found: Attribution, flights: tuple[Flights, Flights], held_out: Flights, rest: EffectSet,
+    repairs: dict[Detection, float],
+) -> _Outcome:  # fmt: skip
+    """_Outcome where the reference tells errors of the position: what makes them smaller. flights : as they are, and without wrong ids and
+    signs, whose effects are not in `rest`, but in `repairs`."""
+    (fitted, sound), base, config, map_function = flights, work.base, work.config, work.map_function
+    trying = work.saying("running the filter without each")
+    # A finding stays one even if the filter does without it; it is only not added.
+    selected = validation.select_by_error(found, sound, validation.Baseline(rest, config), trying, map_function)
+    attribution, selected = repairing.before_others(found, selected, repairs)
+    model = attribution.of(selected)
+    effects, baseline = with_calibration(base, usable(model.effects).effects, model.covariance), validation.Baseline(base, config)
+    work.progress("judging")
+    cases, judged_on = validation.validation_cases(model, fitted, held_out, base, effects)
+    before, after = validation.compare(cases, baseline, work.saying("judging"), work.reference.shift_std, map_function)
+    refused = list(selected.refused)
+    shift_std = max(work.reference.shift_std(flight.name).max() for flight in fitted)
+    why_not = validation.why_not(before, after, shift_std)
+    if why_not and len(effects) > len(base) + len(attribution.of_floor):  # of those it tells nothing
+        refused.append(Refused("all", why_not))
+        selected = replace(validation.empty_selection(attribution), worth=selected.worth)
+        model, after = attribution.of(selected), before
+        effects = with_calibration(base, attribution.of_floor, None)
+    findings = _findings(model.findings(), attribution, selected.worth)
+    return _Outcome(findings, effects, refused, (before, after), judged_on, attribution, baseline)
+
+
+def _by_self_calibration(
+    work: _Work, found: Attribution, flights: tuple[Flights, Flights], held_out: Flights, rest: EffectSet
+) -> _Outcome:
+    """_Outcome where nobody knows errors of the position: positions and delays of anchors together, or nothing.
+
+    A model that is wrong makes innovations smaller too, by pushing the path to where they are. On measured flights
+    functions of the place, fitted to some, made innovations of others smaller and doubled the error of the position.
+    """
+    (fitted, sound), effects, baseline = flights, work.base, validation.Baseline(work.base, work.config)
+    added: list[EffectFinding] = []
+    refused: list[Refused] = []
+    changes: tuple[str, ...] = ()
+    chosen = found.selection.chosen
+    if chosen or rest.covariance is not None or work.reference.constraints:
+        calibration = _calibrated(work, sound, rest)
+        if isinstance(calibration, str):
+            refused = [Refused(" + ".join([candidate.label for candidate in chosen] or OF_ANCHORS), calibration)]
+        else:
+            several = calibration.found(calibration.shifts)
+            effects = with_calibration(effects, several, calibration.covariance)
+            evidence = {"slow_before": round(calibration.before, 4), "slow_left": round(calibration.left, 4)}
+            added = [
+                EffectFinding(
+                    effect, effect.channels[0], evidence, calibration.explained, shares=calibration.shares.get(effect.name, ())
+                )
+                for effect in several
+            ]
+            labels = [candidate.label for candidate in chosen if candidate.name not in OF_ANCHORS]
+            refused = [Refused(label, NOT_TOLD) for label in (*labels, *(one.effect.label for one in found.detections))]
+            changes = tuple(change.as_text() for change in calibration.changes)
+    judged_on = validation.HELD_OUT if held_out else "the flights that were fitted, by their innovations alone"
+    work.progress("judging")
+    cases = [validation.ValidationCase(flight, effects) for flight in held_out or fitted]
+    sides = validation.innovations(cases, baseline, work.saying("judging"), work.map_function)
+    return _Outcome(_findings(added, found, {}), effects, refused, sides, judged_on, found, baseline, changes)
+
+
+def _calibrated(work: _Work, flights: Flights, base: EffectSet) -> SelfCalibration | str:
+    """SelfCalibration of Flights beside the EffectSet `base`, or why nothing of one is to be applied."""
+    known, trying = work.reference.constraints, work.saying("calibrating anchors")
+    try:
+        found = self_calibrate(flights, Tape(), base, work.config, known, trying, work.map_function)
+    except InputError as error:  # flights that are too short for that alone
+        return str(error).rstrip(".")
+    if found.why_not is None and found.explained < EXPLAINED:
+        return f"positions and delays of anchors explain {found.explained:.0%} of what is slow in the innovations"
+    return found.why_not or found
 
 
 def _settled(
@@ -172,31 +261,21 @@ def _settled(
     return reference.settled(flight, base, config)
 
 
-def _findings(attribution: Attribution, model: Attribution, applied: ValidatedSelection) -> list[EffectFinding]:
-    """[EffectFinding]: those that are added, with the values that are written, then the others."""
+def _findings(
+    model: Sequence[EffectFinding], attribution: Attribution, worth: dict[Candidate | Detection, float]
+) -> list[EffectFinding]:
+    """[EffectFinding]: those of the model that is written, with the values that are written, then the others of an Attribution. worth : as
+    of ValidatedSelection."""
     detected = {detection.effect.name: detection for detection in attribution.detections}
 
     def with_worth(finding: EffectFinding, added: bool) -> EffectFinding:
-        tried = finding.candidates or (detected[finding.effect.name],)
-        worth = [applied.worth[each] for each in tried if each in applied.worth]
-        return replace(finding, added=added, worth=float(np.sum(worth)) if worth else None)
+        tried = finding.candidates or [detected[name] for name in (finding.effect.name,) if name in detected]
+        known = [worth[each] for each in tried if each in worth]
+        return replace(finding, added=added, worth=float(np.sum(known)) if known else None)
 
     def usable_there(finding: EffectFinding) -> bool:
         return finding.effect.weighed if finding.on_floor else finding.effect.usable
 
-    out = [with_worth(finding, usable_there(finding)) for finding in model.findings()]
+    out = [with_worth(finding, usable_there(finding)) for finding in model]
     added = {finding.key for finding in out}
     return out + [with_worth(finding, False) for finding in attribution.findings() if finding.key not in added]
-
-
-def same_anchors(flights: Sequence[Flight]) -> None:
-    """Raises InputError unless all of some Flights, at least one, were flown among the same anchors."""
-    if not flights:
-        raise InputError("give at least one flight.")
-    first = flights[0]
-    for flight in flights[1:]:
-        same = np.array_equal(flight.anchors.ids, first.anchors.ids)
-        if not (same and np.allclose(flight.anchors.positions, first.anchors.positions, atol=SAME_PLACE)):
-            raise InputError(
-                f"{flight.name}: its anchors are not those of {first.name}; take each installation and day alone."
-            )

@@ -20,7 +20,6 @@ from uwb_tdoa_ekf.offline import poses_of, run_offline
 from ..scoring.by_phase import EVERYTHING
 from ..scoring.metrics import Score, as_json, pooled
 from .attribution import effects_of, recurs
-from .calibration import calibrate
 from .findings import Refused, usable
 from .regression.fit import refit
 from .regression.select import Selection
@@ -34,9 +33,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.offline import Run
     from ..parallel import MapFunction
     from .attribution import Attribution
-    from .constraints import Constraint
     from .detectors import Detection
-    from .references import Reference
     from .regression.terms import Candidate
 
     Model = tuple[Sequence[Candidate], Sequence[Detection]]
@@ -55,6 +52,7 @@ DRIFTS = ("line", "beyond", "below", "parabola")  # shapes of a function of the 
 WORSE = 0.005  # share of the error by which leaving an effect out must make it smaller, for the effect to be left out
 WORTH_OF_ONE = 0.05  # share of the error by which it must grow, for the effect to stay, if a single flight shows it: others differ
 SELECTED_ON = ", chosen on all of them (--holdout judges the choice too)"
+HELD_OUT = "flights that took no part in the fit"
 SECOND = "give a second flight with this one"
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
@@ -73,14 +71,12 @@ class ValidationCase:
 @dataclass(frozen=True, eq=False)
 class ValidatedSelection:
     """What makes the filter no worse: selection : Selection; detections; refused : (Refused, ...) of the others; worth :
-    {candidate or detection: m by which the mean 3D RMSE is larger without it, of others when they were left out}; changes : sentences, what
-    is not as in the last calibration."""
+    {candidate or detection: m by which the mean 3D RMSE is larger without it, of others when they were left out}."""
 
     selection: Selection
     detections: tuple[Detection, ...]
     refused: tuple[Refused, ...]
     worth: dict[Candidate | Detection, float]
-    changes: tuple[str, ...] = ()
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -195,35 +191,6 @@ def _momentary(candidate: Candidate) -> bool:
     return not recurs(candidate) or any(one.covariate == "time" and one.shape not in DRIFTS for one in functions)
 
 
-_NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
-
-
-def select_calibration(
-    attribution: Attribution, flights: Sequence[Flight], base: EffectSet, config: FilterConfig | None = None,
-    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None,
-    map_function: MapFunction = map,
-) -> ValidatedSelection:  # fmt: skip
-    """ValidatedSelection, where the reference tells no errors: positions and delays of anchors together, or nothing.
-
-    A model that is wrong makes innovations smaller too, by pushing the path to where they are. On measured flights
-    functions of the place, fitted to some, made innovations of others smaller and doubled the error of the position.
-    map_function : as of `attribute`.
-    """
-    selection = attribution.selection
-    if not selection.chosen and base.covariance is None and not constraints:
-        return empty_selection(attribution)
-    calibration = calibrate(flights, attribution, base, config, constraints, progress, map_function)
-    changes = tuple(change.as_text() for change in calibration.changes)
-    if calibration.why_not is None:
-        applied = {candidate.name for candidate in calibration.selection.chosen}
-        labels = [candidate.label for candidate in selection.chosen if candidate.name not in applied]
-        labels += [detection.effect.label for detection in attribution.detections]
-        refused = tuple(Refused(label, _NOT_TOLD) for label in labels)
-        return ValidatedSelection(calibration.selection, (), refused, {}, changes)
-    label = " + ".join(candidate.label for candidate in selection.chosen or calibration.selection.chosen)
-    return empty_selection(attribution, [Refused(label, calibration.why_not)])
-
-
 class Baseline:
     """The model before: runs of the filter with it, one for each flight."""
 
@@ -304,34 +271,17 @@ def _error_and_poses(config: FilterConfig | None, trial: tuple[ValidationCase, P
 
 
 def validation_cases(
-    attribution: Attribution, flights: Sequence[Flight], holdout: Sequence[Flight], base: EffectSet, effects: EffectSet,
-    reference: Reference,
-) -> tuple[list[ValidationCase], str]:  # fmt: skip
-    """(cases, on what, in words) to validate an Attribution on: the hold-out Flights if there are any; or those it was
-    fitted
-    to, cross-fitted or, where the Reference tells no errors, as they are. base : EffectSet that was in the model;
-    effects : EffectSet with what was found."""
+    attribution: Attribution, flights: Sequence[Flight], holdout: Sequence[Flight], base: EffectSet, effects: EffectSet
+) -> tuple[list[ValidationCase], str]:
+    """(cases, on what, in words) to validate an Attribution on: the hold-out Flights if there are any; or those it was fitted to,
+    cross-fitted. base : EffectSet that was in the model; effects : EffectSet with what was found."""
     if holdout:
-        return [ValidationCase(flight, effects) for flight in holdout], "flights that took no part in the fit"
-    if not reference.tells_errors:
-        on = "the flights that were fitted, by their innovations alone"
-        return [ValidationCase(flight, effects) for flight in flights], on
+        return [ValidationCase(flight, effects) for flight in holdout], HELD_OUT
     on = "each half of the flight, every other 5 s, with effects fitted to the other"
     if len(flights) > 1:
         on = "each flight with effects fitted to the others"
     cases = cross_fitted(attribution, flights, base, attribution.selection.chosen, attribution.detections)
     return cases, on + SELECTED_ON
-
-
-def validate(
-    cases: Sequence[ValidationCase], baseline: Baseline, reference: Reference,
-    progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
-) -> tuple[dict[str, Any], dict[str, Any]]:  # fmt: skip
-    """(before, after) of cases: the errors, or, where the Reference tells none, what the filter's own innovations say.
-    As `compare` gives them. map_function : as of `attribute`."""
-    if reference.tells_errors:
-        return compare(cases, baseline, progress, reference.shift_std, map_function)
-    return _innovations(cases, baseline, progress, map_function)
 
 
 def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> str | None:
@@ -410,9 +360,11 @@ def _run(config: FilterConfig | None, case: ValidationCase) -> Run:
     return run_offline(case.flight, config, Corrector(case.flight.anchors, case.effects))
 
 
-def _innovations(
-    cases: Sequence[ValidationCase], baseline: Baseline, progress: Callable[[], object], map_function: MapFunction
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def innovations(
+    cases: Sequence[ValidationCase], baseline: Baseline, progress: Callable[[], object] = lambda: None,
+    map_function: MapFunction = map,
+) -> tuple[dict[str, Any], dict[str, Any]]:  # fmt: skip
+    """What `compare` gives, where nobody knows the errors: figures of the filter's own innovations alone."""
     sides = []
     for after in (False, True):
         rows = []

@@ -66,7 +66,7 @@ class Controller:
         """Set thrust and rates. p (3,) m, v (3,) m/s, q (4,) x y z w: the estimate; wanted (3, 3): position, velocity and
         acceleration, NaN in the position where only the velocity counts; yaw : rad; dt : s since the last call."""
         self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * FELT)) * (self.thrust - self.lift)
-        self.thrust = outer(p, v, q, wanted, yaw, dt, self.weight, self.numbers, self.integral, self.rates)
+        self.thrust = outer((p, v, q), wanted, yaw, dt, (self.weight, self.numbers), self.integral, self.rates)
 
     def support(self, force: float) -> float:
         """Share of the weight that something else than the rotors carries. force : m/s^2, specific, along the body's z, as felt."""
@@ -80,10 +80,13 @@ class Controller:
 
 @compiled
 def outer(
-    p: np.ndarray, v: np.ndarray, q: np.ndarray, wanted: np.ndarray, yaw: float, dt: float, weight: float,
-    gains: Record, integral: np.ndarray, rates: np.ndarray,
+    estimate: tuple[np.ndarray, np.ndarray, np.ndarray], wanted: np.ndarray, yaw: float, dt: float,
+    known: tuple[float, Record], integral: np.ndarray, rates: np.ndarray,
 ) -> float:  # fmt: skip
-    """See Controller.fly. integral (3,) and rates (3,) are written to. Returns the thrust, N."""
+    """See Controller.fly. estimate : (p, v, q); known : (weight, N, gains). integral (3,) and rates (3,) are written to. Returns the
+    thrust, N."""
+    p, v, q = estimate
+    weight, gains = known
     a, error = np.empty(3), np.empty(3)
     far = 0.0
     for k in range(3):

@@ -23,20 +23,25 @@ TURNING = 50.0  # rad/s of a rotor, above which it shakes the vehicle
 
 @compiled
 def interval(
-    state: np.ndarray, gyro: np.ndarray, thrust: float, rates: np.ndarray, gains: Record, known: Record,
-    vehicle: Record, wind: np.ndarray, errors: np.ndarray, shaking: np.ndarray, truth: np.ndarray, samples: np.ndarray,
-    contact: np.ndarray,
+    state: np.ndarray, gyro: np.ndarray, wanted: tuple[float, np.ndarray], controller: tuple[Record, Record],
+    vehicle: Record, disturbances: tuple[np.ndarray, np.ndarray, np.ndarray],
+    felt: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:  # fmt: skip
     """Fly n samples of the inertial sensor long.
 
-    state (17,) and gyro (2, 3) rad/s, as felt last and before that, are updated; thrust : N, rates (3,) rad/s, wanted; gains, known : of
-    the controller;
-    vehicle : NUMBERS, the true ones; wind (n, 3) m/s; errors (n, 6) what the sensor adds to rates, rad/s, and specific force, m/s^2;
-    shaking (n, 3) m/s^2, what rotors add that turn. Written to: truth (n, 17), the states at the samples; samples (n, 6), rates and
-    specific force as felt: means since the sample before; contact (n,): the number of feet on the ground.
+    state (17,) and gyro (2, 3) rad/s, as felt last and before that, are updated; wanted : thrust, N, and rates (3,) rad/s;
+    controller : its gains, and the vehicle that it knows; vehicle : NUMBERS, the true ones;
+    disturbances : wind (n, 3) m/s; errors (n, 6), what the sensor adds to rates, rad/s, and specific force, m/s^2;
+    shaking (n, 3) m/s^2, what rotors add that turn.
+    felt, written to : truth (n, 17), the states at the samples; samples (n, 6), rates and specific force: means since the sample
+    before; contact (n,): the number of feet on the ground.
     """
+    thrust, rates = wanted
+    gains, known = controller
+    wind, errors, shaking = disturbances
+    truth, samples, contact = felt
     dt = STEP * STEPS
-    speeds, scratch, felt, earlier = np.empty(4), np.empty((2, STATE)), np.empty(3), np.empty(STATE)
+    speeds, scratch, force, earlier = np.empty(4), np.empty((2, STATE)), np.empty(3), np.empty(STATE)
     for i in range(len(truth)):
         inner(thrust, rates, gyro, dt, gains, known, speeds)
         earlier[:] = state
@@ -46,11 +51,11 @@ def interval(
             feet = max(feet, step(state, speeds, wind[i], STEP, vehicle, scratch))
             for k in range(3):
                 turn[k] += state[10 + k] / STEPS
-        specific_force(earlier, state, dt, felt)
+        specific_force(earlier, state, dt, force)
         turning = state[13] > TURNING
         for k in range(3):
             samples[i, k] = turn[k] + errors[i, k]
-            samples[i, 3 + k] = felt[k] + errors[i, 3 + k] + (shaking[i, k] if turning else 0.0)
+            samples[i, 3 + k] = force[k] + errors[i, 3 + k] + (shaking[i, k] if turning else 0.0)
         gyro[1] = gyro[0]
         gyro[0] = samples[i, :3]
         truth[i] = state

@@ -86,9 +86,9 @@ class Simulator:
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
         if self._hands is None:
             interval(
-                self.state, self._gyro, controller.thrust, controller.rates, controller.numbers, self._known, self._numbers,
-                self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows],
-                self.states[rows], self.samples[rows], self.contact[rows],
+                self.state, self._gyro, (controller.thrust, controller.rates), (controller.numbers, self._known), self._numbers,
+                (self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows]),
+                (self.states[rows], self.samples[rows], self.contact[rows]),
             )  # fmt: skip
         else:
             self._be_carried(rows)

@@ -9,26 +9,25 @@ from uwb_tdoa_bias.effects import EffectSet
 
 from ..diagnosis.attribution import attribute
 from ..diagnosis.references import Nothing
-from ..diagnosis.self_survey import delay_effect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
-    from .result import Result
+    from ..diagnosis.self_calibration import SelfCalibration
 
 LEAST = 0.2  # m by which an anchor must be late there; antennas alone make up to that
 
 
 def with_blocked(
-    result: Result, flights: Sequence[Flight], config: FilterConfig | None = None,
+    result: SelfCalibration, flights: Sequence[Flight], config: FilterConfig | None = None,
     progress: Callable[[], object] = lambda: None,
-) -> Result:  # fmt: skip
-    """The Result of a survey of Flights with what blocks its anchors, looked for beside all that was found."""
-    found, reference = result.surveyed, Nothing(config)
-    moved = [reference.prepare(replace(flight, anchors=found.anchors)) for flight in flights]
-    base = EffectSet((*result.base.effects, delay_effect(found.anchors, found.delays)))
+) -> SelfCalibration:  # fmt: skip
+    """The SelfCalibration of Flights with what blocks its anchors, looked for beside all that was found."""
+    reference = Nothing(config)
+    moved = [reference.prepare(replace(flight, anchors=result.surveyed)) for flight in flights]
+    base = EffectSet((*result.base.effects, result.found(result.shifts)[1]))
     effects = attribute(moved, reference, base, ("nlos",), undeclared=False, progress=progress).effects
     return replace(result, blocked=tuple(sentence for effect in effects for sentence in large(effect).advice()))
 

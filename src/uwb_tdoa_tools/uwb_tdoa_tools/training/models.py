@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
@@ -37,6 +37,14 @@ HEADINGS = 1.0  # range of the forward axis in training from which on a model te
 _ATTITUDE = ("forward_x", "forward_y", "up_x", "up_y")
 
 
+class Recipe(NamedTuple):
+    """What is trained. kind : of KINDS; seed : of everything that is drawn; options : of structured models."""
+
+    kind: str
+    seed: int
+    options: structured.Options = structured.Options()
+
+
 @dataclass(frozen=True)
 class Trained:
     """model : Paper, Structured or None; effects : EffectSet or None; curve : (label, x, training RMS, validation RMS);
@@ -55,11 +63,10 @@ class Trained:
 
 @in_one_thread
 def train(
-    kind: str, training: Sequence[Flight], validation: Sequence[Flight], seed: int, name: str,
-    options: structured.Options = structured.Options(), progress: Callable[[str], object] = lambda text: None,
-    found: physics.Physics | None = None, curve: bool = True,
+    recipe: Recipe, training: Sequence[Flight], validation: Sequence[Flight], name: str,
+    progress: Callable[[str], object] = lambda text: None, found: physics.Physics | None = None, curve: bool = True,
 ) -> Trained:  # fmt: skip
-    """Train a model of `kind` (of KINDS) on lists of Flights. Returns Trained. Raises InputError.
+    """Train the model of a Recipe on lists of Flights. Returns Trained. Raises InputError.
 
     name : of the model, goes into every corrected message; progress : called with a text now and then; found : Physics
     of the training and then the validation flights, if somebody has looked for it already; curve : whether a learning
@@ -67,6 +74,7 @@ def train(
     flights decide when the paper's network stops, and tell how far off a model is on flights that it has not seen; then
     the linear models are fitted anew to them too.
     """
+    kind, seed, _ = recipe
     if kind not in KINDS:
         raise InputError(f"model: {kind!r} is not known; choose {', '.join(KINDS)}.")
     raw = groups = _labels(training, validation)
@@ -83,14 +91,12 @@ def train(
         progress(f"effects: {found.effects.name}")
         groups = _labels(training, validation, effects)
     if kind.startswith("paper"):
-        model, errors, left = _paper(kind, groups[0], groups[1], seed, progress)
+        model, errors, left = _paper(recipe, groups[0], groups[1], progress)
     elif found is not None and kind == "physics" and not len(free):
         errors, left = _evaluate_effects(found, raw[0], raw[1], _growing(len(training), seed, curve))
     else:
         growing = _growing(len(training), seed, curve)
-        model, free, errors, left = _structured(
-            groups[0], groups[1], seed, options, progress, growing, free, kind == "physics"
-        )
+        model, free, errors, left = _structured(recipe, groups[0], groups[1], progress, growing, free)
         effects = None if effects is None else EffectSet((*free.effects, *effects.effects))
     everything = [*groups[0], *groups[1]]
     meta: dict[str, Any] = {
@@ -118,9 +124,10 @@ def _labels(
 
 
 def _paper(
-    kind: str, training: list[Labels], validation: list[Labels], seed: int, progress: Callable[[str], object]
+    recipe: Recipe, training: list[Labels], validation: list[Labels], progress: Callable[[str], object]
 ) -> tuple[paper.Paper, LearningCurve, list[np.ndarray]]:
     """(Paper, learning curve over epochs, what is left of the errors of each validation flight)."""
+    kind, seed, _ = recipe
     thin, held = (labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation))
     model, errors = paper.fit(
         thin, held, kind == "paper", seed, lambda epoch, error: progress(f"epoch {epoch}: validation {error:.4f} m")
@@ -131,15 +138,16 @@ def _paper(
 
 
 def _structured(
-    training: list[Labels], validation: list[Labels], seed: int, options: structured.Options,
-    progress: Callable[[str], object], growing: Sequence[Sequence[int]], free: EffectSet, alone: bool,
+    recipe: Recipe, training: list[Labels], validation: list[Labels], progress: Callable[[str], object],
+    growing: Sequence[Sequence[int]], free: EffectSet,
 ) -> tuple[structured.Structured | None, EffectSet, LearningCurve, list[np.ndarray]]:  # fmt: skip
     """(Structured, EffectSet, learning curve over numbers of training flights, what is left of the errors of each
     validation flight by a fit to the training flights). The model itself is then fitted to all flights.
 
-    growing : as `_growing` gives; free : linear effects to fit together with the maps; alone : the maps are only there so that the effects
-    do not take what belongs to a place; no model is returned.
+    growing : as `_growing` gives; free : linear effects to fit together with the maps. Of physics alone the maps are only there so that
+    the effects do not take what belongs to a place; no model is returned.
     """
+    (_, seed, options), alone = recipe, recipe.kind == "physics"
     thin = [labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation)]
 
     def remaining(one: Labels) -> np.ndarray:

@@ -21,34 +21,34 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 from ..parallel import in_one_thread
 from ..scoring.borne_out import SHARES, BorneOut, choose
 from ..scoring.evaluation import evaluate
-from . import models, physics, structured
+from . import models, physics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_bias.foundation.flight import Flight
     from ..parallel import MapFunction
+    from .models import Recipe
 
 FOLDS = 5
 
 
 @in_one_thread
 def bear_out(
-    kind: str, flights: Sequence[Flight], plain: Mapping[str, float], seed: int,
-    options: structured.Options = structured.Options(), found: physics.Physics | None = None,
+    recipe: Recipe, flights: Sequence[Flight], plain: Mapping[str, float], found: physics.Physics | None = None,
     progress: Callable[[str], object] = lambda text: None, map_function: MapFunction = map,
 ) -> BorneOut:  # fmt: skip
-    """BorneOut of a kind of model trained on Flights.
+    """BorneOut of the model of a Recipe trained on Flights.
 
     plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with effects;
     map_function(function, folds) : as map, but for the time and the process in which each is done.
     """
-    order = np.random.default_rng(seed).permutation(len(flights))
+    order = np.random.default_rng(recipe.seed).permutation(len(flights))
     errors: dict[str, dict[float | None, float]] = {}
     folds = [order[k :: min(FOLDS, len(flights))].tolist() for k in range(min(FOLDS, len(flights)))]
     rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
     known = [found and physics.Physics(found.fitted_to(others)) for others in rest]
-    for told in map_function(partial(_left_out, kind, flights, plain, seed, options), list(zip(folds, rest, known))):
+    for told in map_function(partial(_left_out, recipe, flights, plain), list(zip(folds, rest, known))):
         of_fold = {name: dict(pairs) for name, pairs in told.items()}
         for name, of in of_fold.items():
             progress("{} left out: {:.3f} m without, {:.3f} m with all".format(name, of[None], of[1.0]))
@@ -78,19 +78,18 @@ def errors_by_share(
 
 
 def train(
-    kind: str, training: Sequence[Flight], validation: Sequence[Flight], seed: int, name: str,
-    options: structured.Options = structured.Options(), progress: Callable[[str], object] = lambda text: None,
-    map_function: MapFunction = map,
+    recipe: Recipe, training: Sequence[Flight], validation: Sequence[Flight], name: str,
+    progress: Callable[[str], object] = lambda text: None, map_function: MapFunction = map,
 ) -> tuple[models.Trained, BorneOut]:  # fmt: skip
     """(Trained, BorneOut): `models.train`, and as much of it as is borne out. map_function : as of `bear_out`."""
     flights = [*training, *validation]
     found = None
-    if kind.startswith("physics"):
+    if recipe.kind.startswith("physics"):
         progress("looking for effects")
         found = physics.find(flights)
-    trained = models.train(kind, training, validation, seed, name, options, progress, found)
+    trained = models.train(recipe, training, validation, name, progress, found)
     plain = uncorrected(flights, map_function)
-    borne_out = bear_out(kind, flights, plain, seed, options, found, progress, map_function)
+    borne_out = bear_out(recipe, flights, plain, found, progress, map_function)
     if trained.model:
         trained = replace(trained, meta={**trained.meta, "share": borne_out.share})
     return trained, borne_out
@@ -98,7 +97,7 @@ def train(
 
 @in_one_thread
 def _left_out(
-    kind: str, flights: Sequence[Flight], plain: Mapping[str, float], seed: int, options: structured.Options,
+    recipe: Recipe, flights: Sequence[Flight], plain: Mapping[str, float],
     fold: tuple[list[int], list[int], physics.Physics | None],
 ) -> dict[str, list[tuple[float | None, float]]]:  # fmt: skip
     """{flight: [(share, 3D RMSE), ...]}, JSON, of a fold: (numbers of the flights left out, of the others, Physics fitted to those or
@@ -106,7 +105,7 @@ def _left_out(
     left_out, others, known = fold
     with TemporaryDirectory() as folder:
         some = [flights[k] for k in others]
-        trained = models.train(kind, some[:-1] or some, some[-1:], seed, kind, options, found=known, curve=False)
+        trained = models.train(recipe, some[:-1] or some, some[-1:], recipe.kind, found=known, curve=False)
         model, _ = models.save(trained, Path(folder))
         network = Network(model) if model else None
     errors = {flights[k].name: errors_by_share(flights[k], plain, trained.effects, network) for k in left_out}

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..prior import DELAY, POSITION
+from ..self_calibration.prior import DELAY, POSITION
 from .markup import paragraphs, section, table
 
 if TYPE_CHECKING:

@@ -67,6 +67,8 @@ EVIDENCE = {
     "held_out_gain": "gain on data held out",
     "held_out_t": "its t value",
     "standard_errors": "standard errors",
+    "slow_before": "slow innovations before, m",
+    "slow_left": "after, m",
     "scatter_over_air": "scatter over that in the air",
 }
 
@@ -78,7 +80,7 @@ def _evidence(diagnosis: Diagnosis) -> str:
         "Criterion: by how much likelier the measurements are with it, as twice a logarithm, less the price of its "
         "parameters and of the search. Gain on data held out: the same on stretches that it was not fitted to, "
         "without any price; its t value says how evenly they agree. Standard errors: the size of what a search of "
-        "its own found, in its uncertainty."
+        "its own found, in its uncertainty. Slow innovations: measured minus predicted TDOAs, averaged over half a second."
     )
     used_keys = [key for key in EVIDENCE if any(key in finding.evidence for finding in diagnosis.findings)]
     rows = [

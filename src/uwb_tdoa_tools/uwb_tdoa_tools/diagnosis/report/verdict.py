@@ -8,7 +8,7 @@ from typing import Any, TYPE_CHECKING
 from uwb_tdoa_bias.effects.wording import listed
 
 from ...scoring.phases import NEAR_THE_FLOOR, TITLES
-from ..calibration import LEFT
+from ..self_calibration.solve import CLEARLY, LEFT
 from .left_over import left_over
 
 if TYPE_CHECKING:
@@ -146,7 +146,7 @@ def _without_truth(diagnosis: Diagnosis) -> Verdict:
     headline = "What was found makes measurements agree better; what that is worth for the position is unknown."
     borne_out = (
         "It is added because what is slow in the innovations becomes small: what it leaves is not above "
-        f"{100 * LEFT:.1f} cm, a limit that was set on measured flights."
+        f"{100 * LEFT:.1f} cm, or {CLEARLY:g} times smaller than it was, limits that were set on measured flights."
     )
     change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
     return Verdict(headline, (_UNKNOWN, borne_out, change), "unknown")

@@ -14,12 +14,14 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from ..checking.known_path import MANY
+from uwb_tdoa_bias.effects import Covariance, EffectSet
+
+from ...checking.known_path import MANY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from numpy.typing import ArrayLike
-    from uwb_tdoa_bias.effects import Covariance
+    from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
     ChangeKey = tuple[str, int]  # effect, number of an anchor
@@ -31,7 +33,7 @@ DRIFT = 0.005  # m, by which anything may be off since the last calibration with
 MOVED, LATER = 0.3, 0.2  # m, standard deviations of changes: of each coordinate, of a delay
 ODDS = 100.0
 LOOSE = 0.05  # m, standard deviation of delays in a preliminary solution
-POSITION, DELAY = "anchor_position", "anchor_delay"
+OF_ANCHORS = POSITION, DELAY = "anchor_position", "anchor_delay"
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +106,27 @@ class Solution:
 def keys_of(ids: Iterable[Any]) -> tuple[tuple[str, str], ...]:
     """((effect, parameter), ...) of all coordinates and delays of anchors."""
     return (*((POSITION, f"{i}.{axis}") for i in ids for axis in "xyz"), *((DELAY, str(i)) for i in ids))
+
+
+def to_keep(keys: tuple[tuple[str, ...], ...], matrix: np.ndarray) -> Covariance:
+    """Covariance to be the prior of the next calibration; of MANY anchors what it says of each of them, or no file could hold it."""
+    out = Covariance(keys, matrix)
+    return out.of_each_anchor() if len({key.partition(".")[0] for _, key in keys}) > MANY else out
+
+
+def with_calibration(base: EffectSet, found: Iterable[Effect], covariance: Covariance | None) -> EffectSet:
+    """The EffectSet `base` with other Effects: positions and delays of anchors are added to those that it has. covariance : of these, for
+    the next calibration; None where none are found."""
+    effects = list(base.effects)
+    for effect in found:
+        same = next((k for k, one in enumerate(effects) if one.name == effect.name and effect.name in OF_ANCHORS), None)
+        if same is None:
+            effects.append(effect)
+            continue
+        known = effects[same]
+        values = {key: known.values.get(key, 0.0) + value for key, value in effect.values.items()}
+        effects[same] = replace(effect, values={**known.values, **values}, std={**known.std, **effect.std})
+    return EffectSet(tuple(effects), covariance or base.covariance)
 
 
 def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray) -> Solution:

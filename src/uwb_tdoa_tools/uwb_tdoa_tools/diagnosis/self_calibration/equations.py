@@ -1,4 +1,4 @@
-"""Where anchors stand and how late they are, from flights of which nobody knows the path.
+"""Normal equations of where anchors stand and how late they are, from flights of which nobody knows the path.
 
 A run of the filter gives innovations and their derivatives by every position and delay, with the path integrated out
 (`uwb_tdoa_ekf/sensitivity.py`). Whatever else is systematic, by antennas, metal or floors, is a smooth function of the
@@ -16,33 +16,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse import csr_array, hstack
 
-from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
-from ..checking.known_path import MANY
-from ..parallel import in_one_thread
-from ..scoring.metrics import AIRBORNE
-from .channels import CHANNELS, Comparison
-from .constraints import Distance, Mark
-from .prior import DELAY, MOVED, POSITION, Prior, keys_of, solve
-from .references.nothing import Nothing
-from .regression.fit import NU, student_scale
+from ...checking.known_path import MANY
+from ...parallel import in_one_thread
+from ...scoring.metrics import AIRBORNE
+from ..channels import CHANNELS, Comparison
+from ..constraints import Distance, Mark
+from ..references.nothing import Nothing
+from ..regression.fit import NU, student_scale
+from .prior import MOVED, Prior
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from uwb_tdoa_bias.effects import Effect, Samples
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.results import Odometry
-    from ..parallel import MapFunction
-    from .channels.tdoa import TdoaResidual
-    from .constraints import Constraint
-    from .diagnose import Diagnosis
-    from .prior import Solution
+    from ...parallel import MapFunction
+    from ..channels.tdoa import TdoaResidual
+    from ..constraints import Constraint
 
-ROUNDS = 2  # linear solutions, each about the last
 BLOCK = 3.0  # s over which sums of scores show how alike errors are
 SYSTEMATIC = 12.0  # by which the information is divided beside that: errors that last are no noise
 PRELIMINARY = 20.0  # the same for the solution about which that is measured
@@ -50,90 +47,6 @@ DETERMINED = 1e-4  # share of the largest eigenvalue that a direction must have 
 FEWEST = 4  # TDOAs in a cell; noise of fewer hides what is slow
 FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 AT_ONCE = 32  # regressors that are made together
-
-
-@dataclass(frozen=True, eq=False)
-class Surveyed:
-    """anchors : Anchors; delays (N,) m; covariance (4N, 4N) m^2, of positions, anchor by anchor, and then of delays;
-    seconds : s in the air that tell; before, left : m, scale of the slow innovations with the anchors as given, and with these; tdoa_std :
-    m, for the filter: so that it believes in as many independent TDOAs as there are; delay_std, function_std : m, what the evidence says of
-    the size of delays, and of functions of the place; changes : (Change, ...) since the last calibration; marks : (before, after, nearer),
-    root mean square of what estimates at marks in the air are off by, m, and share of marks that they come nearer to, each after a fit
-    without it; None where there are none;
-    grounded : how many marks were left out, because they are on the floor: estimates there are metres off and do not know it."""
-
-    anchors: Anchors
-    delays: np.ndarray
-    covariance: np.ndarray
-    seconds: float
-    before: float
-    left: float
-    tdoa_std: float
-    delay_std: float
-    function_std: float
-    changes: tuple[Change, ...] = ()
-    marks: tuple[float, float, float] | None = None
-    grounded: int = 0
-
-    @property
-    def position_std(self) -> np.ndarray:
-        """(N, 3) m."""
-        return np.sqrt(np.diag(self.covariance))[: 3 * len(self.anchors)].reshape(-1, 3)
-
-
-@dataclass(frozen=True, eq=False)
-class Change:
-    """What is not as the last calibration had it: effect : name; anchor : id; values, std : (m,) m, by how much; rivals : names of
-    effects that the flights cannot tell from it."""
-
-    effect: str
-    anchor: str
-    values: np.ndarray
-    std: np.ndarray
-    rivals: tuple[str, ...] = ()
-
-    def as_text(self) -> str:
-        """One sentence."""
-        by = ", ".join(f"{100 * value:+.1f} +- {100 * std:.1f}" for value, std in zip(self.values, self.std))
-        if self.effect == POSITION:
-            return f"anchor {self.anchor} has moved by {by} cm (x, y, z)" + ", or is later than it was" * bool(self.rivals)
-        return f"anchor {self.anchor} is later than it was by {by} cm" + ", or has moved" * bool(self.rivals)
-
-
-def survey(
-    flights: Sequence[Flight], position_std: np.ndarray, base: EffectSet = EffectSet(),
-    config: FilterConfig | None = None, constraints: Sequence[Constraint] = (),
-    progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
-) -> Surveyed:  # fmt: skip
-    """Surveyed of Flights of the same anchors, which are where they say within position_std, (N, 3) m, or as the covariance of
-    `base` says.
-
-    base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known; map_function : as of
-    `attribution.attribute`. The frame is that of the coordinates with the smallest std. Raises InputError for a flight that is too short.
-    """
-    config = config or FilterConfig()
-    given, runs = flights[0].anchors, _Runs(flights, base, config, constraints)
-    n, prior = len(given), Prior.of(given, position_std, base.covariance)
-    start = np.concatenate([given.positions.ravel(), np.zeros(n)])
-
-    def linearised(about: np.ndarray) -> _Equations:
-        anchors, delays = given.at(about[: 3 * n].reshape(n, 3)), about[3 * n :]
-        return runs.equations(anchors, delays, prior.loose, progress, map_function)
-
-    first = last = linearised(start)
-    found = solve(first.gram, first.vector, prior, np.zeros(4 * n))
-    best = start + found.step
-    for _ in range(ROUNDS - 1):
-        last = linearised(best)
-        found = solve(last.gram, last.vector, prior, best - start)
-        best = best + found.step
-    moved, delays = given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :]
-    parts = [runs.residual(flight, moved, delays) for flight in runs.flights]
-    left = student_scale(np.concatenate([_slow(part) for part in parts]))
-    return Surveyed(
-        moved, delays, found.covariance, last.seconds, first.slow, left, last.tdoa_std(config), found.delay_std, found.function_std,
-        _changes(prior, found, best - start), _left_out(first, prior), runs.grounded,
-    )  # fmt: skip
 
 
 @in_one_thread
@@ -144,16 +57,17 @@ def tdoa_std_of(
     not used. map_function : as of `attribution.attribute`."""
     config, anchors = config or FilterConfig(), flights[0].anchors
     loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
-    runs, no_delays = _Runs(flights, effects, config), np.zeros(len(anchors))
+    runs, no_delays = Runs(flights, effects, config), np.zeros(len(anchors))
     return runs.equations(anchors, no_delays, loose, map_function=map_function).tdoa_std(config)
 
 
-def noise_of(
-    diagnosis: Diagnosis, config: FilterConfig | None, map_function: MapFunction, say: Callable[[str], object]
-) -> float | None:
-    """The same of the flights of a Diagnosis beside its effects; None where they are too short to tell, and say(why)."""
+def measured_noise(
+    flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None, map_function: MapFunction = map,
+    say: Callable[[str], object] = lambda why: None,
+) -> float | None:  # fmt: skip
+    """The same; None where the flights are too short to tell, and say(why)."""
     try:
-        return tdoa_std_of(diagnosis.flights, diagnosis.effects, config, map_function)
+        return tdoa_std_of(flights, effects, config, map_function)
     except InputError as error:
         say(f"no ekf_node.yaml: {error}")
         return None
@@ -163,15 +77,15 @@ def noise_of(
 def slow_innovations(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None) -> float:
     """m, scale of the innovations of Flights that are slow, averaged over half a second, beside the EffectSet `effects`: what anchors
     that are elsewhere or late make. Their ground truth is not used. Raises InputError for a flight that is too short."""
-    runs, none = _Runs(flights, effects, config or FilterConfig()), np.zeros(len(flights[0].anchors))
-    return student_scale(np.concatenate([_slow(runs.residual(flight, flight.anchors, none)) for flight in runs.flights]))
+    anchors = flights[0].anchors
+    return Runs(flights, effects, config or FilterConfig()).slow_innovations(anchors, np.zeros(len(anchors)))
 
 
 @dataclass(frozen=True, eq=False)
-class _Equations:
+class Equations:
     """Normal equations of all flights: gram (k, k), vector (k,); marks : [_Mark] that are in them; slow : m, scale of
     the slow innovations; inflation : by how much larger sums of scores are than those of independent errors;
-    seconds : s that tell."""
+    seconds : s that tell; flights : [FlightEquations] of each, but for MANY anchors, of which they would take gigabytes."""
 
     gram: np.ndarray
     vector: np.ndarray
@@ -179,6 +93,7 @@ class _Equations:
     slow: float
     inflation: float
     seconds: float
+    flights: list[FlightEquations]
 
     def tdoa_std(self, config: FilterConfig) -> float:
         """m: as many independent TDOAs as there are tell as much as the filter then believes."""
@@ -186,9 +101,8 @@ class _Equations:
 
 
 @dataclass(frozen=True, eq=False)
-class _FlightEquations:
-    """Those of one flight, as of _Equations, before they are divided by the inflation of their errors; slow (n,) m, the
-    slow innovations."""
+class FlightEquations:
+    """Those of one flight, as of Equations; slow (n,) m, the slow innovations."""
 
     gram: np.ndarray
     vector: np.ndarray
@@ -198,7 +112,7 @@ class _FlightEquations:
     seconds: float
 
 
-class _Runs:
+class Runs:
     """Runs of Flights with anchors that are moved and late. spans : {flight: (first, last) s in the air}, as the first run of each
     says: other anchors may move the path to the floor, but not the tag; grounded : how many marks are on the floor, and left out."""
 
@@ -215,19 +129,20 @@ class _Runs:
         self._marks = [one for one in marks if one.position[2] > AIRBORNE]
         self.grounded = len(marks) - len(self._marks)
 
-    def residual(self, flight: Flight, anchors: Anchors, delays: np.ndarray) -> TdoaResidual:
-        """TdoaResidual of one of `flights` with Anchors that are late by delays (N,) m: the innovations of a run."""
-        return _residual(self._base, self._reference, anchors, delays, flight, self.spans.get(flight.name))[0]
+    def slow_innovations(self, anchors: Anchors, delays: np.ndarray) -> float:
+        """m, scale of the slow innovations of all flights with Anchors that are late by delays (N,) m."""
+        about = self._base, self._reference, anchors, delays
+        return student_scale(np.concatenate([_slow(_residual(*about, one, self.spans.get(one.name))[0]) for one in self.flights]))
 
     def equations(
         self, anchors: Anchors, delays: np.ndarray, loose: np.ndarray, progress: Callable[[], object] = lambda: None,
         map_function: MapFunction = map,
-    ) -> _Equations:  # fmt: skip
-        """_Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may be."""
+    ) -> Equations:  # fmt: skip
+        """Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may be."""
         gram: np.ndarray = np.zeros(())
         vector: np.ndarray = np.zeros(())
         marks: list[_Mark] = []
-        several = []
+        several: list[FlightEquations] = []
         here = [[one for one in self._marks if one.flight == flight.name] for flight in self.flights]
         items = [(flight, self.spans.get(flight.name), some) for flight, some in zip(self.flights, here)]
         told = map_function(partial(_of_flight, self._base, self._reference, anchors, delays, loose), items)
@@ -235,15 +150,14 @@ class _Runs:
             self.spans[flight.name] = span
             marks += one.marks
             several.append(one)
-            gram = gram + one.gram / (SYSTEMATIC * one.inflation)
-            vector = vector + one.vector / (SYSTEMATIC * one.inflation)
+            gram, vector = gram + one.gram, vector + one.vector
             progress()
         of_anchors = [one.equations(anchors, len(vector)) for one in self._of_anchors]
         for more, right in [*((mark.gram, mark.vector) for mark in marks), *of_anchors]:
             gram, vector = gram + more, vector + right
         slow = student_scale(np.concatenate([one.slow for one in several]))
         inflation, seconds = float(np.mean([one.inflation for one in several])), sum(one.seconds for one in several)
-        return _Equations(gram, vector, marks, slow, inflation, seconds)
+        return Equations(gram, vector, marks, slow, inflation, seconds, several if len(anchors) <= MANY else [])
 
 
 def _residual(
@@ -262,60 +176,15 @@ def _residual(
 def _of_flight(
     base: EffectSet, reference: Nothing, anchors: Anchors, delays: np.ndarray, loose: np.ndarray,
     item: tuple[Flight, tuple[float, float] | None, list[Mark]],
-) -> tuple[_FlightEquations, tuple[float, float]]:  # fmt: skip
-    """(_FlightEquations, span) of (Flight, span or None, marks of it)."""
+) -> tuple[FlightEquations, tuple[float, float]]:  # fmt: skip
+    """(FlightEquations, span) of (Flight, span or None, marks of it)."""
     flight, known_span, marks = item
     part, span = _residual(base, reference, anchors, delays, flight, known_span)
     gram, vector, blocks, known = _equations(part, flight, marks)
     n = len(loose)
     inflation = _inflation(gram[:n, :n], vector[:n], blocks, loose)
-    return _FlightEquations(gram, vector, known, _slow(part), inflation, BLOCK * len(blocks)), span
-
-
-def _left_out(equations: _Equations, prior: Prior) -> tuple[float, float, float] | None:
-    """Surveyed.marks: each is left out of _Equations about the anchors as given."""
-    if not equations.marks:
-        return None
-    n, off = len(prior.covariance), []
-    for one in equations.marks:
-        step = solve(equations.gram - one.gram, equations.vector - one.vector, prior, np.zeros(n)).step
-        off.append((one.off, one.off - one.columns[:, :n] @ step))
-    before, after = np.sum(np.square(off), axis=2).T
-    return float(np.sqrt(before.mean())), float(np.sqrt(after.mean())), float(np.mean(after < before))
-
-
-def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[Change, ...]:
-    """(Change, ...) of a Solution."""
-    std, out = np.sqrt(np.diag(found.covariance)), []
-    for (effect, anchor), others in found.changed.items():
-        places, _ = prior.changes()[effect, anchor]
-        rivals = tuple(other for other, _ in others)
-        out.append(Change(effect, prior.ids[anchor], offset[places], std[places], rivals))
-    return tuple(out)
-
-
-def calibrated(
-    base: EffectSet, anchors: Anchors, shifts: np.ndarray, delays: np.ndarray, covariance: np.ndarray
-) -> EffectSet:
-    """The EffectSet `base` with shifts (N, 3) m and delays (N,) m of Anchors on top, and their covariance (4N, 4N) m^2."""
-    std = np.sqrt(np.diag(covariance))
-    keys = keys_of(anchors.ids)
-    found = dict(zip(keys, np.concatenate([shifts.ravel(), delays])))
-    effects = [effect for effect in base.effects if effect.name not in (POSITION, DELAY)]
-    for effect in base.effects:
-        for key, value in effect.values.items() if effect.name in (POSITION, DELAY) else ():
-            found[effect.name, key] = found.get((effect.name, key), 0.0) + value
-    for name in (POSITION, DELAY):
-        values = {key: float(value) for (effect, key), value in found.items() if effect == name}
-        known = {key: float(one) for (effect, key), one in zip(keys, std) if effect == name}
-        effects.append(EFFECTS[name](values, known, "survey"))
-    return EffectSet(tuple(effects), to_keep(keys, covariance))
-
-
-def to_keep(keys: tuple[tuple[str, ...], ...], matrix: np.ndarray) -> Covariance:
-    """Covariance to be the prior of the next calibration; of MANY anchors what it says of each of them, or no file could hold it."""
-    out = Covariance(keys, matrix)
-    return out.of_each_anchor() if len({key.partition(".")[0] for _, key in keys}) > MANY else out
+    less = SYSTEMATIC * inflation
+    return FlightEquations(gram / less, vector / less, known, _slow(part), inflation, BLOCK * len(blocks)), span
 
 
 def delay_effect(anchors: Anchors, delays: np.ndarray) -> Effect:

@@ -1,0 +1,115 @@
+"""One calibration of anchors from flights alone, whoever asks for it: when it may be used, and what `diagnose` makes of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet
+from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
+from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis.diagnose import _calibrated, _Work
+from uwb_tdoa_tools.diagnosis.references import Nothing
+from uwb_tdoa_tools.diagnosis.self_calibration import self_calibrate
+from uwb_tdoa_tools.diagnosis.self_calibration.prior import with_calibration
+from uwb_tdoa_tools.diagnosis.self_calibration.solve import CLEARLY, LEFT
+from uwb_tdoa_tools.scoring.evaluation import evaluate
+from known_effects import clean_flight
+
+DELAYS = {"1": 0.3, "4": -0.2, "6": 0.25}
+LATE = EFFECTS["anchor_delay"](DELAYS)
+
+
+def flight_with(*effects, seed=100, seconds=40.0):
+    flight = clean_flight(seed, seconds)
+    for effect in effects:
+        flight = effect.inject(flight, np.random.default_rng(0))
+    return flight
+
+
+@pytest.fixture(scope="module")
+def late():
+    """Of two flights."""
+    return self_calibrate([flight_with(LATE), flight_with(LATE, seed=101)])
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    return diagnose([flight_with(LATE), flight_with(LATE, seed=101)], reference=Nothing())
+
+
+def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alone(late):
+    assert late.why_not is None and late.explained > 0.5 and late.left < LEFT
+    other, given = flight_with(LATE, seed=102, seconds=30.0), EffectSet(late.found(late.shifts))
+    errors = [evaluate(other, effects=effects)[0].row()["rmse_3d"] for effects in (EffectSet(), given)]
+    moved = evaluate(replace(other, anchors=late.anchors), effects=late.effects)[0].row()["rmse_3d"]
+    assert errors[1] < 0.4 * errors[0] and moved == pytest.approx(errors[1], rel=0.02)  # shifts in effects.yaml, or in the anchors
+
+
+def test_who_asks_makes_no_difference(late, diagnosis):
+    written = {effect.name: effect.values for effect in diagnosis.effects.effects}
+    for effect in late.found(late.shifts):
+        assert written[effect.name] == pytest.approx(effect.values, abs=1e-12)
+    np.testing.assert_array_equal(diagnosis.effects.covariance.matrix, late.effects.covariance.matrix)
+
+
+def test_what_is_applied_is_found_with_its_evidence_and_the_same_in_all_flights(late, diagnosis):
+    added = [finding for finding in diagnosis.findings if finding.added]
+    assert [finding.effect.name for finding in added] == ["anchor_position", "anchor_delay"]
+    assert added[1].evidence == pytest.approx({"slow_before": late.before, "slow_left": late.left}, abs=1e-4)
+    assert added[1].explained == late.explained
+    shares = [(one.share, one.std) for one in added[1].shares]
+    assert len(shares) == 2 and all(abs(share - 1.0) < 0.3 and std < 0.2 for share, std in shares)
+    assert "The same in all 2 flights" in diagnosis.as_text()
+
+
+def test_a_delay_of_one_flight_is_no_delay_of_the_other():
+    found = self_calibrate([flight_with(LATE), flight_with(seed=101)])
+    one, other = (share.share for share in found.shares["anchor_delay"])
+    assert one - other > 1.0
+
+
+def why_not_of(flight):
+    """What `diagnose` says of a self-calibration of a flight, where it does not apply it."""
+    reference = Nothing()
+    return _calibrated(_Work(reference, EffectSet(), None, lambda what: None, map), (reference.prepare(flight),), EffectSet())
+
+
+def test_nothing_is_a_finding_in_a_flight_of_which_nothing_is_wrong():
+    assert "of what is slow in the innovations" in why_not_of(flight_with())
+
+
+def test_flights_that_are_too_short_say_so():
+    assert why_not_of(flight_with(LATE, seconds=20.0)).endswith("30 s are needed: fly for longer")
+
+
+def test_nothing_is_applied_if_something_else_is_wrong_too():
+    blocked = {"2.x": 1.0, "2.y": 0.0, "2.z": 1.0, "2.radius": 1.5, "2.delay": 1.5}
+    other = EFFECTS["nlos"](blocked), LATE, EFFECTS["noise_correlation"]({"std": 0.2, "time": 1.0})
+    assert "something else is wrong too" in why_not_of(flight_with(*other))
+
+
+@pytest.mark.parametrize(
+    "before, left, marks, applied",
+    [
+        (0.1, 0.9 * LEFT, None, True),
+        (0.1, 1.1 * LEFT, None, False),
+        (1.2 * CLEARLY * LEFT, 1.1 * LEFT, None, True),  # the tape was worse than what else is wrong
+        (0.1, 1.1 * LEFT, (0.2, 0.1, 0.8), True),  # marks know better
+        (0.1, 0.9 * LEFT, (0.2, 0.1, 0.7), False),
+        (0.1, 0.9 * LEFT, (0.1, 0.2, 0.8), False),
+    ],
+)
+def test_one_rule_says_whether_it_is_applied(late, before, left, marks, applied):
+    found = replace(late, before=before, left=left, marks=marks)
+    assert (found.why_not is None) == applied
+    assert found.anchors is (found.surveyed if applied else found.given) and len(found.effects) == 2 * applied
+
+
+def test_what_is_found_is_added_to_what_was_known():
+    known = Covariance((("anchor_delay", "1"),), np.eye(1))
+    base = EffectSet((AnchorDelay({"1": 0.1, "2": 0.2}, {"1": 0.01, "2": 0.01}),), known)
+    found = AnchorPosition({"1.x": 0.5}, {"1.x": 0.1}), AnchorDelay({"1": 0.05, "3": 0.3}, {"1": 0.02, "3": 0.02})
+    delay, position = with_calibration(base, found, None).effects
+    assert delay.values == pytest.approx({"1": 0.15, "2": 0.2, "3": 0.3}) and delay.std == {"1": 0.02, "2": 0.01, "3": 0.02}
+    assert position.values == {"1.x": 0.5} and with_calibration(base, found, None).covariance is known

@@ -1,0 +1,268 @@
+"""The one way from flights and what is known of their anchors to better anchors, and whether these may be used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import AnchorDelay, Covariance, EffectSet
+from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.config import FilterConfig
+
+from ...checking.known_path import MANY
+from ...parallel import in_one_thread
+from ..over_flights import Share
+from .equations import Runs
+from .placing import PLACED_STD, place
+from .prior import DELAY, POSITION, Prior, eliminated, keys_of, solve, to_keep, with_calibration
+from .tape import Tape
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from ...parallel import MapFunction
+    from ..constraints import Constraint
+    from .equations import Equations
+    from .prior import Solution
+
+ROUNDS = 2  # linear solutions, each about the last
+LEAST = 30.0  # s in the air; fewer do not tell how alike errors are
+SAME_PLACE = 0.05  # m by which an anchor may differ between flights of one installation
+NOTHING_KNOWN = 1e3  # m, standard deviation of a coordinate of which nothing is known
+IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
+LEFT = 0.055  # m that may be left of slow innovations
+CLEARLY = 2.6  # slow innovations as given over those that are left, beyond which the tape was worse than what else is wrong
+NEARER = 0.75  # share of marks, each left out once, at which the estimate must come nearer
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What is not as the last calibration had it: effect : name; anchor : id; values, std : (m,) m, by how much; rivals : names of
+    effects that the flights cannot tell from it."""
+
+    effect: str
+    anchor: str
+    values: np.ndarray
+    std: np.ndarray
+    rivals: tuple[str, ...] = ()
+
+    def as_text(self) -> str:
+        """One sentence."""
+        by = ", ".join(f"{100 * value:+.1f} +- {100 * std:.1f}" for value, std in zip(self.values, self.std))
+        if self.effect == POSITION:
+            return f"anchor {self.anchor} has moved by {by} cm (x, y, z)" + ", or is later than it was" * bool(self.rivals)
+        return f"anchor {self.anchor} is later than it was by {by} cm" + ", or has moved" * bool(self.rivals)
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCalibration:
+    """What flights tell of their anchors.
+
+    given : Anchors; prior : Prior of them; flights : names; base : EffectSet that was in the model;
+    surveyed : Anchors where the flights put them; delays (N,) m; solution : Solution, whose covariance is of positions, anchor by anchor,
+    and then of delays; seconds : s in the air that tell;
+    before, left : m, scale of the slow innovations with the anchors as given, and with these;
+    tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are;
+    changes : (Change, ...) since the last calibration;
+    marks : (before, after, nearer), root mean square of what estimates at marks in the air are off by, m, and share of marks that they
+    come nearer to, each after a fit without it; None where there are none;
+    grounded : how many marks were left out, because they are on the floor: estimates there are metres off and do not know it;
+    shares : {name of an effect: (Share, ...)}, how much of it each flight shows;
+    blocked : sentences on what makes anchors late somewhere, once somebody has looked (`surveying/blocked.py`).
+    """
+
+    given: Anchors
+    prior: Prior
+    flights: tuple[str, ...]
+    base: EffectSet
+    surveyed: Anchors
+    delays: np.ndarray
+    solution: Solution
+    seconds: float
+    before: float
+    left: float
+    tdoa_std: float
+    changes: tuple[Change, ...]
+    marks: tuple[float, float, float] | None
+    grounded: int
+    shares: dict[str, tuple[Share, ...]]
+    blocked: tuple[str, ...] = ()
+
+    @property
+    def why_not(self) -> str | None:
+        """Why it must not be used instead of what was given; None if it may.
+
+        Where something else is wrong as well, positions and delays take the place of what they look like, and the position gets
+        worse. That shows in what is left of the slow innovations, or at marks.
+        """
+        if self.marks:
+            before, after, nearer = self.marks
+            if after < before and nearer >= NEARER:
+                return None
+            return (
+                f"at marks, each left out once, the estimate is off by {100 * before:.1f} cm with the anchors as given, and by {100 * after:.1f} cm with "
+                f"others, and nearer at {nearer:.0%} of them: the position would suffer; measure more marks, or fly where it is known"
+            )
+        if self.left <= LEFT or self.before > CLEARLY * self.left:
+            return None
+        return (
+            f"{100 * self.before:.1f} cm of the innovations are slow with the anchors as given, and {100 * self.left:.1f} cm with others: more than "
+            f"{100 * LEFT:.1f} cm: something else is wrong too, and the position might suffer; give --marks, or fly where it is known"
+        )
+
+    @property
+    def explained(self) -> float:
+        """Share of the power of the slow innovations that is gone."""
+        return 1.0 - (self.left / self.before) ** 2
+
+    @property
+    def anchors(self) -> Anchors:
+        """The Anchors to use."""
+        return self.surveyed if self.why_not is None else self.given
+
+    @property
+    def effects(self) -> EffectSet:
+        """The EffectSet to use with them, with what was in the model; its covariance is the prior of the next calibration."""
+        if self.why_not is not None:
+            return self.base
+        return with_calibration(self.base, self.found(np.zeros_like(self.shifts)), self.covariance)
+
+    def found(self, shifts: np.ndarray) -> tuple[AnchorPosition, AnchorDelay]:
+        """The effects of positions that are off by shifts (N, 3) m, and of delays."""
+        n, keys = shifts.size, [key for _, key in keys_of(self.given.ids)]
+        values = np.concatenate([shifts.ravel(), self.delays]).tolist()
+        std = np.sqrt(np.diag(self.solution.covariance)).tolist()
+        position, delay = ((dict(zip(keys[some], values[some])), dict(zip(keys[some], std[some]))) for some in (slice(n), slice(n, None)))
+        return AnchorPosition(*position, source="survey"), AnchorDelay(*delay, source="survey")
+
+    @property
+    def covariance(self) -> Covariance:
+        """What the next calibration starts from."""
+        return to_keep(keys_of(self.given.ids), self.solution.covariance)
+
+    @property
+    def shifts(self) -> np.ndarray:
+        """(N, 3) m, from what was given."""
+        return self.surveyed.positions - self.given.positions
+
+    @property
+    def given_std(self) -> np.ndarray:
+        """(N, 3) m, of the positions as given."""
+        return _of_positions(self.prior.covariance)
+
+    @property
+    def position_std(self) -> np.ndarray:
+        """(N, 3) m, of the positions as surveyed."""
+        return _of_positions(self.solution.covariance)
+
+    @property
+    def improved(self) -> np.ndarray:
+        """(N, 3) bool: coordinates that are known better than before."""
+        return self.position_std < IMPROVED * self.given_std
+
+
+@in_one_thread
+def self_calibrate(
+    flights: Sequence[Flight], tape: Tape = Tape(), base: EffectSet = EffectSet(), config: FilterConfig | None = None,
+    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
+) -> SelfCalibration:  # fmt: skip
+    """SelfCalibration of Flights with the anchors that a Tape speaks of. Ground truth is not used.
+
+    base : EffectSet that is in the model already; its covariance, of the last calibration, counts where there is one, not the
+    Tape; config : FilterConfig; constraints : what else is known (`diagnosis/constraints`); map_function : as of
+    `attribution.attribute`. The frame is that of the coordinates with the smallest std. Raises InputError for flights of different
+    anchors or that are too short, and for a Tape that does not fit.
+    """
+    same_anchors(flights)
+    given, config, names = flights[0].anchors, config or FilterConfig(), tuple(flight.name for flight in flights)
+    std, rows = tape.position_std(given), tape.unknown_rows(given)
+    start, start_std = given, std.copy()
+    if rows:
+        start = place(flights, rows, config)
+        start_std[rows], std[rows] = PLACED_STD, NOTHING_KNOWN
+        if base.covariance is not None:
+            base = replace(base, covariance=base.covariance.without(tape.unknown))
+    runs = Runs([replace(flight, anchors=start) for flight in flights], base, config, constraints)
+    n, prior = len(given), Prior.of(given, start_std, base.covariance)
+    mean = np.concatenate([start.positions.ravel(), np.zeros(n)])
+
+    def linearised(about: np.ndarray) -> Equations:
+        return runs.equations(given.at(about[: 3 * n].reshape(n, 3)), about[3 * n :], prior.loose, progress, map_function)
+
+    best, first = mean, linearised(mean)
+    last = first
+    found = solve(first.gram, first.vector, prior, np.zeros(4 * n))
+    for _ in range(ROUNDS - 1):
+        best = best + found.step
+        last = linearised(best)
+        found = solve(last.gram, last.vector, prior, best - mean)
+    if last.seconds < LEAST:
+        raise InputError(f"the flights are {last.seconds:g} s in the air together; {LEAST:g} s are needed: fly for longer.")
+    shares = _shares(last, best - mean, found, names) if n <= MANY else {}
+    best = best + found.step
+    moved, delays = given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :]
+    return SelfCalibration(
+        given, Prior.of(given, std, base.covariance), names, base, moved, delays, found, last.seconds, first.slow,
+        runs.slow_innovations(moved, delays), last.tdoa_std(config), _changes(prior, found, best - mean), _left_out(first, prior),
+        runs.grounded, shares,
+    )  # fmt: skip
+
+
+def same_anchors(flights: Sequence[Flight]) -> None:
+    """Raises InputError unless all of some Flights, at least one, were flown among the same anchors."""
+    if not flights:
+        raise InputError("give at least one flight.")
+    first = flights[0]
+    for flight in flights[1:]:
+        same = np.array_equal(flight.anchors.ids, first.anchors.ids)
+        if not (same and np.allclose(flight.anchors.positions, first.anchors.positions, atol=SAME_PLACE)):
+            raise InputError(
+                f"{flight.name}: its anchors are not those of {first.name}; take each installation and day alone."
+            )
+
+
+def _of_positions(covariance: np.ndarray) -> np.ndarray:
+    """(N, 3) m, of a covariance (4N, 4N) m^2."""
+    return np.sqrt(np.diag(covariance))[: 3 * (len(covariance) // 4)].reshape(-1, 3)
+
+
+def _left_out(equations: Equations, prior: Prior) -> tuple[float, float, float] | None:
+    """SelfCalibration.marks: each is left out of Equations about the anchors as given."""
+    if not equations.marks:
+        return None
+    n, off = len(prior.covariance), []
+    for one in equations.marks:
+        step = solve(equations.gram - one.gram, equations.vector - one.vector, prior, np.zeros(n)).step
+        off.append((one.off, one.off - one.columns[:, :n] @ step))
+    before, after = np.sum(np.square(off), axis=2).T
+    return float(np.sqrt(before.mean())), float(np.sqrt(after.mean())), float(np.mean(after < before))
+
+
+def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[Change, ...]:
+    """(Change, ...) of a Solution."""
+    std, out = np.sqrt(np.diag(found.covariance)), []
+    for (effect, anchor), others in found.changed.items():
+        places, _ = prior.changes()[effect, anchor]
+        rivals = tuple(other for other, _ in others)
+        out.append(Change(effect, prior.ids[anchor], offset[places], std[places], rivals))
+    return tuple(out)
+
+
+def _shares(equations: Equations, offset: np.ndarray, found: Solution, names: Sequence[str]) -> dict[str, tuple[Share, ...]]:
+    """SelfCalibration.shares: a fit of one factor to what each flight alone tells in Equations that were made an offset (4N,) from the
+    mean of the prior."""
+    n, whole, out = len(offset), offset + found.step, {}
+    told = [eliminated(one.gram, one.vector, n, found.function_std)[:2] for one in equations.flights]
+    for name, columns in ((POSITION, slice(3 * n // 4)), (DELAY, slice(3 * n // 4, n))):
+        part = np.zeros(n)
+        part[columns] = whole[columns]
+        fits = [(part @ gram @ part, part @ (vector + gram @ (offset - whole + part))) for gram, vector in told]
+        out[name] = tuple(
+            Share(flight, float(score / power), float(power**-0.5)) if power > 0.0 else Share(flight, 0.0, np.inf)
+            for flight, (power, score) in zip(names, fits)
+        )
+    return out
