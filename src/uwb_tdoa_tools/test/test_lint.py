@@ -28,13 +28,6 @@ def test_no_line_is_longer_than_contributing_says():
 
 
 MOST_ARGUMENTS = 7  # of a function, as CONTRIBUTING.md says; self and cls are none
-CORE = "src/uwb_tdoa_ekf/uwb_tdoa_ekf/core"
-COMPILED = {  # functions of the core that have more: compiled code takes arrays one by one
-    "ground.py": {"explain", "_equations"},
-    "initialization.py": {"_look_for_places", "_begin"},
-    "standing.py": {"weigh", "_on_ground", "land"},
-    "startup.py": {"locate"},
-}
 
 
 def arguments(function):
@@ -46,8 +39,7 @@ def test_no_function_has_more_arguments_than_contributing_says():
     files = [path for source in SOURCES for path in Path(source).rglob("*.py")]
     functions = [(path, node) for path in files for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
     assert len(functions) > 2500
-    many = {(str(path.relative_to(ROOT)), node.name) for path, node in functions if len(arguments(node)) > MOST_ARGUMENTS}
-    assert many == {(f"{CORE}/{name}", function) for name, some in COMPILED.items() for function in some}
+    assert not [f"{path.relative_to(ROOT)}: {node.name}" for path, node in functions if len(arguments(node)) > MOST_ARGUMENTS]
 
 
 @pytest.mark.slow
