@@ -5,7 +5,8 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.diagnosis.attribution import effects_of, near_floor, on_floor
+from uwb_tdoa_tools.diagnosis.attribution import near_floor, on_floor
+from uwb_tdoa_tools.diagnosis.refinement import effects_of
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
 from uwb_tdoa_tools.diagnosis.references import GroundTruth

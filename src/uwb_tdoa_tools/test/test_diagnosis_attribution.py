@@ -3,8 +3,9 @@ import pytest
 
 import undeclared
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, LabelEffect, SmoothTerm
-from uwb_tdoa_tools.diagnosis import attribution
-from uwb_tdoa_tools.diagnosis.attribution import _relinearised, _simpler, attribute, effects_of, residuals_of
+from uwb_tdoa_tools.diagnosis import attribution, refinement
+from uwb_tdoa_tools.diagnosis.attribution import attribute, residuals_of
+from uwb_tdoa_tools.diagnosis.refinement import _simpler, effects_of, relinearised
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
@@ -61,7 +62,7 @@ def test_an_anchor_that_is_far_off_is_fitted_where_it_is(flight):
     table = table_of(at(())).with_terms([term for candidate in candidates for term in candidate.terms])
     selection = select(table, candidates, np.ones(3 * len(table.channels)))
     before = np.std(table_of(at(effects_of(selection))).y - selection.fit.residual)
-    after = _relinearised(selection, at, candidates)
+    after = relinearised(selection, at, candidates)
     assert before > 0.02
     assert np.std(table_of(at(effects_of(after))).y - after.fit.residual) < 0.002
     (effect,) = effects_of(after)
@@ -143,13 +144,13 @@ def test_of_two_models_of_the_same_things_the_one_that_is_worth_more_counts(flig
     table = table_of(residuals_of([shifted], TRUTH, EffectSet())).with_terms(whole.terms)
     inflation = fit(table, list(whole.columns)).inflation
     more, fewer = (select(table, [one], inflation) for one in (whole, along_z))
-    monkeypatch.setattr(attribution, "SAME_STORY", 0.3)
+    monkeypatch.setattr(refinement, "SAME_STORY", 0.3)
     assert _simpler(more, fewer, 10) is _simpler(fewer, more, 10) is more
 
 
 def test_maps_of_the_place_are_looked_for_in_three_flights_or_more(monkeypatch):
     looked = []
-    monkeypatch.setattr(attribution, "_with_maps", lambda selection, *_: looked.append(selection.table.flights) or selection)
+    monkeypatch.setattr(attribution, "with_maps", lambda selection, *_: looked.append(selection.table.flights) or selection)
     flights = [clean_flight(seed, 17.0) for seed in (100, 101, 102)]
     for number in (1, 2, 3):
         attribute(flights[:number], TRUTH)

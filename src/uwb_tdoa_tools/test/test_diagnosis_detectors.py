@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_tools.diagnosis.attribution import attribute, effects_of, near_floor, on_floor
+from uwb_tdoa_tools.diagnosis.attribution import attribute, near_floor, on_floor
+from uwb_tdoa_tools.diagnosis.refinement import effects_of
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.diagnosis.regression.fit import fit

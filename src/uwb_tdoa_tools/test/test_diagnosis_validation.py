@@ -11,11 +11,10 @@ from uwb_tdoa_bias.effects.samples import Track
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import poses_of, run_offline
 from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.comparison import Baseline, ValidationCase, _gain_interval, compare, score, why_not
 from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.diagnosis.validation import (
-    Baseline, ValidationCase, _gain_interval, compare, cross_fitted, score, select_by_error, validation_cases, why_not,
-)  # fmt: skip
+from uwb_tdoa_tools.diagnosis.validation import cross_fitted, select_by_error, validation_cases
 
 TRUTH = GroundTruth()
 NONE = EffectSet()
@@ -61,14 +60,14 @@ def test_parts_of_a_flight_are_judged_by_the_errors_within_them(flights):
 
 def test_what_helps_is_kept_and_said_what_it_is_worth(flights, attribution):
     kept = select_by_error(attribution, flights, Baseline(NONE))
-    assert kept.candidates == attribution.selection.chosen and not kept.refused
-    assert kept.worth[kept.candidates[0]] > 0.05
+    assert kept.selection.chosen == attribution.selection.chosen and not kept.refused
+    assert kept.worth[kept.selection.chosen[0]] > 0.05
 
 
 def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
     clean = [clean_flight(seed, 30.0) for seed in (100, 101)]
     kept = select_by_error(attribution, clean, Baseline(NONE))
-    assert kept.candidates == () and "the filter does better without it" in kept.refused[0].why
+    assert kept.selection.chosen == () and "the filter does better without it" in kept.refused[0].why
 
 
 @pytest.mark.parametrize("effect, recurs", [
@@ -80,7 +79,7 @@ def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recu
     flight = effect.inject(clean_flight(100, 30.0))
     found = attribute([flight], TRUTH)
     kept = select_by_error(found, [flight], Baseline(NONE))
-    assert found.selection.chosen and bool(kept.candidates) == recurs
+    assert found.selection.chosen and bool(kept.selection.chosen) == recurs
     assert all(kept.worth[candidate] > 0.02 for candidate in found.selection.chosen[:1])
     if not recurs:
         assert any("it happened at a time of this flight" in refused.why for refused in kept.refused)
@@ -90,8 +89,8 @@ def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights)
     two = [EFFECTS["gyro_bias"]({"z": 0.006}).inject(flight) for flight in flights]
     found = [attribute(some, TRUTH, undeclared=False) for some in (two, two[:1])]
     several, alone = (select_by_error(one, some, Baseline(NONE)) for one, some in zip(found, (two, two[:1])))
-    assert {candidate.name for candidate in several.candidates} == {"anchor_delay", "gyro_bias"}
-    assert {candidate.name for candidate in alone.candidates} == {"anchor_delay"}
+    assert {candidate.name for candidate in several.selection.chosen} == {"anchor_delay", "gyro_bias"}
+    assert {candidate.name for candidate in alone.selection.chosen} == {"anchor_delay"}
     assert "of one flight, worth less than 5% of the error" in alone.refused[-1].why
     assert sorted(candidate.name for candidate in alone.worth) == ["anchor_delay", "gyro_bias"]
     assert np.array_equal(alone.selection.fit.weight, found[1].selection.fit.weight)  # it is applied as it was tried
@@ -104,7 +103,7 @@ def test_what_no_node_can_take_out_is_not_tried():
     flight = replace(flight, imu=replace(flight.imu, gyro=flight.imu.gyro + turned))
     found = attribute([flight], TRUTH)
     kept = select_by_error(found, [flight], Baseline(NONE))
-    assert [candidate.label for candidate in kept.candidates] == ["gyro.x over acceleration"]
+    assert [candidate.label for candidate in kept.selection.chosen] == ["gyro.x over acceleration"]
     assert not kept.worth and not kept.refused
 
 

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..checking.numbers import numbers
 from ..parallel import in_one_thread
 from ..scoring.metrics import Score
-from . import output, repairing, validation
+from . import comparison, output, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
 from .findings import EffectFinding, Refused, usable
 from .health import health
@@ -49,7 +49,7 @@ class Diagnosis:
 
     flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [EffectFinding]; effects :
     EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
-    `validation.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
+    `comparison.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
     ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes :
     sentences, what is not as in the last calibration;
     applying : ((command line, what it does), ...), how the effects are put to use;
@@ -108,7 +108,7 @@ def diagnose(
     work = _Work(reference, base, config, progress, map_function)
     looking = work.saying(f"looking at {reference.words}")
     settled = []
-    for one in map_function(partial(_settled, reference, base, config), prepared):
+    for one in map_function(partial(reference.settled, base=base, config=config), prepared):
         settled.append(one)
         looking()
     of_truth = {flight.name: said for flight, said in settled if said}
@@ -174,7 +174,7 @@ class _Outcome:
     sides: tuple[dict[str, Any], dict[str, Any]]
     judged_on: str
     attribution: Attribution
-    baseline: validation.Baseline
+    baseline: comparison.Baseline
     changes: tuple[str, ...] = ()
 
 
@@ -187,34 +187,32 @@ def _by_error(
     (fitted, sound), base, config, map_function = flights, work.base, work.config, work.map_function
     trying = work.saying("running the filter without each")
     # A finding stays one even if the filter does without it; it is only not added.
-    selected = validation.select_by_error(found, sound, validation.Baseline(rest, config), trying, map_function)
+    selected = validation.select_by_error(found, sound, comparison.Baseline(rest, config), trying, map_function)
     attribution, selected = repairing.before_others(found, selected, repairs)
     model = attribution.of(selected)
-    effects, baseline = with_calibration(base, usable(model.effects).effects, model.covariance), validation.Baseline(base, config)
+    effects, baseline = with_calibration(base, usable(model.effects).effects, model.covariance), comparison.Baseline(base, config)
     work.progress("judging")
     cases, judged_on = validation.validation_cases(model, fitted, held_out, base, effects)
-    before, after = validation.compare(cases, baseline, work.saying("judging"), work.reference.shift_std, map_function)
+    before, after = comparison.compare(cases, baseline, work.saying("judging"), work.reference.shift_std, map_function)
     refused = list(selected.refused)
     shift_std = max(work.reference.shift_std(flight.name).max() for flight in fitted)
-    why_not = validation.why_not(before, after, shift_std)
+    why_not = comparison.why_not(before, after, shift_std)
     if why_not and len(effects) > len(base) + len(attribution.of_floor):  # of those it tells nothing
         refused.append(Refused("all", why_not))
-        selected = replace(validation.empty_selection(attribution), worth=selected.worth)
+        selected = validation.ValidatedSelection(attribution.selection.only(()), (), (), selected.worth)
         model, after = attribution.of(selected), before
         effects = with_calibration(base, attribution.of_floor, None)
     findings = _findings(model.findings(), attribution, selected.worth)
     return _Outcome(findings, effects, refused, (before, after), judged_on, attribution, baseline)
 
 
-def _by_self_calibration(
-    work: _Work, found: Attribution, flights: tuple[Flights, Flights], held_out: Flights, rest: EffectSet
-) -> _Outcome:
+def _by_self_calibration(work: _Work, found: Attribution, flights: tuple[Flights, Flights], held_out: Flights, rest: EffectSet) -> _Outcome:
     """_Outcome where nobody knows errors of the position: positions and delays of anchors together, or nothing.
 
     A model that is wrong makes innovations smaller too, by pushing the path to where they are. On measured flights
     functions of the place, fitted to some, made innovations of others smaller and doubled the error of the position.
     """
-    (fitted, sound), effects, baseline = flights, work.base, validation.Baseline(work.base, work.config)
+    (fitted, sound), effects, baseline = flights, work.base, comparison.Baseline(work.base, work.config)
     added: list[EffectFinding] = []
     refused: list[Refused] = []
     changes: tuple[str, ...] = ()
@@ -228,9 +226,7 @@ def _by_self_calibration(
             effects = with_calibration(effects, several, calibration.covariance)
             evidence = {"slow_before": round(calibration.before, 4), "slow_left": round(calibration.left, 4)}
             added = [
-                EffectFinding(
-                    effect, effect.channels[0], evidence, calibration.explained, shares=calibration.shares.get(effect.name, ())
-                )
+                EffectFinding(effect, effect.channels[0], evidence, calibration.explained, shares=calibration.shares.get(effect.name, ()))
                 for effect in several
             ]
             labels = [candidate.label for candidate in chosen if candidate.name not in OF_ANCHORS]
@@ -238,8 +234,8 @@ def _by_self_calibration(
             changes = tuple(change.as_text() for change in calibration.changes)
     judged_on = validation.HELD_OUT if held_out else "the flights that were fitted, by their innovations alone"
     work.progress("judging")
-    cases = [validation.ValidationCase(flight, effects) for flight in held_out or fitted]
-    sides = validation.innovations(cases, baseline, work.saying("judging"), work.map_function)
+    cases = [comparison.ValidationCase(flight, effects) for flight in held_out or fitted]
+    sides = comparison.innovations(cases, baseline, work.saying("judging"), work.map_function)
     return _Outcome(_findings(added, found, {}), effects, refused, sides, judged_on, found, baseline, changes)
 
 
@@ -255,15 +251,7 @@ def _calibrated(work: _Work, flights: Flights, base: EffectSet) -> SelfCalibrati
     return found.why_not or found
 
 
-def _settled(
-    reference: Reference, base: EffectSet, config: FilterConfig | None, flight: Flight
-) -> tuple[Flight, tuple[str, ...]]:
-    return reference.settled(flight, base, config)
-
-
-def _findings(
-    model: Sequence[EffectFinding], attribution: Attribution, worth: dict[Candidate | Detection, float]
-) -> list[EffectFinding]:
+def _findings(model: Sequence[EffectFinding], attribution: Attribution, worth: dict[Candidate | Detection, float]) -> list[EffectFinding]:
     """[EffectFinding]: those of the model that is written, with the values that are written, then the others of an Attribution. worth : as
     of ValidatedSelection."""
     detected = {detection.effect.name: detection for detection in attribution.detections}

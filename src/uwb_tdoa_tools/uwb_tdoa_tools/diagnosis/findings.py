@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import Effect, EffectSet, SmoothTerm
+
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable
     from .over_flights import Share

@@ -63,9 +63,7 @@ def as_text(diagnosis: Diagnosis) -> str:
     lines += [("do", sentence) for entry in found if entry.matters for sentence in entry.advice]
     for entry in found:
         judged = f"not added: {entry.why_not}" if entry.why_not else f"worth {worth_in_words(entry)}"
-        what = (
-            f"{entry.title}: {entry.values}; {judged}." if entry.findings[0].declared else f"{entry.title}; {judged}."
-        )
+        what = f"{entry.title}: {entry.values}; {judged}." if entry.findings[0].declared else f"{entry.title}; {judged}."
         lines.append(("found" if entry.findings[0].declared else "no name", what))
         lines += [("", sentence) for sentence in [entry.over_flights, *doubt_in_words(entry)] if sentence]
     for told_by, several in by_remedy(untold(diagnosis)).items():
@@ -146,8 +144,7 @@ def _ambiguous(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         {
             "found": entry.title,
             "alternatives": [
-                {"effect": other.effect, "criterion_gap": other.gap, "tell_apart": other.tell_apart}
-                for other in entry.undecided
+                {"effect": other.effect, "criterion_gap": other.gap, "tell_apart": other.tell_apart} for other in entry.undecided
             ],
         }
         for entry in entries(diagnosis)

@@ -38,6 +38,11 @@ class Share:
     share: float
     std: float
 
+    @classmethod
+    def fitted(cls, flight: str, power: float, score: float) -> Share:
+        """Of a fit of one factor. power, score : second and first derivative of the log-likelihood by it, at 0."""
+        return cls(flight, float(score / power), float(power**-0.5)) if power > 0.0 else cls(flight, 0.0, np.inf)
+
     @property
     def told(self) -> bool:
         """Whether the flight tells it."""
@@ -52,15 +57,11 @@ def shares(selection: Selection, candidate: Candidate, names: Sequence[str]) -> 
     return _shares(part, model.residual + part, model.information(table), table.flight, names)
 
 
-def _shares(
-    part: np.ndarray, y: np.ndarray, information: np.ndarray, flight: np.ndarray, names: Sequence[str]
-) -> tuple[Share, ...]:
+def _shares(part: np.ndarray, y: np.ndarray, information: np.ndarray, flight: np.ndarray, names: Sequence[str]) -> tuple[Share, ...]:
     out = []
     for number, name in enumerate(names):
         rows = flight == number
-        power = information[rows] @ part[rows] ** 2
-        share = information[rows] @ (part[rows] * y[rows]) / power if power > 0.0 else 0.0
-        out.append(Share(name, float(share), float(power**-0.5) if power > 0.0 else np.inf))
+        out.append(Share.fitted(name, information[rows] @ part[rows] ** 2, information[rows] @ (part[rows] * y[rows])))
     return tuple(out)
 
 

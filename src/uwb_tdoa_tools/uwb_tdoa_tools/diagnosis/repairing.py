@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, LabelEffect
-from uwb_tdoa_ekf.offline import run_offline
 
 from ..checking.known_path import KnownPath
 from ..checking.repairs import repairs
+from .comparison import ValidationCase
 from .detectors import Detection
-from .validation import TRIAL_FLIGHTS, WORSE, ValidationCase, score
+from .validation import TRIAL_FLIGHTS, WORSE, error_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -42,9 +41,7 @@ def repaired(
     return out
 
 
-def sound(
-    flights: Sequence[Flight], base: EffectSet, found: Iterable[Detection]
-) -> tuple[tuple[Flight, ...], EffectSet]:
+def sound(flights: Sequence[Flight], base: EffectSet, found: Iterable[Detection]) -> tuple[tuple[Flight, ...], EffectSet]:
     """(Flights without wrong ids and signs, EffectSet of the rest): what `base` and Detections have of these is taken out of the
     flights, so that pairs and anchors are called by their names."""
     labels = [effect for effect in base.effects if isinstance(effect, LabelEffect)]
@@ -79,14 +76,11 @@ def _common(several: Sequence[Sequence[LabelEffect]]) -> list[LabelEffect]:
     return out
 
 
-def _error(
-    flights: Sequence[Flight], effects: Iterable[Effect], config: FilterConfig | None, progress: Callable[[], object]
-) -> float:
+def _error(flights: Sequence[Flight], effects: Iterable[Effect], config: FilterConfig | None, progress: Callable[[], object]) -> float:
     """Mean 3D RMSE, m, of some of the flights."""
     errors = []
     for flight in flights[:: -(-len(flights) // TRIAL_FLIGHTS)]:
-        case = ValidationCase(flight, EffectSet(tuple(effects)))
-        errors.append(score(case, run_offline(flight, config, Corrector(flight.anchors, case.effects))).row()["rmse_3d"])
+        errors.append(error_of(config, (ValidationCase(flight, EffectSet(tuple(effects))), None)))
         progress()
     return float(np.mean(errors))
 

@@ -9,9 +9,11 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 
-from ..diagnosis.attribution import Attribution, attribute, effects_of
+from ..diagnosis.attribution import Attribution, attribute
+from ..diagnosis.comparison import Baseline
 from ..diagnosis.findings import usable
-from ..diagnosis.validation import Baseline, select_by_error
+from ..diagnosis.refinement import effects_of
+from ..diagnosis.validation import select_by_error
 from ..diagnosis.references import GroundTruth
 from ..diagnosis.regression.fit import refit
 from ..diagnosis.regression.terms import columns_of

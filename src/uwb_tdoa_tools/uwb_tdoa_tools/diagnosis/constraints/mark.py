@@ -23,9 +23,7 @@ class Mark:
         """(m,) s. begin : stamp of the first TDOA, s."""
         return begin + np.linspace(self.first, self.last, WITHIN)
 
-    def equations(
-        self, t: np.ndarray, estimate: np.ndarray, covariance: np.ndarray, moved: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def equations(self, t: np.ndarray, estimate: np.ndarray, covariance: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The estimate, averaged over the mark, is off by what the parameters do to it.
 
         t (m,) s: `stamps`; estimate (m, 3) m, covariance (m, 3, 3) m^2, moved (m, 3, k): its derivative by the parameters, all at the

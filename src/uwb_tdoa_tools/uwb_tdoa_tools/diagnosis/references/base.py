@@ -49,9 +49,7 @@ class Reference:
         """The Flight without what must not be used. Raises InputError where it lacks what the reference is."""
         return flight
 
-    def settled(
-        self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
-    ) -> tuple[Flight, tuple[str, ...]]:
+    def settled(self, flight: Flight, base: EffectSet, config: FilterConfig | None = None) -> tuple[Flight, tuple[str, ...]]:
         """(Flight, sentences): a prepared one, in which what this compares with was put right where it is plainly wrong itself. base :
         EffectSet that is in the model; config : FilterConfig."""
         return flight, ()
@@ -69,7 +67,5 @@ class Reference:
         first, last = airborne(poses)
         first, last = first + MARGIN, last - MARGIN
         if last - first < SHORTEST:
-            raise InputError(
-                f"{flight.name}: only {last - first:.1f} s of it are in the air; {SHORTEST:g} s are needed."
-            )
+            raise InputError(f"{flight.name}: only {last - first:.1f} s of it are in the air; {SHORTEST:g} s are needed.")
         return first, last

@@ -38,9 +38,7 @@ class GroundTruth(Reference):
             raise InputError(f"{flight.name}: holds no ground truth to compare with; give --no-truth.")
         return flight
 
-    def settled(
-        self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
-    ) -> tuple[Flight, tuple[str, ...]]:
+    def settled(self, flight: Flight, base: EffectSet, config: FilterConfig | None = None) -> tuple[Flight, tuple[str, ...]]:
         return settled(flight, base, config, self._align)
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:

@@ -32,9 +32,7 @@ class Heights(GroundTruth):
     attitude_known = False
     words = "heights that a range finder measured; x and y are the filter's own"
 
-    def __init__(
-        self, config: FilterConfig | None = None, constraints: Sequence[Constraint | OdometryPath] = ()
-    ) -> None:
+    def __init__(self, config: FilterConfig | None = None, constraints: Sequence[Constraint | OdometryPath] = ()) -> None:
         """config : FilterConfig; constraints are not needed."""
         self._config = config
 

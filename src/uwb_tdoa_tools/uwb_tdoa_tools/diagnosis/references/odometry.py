@@ -35,9 +35,7 @@ class Odometry(GroundTruth):
     attitude_known = False
     knows_floor = False  # the path begins and ends above it
 
-    def __init__(
-        self, config: FilterConfig | None = None, constraints: Sequence[Constraint | OdometryPath] = ()
-    ) -> None:
+    def __init__(self, config: FilterConfig | None = None, constraints: Sequence[Constraint | OdometryPath] = ()) -> None:
         """config : FilterConfig; constraints : OdometryPaths, and Marks that lie on them."""
         self._config, self._paths = config, {one.flight: one for one in constraints if isinstance(one, OdometryPath)}
         self._marks = [one for one in constraints if one.flight is not None and not isinstance(one, OdometryPath)]

@@ -198,9 +198,7 @@ def _slow(part: TdoaResidual) -> np.ndarray:
     return rows.y[rows.count >= FEWEST]
 
 
-def _equations(
-    part: TdoaResidual, flight: Flight, constraints: Sequence[Mark]
-) -> tuple[np.ndarray, np.ndarray, list[_Told], list[_Mark]]:
+def _equations(part: TdoaResidual, flight: Flight, constraints: Sequence[Mark]) -> tuple[np.ndarray, np.ndarray, list[_Told], list[_Mark]]:
     """(gram (k, k), vector (k,), [_Told] of each block) of the normal equations that a TdoaResidual gives, and [_Mark] of constraints of
     its Flight."""
     samples, air, innovations = part.samples, part.airborne, part.innovations
@@ -269,9 +267,7 @@ class _Mark:
     columns: np.ndarray
 
 
-def _known(
-    constraints: Sequence[Mark], stamps: Sequence[np.ndarray], moved: np.ndarray, odometry: Odometry
-) -> list[_Mark]:
+def _known(constraints: Sequence[Mark], stamps: Sequence[np.ndarray], moved: np.ndarray, odometry: Odometry) -> list[_Mark]:
     """[_Mark] of constraints of a flight that ask for the estimate at stamps. moved (m, 3, k): its derivative at all of them in
     turn."""
     order = np.argsort(np.concatenate([[], *stamps]), kind="stable")

@@ -51,9 +51,7 @@ def place(flights: Sequence[Flight], rows: Sequence[int], config: FilterConfig |
     return anchors.at(positions)
 
 
-def _distances(
-    flight: Flight, path: Odometry, row: int, known: np.ndarray, positions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _distances(flight: Flight, path: Odometry, row: int, known: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the tag was, (n, 3) m, and how far from the anchor of a row, (n,) m, as its TDOAs with known ones tell."""
     tdoa = flight.tdoa
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)

@@ -75,13 +75,6 @@ class Prior:
                     out[what, k] = places, std
         return out
 
-    def with_changes(self, changes: Iterable[tuple[np.ndarray, float]], covariance: np.ndarray | None = None) -> np.ndarray:
-        """(4N, 4N) m^2, the covariance, or another one, after some of `changes`."""
-        out = (self.covariance if covariance is None else covariance).copy()
-        for places, std in changes:
-            out[places, places] += std**2
-        return out
-
     def with_delays(self, std: float) -> np.ndarray:
         """(4N, 4N) m^2, the covariance with another standard deviation of all delays."""
         out = self.covariance.copy()
@@ -142,11 +135,12 @@ def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray
         known = np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]
         return max((_evidence(*part[:3], *known, offset), k) for k, part in enumerate(parts))
 
-    covariance, delay_std = prior.covariance, DELAY_STD
+    unchanged, delay_std = prior.covariance, DELAY_STD
     if not prior.told.any():
         evidences = [best(prior.with_delays(std))[0] for std in DELAY_STDS]
         delay_std = next(std for std, evidence in zip(DELAY_STDS, evidences) if evidence >= max(evidences) - np.log(ODDS))
-        covariance = prior.with_delays(delay_std)
+        unchanged = prior.with_delays(delay_std)
+    covariance = unchanged
     evidence, number = best(covariance)
     possible = prior.changes()
     changed: dict[ChangeKey, list[ChangeKey]] = {}
@@ -157,9 +151,9 @@ def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray
             break
         doubt = trials[key] - np.log(ODDS)
         changed[key] = [other for other in trials if other[1] == key[1] and other != key and trials[other] > doubt]
-        covariance = prior.with_changes(
-            [possible[one] for one in changed], covariance=None if prior.told.any() else prior.with_delays(delay_std)
-        )
+        covariance = unchanged.copy()
+        for places, std in (possible[one] for one in changed):
+            covariance[places, places] += std**2
         evidence, number = best(covariance)
     found = posterior(*parts[number][:3], covariance, offset, parts[number][3])
     return replace(found, delay_std=delay_std, changed=changed)
@@ -201,9 +195,7 @@ def posterior(
     return Solution(evidence, inverse @ (vector - prior @ offset), inverse, std)
 
 
-def _evidence(
-    gram: np.ndarray, vector: np.ndarray, evidence: float, prior: np.ndarray, size: float, offset: np.ndarray
-) -> float:
+def _evidence(gram: np.ndarray, vector: np.ndarray, evidence: float, prior: np.ndarray, size: float, offset: np.ndarray) -> float:
     """Logarithm of the evidence of a `posterior`, whose prior has the inverse covariance `prior` and the logarithm of its determinant
     `size`."""
     right, root = vector - prior @ offset, np.linalg.cholesky(gram + prior)

@@ -220,9 +220,7 @@ def same_anchors(flights: Sequence[Flight]) -> None:
     for flight in flights[1:]:
         same = np.array_equal(flight.anchors.ids, first.anchors.ids)
         if not (same and np.allclose(flight.anchors.positions, first.anchors.positions, atol=SAME_PLACE)):
-            raise InputError(
-                f"{flight.name}: its anchors are not those of {first.name}; take each installation and day alone."
-            )
+            raise InputError(f"{flight.name}: its anchors are not those of {first.name}; take each installation and day alone.")
 
 
 def _of_positions(covariance: np.ndarray) -> np.ndarray:
@@ -260,9 +258,8 @@ def _shares(equations: Equations, offset: np.ndarray, found: Solution, names: Se
     for name, columns in ((POSITION, slice(3 * n // 4)), (DELAY, slice(3 * n // 4, n))):
         part = np.zeros(n)
         part[columns] = whole[columns]
-        fits = [(part @ gram @ part, part @ (vector + gram @ (offset - whole + part))) for gram, vector in told]
         out[name] = tuple(
-            Share(flight, float(score / power), float(power**-0.5)) if power > 0.0 else Share(flight, 0.0, np.inf)
-            for flight, (power, score) in zip(names, fits)
+            Share.fitted(flight, part @ gram @ part, part @ (vector + gram @ (offset - whole + part)))
+            for flight, (gram, vector) in zip(names, told)
         )
     return out
