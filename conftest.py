@@ -1,5 +1,7 @@
 """What the tests of all packages share."""
 
+from collections import deque
+from functools import cache
 import os
 import signal
 from pathlib import Path
@@ -13,10 +15,40 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 try:
     from domain_coordinator import domain_id
 except ImportError:  # no ROS: the tests of the cores need none
-    pass
-else:
-    _reservation = domain_id()  # taken until this process ends
-    os.environ["ROS_DOMAIN_ID"] = str(_reservation.__enter__())
+    domain_id = None
+_taken = deque()  # reservations of domains, oldest first; taken until this process ends, or KEPT others came
+KEPT = 20  # tests for which nobody gets the domain of a test that is over: others see a node that was killed for 20 s more
+
+
+def _take_domain():
+    """Live in a ROS domain that nobody else has, and nobody had lately."""
+    while len(_taken) > KEPT:
+        _taken.popleft().__exit__(None, None, None)
+    while True:
+        reservation = domain_id()
+        try:
+            os.environ["ROS_DOMAIN_ID"] = str(reservation.__enter__())
+        except RuntimeError:  # other sessions have all that are left
+            _taken.popleft().__exit__(None, None, None)
+            continue
+        _taken.append(reservation)
+        return
+
+
+@cache
+def _uses_ros(path):
+    return "rclpy" in path.read_text()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """A test that starts nodes, or processes that do, has a domain of its own."""
+    if domain_id is not None and _uses_ros(item.path):
+        _take_domain()
+
+
+if domain_id is not None:
+    _take_domain()
 
 
 @pytest.fixture(scope="session")

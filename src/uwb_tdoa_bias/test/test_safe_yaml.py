@@ -74,10 +74,10 @@ def test_what_could_be_misread_is_refused(text, said):
 def test_aliases_cannot_unfold(tmp_path):
     lines = [f"{b}: &{b} [{('*' + a + ',') * 9}]\n" for a, b in zip("abcdefgh", "bcdefghi")]
     bomb = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(lines)
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(InputError, match="alias"):
         parse_yaml(bomb, "f")
-    assert time.perf_counter() - began < 10.0
+    assert time.process_time() - began < 10.0
 
 
 def test_files(tmp_path):

@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[3]
 FOLDER, MADE = ROOT.parent / "shared" / "ros2cli", ROOT / "build" / "ros2cli"
 WITH = "psutil", "argcomplete", "packaging"  # that it imports
-PATIENCE = 120.0  # s for anything that must happen
+PATIENCE = 180.0  # s for anything that must happen
 WHY_NOT = (
     None if shutil.which("ros2") or FOLDER.is_dir() and all(map(find_spec, WITH))
     else f"no ros2 command: .venv/bin/python -m pip install {' '.join(WITH)}" if FOLDER.is_dir()

@@ -3,6 +3,7 @@
 from copy import copy
 from dataclasses import dataclass, replace
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
+from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
 EPOCH = 1_700_000_000  # s; stamps of today's size
@@ -103,12 +105,15 @@ class Process:
     reader: threading.Thread
 
     def stop(self, number=signal.SIGINT):
-        """Signal the group; returns the exit code and the seconds it took."""
-        started = time.monotonic()
+        """Signal the group; returns the exit code, and for how many seconds it neither ran nor waited for a core before it ended."""
+        started, before, slept = time.monotonic(), worked(self.process.pid), 0.0
         os.killpg(self.process.pid, number)
-        code = self.process.wait(timeout=30.0)
-        self.reader.join(timeout=30.0)
-        return code, time.monotonic() - started
+        while self.process.poll() is None:
+            slept = time.monotonic() - started - (worked(self.process.pid) - before)
+            assert time.monotonic() < started + PATIENCE, f"it does not end: {''.join(self.lines)}"
+            time.sleep(0.02)
+        self.reader.join(timeout=PATIENCE)
+        return self.process.returncode, slept
 
 
 class Rig:
@@ -221,9 +226,9 @@ class Rig:
         self._executor.shutdown()
         self.node.destroy_node()
 
-    def wait(self, condition, what, patience=PATIENCE):
+    def wait(self, condition, what):
         """Listen until condition() holds."""
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + PATIENCE
         while not condition():
             self._executor.spin_once(timeout_sec=0.1)
             for name, process in self._processes.items():
@@ -231,7 +236,7 @@ class Rig:
             if time.monotonic() > deadline:
                 said = "".join(line for process in self._processes.values() for line in process.lines)
                 accounts = {name: self.values(name) for name in self._processes}
-                raise AssertionError(f"waited {patience} s for {what}; {accounts}; {said}")
+                raise AssertionError(f"waited {PATIENCE} s for {what}; {accounts}; {said}")
 
     def values(self, name):
         """{key: text} of the last diagnostics of a node; empty before."""
@@ -248,22 +253,23 @@ class Rig:
     def counts(self, name, **expected):
         """{key: int} of all counts of a node, when those named have the expected values and we have what it sent."""
         own = {
-            "bias_node": ("published", "uwb/tdoa_corrected"),
-            "ekf_node": ("odometry published", "odometry"),
-            "debias_node": ("received", "odometry/debiased"),
-        }
-        sent, topic = own[name]
+            "bias_node": {"uwb/tdoa_corrected": ["published"]},
+            "ekf_node": {"odometry": ["odometry published"], "uwb/residual": VERDICTS.values()},
+            "debias_node": {"odometry/debiased": ["received"]},
+        }[name]
 
         def arrived():
             values = self.values(name)
             return (
                 values
                 and all(values[key.replace("_", " ")] == str(value) for key, value in expected.items())
-                and (topic not in self.received or int(values[sent]) == len(self.received[topic]))
+                and all(
+                    sum(int(values[key]) for key in keys) == len(self.received[topic]) for topic, keys in own.items() if topic in self.received
+                )
             )
 
         self.fresh_status(name)
-        self.wait(arrived, f"{name} to count {expected}", 60.0)
+        self.wait(arrived, f"{name} to count {expected}")
         return {key: int(value) for key, value in self.values(name).items() if value.isdigit()}
 
     def send_anchors(self, anchors, publisher=None):
@@ -332,7 +338,7 @@ class Rig:
                 self.send_aid(*of_aids[0][1:2], flight, of_aids.pop(0)[2], epoch)
             (send_tdoa or self.send_tdoa)(t, tdoa.a[k], tdoa.b[k], tdoa.d[k], epoch, tdoa.variance[k])
             due = before + np.searchsorted(tdoa.t, t - ahead)
-            self.wait(lambda due=due: len(self.residuals) >= due, f"{due} residuals", 60.0)
+            self.wait(lambda due=due: len(self.residuals) >= due, f"{due} residuals")
         for t, gyro, accel in zip(imu.t[i:], imu.gyro[i:], imu.accel[i:]):
             self.send_imu(t, gyro, accel, epoch)
 
@@ -340,3 +346,14 @@ class Rig:
 def _collect(stream, lines):
     for line in stream:
         lines.append(line)
+
+
+def worked(pid):
+    """Seconds that the threads of a process have run, or waited for a core to run on."""
+    total = 0
+    for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        try:
+            total += sum(map(int, file.read_text().split()[:2]))
+        except (OSError, ValueError):  # that thread has ended
+            continue
+    return 1e-9 * total

@@ -231,8 +231,12 @@ def test_an_imu_without_accelerometer_is_not_believed(make_rig):
     rig.send_imu(0.04)
     counts = rig.counts("ekf_node", IMU_samples_received=5)
     assert (counts["imu_invalid"], counts["imu_waiting"] + counts["imu_used"]) == (4, 1)
-    warnings = [line for line in process.lines if "set use_imu to false" in line and "covariance of -1" in line]
-    assert len(warnings) == 1
+
+    def warnings():
+        return [line for line in process.lines if "set use_imu to false" in line and "covariance of -1" in line]
+
+    rig.wait(warnings, "a warning")
+    assert len(warnings()) == 1
 
 
 def test_other_anchors_start_the_filter_anew_and_the_same_do_not(make_rig, tmp_path):

@@ -15,7 +15,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.parameter import parameter_value_to_python  # noqa: E402
 from rclpy.parameter_client import AsyncParameterClient  # noqa: E402
-from real_launch import WHY_NOT, Launch, ros2  # noqa: E402
+from real_launch import PATIENCE, WHY_NOT, Launch, ros2  # noqa: E402
 from rig import make_rig, recording  # noqa: E402, F401
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from test_nodes import ticking  # noqa: E402
@@ -221,11 +221,17 @@ def test_arguments_are_listed(launch, file):
     assert launched.ended() == 0 and "respawn" in launched.said and "on_exit" in launched.said
 
 
-def param(*words):
-    """What `ros2 param ...` does: the CompletedProcess."""
-    return subprocess.run(
-        [*ros2(), "param", *words[:1], "--no-daemon", "--spin-time", "5", *words[1:]], capture_output=True, text=True, timeout=120
-    )
+def param(rig, *words):
+    """What `ros2 param ...` does, once it has found the node: the CompletedProcess."""
+    made = []
+
+    def found():
+        command = [*ros2(), "param", *words[:1], "--no-daemon", "--spin-time", "1", *words[1:]]
+        made.append(subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE))
+        return "Node not found" not in made[-1].stdout + made[-1].stderr
+
+    rig.wait(found, f"ros2 param to find {words[1]}")
+    return made[-1]
 
 
 def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(make_rig, launch, tmp_path):
@@ -239,12 +245,12 @@ def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(m
             launched = launch(*words, *(f"{node}_params:={tmp_path / node}.yaml" for node in nodes), rig=rig)
         for node, name in nodes.items():
             values_of(rig, name, "use_sim_time")  # it is there
-            dump = param("dump", name)
+            dump = param(rig, "dump", name)
             dumps.append(yaml.safe_load(dump.stdout))
             assert len(dumps[-1][name]["ros__parameters"]) > 5, dump.stderr
             (tmp_path / f"{node}.yaml").write_text(dump.stdout)
             if not back:
-                loaded = param("load", name, tmp_path / f"{node}.yaml")
+                loaded = param(rig, "load", name, tmp_path / f"{node}.yaml")
                 assert loaded.returncode == 0 and loaded.stderr == ""
                 assert loaded.stdout.count("successful") == len(values_below(dumps[-1]))
     assert dumps[:2] == dumps[2:] and dumps[1][nodes["ekf"]]["ros__parameters"]["publish_tf"] == "none"

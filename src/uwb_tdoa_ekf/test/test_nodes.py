@@ -118,6 +118,7 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     assert {(m.header.frame_id, m.child_frame_id) for m in rig.odometry} == {("map", "base_link")}
 
     # And so is what is said beside it.
+    rig.wait(lambda: len(rig.received["/tf"]) == n, "all transforms")
     transforms = {seconds_of(t.header.stamp): t for m in rig.received["/tf"] for t in m.transforms}
     for message in rig.odometry:
         transform = transforms[seconds_of(message.header.stamp)].transform
@@ -154,18 +155,21 @@ def test_quality_of_service(make_rig):
         "uwb/tdoa_corrected": {"ekf_node": best_effort},
         "uwb/anchors": {"bias_node": latched, "ekf_node": latched},
     }
+
+    def found(endpoints, topic):
+        return {
+            end.node_name: (end.qos_profile.reliability, end.qos_profile.durability)
+            for end in endpoints(topic if topic.startswith("/") else f"/{rig.namespace}/{topic}")
+            if end.node_namespace == f"/{rig.namespace}" and end.node_name != "rig"
+        }
+
     for expected, endpoints in (
         (publishers, rig.node.get_publishers_info_by_topic),
         (subscriptions, rig.node.get_subscriptions_info_by_topic),
     ):
         for topic, nodes in expected.items():
-            full = topic if topic.startswith("/") else f"/{rig.namespace}/{topic}"
-            found = {
-                end.node_name: (end.qos_profile.reliability, end.qos_profile.durability)
-                for end in endpoints(full)
-                if end.node_namespace == f"/{rig.namespace}" and end.node_name != "rig"
-            }
-            assert found == nodes, topic
+            rig.wait(lambda e=endpoints, t=topic, n=nodes: found(e, t).keys() >= n.keys(), f"the ends of {topic} to be known")
+            assert found(endpoints, topic) == nodes, topic
 
     def arrived():
         rig.send_tdoa(0.1, 10, 11, 0.5)  # best effort: until one is not lost
@@ -269,9 +273,9 @@ def test_a_signal_ends_both_in_good_order(make_rig, number):
     assert any(m.verdict == TdoaResidual.VERDICT_USED for m in rig.residuals)
     with streaming(rig):
         for process in processes:
-            code, took = process.stop(number)
+            code, slept = process.stop(number)
             assert code == 0, "".join(process.lines)
-            assert took < 5.0
+            assert slept < 4.0  # ros2 launch loses patience after 5 s
             assert not any("Traceback" in line or "FATAL" in line for line in process.lines), "".join(process.lines)
 
 

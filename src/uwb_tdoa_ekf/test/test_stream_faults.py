@@ -59,5 +59,5 @@ def test_faults_are_named_and_a_healthy_flight_runs(make_rig):
         return int(values_of(lane.rig.fresh_status("ekf_node"))[key]) - int(before[key])
 
     counted = lambda: more("IMU samples received") + more("lost on imu/data") == sent  # noqa: E731
-    lane.rig.wait(counted, "every sample to be received or counted as lost", 30.0)
+    lane.rig.wait(counted, "every sample to be received or counted as lost")
     assert more("lost on imu/data") > 0

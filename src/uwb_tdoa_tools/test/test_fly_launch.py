@@ -26,8 +26,8 @@ def launch(tmp_path):
 
     with own_domain():
         yield make
-    for each in started:
-        each.close()
+        for each in started:
+            each.close()
 
 
 def test_all_start_and_hear_the_vehicle_and_end_in_good_order(launch):

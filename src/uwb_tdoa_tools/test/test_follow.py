@@ -1,6 +1,5 @@
 """What is played keeps in step with what comes of it."""
 
-import threading
 import time
 
 import pytest
@@ -61,13 +60,22 @@ def follower(node, speaker):
     return follower
 
 
-def test_waits_until_the_topic_is_less_than_the_lead_behind(follower, speaker):
+def waits(follower, stamp):
+    """Whether a message at stamp, ns, is waited for."""
+    stop = Soon()
+    follower.wait(stamp, stop)
+    return stop.came
+
+
+def test_waits_until_the_topic_is_less_than_the_lead_behind(follower, speaker, monkeypatch):
+    monkeypatch.setattr(follow, "SILENCE", 1000.0)
     assert follower.wait(100 * SECOND, False) == 0.0
-    assert follower.wait(100 * SECOND + LEAD, False) < 1.0
-    later = threading.Timer(0.3, speaker.say, [101])
-    later.start()
-    assert follower.wait(101 * SECOND + LEAD, False) > 0.2  # 100.0 was the beginning, 101.0 comes in 0.3 s
-    later.join()
+    assert not waits(follower, 100 * SECOND + LEAD)
+    assert waits(follower, 101 * SECOND + LEAD)  # 100.0 was the beginning
+    speaker.say(101)
+    until = time.monotonic() + 60.0
+    while waits(follower, 101 * SECOND + LEAD):
+        assert time.monotonic() < until
     assert follower.wait(101 * SECOND + LEAD, False) == 0.0
 
 
@@ -75,16 +83,18 @@ def test_a_topic_that_has_gone_silent_is_not_waited_for(follower, speaker, monke
     monkeypatch.setattr(follow, "SILENCE", 0.2)
     follower.wait(0, False)
     assert follower.wait(5 * SECOND, False) > 0.2
-    assert follower.wait(10 * SECOND, False) < 0.2
+    monkeypatch.setattr(follow, "SILENCE", 1000.0)
+    assert not waits(follower, 10 * SECOND)
     speaker.say(9)
     until = time.monotonic() + 60.0
-    while follower.wait(12 * SECOND, False) < 0.2:  # it is waited for again, once that has come
+    while not waits(follower, 12 * SECOND):  # it is waited for again, once that has come
         assert time.monotonic() < until
 
 
-def test_a_signal_ends_the_wait(follower):
+def test_a_signal_ends_the_wait(follower, monkeypatch):
+    monkeypatch.setattr(follow, "SILENCE", 100.0)
     follower.wait(0, False)
-    assert follower.wait(9 * SECOND, True) < 1.0
+    assert follower.wait(9 * SECOND, True) < 90.0
 
 
 def test_what_cannot_be_followed_is_named(node):
@@ -128,23 +138,23 @@ def filtered(starting, speaker, monkeypatch):
 def play(follower, stamps):
     """Play TDOAs at stamps, s, as far as they need not be waited for: how many were."""
     for number, stamp in enumerate(stamps):
-        began = time.monotonic()
-        stop = Soon(began + 0.2)
-        follower.wait(round(stamp * SECOND), stop)
-        if stop:
+        if waits(follower, round(stamp * SECOND)):
             return number
         follower.add_tdoa(round(stamp * SECOND))
     return len(stamps)
 
 
 class Soon:
-    """True from some time on."""
+    """True after 0.2 s in which it was asked often: on a loaded machine time may pass in which nobody does anything.
+    came : whether somebody was told so."""
 
-    def __init__(self, until):
-        self._until = until
+    def __init__(self):
+        self.came, self._until, self._asked = False, time.monotonic() + 0.2, 0
 
     def __bool__(self):
-        return time.monotonic() > self._until
+        self._asked += 1
+        self.came = self._asked > 20 and time.monotonic() > self._until
+        return self.came
 
 
 STAMPS = [10.0 + 0.01 * k for k in range(200)]

@@ -82,7 +82,7 @@ def test_an_interrupt_ends_all_of_it_without_a_word(importable):
     for _ in range(3):
         assert work.stdout.readline() == b"done\n"  # the first by itself, the others by its children
     os.killpg(work.pid, signal.SIGINT)  # as a terminal does
-    _, err = work.communicate(timeout=30)  # returns when the children have closed their ends, too
+    _, err = work.communicate(timeout=120)  # returns when the children have closed their ends, too
     assert work.returncode == 130 and all(b" of 201 flights done, " in line for line in err.splitlines())
 
 

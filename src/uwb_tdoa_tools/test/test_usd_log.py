@@ -222,9 +222,9 @@ def test_names_of_our_streams_are_no_events(read):
 def test_a_header_of_many_types_takes_no_time(read):
     events = {f"e{k}": (1000 + k, []) for k in range(20_000)} | EVENTS
     events["wide"] = (999, [(f"v{k}", "b") for k in range(20_000)])
-    began = time.perf_counter()
+    began = time.process_time()
     assert len(read(log_bytes(events=events)).tdoa) == 2
-    assert time.perf_counter() - began < 5.0
+    assert time.process_time() - began < 5.0
 
 
 @pytest.mark.parametrize("setting", ["cache_dir: planted", "cache_locator_classes: evil.Locator", "disable_jit: 1", "opt: none", "["])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import re
 import signal
 import subprocess
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from .session import Stop
 
-STOP_LIMIT = 10.0  # s
+STOP_LIMIT, PATIENCE = 10.0, 60.0  # s until what was interrupted is killed; the latter if it must end well
 LOOK = 5.0  # s between two looks at what the processes do, and between two lines about it
 READY = re.compile(r"\]: ready\b")  # in the log of a node
 TAIL = 8192  # bytes of a log that are looked at
@@ -51,8 +52,9 @@ def variables(values: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def own_domain() -> Iterator[None]:
-    """A ROS domain that nobody else has, on this machine only, for the block and what it starts."""
-    with domain_id() as number:
+    """A ROS domain that nobody else has, on this machine only, for the block and what it starts. Any of those that are free: in the
+    first of them DDS may still list nodes that have just ended."""
+    with domain_id(lambda: random.randint(1, 100)) as number:
         with variables({"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}):
             yield
 
@@ -142,7 +144,7 @@ class Processes:
 
     def __exit__(self, *_: object) -> None:
         for title in list(self._running)[::-1]:
-            self._end(title)
+            self._end(title, STOP_LIMIT)
 
     def start(
         self, package: str, name: str, *arguments: object, title: str | None = None, may_end_with: Sequence[int] = ()
@@ -190,13 +192,13 @@ class Processes:
 
     def stop(self, title: str) -> None:
         """Interrupt a process and wait for it; raises LiveError if it does not end well."""
-        code = self._end(title)
+        code = self._end(title, PATIENCE)
         if code != 0:
             raise self._failure(title, code)
 
-    def _end(self, title: str) -> int:
+    def _end(self, title: str, limit: float) -> int:
         process = self._running.pop(title)
-        for number, patience in ((signal.SIGINT, STOP_LIMIT), (signal.SIGKILL, None)):
+        for number, patience in ((signal.SIGINT, limit), (signal.SIGKILL, None)):
             if process.poll() is None:
                 os.killpg(process.pid, number)
                 try:
