@@ -17,6 +17,9 @@ try:
 except ImportError:  # no ROS: the tests of the cores need none
     domain_id = None
 _taken = deque()  # reservations of domains, oldest first; taken until this process ends, or KEPT others came
+LONGEST = """waiting checking_check first_hour lockstep hall first_hour_without_truth diagnosis_diagnose launch_files measured_path demo
+    bench localizing diagnosis_attribution diagnosis_validation diagnosis_references printed_lines diagnosis_deviations
+    study_closed_loop replay_record connect plan executables checking_imu_rules""".split()  # files of tests: each takes half a minute or more
 KEPT = 20  # tests for which nobody gets the domain of a test that is over: others see a node that was killed for 20 s more
 
 
@@ -38,6 +41,12 @@ def _take_domain():
 @cache
 def _uses_ros(path):
     return "rclpy" in path.read_text()
+
+
+def pytest_collection_modifyitems(items):
+    """The files that take longest come first: no process has one to itself when the others have nothing left to do."""
+    place = {f"test_{name}": k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 @pytest.hookimpl(tryfirst=True)

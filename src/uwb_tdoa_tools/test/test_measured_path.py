@@ -12,7 +12,7 @@ from uwb_tdoa_tools.live.run import run_live  # noqa: E402
 from uwb_tdoa_tools.scoring.metrics import Score  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 
-SECONDS = 24.0
+SECONDS = 16.0
 VERDICTS = ("used", "rejected", "late", "invalid", "startup", "waiting")
 
 

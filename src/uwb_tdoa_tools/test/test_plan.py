@@ -11,6 +11,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_tools.commands import plan
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.planning import run
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners
 
@@ -65,12 +66,15 @@ def test_a_slice_of_known_height(square, tmp_path, capsys):
     assert "without orientation" in capsys.readouterr().out
 
 
-def test_options_change_the_bound(anchors, tmp_path):
+def test_options_change_the_bound(anchors, tmp_path, monkeypatch):
     def median(*options):
         assert plan.main([anchors, "--step", "1", *options, "--out", str(tmp_path / "o")]) == 0
         return report(tmp_path / "o")["map"]["bound_in_hull"]["median"]
 
     base = median()
+    assert median("--protocol", "tdoa3") == pytest.approx(median("--covariance", "all_pairs"))
+    monkeypatch.setattr(run, "draw_map", lambda *_: None)  # nor is the bound looked for in what follows from it
+    monkeypatch.setattr(run, "addition", lambda *_: None)
     (tmp_path / "weak.yaml").write_text(
         "azimuth: [0,0,0,0]\nelevation_1: [0,0,0,0]\nelevation_2: [0,0,0,0]\ngain_offset: -20\n"
     )
@@ -79,7 +83,6 @@ def test_options_change_the_bound(anchors, tmp_path):
     assert median("--temperature", "60") > 1.2 * base and median("--voltage", "3.5") < 0.95 * base
     assert median("--link-noise", "0.1") > 1.2 * base
     assert median("--noise", "0.01") < 0.2 * base
-    assert median("--protocol", "tdoa3") == pytest.approx(median("--covariance", "all_pairs"))
     assert median("--covariance", "common_reference") == pytest.approx(base)
     assert median("--covariance", "ring_uncorrelated") != pytest.approx(base, rel=1e-3)
 

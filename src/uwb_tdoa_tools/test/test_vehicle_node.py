@@ -52,11 +52,11 @@ def test_what_it_does_not_know_is_refused(given, why):
 
 @pytest.mark.slow
 def test_it_flies_by_services_beside_two_busy_processes(tmp_path, load):  # noqa: F811
-    load(2)
     with hall(tmp_path, "seed:=3", "aids:=[height]") as flown:
         refused = flown.ask(GoTo, "go_to", goal=Point(z=1.0), duration=Duration(sec=5))
         assert not refused.success and refused.message == "it does not fly; take off first."
         flown.wait(lambda: flown.odometry, "odometry")
+        load(2)
         flown.wait(lambda: flown.ask(Takeoff, "takeoff", height=1.0, duration=Duration(sec=2, nanosec=500_000_000)).success, "it to arm")
         flown.wait(lambda: flown.odometry.pose.pose.position.z > 0.8, "it to be up")
         beside = flown.ask(GoTo, "go_to", relative=True, goal=Point(x=0.3), duration=Duration(sec=2))

@@ -5,6 +5,7 @@ Time counts as long as the command itself computes. Where others compute on the 
 import os
 from pathlib import Path
 import selectors
+import signal
 import subprocess
 import sys
 import time
@@ -17,7 +18,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners
 
-FIRST, EVERY, LONG_ENOUGH = 2.0, 5.0, 15.0  # s; the last: of computing, after which enough is known of what does not end before
+FIRST, EVERY, LONG_ENOUGH = 2.0, 5.0, 10.0  # s; the last: of computing, after which enough is known of what does not end before
 WORDS = {  # command: words after it
     "bench": "--quick --only core",
     "calibrate": "flight.bag --out calibrated",
@@ -72,7 +73,8 @@ def silences(name, words, folder):
     """[s] of computing until each thing that a command says, and until its end, or LONG_ENOUGH."""
     out, process = [], None
     line = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *words]
-    with subprocess.Popen(line, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(line, cwd=folder, start_new_session=True, **pipes) as process:
         selector = selectors.DefaultSelector()
         selector.register(process.stdout, selectors.EVENT_READ)
         then, clock, before = time.monotonic(), 0.0, 0.0
@@ -89,7 +91,10 @@ def silences(name, words, folder):
             if clock > LONG_ENOUGH or clock - spoken > 2.0 * EVERY:
                 out.append(clock - spoken)
                 break
-        process.terminate()
+        try:
+            os.killpg(process.pid, signal.SIGKILL)  # what it has started, too
+        except ProcessLookupError:
+            pass
     return out
 
 
