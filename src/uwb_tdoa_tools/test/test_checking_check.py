@@ -16,6 +16,7 @@ from checking_flights import QUICK, recording
 
 OTHER_ROOM = constellation("random-5")
 NOTHING_TRIED = ["stamp_zero", "clipped", "jump"]  # with these, nothing but the streams themselves is judged
+LONGER = {"mirrored_survey": {"duration": 30.0}}  # shows once the yaw is known
 HARMLESS = "clipped_accel"  # nothing is cut off in a smooth simulated flight
 
 
@@ -26,7 +27,7 @@ def rules(report):
 def with_mistake(name, seed=0):
     mistake = MISTAKES[name]
     protocol = "tdoa3" if mistake.needs == "tdoa3" else "tdoa2"
-    healthy = recording(seed, live="live" in mistake.needs, protocol=protocol)
+    healthy = recording(seed, live="live" in mistake.needs, protocol=protocol, **LONGER.get(name, {}))
     other = OTHER_ROOM if mistake.needs == "rooms" else recording(seed + 1, protocol=protocol, trajectory="circle")
     made = mistake.make(healthy, np.random.default_rng([seed, *name.encode()]), other)
     others = [] if mistake.alone else [("right.yaml", healthy.anchors), ("wrong.yaml", OTHER_ROOM)]
