@@ -26,8 +26,8 @@ from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 TAPE = 0.1  # m, standard deviation of each coordinate
-CLEAN = dict(trajectory="sines", duration=60.0, imu_rate=200.0, truth_rate=50.0, bias=False)
-MINUTE = 60.0  # s of a measured flight
+CLEAN = dict(trajectory="sines", imu_rate=200.0, truth_rate=50.0, bias=False)
+MINUTE = 60.0  # s
 LATE, EPOCH = 0.4, 1.7e9  # s
 TURNED = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
 TRUTHS = {  # what may be wrong with a ground truth: function of a Truth
@@ -67,12 +67,12 @@ def off(positions, seed, exact=()):
     return positions + noise
 
 
-def simulated(tape, exact=()):
-    """The Hall of a tape: anchors that stand elsewhere, and are late."""
+def simulated(tape, exact=(), duration=40.0):
+    """The Hall of a tape: anchors that stand elsewhere, and are late. duration : s of each flight."""
     true = tape.at(off(tape.positions, 1, exact))
     rng = np.random.default_rng(2)
     late = AnchorDelay({str(i): float(delay) for i, delay in zip(true.ids, 0.05 * rng.standard_normal(len(true)))})
-    flown = [late.inject(simulate(SimulationConfig(seed=seed, anchors=true, **CLEAN))) for seed in (11, 12, 13)]
+    flown = [late.inject(simulate(SimulationConfig(seed=seed, anchors=true, duration=duration, **CLEAN))) for seed in (11, 12, 13)]
     return Hall(flown[:2], flown[2], tape)
 
 

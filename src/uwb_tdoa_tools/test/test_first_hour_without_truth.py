@@ -5,7 +5,7 @@ from pathlib import Path
 import re
 import shlex
 
-from first_hour import WALK, at_desk, measured, recorded, said_on_the_way, simulated, written
+from first_hour import MINUTE, WALK, at_desk, measured, recorded, said_on_the_way, simulated, written
 import numpy as np
 import pytest
 from recordings import log_bytes
@@ -27,7 +27,7 @@ def test_from_tape_to_calibrated_without_ground_truth(tmp_path, monkeypatch, cap
     """docs/calibration.md, in one command and step by step, and docs/localizing.md."""
     at_desk(tmp_path, monkeypatch)
     survey = read_survey(written("anchors.yaml", *blocks(WALK, "yaml")))
-    hall = simulated(survey, (0, 6)) if source == "simulated" else measured(shared_data)
+    hall = simulated(survey, (0, 6), MINUTE) if source == "simulated" else measured(shared_data)
     run(recorded(hall, False))
     for day, name in (("monday", "first"), ("tuesday", "second")):
         Path(f"{day}.bag").rename(f"{name}.bag")

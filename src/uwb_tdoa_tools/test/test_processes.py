@@ -1,6 +1,7 @@
 """The life of the processes of a live run, and what they say."""
 
 from contextlib import nullcontext
+import os
 import signal
 import time
 from types import SimpleNamespace
@@ -74,6 +75,16 @@ def test_what_ignores_the_interrupt_is_killed(start, tmp_path, monkeypatch):
     with pytest.raises(processes.LiveError, match="node ended with code -9"):
         start.processes.stop("node")
     assert node.returncode == -signal.SIGKILL
+
+
+def test_a_domain_that_was_just_left_is_not_the_next_one():
+    """Others would hear nodes of the run before."""
+
+    def number():
+        with processes.own_domain():
+            return os.environ["ROS_DOMAIN_ID"]
+
+    assert len({number() for _ in range(8)}) > 1
 
 
 def test_a_signal_to_us_ends_the_run(start):
