@@ -1,5 +1,6 @@
 """plan of a hall in which a tag hears the anchors within the radio's reach."""
 
+from dataclasses import replace
 import json
 
 import numpy as np
@@ -11,6 +12,7 @@ from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.hall import Hall, summary
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid, chart
+from uwb_tdoa_tools.simulation.walls import Walls
 
 REACH = 15.0  # m
 
@@ -43,6 +45,15 @@ def test_cells_hear_the_anchors_within_reach():
     assert not found.flyable[heard < 4].any() and np.isinf(found.error[heard < 4]).all()
 
 
+def test_cells_hear_nothing_through_a_wall():
+    anchors, walls = anchors_of(6, 5), Walls(((20.5, -50.0, 20.5, 50.0, np.inf),))
+    grid = Grid.slice((-4.0, 44.0), (-4.0, 36.0), 1.2, 8.0)
+    hall = replace(hall_of(anchors), walls=walls)
+    away = np.linalg.norm(grid.points[:, None] - anchors.positions, axis=2)
+    beside = (grid.points[:, None, 0] > 20.5) == (anchors.positions[:, 0] > 20.5)
+    np.testing.assert_array_equal([len(rows) for rows in hall.heard(grid.points)], np.sum((away <= REACH) & beside, axis=1))
+
+
 def test_where_all_are_heard_it_is_the_chart_of_a_room():
     anchors = anchors_of(3, 3)
     grid, hall = Grid.slice((1.0, 15.0), (1.0, 15.0), 1.2, 2.0), hall_of(anchors, 100.0)
@@ -72,9 +83,12 @@ def test_the_command_writes_a_picture_and_says_who_hears_how_many(tmp_path, caps
         "8",
         "--jobs",
         "1",
+        "--walls",
+        str(tmp_path / "walls.yaml"),
         "--out",
         str(tmp_path / "out"),
     ]
+    (tmp_path / "walls.yaml").write_text("walls: [[20.5, -50, 20.5, 20]]\n")
     assert main(command) == 0
     assert "anchors heard" in capsys.readouterr().out
     assert {"hall.png", "plan.json", "flyable.npz", "plan.bag"} <= {path.name for path in (tmp_path / "out").iterdir()}
@@ -94,5 +108,6 @@ def test_what_a_hall_does_not_have_is_refused(tmp_path, capsys):
     anchors_of(6, 5).to_yaml(tmp_path / "hall.yaml")
     command = [str(tmp_path / "hall.yaml"), "--radio-reach", "15", "--out", str(tmp_path / "out")]
     assert main([*command, "--check"]) == 2 and "leave out --check" in capsys.readouterr().err
+    assert main([command[0], *command[3:], "--walls", "walls.yaml"]) == 2 and "give --radio-reach too" in capsys.readouterr().err
     command[2] = "-1"
     assert main(command) == 2 and "radio reach" in capsys.readouterr().err

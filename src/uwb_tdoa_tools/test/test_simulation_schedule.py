@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_tools.simulation.schedule import PROTOCOLS, make_schedule, within_reach
+from uwb_tdoa_tools.simulation.schedule import PROTOCOLS, among_heard, make_schedule
+from uwb_tdoa_tools.simulation.walls import heard_at
 
 
 def schedule(protocol, n_anchors=8, duration=60.0, seed=0):
@@ -52,16 +53,32 @@ def test_seeded(protocol):
     assert schedule(protocol, seed=4).t[0] != schedule(protocol, seed=5).t[0]
 
 
-@given(st.sampled_from(PROTOCOLS), st.floats(4.0, 30.0), st.integers(0, 100))
-def test_within_reach_only_anchors_that_are_near_are_heard(protocol, reach, seed):
+def across_a_hall(protocol, reach, seed, cells=None):
+    """(Schedule, place (n, 3) of each measurement, positions (40, 3)) of a tag that crosses 60 m of a hall."""
     rng = np.random.default_rng(seed)
     positions = np.column_stack([rng.uniform(0.0, 60.0, (40, 2)), rng.uniform(0.0, 5.0, 40)])
     schedule = make_schedule(protocol, len(positions), 2.0, rng)
     p = np.column_stack([np.linspace(5.0, 55.0, len(schedule.t)), np.full((len(schedule.t), 2), (30.0, 1.0))])
-    near = within_reach(schedule, p, positions, reach, protocol, rng)
-    there = p[np.searchsorted(schedule.t, near.t)]
+    near = among_heard(schedule, heard_at(p, positions, reach), protocol, rng, cells)
+    assert np.isin(near.t, schedule.t).all()
+    return near, p[np.searchsorted(schedule.t, near.t)], positions
+
+
+@given(st.sampled_from(PROTOCOLS), st.floats(4.0, 30.0), st.integers(0, 100))
+def test_within_reach_only_anchors_that_are_near_are_heard(protocol, reach, seed):
+    near, there, positions = across_a_hall(protocol, reach, seed)
     for rows, heard in ((near.a, near.heard_a), (near.b, near.heard_b)):
         np.testing.assert_array_equal(near.sender[heard], rows)
-    assert (near.a != near.b).all() and np.isin(near.t, schedule.t).all()
+    assert (near.a != near.b).all()
     assert (np.linalg.norm(there - positions[near.b], axis=1) <= reach).all()
     assert (np.linalg.norm(there - positions[near.a], axis=1) <= reach).all()
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_tdoas_are_of_two_anchors_of_one_cell(protocol):
+    cells = np.arange(40) // 10
+    near, _, _ = across_a_hall(protocol, 30.0, 0, cells)
+    np.testing.assert_array_equal(cells[near.a], cells[near.b])
+    assert (near.a != near.b).all() and len(np.unique(cells[near.a])) == 4
+    mixed, _, _ = across_a_hall(protocol, 30.0, 0)
+    assert (cells[mixed.a] != cells[mixed.b]).any()

@@ -42,7 +42,7 @@ def parser() -> ArgumentParser:
         "plan square.yaml --planar --height 0.2 --check --out plan/",
         "plan survey.txt --volume --with height --flights flights/0425 --out plan/",
         "plan survey.txt --volume --improve add --out plan/",
-        "plan hall.yaml --radio-reach 18 --height 1.2 --out plan/",
+        "plan hall.yaml --radio-reach 18 --height 1.2 --walls walls.yaml --out plan/",
     )
     number: dict[str, Any] = {"type": float}
     path: dict[str, Any] = {"type": Path}
@@ -75,6 +75,7 @@ def parser() -> ArgumentParser:
     unique = "one solution by every pairing alone or by a whole round (default: pairings; with --radio-reach: round)"
     add("--flyable", choices=FLYABLE, help=unique)
     add("--radio-reach", metavar="M", **number, help="a hall: the tag hears the anchors within that, not all; many more anchors are possible")
+    add("--walls", metavar="FILE", **path, help="with --radio-reach: no signal comes through these, YAML, walls: [[x0, y0, x1, y1], ...]")
 
     more = made.add_argument_group("more")
     add = more.add_argument
@@ -94,6 +95,8 @@ def _plan(args: Namespace) -> None:
     cli.check_folders(args.json)
     args.flyable = args.flyable or ("pairings" if args.radio_reach is None else "round")
     anchors = read_survey(args.anchors)
+    if args.walls is not None and args.radio_reach is None:
+        raise InputError("walls: are for a hall of which a tag hears a part; give --radio-reach too.")
     installation = options.installation_of(args, anchors)
     room = options.room_for(args, anchors)
     grid = options.grid_of(args, room)

@@ -20,6 +20,7 @@ from ..simulation.plots import check_image, plot
 from ..simulation.schedule import PROTOCOLS
 from ..simulation.summary import catalogue, summary
 from ..simulation.trajectories import TRAJECTORIES
+from ..simulation.walls import Walls
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -41,6 +42,7 @@ def parser() -> ArgumentParser:
         "simulate --trajectory circle --protocol tdoa3 --height-noise 0.01 --seed 7 --out circle.bag --plot circle.png",
         "simulate --constellation random-12-16 --duration 120 --out unseen.bag --json unseen.json",
         "simulate --anchors hall.yaml --radio-reach 18 --protocol tdoa3 --duration 300 --out hall.bag",
+        "simulate --anchors hall.yaml --radio-reach 18 --walls walls.yaml --cell-ids 256 --protocol tdoa3 --out cells.bag",
         "simulate --no-bias --no-multipath --no-outliers --noise 0 --perfect-imu --out exact.bag",
         "simulate --list",
     )
@@ -70,6 +72,8 @@ def parser() -> ArgumentParser:
     off: dict[str, Any] = {"action": "store_false"}
     add("--protocol", choices=PROTOCOLS, default=default.protocol, help="(default: tdoa2)")
     add("--radio-reach", metavar="M", type=float, help="anchors farther from the tag than that are not heard (default: all are)")
+    add("--walls", metavar="FILE.yaml", type=Path, help="no signal comes through these: walls: [[x0, y0, x1, y1], ...], m, with a height or without")
+    add("--cell-ids", metavar="N", type=int, help="cells with clocks of their own: TDOAs only between anchors with the same id // N")
     add("--noise", dest="noise_std", metavar="M", type=float, default=default.noise_std, help="standard deviation, m (default: 0.06)")
     add("--shared-noise", action="store_true", help="TDOAs made from the same reception share its noise")
     add(
@@ -124,6 +128,7 @@ def _simulate(args: Namespace) -> None:
 def _config(args: Namespace) -> SimulationConfig:
     """SimulationConfig of the options, most of which have the names of its fields."""
     values = {field.name: getattr(args, field.name) for field in fields(SimulationConfig) if hasattr(args, field.name)}
+    values["walls"] = None if args.walls is None else Walls.from_yaml(args.walls)
     values["anchors"] = None if args.anchors is None else Anchors.from_yaml(args.anchors)
     values["imu_errors"] = NO_IMU_ERRORS if args.perfect_imu else ImuErrors(vibration=args.vibration)
     return SimulationConfig(**values)

@@ -14,6 +14,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import parallel
 from ..checking.sides import sides_of, to_copy
 from ..scoring.plots import plt
+from ..simulation.walls import heard_at
 from .bifurcation import CLEAR, Subsets
 from .maps import Chart
 from .precision import bound, dilution, information, position_error
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
     from uwb_tdoa_bias.foundation.anchors import Anchors
+    from ..simulation.walls import Walls
     from .goal import Goal
     from .maps import Grid
 
@@ -38,18 +40,18 @@ HEARD_COLOURS = [0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25]  # bounds of the colour
 
 @dataclass(frozen=True)
 class Hall:
-    """goal : Goal, whose points are not used; anchors : Anchors; reach : m. Can be pickled."""
+    """goal : Goal, whose points are not used; anchors : Anchors; reach : m; walls : Walls, or None. Can be pickled."""
 
     goal: Goal
     anchors: Anchors
     reach: float
+    walls: Walls | None = None
 
     def heard(self, points: np.ndarray) -> list[np.ndarray]:
-        """Rows of the anchors within reach of points (n, 3) m, the nearest first: list of (k,) arrays."""
-        tree = cKDTree(self.anchors.positions)
+        """Rows of the anchors that are heard at points (n, 3) m, the nearest first: list of (k,) arrays."""
         return [
-            np.array(rows)[np.argsort(np.linalg.norm(self.anchors.positions[rows] - p, axis=1))] if rows else np.empty(0, int)
-            for p, rows in zip(points, tree.query_ball_point(points, self.reach))
+            rows[np.argsort(np.linalg.norm(self.anchors.positions[rows] - p, axis=1))]
+            for p, rows in zip(points, heard_at(points, self.anchors.positions, self.reach, self.walls))
         ]
 
     def chart(self, grid: Grid, jobs: int | None = None, dask: str | None = None) -> tuple[Chart, np.ndarray]:
@@ -115,7 +117,7 @@ class Hall:
             position = np.array([*points[cell, :2].round(1), floor + ANCHOR_HEIGHT])
             near = holes[tree.query_ball_point(position, self.reach)]
             near = near[np.linspace(0, len(near) - 1, min(len(near), LOOKED_AT)).astype(int)] if len(near) else near
-            more = Hall(self.goal, _with(self.anchors, position), self.reach)
+            more = Hall(self.goal, _with(self.anchors, position), self.reach, self.walls)
             gained = 0
             for rows, point in zip(more.heard(points[near]), points[near]):
                 nearest = sorted(rows[:MOST_HEARD].tolist())
@@ -167,8 +169,9 @@ def say(about: dict[str, Any], addition: dict[str, Any] | None, side: dict[str, 
         print(f"one more anchor would help most near ({at}): {100.0 * (about['flyable_share'] + addition['gain']):.1f} % of the cells")
 
 
-def plot(anchors: Anchors, chart: Chart, heard: np.ndarray, path: str | Path) -> None:
+def plot(hall: Hall, chart: Chart, heard: np.ndarray, path: str | Path) -> None:
     """How many are heard, and how precise a round is where it can be flown; seen from above, of the middle layer."""
+    anchors = hall.anchors
     x, y, z = chart.grid.axes
     k, wide = len(z) // 2, np.ptp(x) > 1.2 * np.ptp(y)
     shape, ratio = ((2, 1) if wide else (1, 2)), (np.ptp(y) + 1.0) / (np.ptp(x) + 1.0)
@@ -184,6 +187,8 @@ def plot(anchors: Anchors, chart: Chart, heard: np.ndarray, path: str | Path) ->
         ax.set_facecolor("0.75")
         mesh = ax.pcolormesh(x, y, chart.grid.layer(values, k), shading="nearest", rasterized=True, **kind)
         ax.plot(*anchors.positions[:, :2].T, "r^", ms=float(np.clip(60.0 / np.sqrt(len(anchors)), 1.5, 6.0)), mew=0.0)
+        for x0, y0, x1, y1, _ in hall.walls.segments if hall.walls else ():
+            ax.plot([x0, x1], [y0, y1], "w-", lw=2.0)
         ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
         figure.colorbar(mesh, ax=ax, label=label, shrink=0.85)
     figure.suptitle(f"{len(anchors)} anchors, z = {z[k]:.2f} m: {100.0 * chart.flyable.mean():.0f} % can be flown", fontsize=11)

@@ -13,6 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import cli
 from ..progress import Progress
 from ..readers.inputs import Reading
+from ..simulation.walls import Walls
 from . import accuracy, hall, layout, messages, options, plots, report
 from .check import brute_force
 from .maps import Grid, chart, flyable
@@ -44,14 +45,15 @@ def plan_hall(
         raise InputError(f"radio reach: {args.radio_reach:g} m is none; give one above 0, e.g. 18.")
     report.say_room(room, args.room is not None)
     cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
-    whole = hall.Hall(options.goal_of(args, installation), anchors, args.radio_reach)
+    walls = None if args.walls is None else Walls.from_yaml(args.walls)
+    whole = hall.Hall(options.goal_of(args, installation), anchors, args.radio_reach, walls)
     found, heard = whole.chart(grid, args.jobs, args.dask)
     figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args)}
     figures["map"] = hall.summary(found, heard)
     figures["addition"] = whole.addition(found, room.lower[2])
     figures["side"] = whole.side(grid.points)
     hall.say(figures["map"], figures["addition"], figures["side"])
-    hall.plot(anchors, found, heard, args.out / "hall.png")
+    hall.plot(whole, found, heard, args.out / "hall.png")
     found.volume(anchors, installation.dimensions).save(args.out / "flyable.npz")
     outgoing = messages.messages(found, anchors)
     messages.write(outgoing, args.out / "plan.bag")

@@ -16,6 +16,7 @@ from .imu import ImuErrors
 from .room import room_of
 from .schedule import PROTOCOLS
 from .trajectories import TRAJECTORIES
+from .walls import Walls
 
 if TYPE_CHECKING:
     from .room import Room
@@ -62,6 +63,9 @@ class SimulationConfig(_Noises):
     ---------------------
     protocol : "tdoa2" (ring, about 475 per second) or "tdoa3" (any pair, about 240 per second) (default "tdoa2")
     radio_reach : m; anchors farther from the tag than that are not heard (default None: all are)
+    walls : Walls that no signal comes through, with radio_reach (default None)
+    cell_ids : anchors of one cell, which have a clock of their own, have ids with the same id // cell_ids; TDOAs are of two anchors of one
+        cell; with radio_reach (default None: all anchors have one clock)
     noise_std : standard deviation of the white noise of one TDOA, m; 0 for none (default 0.06)
     anchor_noise_std : standard deviation of the arrival noise of each anchor, m, in the order of the anchors; a TDOA
         then has the root of the summed squares of its two (default None: noise_std / sqrt(2) for every anchor)
@@ -99,6 +103,8 @@ class SimulationConfig(_Noises):
     truth_rate: float = 250.0
     protocol: str = "tdoa2"
     radio_reach: float | None = None
+    walls: Walls | None = None
+    cell_ids: int | None = None
     noise_std: float = 0.06
     anchor_noise_std: tuple[float, ...] | None = None
     shared_noise: bool = False
@@ -117,6 +123,11 @@ class SimulationConfig(_Noises):
             value = getattr(self, name)
             if not (isinstance(value, (int, np.integer)) and 0 <= value < 2**32):
                 raise InputError(f"{name}: {value!r} is not a whole number from 0 to 4294967295.")
+        if self.cell_ids is not None and not (isinstance(self.cell_ids, (int, np.integer)) and self.cell_ids >= 2):
+            raise InputError(f"cell_ids: {self.cell_ids!r} is not a whole number of at least 2; give how many ids each cell may use, e.g. 256.")
+        for name in ("walls", "cell_ids"):
+            if getattr(self, name) is not None and self.radio_reach is None:
+                raise InputError(f"{name}: says which anchors are heard together where not all are; give radio_reach too.")
         for name, lowest, highest in (
             ("duration", 1.0, 3600.0),
             ("speed", 0.01, 20.0),
@@ -184,4 +195,5 @@ class SimulationConfig(_Noises):
         """Plain numbers, strings and lists, for Flight.meta and JSON; the anchors by their ids."""
         content = asdict(replace(self, anchors=None))
         content["anchors"] = None if self.anchors is None else self.anchors.ids.tolist()
+        content["walls"] = None if self.walls is None else [[x for x in wall if x < np.inf] for wall in self.walls.segments]
         return content

@@ -13,7 +13,8 @@ from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_bias.foundation.radio import FLAT_MOUNT, RadioLink, arrival_bias
 
-from .schedule import make_schedule, within_reach
+from .schedule import among_heard, make_schedule
+from .walls import heard_at
 
 if TYPE_CHECKING:
     from .config import SimulationConfig
@@ -56,11 +57,12 @@ def measure(
     anchors, random = config.anchors, config.random
     schedule = make_schedule(config.protocol, len(anchors), config.duration, random("schedule"))
     if config.radio_reach is not None:
-        p = trajectory.motion(schedule.t).p
-        schedule = within_reach(schedule, p, anchors.positions, config.radio_reach, config.protocol, random("reach"))
+        heard = heard_at(trajectory.motion(schedule.t).p, anchors.positions, config.radio_reach, config.walls)
+        cells = None if config.cell_ids is None else anchors.ids // config.cell_ids
+        schedule = among_heard(schedule, heard, config.protocol, random("reach"), cells)
         if not len(schedule.t):
             raise InputError(
-                f"radio_reach: two anchors are nowhere within {config.radio_reach:g} m of the path; give a larger one, or another place."
+                f"radio_reach: two anchors are nowhere heard within {config.radio_reach:g} m of the path; give a larger one, or another place."
             )
     t, a, b = schedule.t, schedule.a, schedule.b
     motion = trajectory.motion(t)

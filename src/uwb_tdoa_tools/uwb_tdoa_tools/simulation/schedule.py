@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 SLOT = 2.0e-3  # s, TDOA2: one packet per slot
 SLOT_JITTER = 1.0e-4  # s, standard deviation of a stamp around its slot
@@ -45,14 +48,15 @@ def make_schedule(
     return _tdoa3(n_anchors, duration, rng, TDOA3_MEAN_WAIT if rate is None else max(1.0 / rate - TDOA3_DEAD_TIME, 0.0))
 
 
-def within_reach(
-    schedule: Schedule, p: np.ndarray, positions: np.ndarray, reach: float, protocol: str, rng: np.random.Generator
+def among_heard(
+    schedule: Schedule, heard: Sequence[np.ndarray], protocol: str, rng: np.random.Generator, cells: np.ndarray | None = None
 ) -> Schedule:
-    """The Schedule among anchors of which the tag hears those that are within reach, m; p (n, 3) m, of the tag at each measurement;
-    positions (N, 3) m, of the anchors. Where it hears fewer than two there is nothing.
+    """The Schedule among anchors of which the tag hears some. heard : rows of those at each measurement, rising, n arrays; cells (N,) :
+    number of the cell of each anchor, whose anchors have a clock of their own, so that TDOAs are of two anchors of one cell; None for one
+    clock. Where fewer than two are heard there is nothing.
 
-    TDOA2: those that are heard send in turn, in the order of their rows, as cells that are out of each other's reach use slots again.
-    TDOA3: any two of those that are heard.
+    TDOA2: those that are heard, in cells of one of them, send in turn, in the order of their rows, as cells that are out of each other's
+    reach use slots again. TDOA3: any two of those that are heard, in cells of one of them. Which cell it is is drawn, by how many are heard.
     """
     rows, pairs, numbers = [], [], []  # of measurements, (a, b) and their receptions
     senders: list[int] = []  # row of the anchor of each reception
@@ -62,8 +66,9 @@ def within_reach(
         latest[anchor] = len(senders)
         senders.append(anchor)
 
-    heard = cKDTree(positions).query_ball_point(p, reach, return_sorted=True)
-    chosen = rng.random((len(p), 2))
+    chosen = rng.random((len(heard), 2))
+    if cells is not None:
+        heard = [_of_one_cell(near, cells, draw) for near, draw in zip(heard, rng.random(len(heard)))]
     for row, (near, (first, second)) in enumerate(zip(heard, chosen)):
         if len(near) < 2:
             continue
@@ -73,7 +78,7 @@ def within_reach(
         else:
             b = int(first * len(near))
             a = (b + 1 + int(second * (len(near) - 1))) % len(near)
-        a, b = near[a], near[b]
+        a, b = int(near[a]), int(near[b])
         if a not in latest:
             receive(a)
         of_a = latest[a]
@@ -84,6 +89,11 @@ def within_reach(
     (rows_a, rows_b), (heard_a, heard_b) = (np.array(each, int).reshape(-1, 2).T for each in (pairs, numbers))
     sender = np.array(senders, int)
     return replace(schedule, t=schedule.t[rows], a=rows_a, b=rows_b, heard_a=heard_a, heard_b=heard_b, sender=sender)
+
+
+def _of_one_cell(near: np.ndarray, cells: np.ndarray, draw: float) -> np.ndarray:
+    """Those of the rows of anchors, (k,), that are in the cell of one of them, which a number 0 ... 1 draws."""
+    return near[cells[near] == cells[near[int(draw * len(near))]]] if len(near) else near
 
 
 def _tdoa2(n_anchors: int, duration: float, rng: np.random.Generator, loss: float) -> Schedule:
