@@ -7,9 +7,10 @@ import numpy as np
 from uwb_tdoa_bias.foundation.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.crazyflie.log_blocks import PERIOD
-from uwb_tdoa_tools.crazyflie.streamed import Link, as_received, streamed
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
+
+from .radio_link import Link, as_received, streamed
 
 WAYS = {
     "log as it is, 1 kHz IMU": lambda flight: flight,

@@ -23,7 +23,8 @@ from uwb_tdoa_tools.scoring.by_phase import Together
 from uwb_tdoa_tools.scoring.metrics import READY, Score
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners, facing
-from uwb_tdoa_tools.simulation.path import Path, between
+
+from .any_path import Path, between
 
 RIGHT, FOR = 0.5, 2.0  # m: an estimate that is off by less for so many seconds, or to the end, is right again
 FLYING = ImuErrors(vibration=1.0)

@@ -21,7 +21,7 @@ from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import cli, parallel
 from uwb_tdoa_tools.flying import fleet
-from uwb_tdoa_tools.flying.path import Circles, Sines
+from uwb_tdoa_tools.flying.path import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.world import World
 from uwb_tdoa_tools.simulation.constellations import constellation
@@ -29,6 +29,7 @@ from uwb_tdoa_tools.simulation.room import room_of
 from uwb_tdoa_tools.training import labels, models, physics
 
 from . import pictures
+from .sines import Sines
 
 TRAINING = "corners", "wall_middles", "staircase"
 KNOWN, UNSEEN = TRAINING[0], ("low_ceiling", "random-7", "random-8")

@@ -5,9 +5,10 @@ import json
 import pytest
 
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_tools.training import simulated, structured
+from uwb_tdoa_tools.training import structured
 
 from studies import __main__ as study
+from studies.training import simulated
 
 
 @pytest.fixture(autouse=True)

@@ -12,8 +12,9 @@ from tqdm import tqdm
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.readers import inputs
-from uwb_tdoa_tools.training import models, simulated
+from uwb_tdoa_tools.training import models
 
+from . import simulated
 from .comparison import compare
 from .table import markdown
 

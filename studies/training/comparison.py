@@ -10,9 +10,9 @@ from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.scoring.metrics import pooled
 from uwb_tdoa_tools.training import labels as labelling
 from uwb_tdoa_tools.training import models, physics
-from uwb_tdoa_tools.training.plots import plot_bars, plot_histograms
 
 from . import bounds
+from .pictures import plot_bars, plot_histograms
 
 BOUNDS = {"oracle 0.5 s": 0.5, "oracle 1 s": 1.0, "oracle 2 s": 2.0}
 

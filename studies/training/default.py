@@ -18,7 +18,9 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.training import labels as labelling
-from uwb_tdoa_tools.training import models, simulated, structured
+from uwb_tdoa_tools.training import models, structured
+
+from . import simulated
 
 FLIGHTS, SEED, SPACING = 20, 100, 0.02  # in each constellation; first seed; s between samples
 OPTIONS = structured.Options(centres=10, link_centres=100)

@@ -1,7 +1,5 @@
-"""Log variables of a Crazyflie, sampled and late, to streams; and the example node around that."""
+"""Log variables of a Crazyflie to streams; studies/test/test_study_radio_link.py runs the example node around that."""
 
-from dataclasses import replace
-import json
 import subprocess
 import sys
 
@@ -10,17 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.crazyflie.log_blocks import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
-from uwb_tdoa_tools.crazyflie.streamed import BLOCKS, PAIRS, Link, as_received, messages, streamed
-from uwb_tdoa_tools.scoring.evaluation import evaluate
-from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-
-
-@pytest.fixture(scope="module")
-def flight():
-    rates = dict(duration=12.0, imu_rate=500.0, truth_rate=50.0)
-    return simulate(SimulationConfig(seed=1, outlier_probability=0.0, start_in_air=True, **rates))
 
 
 def test_a_value_is_a_measurement_once():
@@ -52,39 +40,6 @@ def test_the_clock_is_off_by_the_least_delay_and_never_runs_back_far(delays, off
         assert stamped >= t + offset - 1e-6
 
 
-def test_what_is_sent_fits_the_link(flight):
-    assert sum(map(len, BLOCKS)) == 14 and all(4 * len(block) <= 26 for block in BLOCKS)
-    sent = messages(flight, Link(lost=0.1), np.random.default_rng(0))
-    assert len(sent) / 12.0 == pytest.approx(3 * 0.9 / PERIOD, rel=0.03)
-    arrivals = [message[0] for message in sent]
-    assert arrivals == sorted(arrivals)
-
-
-def test_what_comes_out_was_measured_and_in_time(flight):
-    made = streamed(flight, Link())
-    known = {pair: np.flatnonzero((flight.tdoa.a == pair[0]) & (flight.tdoa.b == pair[1])) for pair in pairs()}
-    late = []
-    for t, a, b, d in zip(made.tdoa.t, made.tdoa.a, made.tdoa.b, made.tdoa.d):
-        rows = known[a, b]
-        row = rows[np.argmin(np.abs(flight.tdoa.d[rows] - d))]
-        assert abs(flight.tdoa.d[row] - d) < 1e-6
-        late.append(t - flight.tdoa.t[row])
-    assert np.median(late) == pytest.approx(Link().latency, abs=0.003) and np.ptp(late) < 2.0 * PERIOD
-    assert 0.7 < len(made.tdoa) / len(flight.tdoa) <= 1.0
-    assert len(as_received(flight, Link()).tdoa) > 1.5 * len(flight.tdoa)
-    assert 1.0 / np.median(np.diff(made.imu.t)) == pytest.approx(1.0 / PERIOD, rel=0.1)
-
-
-def pairs():
-    return [(int(name[7]), int(name[9])) for name in PAIRS]
-
-
-def test_the_estimate_loses_little(flight):
-    direct = evaluate(flight, FilterConfig())[0].row()["rmse_3d"]
-    for link in (Link(), Link(half=True, lost=0.05)):
-        assert evaluate(streamed(flight, link), FilterConfig())[0].row()["rmse_3d"] < direct + 0.03
-
-
 def test_the_example_says_what_is_missing():
     pytest.importorskip("rclpy")
     pytest.importorskip("uwb_tdoa_msgs.msg")
@@ -94,90 +49,3 @@ def test_the_example_says_what_is_missing():
     if "crazyflie_interfaces" not in done.stderr:
         pytest.skip("crazyswarm2 is installed")
     assert done.returncode == 1 and done.stderr.count("\n") == 1 and "install crazyswarm2" in done.stderr
-
-
-PLAYER = """
-import json, sys, time, rclpy
-from crazyflie_interfaces.msg import LogDataGeneric
-from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Imu
-from uwb_tdoa_msgs.msg import Tdoa
-
-rclpy.init()
-node = rclpy.create_node("player")
-tdoas, samples, deep = [], [], QoSProfile(depth=20000)
-node.create_subscription(Tdoa, "uwb/tdoa", tdoas.append, deep)
-node.create_subscription(Imu, "imu/data", samples.append, deep)
-topics = [node.create_publisher(LogDataGeneric, name, deep) for name in ("tdoa_a", "tdoa_b", "imu")]
-sent, expected = json.load(open(sys.argv[1]))
-while not all(topic.get_subscription_count() for topic in topics):
-    rclpy.spin_once(node, timeout_sec=0.1)
-seconds = lambda stamp: stamp.sec + 1e-9 * stamp.nanosec
-for number, (arrival, block, timestamp, values) in enumerate(sent):
-    message = LogDataGeneric(timestamp=timestamp, values=values)
-    message.header.stamp.sec, message.header.stamp.nanosec = int(arrival), int(1e9 * (arrival % 1.0))
-    topics[block].publish(message)
-    before, again = len(samples), time.monotonic() + 1.0
-    while block == 2 and len(samples) == before:  # in order over all topics: the next goes when this has come back
-        rclpy.spin_once(node, timeout_sec=0.1)
-        if not before and time.monotonic() > again:  # the first, of which the answer was lost: the node did not know us yet
-            topics[block].publish(message)
-            again = time.monotonic() + 1.0
-    rclpy.spin_once(node, timeout_sec=0.002)
-until = time.monotonic() + 120.0
-while len(tdoas) < expected and time.monotonic() < until:
-    rclpy.spin_once(node, timeout_sec=0.05)
-samples = list({seconds(m.header.stamp): m for m in samples}.values())
-rows = [(seconds(m.header.stamp), m.anchor_a, m.anchor_b, m.distance_difference) for m in tdoas]
-print(json.dumps({"tdoas": rows, "samples": [(seconds(m.header.stamp), m.linear_acceleration.z) for m in samples]}))
-"""
-CMAKE = """
-cmake_minimum_required(VERSION 3.8)
-project(crazyflie_interfaces)
-find_package(ament_cmake REQUIRED)
-find_package(rosidl_default_generators REQUIRED)
-find_package(std_msgs REQUIRED)
-rosidl_generate_interfaces(${PROJECT_NAME} msg/LogDataGeneric.msg DEPENDENCIES std_msgs)
-ament_package()
-"""
-
-
-@pytest.mark.slow
-def test_the_example_over_topics_gives_what_the_converter_gives(flight, tmp_path):
-    """With a LogDataGeneric as crazyswarm2 defines it, built for the test."""
-    pytest.importorskip("rclpy")
-    pytest.importorskip("colcon_core")
-    package = tmp_path / "src" / "crazyflie_interfaces"
-    (package / "msg").mkdir(parents=True)
-    (package / "msg" / "LogDataGeneric.msg").write_text("std_msgs/Header header\nuint32 timestamp\nfloat32[] values\n")
-    (package / "CMakeLists.txt").write_text(CMAKE)
-    ours = (ROOT / "src" / "uwb_tdoa_msgs" / "package.xml").read_text()
-    without = "".join(line for line in ours.splitlines(True) if "geometry_msgs" not in line)
-    (package / "package.xml").write_text(without.replace("uwb_tdoa_msgs", "crazyflie_interfaces"))
-    build = [sys.executable, "-m", "colcon", "--log-base", "log", "build", "--merge-install"]
-    build += ["--cmake-args", f"-DPython3_EXECUTABLE={sys.executable}"]
-    subprocess.run(build, cwd=tmp_path, check=True, capture_output=True)
-    short, link = replace(flight, tdoa=_until(flight.tdoa, 4.0), imu=_until(flight.imu, 4.0)), Link()
-    sent = [
-        (arrival, number, int(timestamp), values.tolist())
-        for arrival, number, timestamp, values in messages(short, link, np.random.default_rng(0))
-    ]
-    expected = streamed(short, link)
-    (tmp_path / "sent.json").write_text(json.dumps([sent, len(expected.tdoa)]))
-    (tmp_path / "player.py").write_text(PLAYER)
-    script = f"source install/local_setup.bash; {sys.executable} {ROOT / 'docs/connect/crazyflie_node.py'} & node=$!; "
-    script += f"{sys.executable} player.py sent.json; kill -INT $node; wait $node"
-    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=600)
-    assert done.stderr == ""
-    got = json.loads(done.stdout)
-    t, a, b, d = (np.array(column) for column in zip(*sorted(got["tdoas"])))
-    assert len(t) == len(expected.tdoa) and len(got["samples"]) == len(expected.imu)
-    # Topics overtake each other by a few messages, over which the clock drifts by microseconds.
-    np.testing.assert_allclose(np.sort(t), np.sort(expected.tdoa.t), atol=1e-4)
-    np.testing.assert_allclose(np.sort(d), np.sort(expected.tdoa.d), atol=1e-9)
-    assert np.mean([z for _, z in got["samples"]]) == pytest.approx(expected.imu.accel[:, 2].mean(), abs=1e-6)
-
-
-def _until(stream, length):
-    rows = stream.t < stream.t[0] + length
-    return type(stream)(*(column[rows] for column in vars(stream).values()))

@@ -1,12 +1,9 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.path import SINK, Circles, Sines
-from uwb_tdoa_tools.simulation.constellations import constellation
-from uwb_tdoa_tools.simulation.room import room_of
+from uwb_tdoa_tools.flying.path import SINK, Circles
 
 GROUND = 0.03
-ROOM = room_of(constellation("corners"))
 
 
 def followed(path, place=(0.3, -0.2)):
@@ -16,7 +13,7 @@ def followed(path, place=(0.3, -0.2)):
     return reference, t, reference.at(t)
 
 
-@pytest.mark.parametrize("path", [Circles(), Circles(swing=0.4), Circles(radius=0.0), Sines(ROOM, 3)])
+@pytest.mark.parametrize("path", [Circles(), Circles(swing=0.4), Circles(radius=0.0)])
 def test_it_begins_and_ends_at_rest_in_one_place_and_then_sinks(path):
     reference, t, wanted = followed(path)
     for k, height in ((0, GROUND), (-1, GROUND + 0.4)):
@@ -32,14 +29,3 @@ def test_a_swing_is_one_of_the_height_alone():
     off = swung[:, 0] - level[:, 0]
     np.testing.assert_allclose(off[:, :2], 0.0, atol=1e-9)
     assert off[:, 2].max() == pytest.approx(0.4, abs=1e-3) and off[:, 2].min() == pytest.approx(-0.4, abs=1e-3)
-
-
-def test_sines_fill_the_room_stay_inside_and_turn():
-    reference, t, wanted = followed(Sines(ROOM, 3), (0.0, 0.0))
-    air = wanted[(t > 10.0) & (t < 56.0), 0]
-    low, high = ROOM.flyable
-    assert (air >= low).all() and (air <= high).all() and (np.ptp(air, axis=0) > 0.4 * (high - low)).all()
-    speed = np.linalg.norm(wanted[:, 1], axis=1)
-    assert np.sqrt(np.mean(speed**2)) == pytest.approx(0.7, abs=0.2) and speed.max() < 2.0
-    assert reference.turned(10.0) == pytest.approx(3.0)
-    assert np.abs(followed(Sines(ROOM, 4), (0.0, 0.0))[2] - wanted).max() > 0.5

@@ -7,14 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from ..simulation.config import SimulationConfig
-from ..simulation.room import Room
-from ..simulation.trajectories import sines
-
 KNOT, FINE = 0.02, 0.0025  # s, of the spline, and of the points at which it is looked up
 SPEED_UP = 1.5  # s, from hovering to the circle and back
 CLIMB = 0.4  # of the time up, and of that down, to get as fast as it climbs, and the same to stop
-AWAY = 6.0  # s, from the middle to the sines and back
 SETTLE = 0.4  # m above the ground from which it sinks slowly
 SINK = 0.2  # m/s
 
@@ -41,48 +36,15 @@ class Circles:
         """The Reference from `place` (2,) m, where the circle is entered at its point nearest to +x; ground : m, height at which the body
         stands."""
         knots = np.arange(0.0, self.duration + KNOT, KNOT)
-        up = _cruise(knots / self.rise, CLIMB)
-        down = _cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
+        up = cruise(knots / self.rise, CLIMB)
+        down = cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
         air = self.turns * self.turn_time
-        angle = 2.0 * np.pi * self.turns * _cruise((knots - self.rise) / air, SPEED_UP / air)
+        angle = 2.0 * np.pi * self.turns * cruise((knots - self.rise) / air, SPEED_UP / air)
         p = np.empty((len(knots), 3))
         p[:, 0] = place[0] + self.radius * (np.cos(angle) - 1.0)
         p[:, 1] = place[1] + self.radius * np.sin(angle)
         p[:, 2] = ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
         return Reference(p)
-
-
-@dataclass(frozen=True)
-class Sines:
-    """Up, through a whole room in products of sines (`simulate`'s, those of the training flights of Zhao et al. 2021), back, and down.
-    room : Room; seed : of the sines; height, rise, fall : as of Circles; seconds : in the air; speed : m/s, root mean square; turning :
-    rad/s, all the while."""
-
-    room: Room
-    seed: int
-    height: float = 1.2
-    rise: float = 3.0
-    fall: float = 4.0
-    seconds: float = 60.0
-    speed: float = 0.7
-    turning: float = 0.3
-    radius = 0.0  # m: it begins in the middle
-
-    @property
-    def duration(self) -> float:
-        """As of Circles."""
-        return self.rise + self.seconds + self.fall
-
-    def along(self, place: np.ndarray, ground: float) -> Reference:
-        """The Reference, as of Circles."""
-        knots = np.arange(0.0, self.duration + KNOT, KNOT)
-        up = _cruise(knots / self.rise, CLIMB)
-        down = _cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
-        p = np.empty((len(knots), 3))
-        p[:, :2], p[:, 2] = place, ground + self.height * up - (self.height - SETTLE) * down
-        away = _smooth((knots - self.rise) / AWAY) * _smooth((self.duration - self.fall - knots) / AWAY)
-        there = sines(knots, SimulationConfig(speed=self.speed), self.room, np.random.default_rng(self.seed))
-        return Reference(p + away[:, None] * (there - p), self.turning)
 
 
 class Reference:
@@ -116,15 +78,15 @@ def sinking(wanted: np.ndarray, after: np.ndarray) -> np.ndarray:
     return wanted
 
 
-def _smooth(x: np.ndarray) -> np.ndarray:
+def smooth(x: np.ndarray) -> np.ndarray:
     """0 to 1 with three derivatives zero at both ends."""
     x = np.clip(x, 0.0, 1.0)
     return x**4 * (35.0 - 84.0 * x + 70.0 * x**2 - 20.0 * x**3)
 
 
-def _cruise(x: np.ndarray, ramp: float) -> np.ndarray:
+def cruise(x: np.ndarray, ramp: float) -> np.ndarray:
     """0 to 1 over x in 0 ... 1, at one speed but for smooth ramps of that length at both ends."""
     fine = np.linspace(0.0, 1.0, 4001)
-    speed = _smooth(fine / ramp) * _smooth((1.0 - fine) / ramp)
+    speed = smooth(fine / ramp) * smooth((1.0 - fine) / ramp)
     way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))])
     return np.interp(x, fine, way / way[-1])  # held beyond

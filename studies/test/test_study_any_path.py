@@ -1,7 +1,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_tools.simulation.path import Path, between
+from studies.any_path import Path, between
 
 
 def test_the_motion_of_a_path_is_its_derivative_and_what_a_sensor_feels():

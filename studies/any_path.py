@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from .trajectories import DRAG, GRAVITY, STEP, Motion
+from uwb_tdoa_tools.simulation.trajectories import DRAG, GRAVITY, STEP, Motion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

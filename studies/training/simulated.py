@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ..simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
