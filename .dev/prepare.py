@@ -32,7 +32,7 @@ BASE_PYTHON = os.path.realpath(sys.executable)  # never the one of a virtual env
 OWN_ROS = os.environ.get("ROS_DISTRO") == "jazzy"  # the user has sourced one; else ROS comes from wheels
 # What a ROS installation may lack: the name to import, and the one in requirements.txt.
 MODULES = {name: name for name in "hypothesis joblib matplotlib numba onnx onnxruntime rosbags scipy tqdm".split()}
-MODULES |= {"PIL": "pillow", "sklearn": "scikit-learn", "yaml": "PyYAML"}
+MODULES |= {"PIL": "pillow", "jinja2": "Jinja2", "sklearn": "scikit-learn", "yaml": "PyYAML"}
 # Jazzy is built for numpy 1.26, and a pytest plugin of its launch_testing breaks newer pytests.
 LIMITS = ["numpy<2", "pytest<8"]
 

@@ -18,6 +18,7 @@ setup(
     install_requires=[
         "setuptools",
         "backports.zstd>=1.0; python_version < '3.14'",
+        "Jinja2>=3.1",
         "joblib>=1.3",
         "lz4>=4.0",
         "matplotlib>=3.6",
@@ -44,6 +45,7 @@ setup(
         (f"share/{NAME}/config", glob("config/*.yaml")),
         (f"share/{NAME}/launch", glob("launch/*.py")),
     ],
+    package_data={NAME: ["diagnosis/report/templates/*"]},
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [

@@ -1,6 +1,7 @@
 """What tests of reports share: findings and diagnoses made up, and pages read."""
 
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 import re
 
@@ -16,17 +17,8 @@ NAMES_BELOW = {"parameters", "std", "direction", "values", "autocorrelation"}
 
 def said(page):
     """The words of a page, without markup."""
-    text = re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.S)
-    for code, sign in (
-        ("&lt;", "<"),
-        ("&gt;", ">"),
-        ("&quot;", '"'),
-        ("&#x27;", "'"),
-        ("&amp;", "&"),
-        ("m/s²", "m/s^2"),
-    ):
-        text = text.replace(code, sign)
-    return " ".join(text.split())
+    text = unescape(re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.S))
+    return " ".join(text.replace("m/s²", "m/s^2").split())
 
 
 def finding(effect, added=True, worth=0.02, alternatives=(), tried=True, channel="tdoa"):

@@ -15,16 +15,17 @@ from uwb_tdoa_tools.diagnosis.findings import EffectFinding, Refused
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative, Unobservable
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
-from uwb_tdoa_tools.diagnosis.report import curves, maps, pictures, room, sections
+from uwb_tdoa_tools.diagnosis.report import curves, maps, pictures, room
 from uwb_tdoa_tools.diagnosis.report.apply import applying
 from uwb_tdoa_tools.diagnosis.report.entries import doubt_in_words, entries, worth_in_words
-from uwb_tdoa_tools.diagnosis.report.style import STYLE
+from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.diagnosis.report.unclear import by_remedy, untold
 from uwb_tdoa_tools.diagnosis.report.verdict import verdict
 from uwb_tdoa_tools.diagnosis.report.words import TERMS
 from known_effects import clean_flight
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
+STYLE = (Path(maps.__file__).parent / "templates" / "style.css").read_text()
 ELSEWHERE = Alternative("pair_offset", 0.95, None, "TDoA3")
 AS_WELL = Alternative("anchor_position", 1.0, 2.0, "a flight on several sides")
 
@@ -312,6 +313,16 @@ def test_a_page_holds_everything_itself_and_is_light(all_pages):
         assert len(page) < 1_000_000
 
 
+def test_names_of_others_are_text(result):
+    name = """</title><script>alert('"')</script>"""
+    flights = tuple(replace(flight, name=name) for flight in result.flights)
+    sides = [{**side, "runs": [{**run, "flight": name} for run in side["runs"]]} for side in (result.before, result.after)]
+    page = replace(result, flights=flights, before=sides[0], after=sides[1], applying=((name, name),)).as_html()
+    assert "<script" not in page and Tags(page).open == []
+    assert name in said(page)
+    assert any(name in attributes["alt"] for tag, attributes, _ in Tags(page).seen if tag == "img")
+
+
 def test_a_page_is_well_formed_and_every_picture_is_described(all_pages):
     for page in all_pages:
         tags = Tags(page)
@@ -354,7 +365,7 @@ def test_a_row_is_either_worth_something_or_says_why_it_is_not_in_the_file(resul
     changed = replace(
         result, findings=findings, refused=[Refused("floor_multipath", "does not make the filter better")]
     )
-    text = said(sections.worth(changed, entries(changed)))
+    text = said(html(changed, "worth"))
     assert "3.0 cm" in text and "not in effects.yaml: does not make the filter better" in text
     assert "yes" not in text.split() and "0 %" not in text
     assert "Nothing else in the catalogue explains as much." in text  # of the delay, that nothing imitates
@@ -366,7 +377,7 @@ def test_advice_on_what_is_not_added_is_less_urgent(result):
         finding(delay(), worth=0.0),
         finding(EFFECTS["outlier_rate"]({"share": 0.1}, {"share": 0.01}), False, None, tried=False),
     ]
-    text = said(sections.to_do(result, entries(replace(result, findings=findings))))
+    text = said(html(replace(result, findings=findings), "to_do"))
     todo, _, rest = text.partition("Seen too, not worth a visit")
     assert "Calibrate" not in todo and "Calibrate the antenna delay" in rest and "10 ± 1 % of the TDOAs" in rest
 
@@ -375,7 +386,7 @@ def test_what_gains_less_than_half_a_centimetre_is_asked_of_nobody_unless_it_is_
     sign = EFFECTS["pair_sign"]({"0-1": -1.0}, {})
     for effect, worth, asked in ((delay(), 0.0045, False), (delay(), 0.0055, True), (sign, 0.001, True)):
         changed = replace(result, findings=[finding(effect, worth=worth)])
-        todo, _, rest = said(sections.to_do(changed, entries(changed))).partition("Seen too, not worth a visit")
+        todo, _, rest = said(html(changed, "to_do")).partition("Seen too, not worth a visit")
         (sentence,) = effect.advice()
         assert (sentence in todo, sentence in rest) == (asked, not asked)
         assert any(line.startswith("do ") for line in changed.as_text().splitlines()) == asked
@@ -385,12 +396,12 @@ def test_values_of_many_anchors_are_a_table(result):
     few, many = ({str(k): 0.1 + 0.01 * k for k in range(n)} for n in (3, 5))
     for values in (few, many):
         effect = EFFECTS["anchor_delay"](values, dict.fromkeys(values, 0.01))
-        page = sections.to_do(result, entries(replace(result, findings=[finding(effect)])))
+        page = html(replace(result, findings=[finding(effect)]), "to_do")
         assert ("<table>" in page) == (len(values) > 3)
     text = said(page)
     assert "Calibrate the antenna delay of anchors 0, 1, 2, 3 and 4." in text and "4 +14 ± 1" in text and "[cm]" in text
     shifts = EFFECTS["anchor_position"]({f"{k}.{axis}": 0.2 for k in range(4) for axis in "xz"}, {f"{k}.x": 0.01 for k in range(4)})
-    text = said(sections.to_do(result, entries(replace(result, findings=[finding(shifts)]))))
+    text = said(html(replace(result, findings=[finding(shifts)]), "to_do"))
     assert (
         "Measure anchors 0, 1, 2 and 3 again before you move them. If the survey proves right" in text
         and "anchor x [cm] z [cm] 0 +20 ± 1 +20" in text
@@ -407,9 +418,9 @@ def test_angles_are_in_degrees(result):
 
 def test_labels_of_anchors_lie_on_nothing(result, monkeypatch):
     drawn = []
-    monkeypatch.setattr(maps, "embedded", lambda figure, *_: drawn.append(figure) or "")
-    page = maps.maps(result)
-    assert page.count("Triangles: anchors") == 1 and f"Flight: {result.before['runs'][0]['flight']}." in page
+    monkeypatch.setattr(maps, "embedded", lambda figure, *_: drawn.append(figure))
+    caption, _ = maps.maps(result)
+    assert "Triangles: anchors" in caption and f"Flight: {result.before['runs'][0]['flight']}." in caption
     assert len(drawn) == 2
     for figure in drawn:
         figure.canvas.draw()
@@ -438,8 +449,8 @@ def test_a_blocked_region_is_on_the_map_and_in_the_list(result):
     changed = replace(result, findings=[finding(effect)], effects=EffectSet((effect,)))
     shifts, (region,) = room.shifts_and_regions(changed)
     assert shifts == {} and region.anchor == 1 and region.radius == 1.0
-    assert "1 region where an anchor is disturbed" in maps.maps(changed)
-    assert "anchor 1 and (-0.9, -1.2, 2.0) m" in said(sections.to_do(changed, entries(changed)))
+    assert all("1 region where an anchor is disturbed" in one.alt for one in maps.maps(changed)[1])
+    assert "anchor 1 and (-0.9, -1.2, 2.0) m" in said(html(changed, "to_do"))
 
 
 def test_shifts_of_anchors_add_up_over_effects(result):
@@ -476,7 +487,7 @@ def test_runs_without_an_estimate_are_left_out(result):
     assert len(run.t) == 15 and run.t[0] == pytest.approx(0.5)
     sides = [{**side, "scores": [lost]} for side in (result.before, result.after)]
     changed = replace(result, before=sides[0], after=sides[1])
-    assert curves.errors_over_time(changed) == "" and "estimated path" in maps.maps(changed)
+    assert curves.errors_over_time(changed) == ([], 0) and "estimated path" in maps.maps(changed)[0]
 
 
 def test_a_curve_keeps_its_largest_value():
@@ -488,7 +499,7 @@ def test_a_curve_keeps_its_largest_value():
 
 def test_the_smaller_kind_of_picture_is_taken():
     few, _ = pictures.drawing(2.0)
-    assert "data:image/svg+xml" in pictures.embedded(few, "empty axes", "")
+    assert "data:image/svg+xml" in pictures.embedded(few, "empty axes").source
     many, ax = pictures.drawing(2.0)
     ax.plot(np.random.default_rng(0).random((20_000, 2)), ".")
-    assert "data:image/png" in pictures.embedded(many, "many dots", "")
+    assert "data:image/png" in pictures.embedded(many, "many dots").source

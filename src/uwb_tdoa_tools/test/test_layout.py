@@ -38,6 +38,7 @@ KEYS = {
     "dask": (None, "distributed"),
     "distributed": (None, "distributed"),
     "hypothesis": ("python3-hypothesis", "hypothesis"),
+    "jinja2": ("python3-jinja2", "Jinja2"),
     "joblib": ("python3-joblib", "joblib"),
     "lz4": (None, "lz4"),
     "matplotlib": ("python3-matplotlib", "matplotlib"),
@@ -243,7 +244,7 @@ def test_commands_are_thin(module):
     text = modules()[module].read_text()
     body = ast.parse(text).body
     functions = {node.name for node in body if isinstance(node, ast.FunctionDef)}
-    assert {"main", "parser"} <= functions and 'if __name__ == "__main__":\n    sys.exit(main())' in text
+    assert "parser" in functions and re.search(r'\nmain = cli.executable\(.*\)\n\nif __name__ == "__main__":\n    sys.exit\(main\(\)\)\n$', text)
     imported = [
         node for node in body if isinstance(node, (ast.Import, ast.ImportFrom)) or ast.unparse(node).startswith("if TYPE_CHECKING:")
     ]

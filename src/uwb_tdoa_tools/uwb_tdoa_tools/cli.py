@@ -1,12 +1,11 @@
 """What the mains of all executables share: the look of --help, and how a failure is told and counted.
 
-    def main(argv=None):
-        return cli.run(_convert, parser(), argv)          # _convert(args) -> exit code, None for 0
-
     def parser():
         made = cli.parser("convert", "Convert a log to a bag.", "convert flight.log --survey s.txt --out flight.bag")
         made.add_argument("log")
         return made
+
+    main = cli.executable(_convert, parser)          # _convert(args) -> exit code, None for 0
 """
 
 from __future__ import annotations
@@ -46,6 +45,13 @@ def parser(name: str, description: str, *examples: str) -> argparse.ArgumentPars
     )
     made.add_argument("--version", action="version", version=f"{name} of {written_by()}")
     return made
+
+
+def executable(
+    command: Callable[[argparse.Namespace], int | None], parser: Callable[[], argparse.ArgumentParser], ros: bool = False
+) -> Callable[..., int]:
+    """The function main(argv=None) of an executable: `run` with what parser() gives."""
+    return lambda argv=None: run(command, parser(), argv, ros)
 
 
 def run(

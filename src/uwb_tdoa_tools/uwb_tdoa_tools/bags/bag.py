@@ -188,7 +188,6 @@ def read_bag(
     with numbers that are not finite.
     """
     with open_bag(path, salvage) as reader:
-        connections = _connections(reader)
         about = _about(path)
         meta = {**about["meta"], "bag": str(path)}
         remarks, name_of, frames = [], Names(namespace, topics), {}
@@ -198,8 +197,8 @@ def read_bag(
             make: Callable[[np.ndarray, np.ndarray], Made],
             sound: Callable[[np.ndarray], np.ndarray] = bag_messages.sound,
         ) -> Made | None:  # fmt: skip
-            found = _find(path, connections, name_of(topic), msgtype)
-            stamps, rows, falls, frames[topic] = _table(path, reader, found, row)
+            found = read_topic(path, reader, name_of(topic), msgtype, row)
+            (stamps, rows, falls), frames[topic] = found.in_order(), found.frames
             if falls:
                 meta.setdefault("reordered", {})[topic] = falls
             if not len(stamps):
@@ -220,10 +219,10 @@ def read_bag(
             tdoa = bag_messages.tdoas_of(np.empty(0), np.empty((0, 4)))
         if tdoa is None:
             count = reader.unreadable[name_of("uwb/tdoa")]
-            why = f"{count} that are there cannot be read" if count else _others(connections, namespace)
+            why = f"{count} that are there cannot be read" if count else _others(reader, namespace)
             raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {why}.")
         if anchors is None:
-            anchors = _read_anchors(path, reader, connections, name_of("uwb/anchors"))
+            anchors = read_anchors(path, reader, name_of("uwb/anchors"))
         if anchors is None:
             raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
         imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
@@ -252,9 +251,8 @@ def read_odometry(
     """
     with open_bag(path, salvage) as reader:
         topic = Names(namespace, topics)("odometry")
-        names = _connections(reader)
-        found = _find(path, names, topic, "nav_msgs/msg/Odometry")
-        t, rows, *_ = _table(path, reader, found, bag_messages.odometry_row)
+        names = [connection.topic for connection in reader.connections]
+        t, rows, _ = read_topic(path, reader, topic, "nav_msgs/msg/Odometry", bag_messages.odometry_row).in_order()
         remarks = tuple(remarks_of(reader))
     if not len(t):
         others = " or ".join(f"--topic odometry={name}" for name in names if name.endswith("/odometry"))
@@ -274,7 +272,7 @@ def late_tdoas(
     0 where that was not recorded. Arguments as of `read_odometry`. Raises InputError."""
     beside = Names(namespace, topics)("odometry").rpartition("/")[0]
     with open_bag(path, salvage) as reader:
-        found = _find(path, _connections(reader), f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual")
+        found = _connections(path, reader, f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual")
         return sum(residual.verdict == residual.VERDICT_LATE for _, _, residual in readable(path, reader, found))
 
 
@@ -286,7 +284,7 @@ def read_fields(path: str | Path, topic: str, namespace: str = "") -> dict[str, 
     """
     with open_bag(path) as reader:
         topic = Names(namespace)(topic)
-        found = _find(path, _connections(reader), topic)
+        found = _connections(path, reader, topic)
         if not found:
             raise InputError(f"{path}: has no topic {topic}; record it.")
         recorded = [message for _, _, message in readable(path, reader, found)]
@@ -299,10 +297,6 @@ def read_fields(path: str | Path, topic: str, namespace: str = "") -> dict[str, 
         if isinstance(values[0], (bool, int, float, str)):
             columns[name] = np.array(values)[order]
     return columns
-
-
-def _connections(reader: BagReader) -> dict[str, Connection]:
-    return {connection.topic: connection for connection in reader.connections}
 
 
 def _about(path: str | Path) -> dict[str, Any]:
@@ -346,59 +340,58 @@ class Names:
         return f"/{name.strip('/')}" if absolute else f"/{self._namespace}/{name.strip('/')}"
 
 
-def _find(
-    path: str | Path, connections: dict[str, Connection], topic: str, msgtype: str | None = None
-) -> list[Connection]:
-    """The connection of a topic as a list, empty if it is not there; raises InputError if its type is another."""
-    connection = connections.get(topic)
-    if connection is None:
-        return []
-    if msgtype is not None and connection.msgtype != msgtype:
-        raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {msgtype} is needed there.")
-    check_type(path, connection)
-    return [connection]
+@dataclass(frozen=True)
+class TopicMessages:
+    """Messages of a topic in the order of the bag. stamps, arrived : (n,) int ns, of their headers, and of when they were recorded; rows :
+    (n, k), what else was taken of each; frames : {frame_id: messages}."""
+
+    stamps: np.ndarray
+    arrived: np.ndarray
+    rows: np.ndarray
+    frames: Counter[str]
+
+    def in_order(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """(stamps (n,) s, rows (n, k)) in order of the stamps, and how often these fell."""
+        order = np.argsort(self.stamps, kind="stable")
+        return self.stamps[order] / 1e9, self.rows[order], int((np.diff(self.stamps) < 0).sum())
 
 
-def _table(
-    path: str | Path, reader: BagReader, connections: list[Connection], row: Callable[[Any], tuple[float, ...]]
-) -> tuple[np.ndarray, np.ndarray, int, Counter[str]]:
-    """Stamps (n,) s, the other columns (n, k) of row(message) in order of stamps, how often the stamps fell, and
-    {frame_id: messages}."""
-    rows = []
-    frames: Counter[str] = Counter()
-    for _, _, message in readable(path, reader, connections):
+def read_topic(path: str | Path, reader: BagReader, topic: str, msgtype: str, row: Callable[[Any], tuple[float, ...]]) -> TopicMessages:
+    """TopicMessages of a topic, none if it is not there. row(message) : its stamp, ns, and k other numbers. Raises InputError if its type is
+    another than msgtype."""
+    arrived, rows, frames = [], [], Counter[str]()
+    for _, received, message in readable(path, reader, _connections(path, reader, topic, msgtype)):
+        arrived.append(received)
         rows.append(row(message))
         frames[message.header.frame_id] += 1
-    if not rows:
-        return np.empty(0), np.empty((0, 1)), 0, frames
-    stamps = np.array([values[0] for values in rows], dtype=np.int64)
-    table = np.array([values[1:] for values in rows], dtype=float)
-    falls = int((np.diff(stamps) < 0).sum())
-    if falls:
-        order = np.argsort(stamps, kind="stable")
-        stamps, table = stamps[order], table[order]
-    return stamps / 1e9, table, falls, frames
+    stamps, table = np.array([values[0] for values in rows], dtype=np.int64), np.array([values[1:] for values in rows], dtype=float)
+    return TopicMessages(stamps, np.array(arrived, dtype=np.int64), table, frames)
 
 
-def _read_anchors(
-    path: str | Path, reader: BagReader, connections: dict[str, Connection], topic: str
-) -> Anchors | None:
-    """The last Anchors of a topic, or None."""
-    found = _find(path, connections, topic, "uwb_tdoa_msgs/msg/AnchorArray")
+def read_anchors(path: str | Path, reader: BagReader, topic: str) -> Anchors | None:
+    """The last Anchors of a topic, or None. Raises InputError."""
     last = None
-    for _, _, last in readable(path, reader, found):
+    for _, _, last in readable(path, reader, _connections(path, reader, topic, "uwb_tdoa_msgs/msg/AnchorArray")):
         pass
-    if last is None:
-        return None
     try:
-        return Anchors.from_message(last)
+        return None if last is None else Anchors.from_message(last)
     except InputError as error:
         raise InputError(f"{path}: {topic}: {error}") from error
 
 
-def _others(connections: dict[str, Connection], namespace: str) -> str:
+def _connections(path: str | Path, reader: BagReader, topic: str, msgtype: str | None = None) -> list[Connection]:
+    """The connections of a topic; raises InputError if their type is another, or not known."""
+    found = [connection for connection in reader.connections if connection.topic == topic]
+    for connection in found:
+        if msgtype is not None and connection.msgtype != msgtype:
+            raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {msgtype} is needed there.")
+        check_type(path, connection)
+    return found
+
+
+def _others(reader: BagReader, namespace: str) -> str:
     """Where the bag has such a topic instead, for an error message."""
-    places = sorted(topic.removesuffix("/uwb/tdoa") for topic in connections if topic.endswith("/uwb/tdoa"))
+    places = sorted({one.topic.removesuffix("/uwb/tdoa") for one in reader.connections if one.topic.endswith("/uwb/tdoa")})
     places = [place for place in places if place.strip("/") != namespace.strip("/")]
     if places:
         return f"give the namespace it was recorded in: {', '.join(place or '/' for place in places)}"

@@ -1,6 +1,7 @@
 """MCAP files record by record (https://mcap.dev/spec): what rosbags does not check, and what is left of a cut one.
 
-Sizes are compared with the file, or bounded, before anything is read or unpacked.
+Sizes are compared with the file, or bounded, before anything is read or unpacked. The package `mcap` (1.6) does neither: it unpacks a chunk
+whatever it unpacks to, does not compare the index with the chunks, and cannot fill in the checksums that rosbags leaves out.
 """
 
 from __future__ import annotations

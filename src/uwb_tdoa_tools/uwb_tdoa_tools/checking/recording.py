@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 import tempfile
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,9 +15,8 @@ from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 
 from ..bags import messages as bag_messages, placing
-from ..bags.bag import Names, is_bag
-from ..bags.files import open_bag, readable, remarks_of
-from ..bags.message_types import check_type
+from ..bags.bag import Names, is_bag, read_anchors, read_topic
+from ..bags.files import open_bag, remarks_of
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
 
@@ -26,12 +24,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_bias.foundation.sensors.sensor import Sensor, Stream
+    from ..bags.bag import TopicMessages
     from ..bags.files import BagReader
     from ..bags.placing import Place
     from ..readers.inputs import Reading
     from .wiring import End
-
-Made = TypeVar("Made")
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
 HEARD = (TDOA, IMU, "uwb/anchors", *(of.topics[0][0] for of in SENSORS.values()), "uwb/tdoa_corrected", "odometry", "uwb/residual")
@@ -112,10 +109,10 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     name_of = Names(reading.namespace, reading.topics)
     with open_bag(path, reading.salvage) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
-        tdoa, imu = (_stream(path, reader, name_of(topic), *_ROWS[topic]) for topic in (TDOA, IMU))
+        tdoa, imu = (read_topic(path, reader, name_of(topic), *_ROWS[topic]) for topic in (TDOA, IMU))
         sensors = {name: _stream_of(path, reader, name_of(sensor.topics[0][0]), sensor) for name, sensor in SENSORS.items()}
         sensors = {name: stream for name, stream in sensors.items() if len(stream)}
-        recorded = _last(path, reader, name_of("uwb/anchors"), Anchors.from_message)
+        recorded = read_anchors(path, reader, name_of("uwb/anchors"))
         tree = placing.read_frames(path, reader)
         remarks = tuple(remarks_of(reader))
     if not len(tdoa.stamps) and not sensors.keys() & set(LOCATING):
@@ -126,16 +123,16 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     anchors = read_survey(survey) if survey else recorded
     if anchors is None:
         raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
-    samples = bag_messages.imu_of(imu.stamps, imu.rows) if len(imu.stamps) else None
+    samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
     if samples is not None and (place := placing.placed(tree, IMU, imu.frames)[0]):
         samples = placing.imu_in_body(samples, place)
     return Recording(
         name=path.stem,
         anchors=anchors,
-        tdoa=bag_messages.tdoas_of(tdoa.stamps, tdoa.rows.reshape(len(tdoa.stamps), 4)),
+        tdoa=bag_messages.tdoas_of(tdoa.stamps / 1e9, tdoa.rows.reshape(len(tdoa.stamps), 4)),
         imu=samples,
-        tdoa_arrival=tdoa.arrival,
-        imu_arrival=imu.arrival,
+        tdoa_arrival=_arrival(tdoa),
+        imu_arrival=_arrival(imu),
         frames={topic: dict(stream.frames) for topic, stream in ((TDOA, tdoa), (IMU, imu)) if len(stream.stamps)},
         places={frame: place for frame in {*tdoa.frames, *imu.frames} if (place := placing.place_of(tree, frame))},
         topics=topics,
@@ -145,49 +142,14 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     )
 
 
-@dataclass
-class _Stream:
-    stamps: np.ndarray
-    arrival: np.ndarray
-    rows: np.ndarray
-    frames: Counter[str]
-
-
-def _stream(path: Path, reader: BagReader, topic: str, kind: str, row: Callable[[Any], tuple[float, ...]]) -> _Stream:
-    """Messages of one topic in the order of the bag. A bag whose times are the stamps themselves tells no arrivals."""
-    connections = [c for c in reader.connections if c.topic == topic]
-    for connection in connections:
-        if connection.msgtype != kind:
-            raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {kind} is needed there.")
-        check_type(path, connection)
-    arrived, rows = [], []
-    frames: Counter[str] = Counter()
-    for _, received, message in readable(path, reader, connections):
-        arrived.append(received)
-        rows.append(row(message))
-        frames[message.header.frame_id] += 1
-    stamps, arrivals = np.array([r[0] for r in rows], dtype=np.int64), np.array(arrived, dtype=np.int64)
-    table = np.array([r[1:] for r in rows], dtype=float)
-    known = bool((stamps != arrivals).any())
-    return _Stream(stamps / 1e9, arrivals / 1e9 if known else np.full(len(rows), np.nan), table, frames)
+def _arrival(messages: TopicMessages) -> np.ndarray:
+    """(n,) s at which messages were recorded; NaN of a bag whose times are the stamps themselves: they tell no arrivals."""
+    known = bool((messages.stamps != messages.arrived).any())
+    return messages.arrived / 1e9 if known else np.full(len(messages.arrived), np.nan)
 
 
 def _stream_of(path: Path, reader: BagReader, topic: str, sensor: Sensor) -> Stream:
     """Stream of a Sensor."""
     row, make, _ = bag_messages.of_sensor(sensor)
-    found = _stream(path, reader, topic, sensor.message, row)
-    return make(found.stamps, found.rows.reshape(len(found.stamps), sum(sensor.fields.values())))
-
-
-def _last(path: Path, reader: BagReader, topic: str, make: Callable[[Any], Made]) -> Made | None:
-    """make(the last message of a topic), or None."""
-    found = None
-    connections = [c for c in reader.connections if c.topic == topic]
-    for connection in connections:
-        check_type(path, connection)
-    for _, _, message in readable(path, reader, connections):
-        try:
-            found = make(message)
-        except InputError as error:
-            raise InputError(f"{path}: {topic}: {error}") from error
-    return found
+    found = read_topic(path, reader, topic, sensor.message, row)
+    return make(found.stamps / 1e9, found.rows.reshape(len(found.stamps), sum(sensor.fields.values())))

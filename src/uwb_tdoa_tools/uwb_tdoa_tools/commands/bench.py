@@ -13,7 +13,6 @@ from ..benchmark.suite import PARTS, measure
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
 
 DESCRIPTION = """Measure on this machine, in this run: the compiled core, whole recordings, both nodes live, several
 tags, replays, and what else nodes answer. Figures are medians with their quartiles, beside their targets.
@@ -30,11 +29,6 @@ With --peer, another filter, e.g. that of a firmware, runs over the same events 
 Real nodes run in a ROS domain of their own. Whatever else the machine does shows in the figures, above all in the
 latencies: what others used is printed. The last example keeps them away.
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_bench, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -75,6 +69,8 @@ def _bench(args: Namespace) -> None:
     if args.json is not None:
         cli.write_json(args.json, {"machine": machine, "figures": as_json(figures)})
 
+
+main = cli.executable(_bench, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -36,11 +36,6 @@ lines that start the nodes. --quick says within a minute what that is likely to 
 Exit code: 0 calibrated (--quick: worth it), 1 stopped, 2 bad input."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_calibrate, parser(), argv)
-
-
 def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
@@ -132,6 +127,8 @@ def _write(made: Calibration, out: Path, recordings: Sequence[str | Path], truth
     cli.show("fly by it:", *command_lines.nodes(survey, corrected, tuned))
     return 0
 
+
+main = cli.executable(_calibrate, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -19,7 +19,7 @@ from ..readers import read_survey
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from ..checking.recording import Recording
     from ..readers.inputs import Reading
@@ -32,11 +32,6 @@ and a line to copy. Where --survey is a folder, the survey that fits is named, t
 used. With --live it listens to the topics themselves, and also says who publishes and hears them, and with which QoS.
 
 Exit code: 0 nothing is wrong (there may be warnings), 1 there are errors, 2 bad input."""
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_check, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -99,6 +94,8 @@ def _surveys(folder: Path) -> list[tuple[str, Anchors]]:
     """[(path, Anchors)] of a folder of surveys."""
     return [(str(path), read_survey(path)) for path in sorted(folder.glob("anchor_?*"))]
 
+
+main = cli.executable(_check, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

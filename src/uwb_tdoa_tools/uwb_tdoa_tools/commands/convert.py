@@ -20,7 +20,7 @@ from ..scoring.settling import on_one_clock
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
     from uwb_tdoa_bias.foundation.flight import Flight
     from ..readers.names import Named
 
@@ -31,11 +31,6 @@ CSV file or several of any other tool (cells divided by commas, semicolons or ta
 the survey has for them; records with empty cells are left out and counted). The new bag has imu/data, uwb/tdoa,
 uwb/anchors, ground_truth/pose and /tf_static. It appears only when it is complete.
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_convert, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -126,6 +121,8 @@ def _read(args: Namespace, named: Named | None) -> Flight:
         raise InputError(f"IN: {len(args.input)} recordings are given; convert one by one, or name --columns.")
     return options.reading_of(args).one(args.input[0])
 
+
+main = cli.executable(_convert, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

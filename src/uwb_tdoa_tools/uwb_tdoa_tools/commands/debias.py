@@ -29,11 +29,6 @@ take it out.
 A map belongs to one room, one anchor constellation and one estimator. debias_node applies it on line."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(lambda args: {"fit": _fit, "judge": _judge}[args.command](args), parser(), argv)
-
-
 def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
@@ -112,6 +107,8 @@ def _write(path: str | Path | None, figures: dict[str, Any]) -> None:
     if path is not None:
         cli.write_json(path, figures)
 
+
+main = cli.executable(lambda args: {"fit": _fit, "judge": _judge}[args.command](args), parser)
 
 if __name__ == "__main__":
     sys.exit(main())

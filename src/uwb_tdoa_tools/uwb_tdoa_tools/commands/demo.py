@@ -32,11 +32,6 @@ without ROS. The exit code is 1 if the estimate diverged, or messages were lost 
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_demo, parser(), argv)
-
-
 def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
@@ -114,6 +109,8 @@ def _all_in_time(flight: Flight, became: dict[str, int]) -> bool:
     cli.show(f"nodes      IMU samples {samples}: {became['imu_late']} late, {became['imu_lost']} lost")
     return not any(became[name] for name in ("lost", "late", "imu_late", "imu_lost"))
 
+
+main = cli.executable(_demo, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

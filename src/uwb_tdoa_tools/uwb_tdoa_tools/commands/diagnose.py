@@ -23,7 +23,6 @@ from ..surveying.paths import DRIFT, read_paths
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
     from ..diagnosis.constraints.distance import Distance
     from ..diagnosis.constraints.mark import Mark
     from ..diagnosis.references.path import OdometryPath
@@ -41,11 +40,6 @@ UNUSED = {  # by references, of the options of what is known
     "truth": ("marks", "distances", "odometry"), "heights": ("marks", "distances", "odometry"), "odometry": ("distances",),
     "marks": ("odometry",), "nothing": ("odometry",),
 }  # fmt: skip
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_diagnose, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -128,6 +122,8 @@ def _diagnose(args: Namespace) -> None:
     cli.show(result.as_text())
     cli.show(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
 
+
+main = cli.executable(_diagnose, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

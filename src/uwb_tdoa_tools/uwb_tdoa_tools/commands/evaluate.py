@@ -18,15 +18,9 @@ from ..scoring.metrics import FIGURES, Pool, as_json
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
 
 NO_MATTER = ("flights", "survey", "json", "markdown", "beside", "resume", "jobs", "dask")  # to what is kept of a flight
 NOT_OF_ODOMETRY = "effects", "config", "model", "no_bias", "parameters", "without", "smooth"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_evaluate, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -108,6 +102,8 @@ def _evaluate(args: Namespace) -> int:
                 "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip
     return int(late > 0)
 
+
+main = cli.executable(_evaluate, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -20,9 +19,6 @@ from ..flying.trial import Task
 from ..flying.world import MOMENTS, WORLDS, world_of
 from ..results_file import asked_of
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 NO_MATTER = "flights", "seed", "jobs", "dask", "at_least", "json", "plot", "record", "resume"  # to what becomes of a flight
 DESCRIPTION = """Fly a simulated quadrotor in closed loop, in lockstep and without ROS: its controller gets position, velocity and
 attitude from nothing but the estimate, by the very code of ekf_node, and its rates from the gyroscope. Four seconds at rest, up to
@@ -30,11 +26,6 @@ attitude from nothing but the estimate, by the very code of ekf_node, and its ra
 
 A flight has landed if it took off, came down within 0.3 m of the wanted place at less than 0.6 m/s, and stands upright. Exit code 1
 if fewer than --at-least have."""
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_fly, parser(), argv)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -103,6 +94,8 @@ def _fly(args: argparse.Namespace) -> int:
         plot(pictures, world.anchors, args.plot)
     return int(summed["landed"] < args.at_least)
 
+
+main = cli.executable(_fly, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -15,18 +15,12 @@ from ..simulation.inject import catalogue, inject, parse_effect
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
 
 DESCRIPTION = """Add a declared effect to a flight, and write the flight that would have been recorded with it as a
 ROS 2 bag.
 
 A value is PARAMETER=NUMBER, as in effects.yaml; a number alone is for the effect's first parameter. --list shows
 them."""
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_inject, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -65,6 +59,8 @@ def _inject(args: Namespace) -> None:
     added = ", ".join(f"{key} = {value:g}" for key, value in effect.values.items())
     cli.show(f"{name}: added {effect.name} ({added}, in {effect.unit}) -> {args.out}")
 
+
+main = cli.executable(_inject, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

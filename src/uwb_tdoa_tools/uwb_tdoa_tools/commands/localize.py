@@ -13,7 +13,6 @@ from ..localizing.localize import Localizer, all_good, check_names
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
 
 DESCRIPTION = """Where the tag was: trajectories of recordings, without ground truth, which is not read.
 
@@ -26,11 +25,6 @@ It says how far each trajectory is to be believed, and what would make it better
 of the time; doubtful: the filter was lost, or began anew, or many TDOAs speak against it; bad: check finds an error, or there is none.
 
 Exit code: 0 all are good, 1 some are not, 2 bad input."""
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_localize, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -82,6 +76,8 @@ def _localize(args: Namespace) -> int:
         cli.write_json(args.json, {"flights": [one.as_dict() for one in located]})
     return int(not all_good(located))
 
+
+main = cli.executable(_localize, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

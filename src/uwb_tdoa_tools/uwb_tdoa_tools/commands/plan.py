@@ -22,12 +22,6 @@ from ..readers import inputs, read_survey
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_plan, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -133,6 +127,8 @@ def _plan(args: Namespace) -> None:
         report.say_improvement(figures["improve"])
     run.end(args, figures, outgoing)
 
+
+main = cli.executable(_plan, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -15,7 +15,7 @@ from ..live.session import PACKAGE
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
 DESCRIPTION = """Record ROS topics to a bag, like `ros2 bag record`, until SIGINT (Ctrl-C) or SIGTERM.
@@ -24,11 +24,6 @@ Topics are found as they appear; each is subscribed to with the strongest QoS th
 are stored as they come, with the time of their arrival. The bag appears when the recording ends. With --rerun, odometry,
 uwb/residual, uwb/anchors and uwb/tdoa, if they are recorded, are written for the viewer Rerun then, too.
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_record, parser(), argv, ros=True)
 
 
 def parser() -> ArgumentParser:
@@ -78,6 +73,8 @@ def _rerun_of(args: Namespace, say: Callable[[str], object]) -> Path | None:
 
     return options.rerun_of(args, 1, say)
 
+
+main = cli.executable(_record, parser, ros=True)
 
 if __name__ == "__main__":
     sys.exit(main())

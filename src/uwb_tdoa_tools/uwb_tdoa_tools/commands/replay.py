@@ -5,14 +5,10 @@ from __future__ import annotations
 import argparse
 from functools import partial
 import sys
-from typing import TYPE_CHECKING
 
 from .. import cli
 from ..live.replay import ACKNOWLEDGE_LIMIT, Options, replay
 from ..live.session import PACKAGE
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 bag play`.
 
@@ -25,11 +21,6 @@ subscription has everything, and tells what was published and how late; with cod
 the same. ROS arguments put all topics (but /tf, /clock and the like) into the namespace of a tag, or move single ones,
 as in the last examples.
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_replay, parser(), argv, ros=True)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -99,6 +90,8 @@ def _positive(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
     return value
 
+
+main = cli.executable(_replay, parser, ros=True)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -24,12 +24,6 @@ from ..simulation.walls import Walls
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_simulate, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -133,6 +127,8 @@ def _config(args: Namespace) -> SimulationConfig:
     values["imu_errors"] = NO_IMU_ERRORS if args.perfect_imu else ImuErrors(vibration=args.vibration)
     return SimulationConfig(**values)
 
+
+main = cli.executable(_simulate, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -16,7 +16,6 @@ from ..surveying.report import as_dict, as_text, picture
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
 
 DESCRIPTION = """Make a tape-measured survey better, from flights alone.
 
@@ -32,11 +31,6 @@ anchors, and how well all is known), ekf_node.yaml (noise that the filter should
 (covariance) and survey.png (before and after) to --out.
 
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_survey, parser(), argv)
 
 
 def parser() -> ArgumentParser:
@@ -84,6 +78,8 @@ def _survey(args: Namespace) -> int:
         cli.show(f"next: {command_lines.judging(args.flights, *files, all(flight.truth is not None for flight in flights))}")
     return 0 if result.why_not is None else 1
 
+
+main = cli.executable(_survey, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -26,11 +26,6 @@ NO_MATTER = ("flights", "survey", "name", "out", "resume", "jobs", "dask")  # to
 MOST = 1_500_000  # TDOAs; what they take: docs/speed.md
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The executable. Returns the exit code."""
-    return cli.run(_train, parser(), argv)
-
-
 def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
@@ -113,6 +108,8 @@ def _write(args: Namespace, several: Sequence[Flight], over: MapFunction, progre
     cli.write_json(args.out / "training.json", content)
     cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
 
+
+main = cli.executable(_train, parser)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..self_calibration.prior import DELAY, POSITION
-from .markup import paragraphs, section, table
+from .tables import Table
 
 if TYPE_CHECKING:
     from ..diagnose import Diagnosis
@@ -47,13 +47,7 @@ def lines(diagnosis: Diagnosis) -> list[str]:
     return [f"{TITLE} (? less than {SURE:g} standard deviations):", *("".join(f"{cell:>12s}" for cell in row) for row in several)]
 
 
-def fitted(diagnosis: Diagnosis) -> str:
-    """The section of the page; "" without any."""
+def table(diagnosis: Diagnosis) -> Table:
+    """The same for the page."""
     several = rows(diagnosis)
-    if not several:
-        return ""
-    words = (
-        f"± one standard deviation of where the anchor may be, not of the fit; ? marks less than {SURE:g} of them. What else makes such "
-        "errors, another one in each direction, or a delay, has been counted."
-    )
-    return section(TITLE, paragraphs([words], "note"), table(several[0], several[1:], range(1, len(several[0]))))
+    return Table(several[0], several[1:], range(1, len(several[0]))) if several else Table()

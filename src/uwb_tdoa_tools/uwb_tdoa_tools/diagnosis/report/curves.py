@@ -12,8 +12,7 @@ from uwb_tdoa_bias.effects.wording import listed
 
 from ..channels import CHANNELS
 from ..health import health
-from .markup import grid, paragraphs
-from .pictures import AFTER, BEFORE, COLOURS, FULL, WIDTH, drawing, embedded
+from .pictures import AFTER, BEFORE, COLOURS, FULL, WIDTH, Picture, drawing, embedded
 from .room import changed, flown
 from .runs import CM, labels
 
@@ -35,8 +34,8 @@ POINTS = 3000  # of a series of residuals
 ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 2, "frameon": False}  # of a legend
 
 
-def errors_over_time(diagnosis: Diagnosis) -> str:
-    """Markup: the 3D error of every judged flight before and after, the largest marked."""
+def errors_over_time(diagnosis: Diagnosis) -> tuple[list[Picture], int]:
+    """The 3D error of every judged flight before and after, the largest marked: (pictures, of how many flights)."""
     sides = [("before", BEFORE, diagnosis.before), ("after", AFTER, diagnosis.after)] if changed(diagnosis) else []
     sides = sides or [("error", AFTER, diagnosis.before)]
     curves = [
@@ -44,16 +43,11 @@ def errors_over_time(diagnosis: Diagnosis) -> str:
         for k in range(len(diagnosis.before["scores"]))
     ]
     runs = [(name, each) for name, each in zip(labels(diagnosis), curves) if each]
-    if not runs:
-        return ""
-    note = f"Distance between estimate and ground truth, judged on {diagnosis.judged_on}. Dots mark the largest."
-    if len(runs) > MOST:
-        note += f" The first {MOST} of {len(runs)} are shown."
-    top = CM * max(run.distance.max() for _, each in runs[:MOST] for _, _, run in each)
-    return paragraphs([note], "note") + "".join(_errors(name, each, top) for name, each in runs[:MOST])
+    top = CM * max((run.distance.max() for _, each in runs[:MOST] for _, _, run in each), default=0.0)
+    return [_errors(name, each, top) for name, each in runs[:MOST]], len(runs)
 
 
-def _errors(name: str, each: Sequence[_Curve], top: float) -> str:
+def _errors(name: str, each: Sequence[_Curve], top: float) -> Picture:
     """One picture; each : [(title, colour, Flown)]; top : cm, largest error that is to be seen."""
     largest = listed(f"{CM * run.distance.max():.0f} cm ({title})" for title, _, run in each)
     wide, narrow = (_drawn_errors(name, each, top, width) for width in (FULL, WIDTH))
@@ -95,18 +89,10 @@ def _peaks(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t[starts], largest
 
 
-def residual_series(diagnosis: Diagnosis) -> str:
-    """Markup: what every channel leaves in the first flight, before and after."""
+def residual_series(diagnosis: Diagnosis) -> list[Picture]:
+    """What every channel leaves in the first flight, before and after."""
     before, after = (_series(found[0]) for found in (diagnosis.attribution.residuals, diagnosis.remaining))
-    note = (
-        f"Measured minus modelled at the place and attitude of the reference, {diagnosis.flights[0].name}. A good "
-        "model leaves a narrow band about zero that does not wander. Where nothing has changed, before lies hidden "
-        "behind after."
-    )
-    names = [name for name in before if name in after]
-    return paragraphs([note], "note") + grid(
-        [_residuals(f"{name}, {diagnosis.flights[0].name}", before[name], after[name]) for name in names]
-    )
+    return [_residuals(f"{name}, {diagnosis.flights[0].name}", before[name], after[name]) for name in before if name in after]
 
 
 def _series(flight: ChannelResiduals) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -114,7 +100,7 @@ def _series(flight: ChannelResiduals) -> dict[str, tuple[np.ndarray, np.ndarray]
     return {label: series for part in flight.values() for label, series in part.series().items()}
 
 
-def _residuals(name: str, *sides: tuple[np.ndarray, np.ndarray]) -> str:
+def _residuals(name: str, *sides: tuple[np.ndarray, np.ndarray]) -> Picture:
     figure, ax = drawing(1.8)
     for side, colour, title in zip(sides, (BEFORE, AFTER), ("before", "after")):
         t, r = (values[:: max(1, len(values) // POINTS)] for values in side)
@@ -130,21 +116,21 @@ def _residuals(name: str, *sides: tuple[np.ndarray, np.ndarray]) -> str:
     return embedded(figure, f"Residual of {name} over time, standard deviation {scatter}")
 
 
-def pairs(diagnosis: Diagnosis) -> str:
-    """Markup: offset and scatter of every pair of anchors, before and after."""
+def pairs(diagnosis: Diagnosis) -> list[Picture]:
+    """Offset and scatter of every pair of anchors, before and after, in one picture, if there is any pair."""
     after = {item["pair"]: item for item in health(diagnosis.remaining)["pairs"]}
     before = {
         item["pair"]: item for item in diagnosis.health["pairs"] if item["count"] >= FEWEST and item["pair"] in after
     }
     names = sorted(before, key=lambda name: -before[name]["count"])[:PAIRS]
     if not names:
-        return ""
+        return []
     sides, of = (before, after), listed(flight.name for flight in diagnosis.flights)
     caption = (
         f"Dots: by how much the measurements of a pair are off, their median; bars: how much they scatter about it. Of {of}."
     )
     wide, narrow = (_drawn_pairs(names, sides, width) for width in (FULL, WIDTH))
-    return embedded(wide, "Offset and scatter of the residual of every pair of anchors, before and after", caption, narrow)
+    return [embedded(wide, "Offset and scatter of the residual of every pair of anchors, before and after", caption, narrow)]
 
 
 def _drawn_pairs(names: Sequence[str], sides: tuple[dict[str, Any], dict[str, Any]], width: float) -> Figure:
@@ -161,12 +147,12 @@ def _drawn_pairs(names: Sequence[str], sides: tuple[dict[str, Any], dict[str, An
     return figure
 
 
-def functions(diagnosis: Diagnosis) -> str:
-    """Markup: functions without a name, in the model or not."""
-    return grid([_function(finding.function) for finding in diagnosis.findings if finding.function][:FUNCTIONS])
+def functions(diagnosis: Diagnosis) -> list[Picture]:
+    """Functions without a name, in the model or not."""
+    return [_function(finding.function) for finding in diagnosis.findings if finding.function][:FUNCTIONS]
 
 
-def _function(effect: SmoothTerm) -> str:
+def _function(effect: SmoothTerm) -> Picture:
     at = np.linspace(effect.knots[0], effect.knots[-1], 60)
     prefixes = sorted({key.rpartition("c")[0] for key in effect.values})
     figure, ax = drawing(2.6)

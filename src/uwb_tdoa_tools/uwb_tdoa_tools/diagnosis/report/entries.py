@@ -27,6 +27,7 @@ WORTH_DOING = 0.005  # m of position: what gains less is not asked of anybody
 DEGREES = float(np.degrees(1.0))  # in a radian
 FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}
 SHOWN = 6  # values
+LONGEST = 8.0  # em, of a bar
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,12 @@ class Entry:
             isinstance(finding.effect, LabelEffect) for finding in self.findings
         )  # a plain mistake, to be put right whatever it is worth
         return self.added and (fault or self.worth is None or self.worth >= WORTH_DOING)
+
+    @property
+    def physics(self) -> str:
+        """Where it comes from, in words."""
+        first = self.findings[0]
+        return first.effect.physics if first.declared else "structure that no effect of the catalogue explains"
 
     @property
     def over_flights(self) -> str:
@@ -122,6 +129,20 @@ def certainty_in_words(entry: Entry) -> str:
         return "Nothing else in the catalogue explains as much."
     like = first.effect.confounded_with
     return f"Was not compared with others{f'; may be confused with {listed(like, OR)}' if like else ''}."
+
+
+def known_with(entry: Entry) -> list[str]:
+    """What has to be known with its advice: [sentence]."""
+    together = ", together" * (len(entry.advice) > 1)
+    worth = [] if entry.worth is None else [f"Worth {worth_in_words(entry)} of position{together}."]
+    doubt = " ".join(undecided_in_words(entry))
+    return worth + ([f"Make sure first: this {doubt[0].lower()}{doubt[1:]}"] if doubt else [])
+
+
+def bar(entry: Entry, found: Iterable[Entry]) -> float:
+    """em, length of the bar that shows its worth beside the largest of those that are added; 0 for none."""
+    largest = max((other.worth or 0.0 for other in found if other.added), default=0.0)
+    return LONGEST * entry.worth / largest if entry.worth and entry.worth >= LEAST_WORTH and largest > 0.0 else 0.0
 
 
 def by_flight(alternatives: Iterable[Alternative]) -> list[tuple[str, str]]:

@@ -12,8 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Ellipse
 from uwb_tdoa_bias.effects.wording import listed
 
-from .markup import grid, paragraphs
-from .pictures import FOUND, REGION, WIDTH, drawing, embedded, plt
+from .pictures import FOUND, REGION, WIDTH, Picture, drawing, embedded, plt
 from .room import CELL, VIEWS, changed, estimated, flown, mean_errors, shifts_and_regions
 
 if TYPE_CHECKING:
@@ -36,19 +35,19 @@ COLOURS = LinearSegmentedColormap.from_list("error", plt.get_cmap("viridis_r")(n
 ARROW = {"arrowstyle": "-|>", "color": FOUND, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
 
 
-def maps(diagnosis: Diagnosis) -> str:
-    """Markup: one map before and one after; one alone if nothing has changed, or nobody knows the errors."""
+def maps(diagnosis: Diagnosis) -> tuple[str, list[Picture]]:
+    """(caption of all, pictures): one map before and one after; one alone if nothing has changed, or nobody knows the errors."""
     sides = [(name, flown(side["scores"])) for name, side in (("before", diagnosis.before), ("after", diagnosis.after))]
     if not any(runs for _, runs in sides):
         arrows = Arrows.of(diagnosis, [])
-        return paragraphs([_caption(diagnosis, [], arrows.enlarged)], "note") + grid([_drawn(diagnosis, "", [], None, arrows)])
+        return _caption(diagnosis, [], arrows.enlarged), [_drawn(diagnosis, "", [], None, arrows)]
     if not changed(diagnosis):
         sides = [("", sides[0][1])]
     distances = np.concatenate([run.distance for _, runs in sides for run in runs])
     norm = Normalize(0.0, 100.0 * np.quantile(distances, BRIGHT))
     arrows = Arrows.of(diagnosis, [runs for _, runs in sides])
-    note = paragraphs([_caption(diagnosis, sides[0][1], arrows.enlarged)], "note")  # once for both
-    return note + grid([_drawn(diagnosis, title, runs, norm, arrows) for title, runs in sides])
+    caption = _caption(diagnosis, sides[0][1], arrows.enlarged)  # once for both
+    return caption, [_drawn(diagnosis, title, runs, norm, arrows) for title, runs in sides]
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class Arrows:
         )
 
 
-def _drawn(diagnosis: Diagnosis, title: str, runs: Sequence[Flown], norm: Normalize | None, arrows: Arrows) -> str:
+def _drawn(diagnosis: Diagnosis, title: str, runs: Sequence[Flown], norm: Normalize | None, arrows: Arrows) -> Picture:
     low, high = _limits(diagnosis, runs)
     size = high - low
     tall = WIDTH * 0.87 * (size[1] + size[2]) / size[0]

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import base64
 import io
-from html import escape
+from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 
 from ...scoring.plots import plt
-from .style import NARROW
-
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -33,16 +31,21 @@ def drawing(height: float, width: float = WIDTH, **options: Any) -> tuple[Figure
         return plt.subplots(figsize=(width, height), layout="constrained", **options)
 
 
-def embedded(figure: Figure, alt: str, caption: str = "", narrow: Figure | None = None) -> str:
-    """<figure> with a drawn Figure, as SVG, or as PNG where that is smaller and it matters; the Figure is closed.
+@dataclass(frozen=True)
+class Picture:
+    """alt : what it shows, for who cannot see it; source : data URL; width : pixels; caption : how to read it, if nothing else says so;
+    narrow : data URL of the same for a narrow screen, or ""."""
 
-    alt : what it shows, for who cannot see it; caption : how to read it, if nothing else says so; narrow : the same for a narrow screen.
-    """
-    source, width = _source(figure)
-    image = f'<img alt="{escape(alt)}" width="{width}" src="{source}">'
-    if narrow is not None:
-        image = f'<picture><source media="(max-width: {NARROW})" srcset="{_source(narrow)[0]}">{image}</picture>'
-    return f"<figure>{image}{f'<figcaption>{escape(caption)}</figcaption>' if caption else ''}</figure>"
+    alt: str
+    source: str
+    width: int
+    caption: str = ""
+    narrow: str = ""
+
+
+def embedded(figure: Figure, alt: str, caption: str = "", narrow: Figure | None = None) -> Picture:
+    """Picture of a drawn Figure, as SVG, or as PNG where that is smaller and it matters; the Figures are closed. Arguments as of Picture."""
+    return Picture(alt, *_source(figure), caption, "" if narrow is None else _source(narrow)[0])
 
 
 def _source(figure: Figure) -> tuple[str, int]:

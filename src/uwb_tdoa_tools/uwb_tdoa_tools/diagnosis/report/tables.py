@@ -1,0 +1,187 @@
+"""The tables of the page: values, errors, health, and what could not be told."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, TYPE_CHECKING
+
+from uwb_tdoa_bias.effects.wording import listed, measured, rounded, significant
+
+from ...scoring.phases import TITLES
+from ..channels import CHANNELS
+from .entries import by_anchor, for_people
+from .runs import CM, labels
+from .unclear import by_remedy, untold
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from uwb_tdoa_bias.effects import Effect
+    from ..channels.base import Figures
+    from ..diagnose import Diagnosis
+    from .entries import Entry
+
+UNITS = ", ".join(f"{channel.unit} for {name}" for name, channel in CHANNELS.items())
+MANY = 3  # anchors that a sentence names with their values
+SIDE_BY_SIDE = 2  # runs that a phone shows beside each other
+EVIDENCE = {
+    "criterion": "criterion",
+    "held_out_gain": "gain on data held out",
+    "held_out_t": "its t value",
+    "standard_errors": "standard errors",
+    "slow_before": "slow innovations before, m",
+    "slow_left": "after, m",
+    "scatter_over_air": "scatter over that in the air",
+}
+FIGURES = (  # key, title, factor
+    ("rmse_x", "x", CM), ("rmse_y", "y", CM), ("rmse_z", "z", CM), ("rmse_3d", "3D RMSE", CM),
+    ("median_3d", "median", CM), ("max_3d", "largest", CM), ("residual_spread", "scatter of innovations", CM),
+    ("nis_mean", "NIS", 1.0), ("nees_mean", "NEES", 1.0),
+)  # fmt: skip
+
+
+class Table(NamedTuple):
+    """head : names of columns; rows : of cells; numbers : places of columns of figures."""
+
+    head: Sequence[str] = ()
+    rows: Sequence[Sequence[object]] = ()
+    numbers: Sequence[int] = ()
+
+
+def advice(effect: Effect) -> tuple[Sequence[str], Table]:
+    """(sentences, values of more than MANY anchors, lengths in cm) on what a person can do about an Effect."""
+    anchors, sentences = by_anchor(effect), effect.advice()
+    if len(anchors) <= MANY or not sentences:
+        return sentences, Table()
+    first, _, rest = sentences[0].partition(": ")
+    last = rest.rpartition("; ")[2].partition(". ")[2]
+    unit, factor = ("cm", 100.0) if effect.unit == "m" else for_people(effect.unit)
+    parts = sorted({part for values in anchors.values() for part in values})
+    head = ("anchor", *(f"{part} [{unit}]".lstrip() for part in parts))
+    rows = [(anchor, *(_signed(values.get(part), factor) for part in parts)) for anchor, values in anchors.items()]
+    return [f"{first}.", *filter(None, [last]), *sentences[1:]], Table(head, rows, range(1, len(head)))
+
+
+def _signed(found: tuple[float, float | None] | None, factor: float) -> str:
+    """ "+12.3 ± 0.5" """
+    if found is None:
+        return ""
+    value, std = found
+    text = measured(factor * value, factor * std if std else None)
+    return text if text.startswith("-") else f"+{text}"
+
+
+def remedies(diagnosis: Diagnosis) -> Table:
+    """What would tell what could not be told."""
+    rows = [(told_by, listed(what)) for told_by, what in by_remedy(untold(diagnosis)).items()]
+    return Table(("what would tell", "effects that could be there unseen"), rows)
+
+
+def untraced(diagnosis: Diagnosis) -> Table:
+    """Every combination of parameters that leaves too little trace."""
+    rows = [(item.effect, item.what or "all of it", item.told_by) for item in untold(diagnosis) if item.what or not item.harmless]
+    return Table(("effect", "parameters", "what would tell"), rows)
+
+
+def values(diagnosis: Diagnosis) -> Table:
+    """Of effects.yaml."""
+    rows = []
+    for effect in (effect for effect in diagnosis.effects.effects if not effect.settings):
+        known = significant(effect)
+        for key, value in effect.values.items():
+            std, (unit, factor) = effect.std.get(key), for_people(effect.unit, key)
+            sure = "" if std is None else ("yes" if key in known else "no")
+            spread = None if std is None else factor * std
+            error = "" if spread is None else rounded(spread, spread)
+            rows.append((effect.name, key, rounded(factor * value, spread), error, unit, sure))
+    return Table(("effect", "parameter", "value", "standard deviation", "unit", "significant"), rows, (2, 3))
+
+
+def evidence(diagnosis: Diagnosis, found: Sequence[Entry]) -> Table:
+    """How sure each finding is."""
+    used = [key for key in EVIDENCE if any(key in finding.evidence for finding in diagnosis.findings)]
+    firsts = [(entry.title, entry.findings[0]) for entry in found]
+    rows = [(title, first.channel, *(first.evidence.get(key) or "" for key in used)) for title, first in firsts]
+    head = ("finding", "channel", *(EVIDENCE[key] for key in used))
+    return Table(head, rows, range(2, len(head)))
+
+
+def errors(diagnosis: Diagnosis) -> Table:
+    """Figures of every run, before and after."""
+    before, after = diagnosis.before, diagnosis.after
+    shown = [item for item in FIGURES if before["pooled"].get(item[0]) is not None]
+    names = [*labels(diagnosis), "all"]
+    rows = []
+    for name, first, second in zip(names, [*before["runs"], before["pooled"]], [*after["runs"], after["pooled"]]):
+        intervals = [_interval(side) for side in (first, second)] if first.get("rmse_3d_ci") else []
+        figures = (f"{_figure(first, key, factor)} → {_figure(second, key, factor)}" for key, _, factor in shown)
+        rows.append((name, *figures, *intervals))
+    bounds = ("95 % of 3D RMSE before", "after") if len(rows[0]) > 1 + len(shown) else ()
+    head = ("run", *(title for _, title, _ in shown), *bounds)
+    return Table(head, rows, range(1, len(head)))
+
+
+def phases(diagnosis: Diagnosis) -> tuple[Table, Table]:
+    """The error in each phase of a recording, before and after: (of all runs where there are many, of each of these many)."""
+    sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
+    found = [[row.get("phases", {}) for row in side] for side in sides]
+    names = [name for name in TITLES if any(phases.get(name, {}).get("rmse_3d") is not None for side in found for phases in side)]
+    runs = labels(diagnosis)
+    columns = dict(zip([*runs, "all"], zip(*found)))
+    if len(runs) == 1:
+        del columns["all"]
+    if len(columns) <= SIDE_BY_SIDE:
+        return _of_phases(names, columns), Table()
+    return _of_phases(names, {"all": columns["all"]}), _of_phases(names, columns)
+
+
+def _of_phases(names: Sequence[str], columns: Mapping[str, Sequence[dict[str, Any]]]) -> Table:
+    """A row for each phase, a column for each run."""
+    rows = [(TITLES[name], *(_phase(first.get(name), second.get(name)) for first, second in columns.values())) for name in names]
+    return Table(("", *columns), rows, numbers=range(1, 1 + len(columns)))
+
+
+def _phase(before: dict[str, Any] | None, after: dict[str, Any] | None) -> str:
+    """A cell of figures of one phase, before and after."""
+    if before is None or after is None:
+        return ""
+    errors, nees = (
+        " → ".join(_figure(side, key, factor) for side in (before, after)) for key, factor in (("rmse_3d", CM), ("nees_mean", 1.0))
+    )
+    return f"{errors}; NEES {nees}"
+
+
+def _figure(row: dict[str, Any], key: str, factor: float) -> str:
+    value = row.get(key)
+    return "?" if value is None else f"{value * factor:.{1 if factor > 1.0 else 2}f}"
+
+
+def _interval(row: dict[str, Any]) -> str:
+    return " to ".join(f"{bound * CM:.1f}" for bound in row["rmse_3d_ci"] or ()) or "?"
+
+
+def refused(diagnosis: Diagnosis) -> Table:
+    """What was looked at and not added."""
+    added = {finding.effect.label for finding in diagnosis.findings if finding.added}
+    return Table(
+        ("what", "why not"),
+        [(f"a further part of {item.what}" if item.what in added else item.what, item.why) for item in diagnosis.refused],
+    )
+
+
+def health(figures: Figures) -> Iterator[Table]:
+    """Of every channel."""
+    for group, name in (("pairs", "pair"), ("anchors", "anchor"), ("axes", "axis")):
+        head = (name, "samples", "offset", "scatter", "far off", "likeness")
+        yield Table(head, [_of_channel(item, name) for item in figures[group]], range(1, 6))
+    crossed = [(" and ".join(item["pairs"]), f"{item['correlation']:.2f}") for item in figures["cross_correlation"]]
+    yield Table(("pairs that err together", "correlation"), crossed, (1,))
+    rows = []
+    for item in figures["filter"]:
+        means = [f"{item[key]:.2f}" for key in ("nis_mean", "nees_mean")]
+        rows.append((item["flight"], *means, *(f"{item[key]:.0%}" for key in ("nis_below_3.84", "nees_below_7.81"))))
+    yield Table(("flight", "NIS", "NEES", "NIS within its 95 % bound", "NEES within its 95 % bound"), rows, range(1, 5))
+
+
+def _of_channel(item: dict[str, Any], name: str) -> tuple[Any, ...]:
+    near = next(iter((item.get("autocorrelation") or {}).values()), None)
+    offset, scatter = (f"{item[key]:.2g}" for key in ("bias", "spread"))
+    return item[name], item["count"], offset, scatter, f"{item['tails']:.1%}", "" if near is None else f"{near:.2f}"
