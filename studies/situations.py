@@ -19,7 +19,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools import cli, parallel
 from uwb_tdoa_tools.results_file import ResultsFile
-from uwb_tdoa_tools.scoring.by_phase import Together
+from uwb_tdoa_tools.scoring.by_phase import PooledErrors
 from uwb_tdoa_tools.scoring.metrics import READY, Score
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners, facing
@@ -91,20 +91,20 @@ def _results(items, path, jobs):
 
 
 def measure(item):
-    """{"figures": of the judged stretch, as of `scoring.by_phase.Judged`, null where there are none; "again": s, null for never} of (name,
+    """{"figures": of the judged stretch, as of `scoring.by_phase.ErrorSeries`, null where there are none; "again": s, null for never} of (name,
     seed)."""
     name, seed = item
     (situation,) = [one for one in SITUATIONS if one.name == name]
     common = {"seed": seed, "imu_rate": 500.0, "truth_rate": 100.0, "protocol": "tdoa2" if seed % 2 else "tdoa3", "anchors": corners()}
     flight = situation.make(np.random.default_rng([seed, 28]), common)
-    judged = Score(name, run_offline(flight, FilterConfig(**situation.config)).odometry, flight.truth).judged
+    judged = Score(name, run_offline(flight, FilterConfig(**situation.config)).odometry, flight.truth).series
     begin, end = situation.judged
     since = flight.tdoa.t[READY - 1] if situation.over is None else situation.over
     return {"figures": _plain(judged.figures(begin, end)), "again": again(judged, since)}
 
 
 def again(judged, since):
-    """s from `since` until the estimates of a Judged are right for FOR seconds, or to their end; None if they never are."""
+    """s from `since` until the estimates of an ErrorSeries are right for FOR seconds, or to their end; None if they never are."""
     after = judged.t >= since
     t, wrong = judged.t[after], ~(np.linalg.norm(judged.error[after], axis=1) <= RIGHT)
     if not len(t):
@@ -116,8 +116,8 @@ def again(judged, since):
 
 
 def figures(results):
-    """Of the `measure` of several seeds: a dict as of `Together.figures`, besides again_median, again_max, s, and never, how many."""
-    pool = Together()
+    """Of the `measure` of several seeds: a dict as of `PooledErrors.figures`, besides again_median, again_max, s, and never, how many."""
+    pool = PooledErrors()
     for result in results:
         pool.add({name: math.nan if value is None else value for name, value in result["figures"].items()})
     times = [result["again"] for result in results if result["again"] is not None]

@@ -80,7 +80,7 @@ def run(args: Namespace) -> None:
     kinds = [(by, where, path) for where in (KNOWN, *UNSEEN) for path in TRAJECTORIES for by in ESTIMATORS]
     seeds = range(args.seed, args.seed + args.flights)
     tasks = [task(kind, seed, trained) for kind in kinds for seed in seeds]
-    flown = list(parallel.over(partial(fleet.judged, None, True), tasks, args.jobs))
+    flown = list(parallel.over(partial(fleet.fly_one, None, True), tasks, args.jobs))
     of_kind = {kind: flown[k * len(seeds) : (k + 1) * len(seeds)] for k, kind in enumerate(kinds)}
     verdicts = {kind: [verdict for verdict, _ in some] for kind, some in of_kind.items()}
     told = [dict(zip(("by", "constellation", "trajectory", "flights"), (*kind, some))) for kind, some in verdicts.items()]

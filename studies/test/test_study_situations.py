@@ -14,7 +14,7 @@ FEW = ["situations", "--only", "on the floor, low", "1 m high", "--seeds", "2", 
 
 
 def run_of(seconds, right, rate=100.0):
-    """What of a Judged `again` takes: right in spans ((begin, end), ...) s, else 2 m off."""
+    """What of an ErrorSeries `again` takes: right in spans ((begin, end), ...) s, else 2 m off."""
     t = np.arange(0.0, seconds, 1.0 / rate)
     good = np.any([(t >= begin) & (t < end) for begin, end in right], axis=0)
     return SimpleNamespace(t=t, error=np.where(good, 0.1, 2.0)[:, None] * [0.0, 1.0, 0.0])

@@ -4,13 +4,13 @@ import argparse
 
 from training_flights import flight
 
-from uwb_tdoa_tools.scoring.borne_out import SHARES
+from uwb_tdoa_tools.scoring.shrinkage import SHARES
 
 from studies.training import splits
 
 
 def errors(*ratios):
-    """As of BorneOut: of flights with an error of 0.5 m, ratios at all SHARES."""
+    """As of Shrinkage: of flights with an error of 0.5 m, ratios at all SHARES."""
     return {str(k): {None: 0.5} | dict(zip(SHARES, (0.5 * ratio for ratio in some))) for k, some in enumerate(ratios)}
 
 

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.results_file import ResultsFile
-from uwb_tdoa_tools.scoring.borne_out import choose
+from uwb_tdoa_tools.scoring.shrinkage import best_share
 from uwb_tdoa_tools.training import models, physics, shrinking
 
 WORSE = 1.05  # ratio of errors beyond which a judged flight counts as harmed
@@ -51,7 +51,7 @@ def split(flights, plain, seed, fit, kinds):
     found = physics.find(chosen) if any(kind.startswith("physics") for kind in kinds) else None
     for kind in kinds:
         known = found if kind.startswith("physics") else None
-        borne_out = shrinking.bear_out(models.Recipe(kind, seed), chosen, plain, known)
+        borne_out = shrinking.cross_validated(models.Recipe(kind, seed), chosen, plain, known)
         with TemporaryDirectory() as folder:
             trained = models.train(models.Recipe(kind, seed), chosen[:-1], chosen[-1:], kind, found=known, curve=False)
             model, _ = models.save(trained, Path(folder))
@@ -72,7 +72,7 @@ def table(rows, shrunk):
     for row in rows:
         by_kind[row["kind"]].append(row)
     for kind, some in by_kind.items():
-        shares = [choose(_numbers(row["left_out"])) if shrunk else 1.0 for row in some]
+        shares = [best_share(_numbers(row["left_out"])) if shrunk else 1.0 for row in some]
         ratios = [_ratios(row["judged"], share) for row, share in zip(some, shares)]
         expected = np.mean([1.0 - _ratios(row["left_out"], share).mean() for row, share in zip(some, shares)])
         gains, every = np.array([1.0 - each.mean() for each in ratios]), np.concatenate(ratios)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence, Sized
+from dataclasses import dataclass
 import math
 from typing import TypeVar
 
@@ -71,11 +72,15 @@ class Odometry:
         return len(self.t)
 
 
-Result = TypeVar("Result", Odometry, Residuals)
+Arrays = TypeVar("Arrays", bound=Sized)  # a dataclass of arrays of one length: Odometry, Residuals, a stream of a Flight
 
 
-def concatenated(parts: list[Result]) -> Result:
-    """One Odometry, or Residuals, of several, at least one."""
+def rows_of(part: Arrays, rows: np.ndarray | slice) -> Arrays:
+    """Some rows of a dataclass of arrays of one length."""
+    return type(part)(*(column[rows] for column in vars(part).values()))
+
+
+def concatenated(parts: Sequence[Arrays]) -> Arrays:
+    """One dataclass of arrays of several, at least one."""
     parts = [part for part in parts if len(part)] or parts[:1]
-    kind = type(parts[0])
-    return parts[0] if len(parts) == 1 else kind(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind)))
+    return parts[0] if len(parts) == 1 else type(parts[0])(*map(np.concatenate, zip(*(vars(part).values() for part in parts))))

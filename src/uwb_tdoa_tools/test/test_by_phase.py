@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hand_made import flown, truth_of
-from uwb_tdoa_tools.scoring.by_phase import Together
+from uwb_tdoa_tools.scoring.by_phase import PooledErrors
 from uwb_tdoa_tools.scoring.metrics import Pool, Score
 from uwb_tdoa_tools.scoring.phases import phases
 from uwb_tdoa_tools.scoring.table import lines_of_phases, markdown_of
@@ -126,7 +126,7 @@ def test_a_tag_that_never_moves_is_judged_over_all():
 
 
 def test_figures_of_several_runs_are_those_of_all_their_samples():
-    together, runs = Together(), []
+    together, runs = PooledErrors(), []
     for seed, off in enumerate((0.3, 2.0, 0.5)):
         truth, rng = flown(rest=3.0 + seed), np.random.default_rng(seed)
         score = Score("flight", odometry_of(truth, lambda t: off * rng.standard_normal((len(t), 3))), truth)

@@ -33,11 +33,11 @@ def test_a_bag_of_convert_knows_no_arrivals(tmp_path):
 def test_the_truth_stays_closed(tmp_path, monkeypatch):
     flight = small_flight()
     write_bag(flight, tmp_path / "f.bag")
-    from uwb_tdoa_tools.checking import recording
+    from uwb_tdoa_tools.bags import bag
 
     opened = []
-    original = recording.readable
-    monkeypatch.setattr(recording, "readable", lambda p, r, some: opened.extend(c.topic for c in some) or original(p, r, some))
+    original = bag.readable
+    monkeypatch.setattr(bag, "readable", lambda p, r, some: opened.extend(c.topic for c in some) or original(p, r, some))
     read_recording(Reading(), tmp_path / "f.bag")
     assert "/ground_truth/pose" not in opened and "/uwb/tdoa" in opened
 

@@ -7,9 +7,8 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
-from uwb_tdoa_tools.checking.check import check
+from uwb_tdoa_tools.checking.check import check, sensors
 from uwb_tdoa_tools.checking.recording import of_flight, read_recording
-from uwb_tdoa_tools.checking.sensor_rules import sensors
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 

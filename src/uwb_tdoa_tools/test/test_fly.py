@@ -7,7 +7,7 @@ from test_flying_verdict import made_up
 
 from uwb_tdoa_tools.commands.fly import main
 from uwb_tdoa_tools.flying import fleet
-from uwb_tdoa_tools.flying.verdict import judge
+from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.readers import read_flight
 
 
@@ -55,7 +55,7 @@ def test_it_goes_on_from_what_is_there(tmp_path, capsys, monkeypatch):
         flown.append(task.seed)
         return task.seed
 
-    verdict = judge(made_up())
+    verdict = verdict_of(made_up())
     monkeypatch.setattr(fleet, "fly", one)
     monkeypatch.setattr(fleet, "judge", lambda seed: {**verdict, "seed": seed})
     main(options)

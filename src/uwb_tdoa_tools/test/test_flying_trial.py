@@ -6,7 +6,7 @@ import pytest
 from uwb_tdoa_tools.flying.mission import DONE, REFUSED, Rules
 from uwb_tdoa_tools.flying.path import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
-from uwb_tdoa_tools.flying.verdict import judge
+from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.scoring.metrics import position_at
@@ -24,7 +24,7 @@ def plain():
 
 
 def test_it_takes_off_follows_the_path_and_lands(plain):
-    verdict = judge(plain)
+    verdict = verdict_of(plain)
     assert verdict["landed"] and verdict["why"] == ""
     assert plain.missions[0].state == DONE and plain.missions[0].started == 4.0
     assert verdict["tracking"] < 0.2 and verdict["place"] < 0.1 and verdict["touchdown"] < 0.4
@@ -62,12 +62,12 @@ def test_in_a_silence_nothing_is_heard_and_it_lands(silent):
     gap = np.argmax(np.diff(heard))
     began = silent.missions[0].started + SHORT.rise + 4.0
     assert heard[gap] == pytest.approx(began, abs=0.02) and heard[gap + 1] - heard[gap] == pytest.approx(3.0, abs=0.02)
-    assert judge(silent)["safe"]
+    assert verdict_of(silent)["safe"]
 
 
 def test_everything_comes_late_and_is_flown_by_all_the_same():
     flown = fly(Task(replace(PERFECT, latency=0.05), seed=3, told="place", path=SHORT))
-    assert judge(flown)["safe"]
+    assert verdict_of(flown)["safe"]
     truth = flown.flight.truth
     assert truth.t[-1] - flown.odometry.t[-1] >= 0.05 - 1e-9
 
@@ -92,7 +92,7 @@ def test_after_a_minute_it_flies_once_more_from_where_it_was_carried():
     assert carried[:, 2].max() == pytest.approx(0.53, abs=0.02)
     lifted = (imu.t > second.begin - 6.0) & (imu.t < second.begin - 4.0)
     assert np.abs(imu.accel[lifted, 2] - 9.81).max() > 0.3  # its sensors feel that
-    verdict = judge(flown)
+    verdict = verdict_of(flown)
     assert verdict["started"] == second.started
     assert position_at(np.array([truth.t[-1]]), truth)[0, 2] < 0.05
 
@@ -100,7 +100,7 @@ def test_after_a_minute_it_flies_once_more_from_where_it_was_carried():
 def test_it_is_flown_by_what_a_network_corrects():
     world, path = replace(PERFECT, antennas=True), Circles(turns=1, turn_time=4.0)
     models = None, "default"
-    plain, corrected = (judge(fly(Task(world, seed=1, told="place", model=model, path=path))) for model in models)
+    plain, corrected = (verdict_of(fly(Task(world, seed=1, told="place", model=model, path=path))) for model in models)
     assert corrected["landed"] and corrected["estimation"] < 0.9 * plain["estimation"]
 
 
@@ -114,7 +114,7 @@ def test_every_world_can_be_flown_in(name):
 
 def test_near_the_floor_low_anchors_are_late_one_by_one():
     flown = fly(Task(HALL, seed=0, rules=Rules(rest=1.0, patience=0.5, arm=1e-6)))
-    assert flown.missions[0].state == REFUSED and judge(flown)["why"] == "refused to arm"
+    assert flown.missions[0].state == REFUSED and verdict_of(flown)["why"] == "refused to arm"
     tdoa, anchors = flown.flight.tdoa, flown.flight.anchors
     low = anchors.positions[:, 2] < 1.0
     p = flown.flight.truth.p[-1]

@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_tools.flying.mission import DONE, REFUSED
 from uwb_tdoa_tools.flying.report import summary, text
-from uwb_tdoa_tools.flying.verdict import judge
+from uwb_tdoa_tools.flying.verdict import verdict_of
 
 T = np.arange(0.0, 20.0, 0.0025)
 UP, DOWN = 4.0, 14.0  # s, between which it is in the air
@@ -39,7 +39,7 @@ def made_up(z=None, xy=(0.0, 0.0), tilt=0.0, off=0.1, deviation=0.1, sink=0.2, c
 
 
 def test_a_good_flight_has_landed_and_its_figures_are_right():
-    verdict = judge(made_up())
+    verdict = verdict_of(made_up())
     assert verdict["landed"] and verdict["safe"] and verdict["why"] == "" and verdict["seed"] == 7
     assert verdict["touchdown"] == pytest.approx(0.2, abs=0.01) and verdict["place"] == 0.0
     assert verdict["tracking"] == pytest.approx(0.3) and verdict["estimation"] == pytest.approx(0.1)
@@ -51,7 +51,7 @@ def test_a_good_flight_has_landed_and_its_figures_are_right():
 def test_an_estimate_that_is_no_number_is_none():
     flown = made_up()
     flown.odometry.p[flown.odometry.t > UP + 5.0] = np.nan
-    verdict = judge(flown)
+    verdict = verdict_of(flown)
     assert [*verdict["phases"]] == ["before", "lift_off", "air"] and verdict["phases"]["air"]["rmse"] == pytest.approx(0.1)
 
 
@@ -69,19 +69,19 @@ def test_an_estimate_that_is_no_number_is_none():
     ],
 )
 def test_what_kept_it_from_landing_is_said(why, safe, flown):
-    verdict = judge(made_up(**flown))
+    verdict = verdict_of(made_up(**flown))
     assert (verdict["why"], verdict["landed"], verdict["safe"]) == (why, False, safe)
 
 
 def test_the_estimate_is_judged_and_does_not_judge():
-    verdict = judge(made_up(off=2.0, deviation=0.1))
+    verdict = verdict_of(made_up(off=2.0, deviation=0.1))
     assert verdict["landed"] and verdict["armed_deviations"] > 3.0
     assert verdict["lost"] == pytest.approx(UP, abs=0.03)
     assert verdict["phases"]["air"]["nees"] == pytest.approx(400.0, rel=0.01)
 
 
 def test_flights_are_summed_up():
-    verdicts = [judge(made_up()), judge(made_up(xy=(1.0, 0.0))), judge(made_up(off=2.0))]
+    verdicts = [verdict_of(made_up()), verdict_of(made_up(xy=(1.0, 0.0))), verdict_of(made_up(off=2.0))]
     summed = summary(verdicts)
     assert (summed["flights"], summed["landed"], summed["safe"], summed["why"]) == (3, 2, 3, {"landed elsewhere": 1})
     assert summed["armed_beyond_three_deviations"] == 1

@@ -14,7 +14,7 @@ from uwb_tdoa_tools.bags.bag import read_bag, write_bag  # noqa: E402
 from uwb_tdoa_tools.commands import check, convert, debias, demo, diagnose, evaluate, inject, localize, survey  # noqa: E402
 from uwb_tdoa_tools.diagnosis.references import REFERENCES  # noqa: E402
 from uwb_tdoa_tools.localizing.estimate import with_antenna  # noqa: E402
-from uwb_tdoa_tools.scoring.judge import Judge  # noqa: E402
+from uwb_tdoa_tools.scoring.evaluator import Evaluator  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
 CLEAN = dict(duration=14.0, floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
@@ -33,9 +33,9 @@ def desk(tmp_path, monkeypatch):
 
 def rmse(words, monkeypatch):
     """3D RMSE that evaluate reaches."""
-    results, judge = [], Judge.__call__
+    results, judge = [], Evaluator.__call__
     with monkeypatch.context() as patch:
-        patch.setattr(Judge, "__call__", lambda self, one: results.append(judge(self, one)) or results[-1])
+        patch.setattr(Evaluator, "__call__", lambda self, one: results.append(judge(self, one)) or results[-1])
         assert evaluate.main(words) == 0
     return results[0].row["rmse_3d"]
 

@@ -21,7 +21,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking import report
 from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
 from uwb_tdoa_tools.readers.inputs import Reading
-from uwb_tdoa_tools.scoring.judge import Judge
+from uwb_tdoa_tools.scoring.evaluator import Evaluator
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 READS = {"anchors_file": read_survey, "effects_file": EffectSet.from_yaml, "--params-file": FilterConfig.from_yaml}
@@ -159,8 +159,8 @@ def test_the_line_that_survey_prints_makes_the_error_of_a_measured_flight_smalle
     assert survey.main(["flight1.bag", "--out", "surveyed/"]) == 0
     (line,) = lines_of(capsys.readouterr().out)
     errors = []
-    judge = Judge.__call__
-    monkeypatch.setattr(Judge, "__call__", lambda self, one: errors.append(judge(self, one)) or errors[-1])
+    judge = Evaluator.__call__
+    monkeypatch.setattr(Evaluator, "__call__", lambda self, one: errors.append(judge(self, one)) or errors[-1])
     words = shlex.split(line.replace("flight1.bag", "flight2.bag"))[4:]
     assert evaluate.main(["flight2.bag"]) == evaluate.main(words) == 0
     before, after = (one.row["rmse_3d"] for one in errors)

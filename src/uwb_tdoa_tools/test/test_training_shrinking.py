@@ -7,14 +7,14 @@ from training_flights import flight
 
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.scoring.borne_out import SHARES, BorneOut, choose
+from uwb_tdoa_tools.scoring.shrinkage import SHARES, Shrinkage, best_share
 from uwb_tdoa_tools.training import models, shrinking, structured
 
 RECIPE = models.Recipe("structured", 0, structured.Options(centres=10, link_centres=10))
 
 
 def errors(*ratios):
-    """As of BorneOut: of flights with an error of 0.5 m, ratios at all SHARES."""
+    """As of Shrinkage: of flights with an error of 0.5 m, ratios at all SHARES."""
     return {str(k): {None: 0.5} | dict(zip(SHARES, (0.5 * ratio for ratio in some))) for k, some in enumerate(ratios)}
 
 
@@ -27,18 +27,18 @@ def errors(*ratios):
     ],
 )
 def test_takes_what_gains_without_harm(ratios, share):
-    assert choose(errors(*ratios)) == share
+    assert best_share(errors(*ratios)) == share
 
 
 def test_effects_alone_are_taken_as_they_are():
-    told = BorneOut(choose({"a": {None: 0.4, 1.0: 0.3}}), {"a": {None: 0.4, 1.0: 0.3}})
+    told = Shrinkage(best_share({"a": {None: 0.4, 1.0: 0.3}}), {"a": {None: 0.4, 1.0: 0.3}})
     assert told.share == 1.0 and "falls by 25% +- 0% (of 1 flights, each left out; the worst +25%)" in told.as_text()
 
 
 def test_a_flight_is_judged_by_what_it_took_no_part_in():
     late = EFFECTS["anchor_delay"]({"3": 0.4, "5": -0.4})
     flights = [late.inject(flight(seed)) for seed in range(2)] + [flight(2)]
-    told = shrinking.bear_out(RECIPE, flights, shrinking.uncorrected(flights))
+    told = shrinking.cross_validated(RECIPE, flights, shrinking.uncorrected(flights))
     assert set(told.errors) == {one.name for one in flights}
     alike, other = (told.errors[flights[k].name] for k in (0, 2))
     assert alike[1.0] < 0.95 * alike[None] and other[1.0] > 1.05 * other[None]
@@ -51,5 +51,5 @@ def test_two_processes_give_the_same_to_the_bit():
     for jobs in (1, 2):
         over = partial(parallel.over, jobs=jobs)
         plain = shrinking.uncorrected(flights, over)
-        told.append(shrinking.bear_out(RECIPE, flights, plain, map_function=over))
+        told.append(shrinking.cross_validated(RECIPE, flights, plain, map_function=over))
     assert told[0] == told[1] and set(told[0].errors) == {one.name for one in flights}

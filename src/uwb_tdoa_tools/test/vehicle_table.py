@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from live_flights import hall  # noqa: E402
 from uwb_tdoa_tools.flying.report import sentence  # noqa: E402
 from uwb_tdoa_tools.flying.trial import Task, fly  # noqa: E402
-from uwb_tdoa_tools.flying.verdict import judge  # noqa: E402
+from uwb_tdoa_tools.flying.verdict import verdict_of  # noqa: E402
 from uwb_tdoa_tools.flying.world import WORLDS  # noqa: E402
 
 LONGEST = 600.0  # s of a flight
@@ -36,7 +36,7 @@ def main():
                 with hall(folder, f"seed:={seed}", f"world:={args.world}", "mission:=true") as flown:
                     flown.wait(lambda flown=flown: flown.verdicts, "the verdict", LONGEST)
                 took, live = time.monotonic() - began, flown.verdicts[0]
-            lockstep = judge(fly(Task(WORLDS[args.world], seed, "place")))
+            lockstep = verdict_of(fly(Task(WORLDS[args.world], seed, "place")))
             apart = [abs((live[name] or 0.0) - (lockstep[name] or 0.0)) for name in ("tracking", "place", "touchdown")]
             print(f"{seed}: {sentence(live)}; {took:.0f} s", flush=True)
             print(f"      lockstep: {sentence(lockstep)}; apart by " + ", ".join(f"{value:.1g}" for value in apart), flush=True)

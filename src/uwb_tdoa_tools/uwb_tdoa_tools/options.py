@@ -4,6 +4,8 @@
     options.add_filter(parser)                      # --effects, --config
     options.add_estimator(parser)                   # these, --model, --no-bias, -p, --without, --smooth
     options.add_most(parser, 10**6)                 # --most
+    options.add_bag(parser)                         # --storage, --force
+    options.add_holdout(parser)                     # --holdout
     options.add_known(parser)                       # --marks, --distances
     options.add_tape(parser)                        # --std, --height-std, --trusted, --trusted-std, --unknown
     options.add_align(parser)                       # --align
@@ -25,6 +27,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
 from . import cli
+from .bags.files import STORAGES
 from .diagnosis.self_calibration import Tape
 from .localizing import rerun_file
 from .localizing.estimate import Estimator
@@ -92,11 +95,8 @@ def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
 def add_estimator(parser: ArgumentParser) -> None:
     """--effects, --config, --model, --no-bias, -p, --without and --smooth: how positions are estimated."""
     add_filter(parser, "effects.yaml: systematic effects to correct for")
+    add_model(parser)
     add = parser.add_argument
-    add(
-        "--model", metavar="FILE",
-        help=f'ONNX bias network to correct with; "default" is the one shipped: {UNPROVEN}'.replace("%", "%%"),
-    )  # fmt: skip
     add("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
     add(
         "-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[],
@@ -107,6 +107,12 @@ def add_estimator(parser: ArgumentParser) -> None:
         help=f"not to be used though it is there: {', '.join(SENSORS)}; may be repeated",
     )  # fmt: skip
     add("--smooth", action="store_true", help="smooth: use what came after each estimate too")
+
+
+def add_model(parser: ArgumentParser) -> None:
+    """--model."""
+    words = f'ONNX bias network to correct with; "default" is the one shipped: {UNPROVEN}'
+    parser.add_argument("--model", metavar="FILE", help=words.replace("%", "%%"))
 
 
 def estimator_of(args: Namespace, say: Callable[[str], object]) -> Estimator:
@@ -135,6 +141,23 @@ def refuse(args: Namespace, names: Iterable[str], because: str) -> None:
         if given(args, name):
             option = {"parameters": "-p", "topics": "--topic"}.get(name, f"--{name.replace('_', '-')}")
             raise InputError(f"{option}: {because}; leave it out.")
+
+
+def add_bag(parser: ArgumentParser) -> None:
+    """--storage and --force: how a bag is written."""
+    parser.add_argument("--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)")
+    parser.add_argument("--force", action="store_true", help="replace an existing bag")
+
+
+def add_holdout(parser: ArgumentParser) -> None:
+    """--holdout."""
+    parser.add_argument("--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit")
+
+
+def check_holdout(fitted: Iterable[str | Path], held: Iterable[str | Path]) -> None:
+    """Raise InputError if a flight to judge on, by its name or its path, is also one to fit."""
+    if shared := set(fitted) & set(held):
+        raise InputError(f"--holdout: {min(map(str, shared))} is also a FLIGHT to fit; leave it out of one of them.")
 
 
 def add_most(parser: ArgumentParser, default: int) -> None:

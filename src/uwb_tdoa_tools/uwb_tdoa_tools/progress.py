@@ -1,4 +1,4 @@
-"""Telling that long work goes on: on a terminal in one line, elsewhere in a line every few seconds.
+"""Telling that long work goes on: on a terminal in one line, by tqdm; elsewhere in a line every few seconds, which tqdm cannot.
 
     with Progress("diagnose") as progress:                       # what is done is told by a thread of its own
         progress("looking at ids")

@@ -11,6 +11,7 @@ places of their lines are held.
 
 from __future__ import annotations
 
+from functools import partial
 import hashlib
 import json
 import os
@@ -25,7 +26,7 @@ from uwb_tdoa_bias.foundation.version import written_by
 
 if TYPE_CHECKING:
     from argparse import Namespace
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from .parallel import MapFunction
 
 Item = TypeVar("Item")
@@ -99,6 +100,21 @@ class ResultsFile:
     def __setitem__(self, key: str, result: object) -> None:
         self._places[key] = self._append({"key": key, "result": result})
 
+    def keys_done(
+        self, keys: Sequence[str], items: Sequence[Item], make: Callable[[Iterable[Item]], Iterable[object]], unit: str
+    ) -> Iterator[str]:
+        """Generator of keys, in turn, each when its result is here: make(items) gives, in their order, the results of those that are not. unit :
+        what items are called, in words."""
+        missing = {key: item for key, item in zip(keys, items) if key not in self}
+        if len(missing) < len(items):
+            tqdm.write(f"{self._path} holds {len(items) - len(missing)} of {len(items)} {unit}; going on with the others", sys.stderr)
+        made = iter(make(missing.values()))
+        for key in keys:
+            if key not in self:
+                self[key] = next(made)
+            yield key
+        next(made, None)  # to its end, so that its processes are kept
+
     def __enter__(self) -> ResultsFile:
         return self
 
@@ -125,22 +141,15 @@ class ResultsFile:
         return InputError(f"{self._path}: holds something else than results of this tool; name another file.")
 
 
-def resumed(over: MapFunction, path: str | Path, done: ResultsFile) -> MapFunction:
+def resumed(over: MapFunction, done: ResultsFile) -> MapFunction:
     """over(function, items), as of `parallel.over`, that takes from a ResultsFile what is there, by the name of the function and the
-    place of the item, and keeps there what is not. path : of the file; done : ResultsFile."""
+    place of the item, and keeps there what is not."""
 
     def over_missing(function: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
         name, items = getattr(function, "func", function).__name__, list(items)
         keys = [f"{name} {place}" for place in range(len(items))]
-        missing = [item for key, item in zip(keys, items) if key not in done]
-        if len(missing) < len(items):
-            tqdm.write(f"{path} holds {len(items) - len(missing)} of {len(items)} parts; going on with the others", sys.stderr)
-        made = iter(over(function, missing))
-        for key in keys:
-            if key not in done:
-                done[key] = next(made)
+        for key in done.keys_done(keys, items, partial(over, function), "parts"):
             yield done[key]
-        next(made, None)  # to its end, so that its processes are kept
 
     return over_missing
 

@@ -30,7 +30,7 @@ from .flying.pilot import Pilot
 from .flying.report import sentence
 from .flying.sensors import AIDS
 from .flying.trial import Task, Trial
-from .flying.verdict import judge
+from .flying.verdict import verdict_of
 from .flying.world import WORLDS, world_of
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class VehicleNode(ros.StreamNode):
         self._pace = Lockstep() if own["simulated_time"] else RealTime()
         self._topics = OverTopics(self, world, self._pace, own["simulated_time"])
         self._trial = Trial(task, self._topics, None if self._mission else own["duration"])
-        self._pilot, self._judged = Pilot(self._trial), 0  # missions that were judged
+        self._pilot, self._reported = Pilot(self._trial), 0  # missions that were judged
         self._verdict = self.create_publisher(String, "verdict", ANCHORS_QOS)
         self._offered = () if self._mission else [
             self.create_service(Takeoff, "takeoff", self._on_takeoff),
@@ -94,16 +94,16 @@ class VehicleNode(ros.StreamNode):
             trial.begin()
         trial.turn()
         self._topics.turned(trial.simulator.now, trial.simulator.state)
-        if len(trial.missions) > self._judged and trial.over:
-            self._judge()
+        if len(trial.missions) > self._reported and trial.over:
+            self._report_verdict()
         if trial.crash or trial.simulator.over:
             self.get_logger().error(f"the flight is over: {trial.crash or 'its time is up'}")
             raise SystemExit(1)
         return True
 
-    def _judge(self) -> None:
+    def _report_verdict(self) -> None:
         """Say what became of the mission under way; of the standard one with the exit code."""
-        verdict, self._judged = judge(self._trial.flown), len(self._trial.missions)
+        verdict, self._reported = verdict_of(self._trial.flown), len(self._trial.missions)
         self._verdict.publish(String(data=json.dumps(verdict)))
         self.get_logger().info(sentence(verdict))
         if self._mission:

@@ -356,7 +356,9 @@ class TopicMessages:
         return self.stamps[order] / 1e9, self.rows[order], int((np.diff(self.stamps) < 0).sum())
 
 
-def read_topic(path: str | Path, reader: BagReader, topic: str, msgtype: str, row: Callable[[Any], tuple[float, ...]]) -> TopicMessages:
+def read_topic(
+    path: str | Path, reader: BagReader, topic: str, msgtype: str, row: Callable[[Any], tuple[float, ...]]
+) -> TopicMessages:
     """TopicMessages of a topic, none if it is not there. row(message) : its stamp, ns, and k other numbers. Raises InputError if its type is
     another than msgtype."""
     arrived, rows, frames = [], [], Counter[str]()

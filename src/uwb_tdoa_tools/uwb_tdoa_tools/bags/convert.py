@@ -9,6 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_ekf.results import rows_of
 
 from .bag import check_output, write_bag
 
@@ -83,7 +84,7 @@ def _from_zero_on(flight: Flight) -> Flight:
         stream = getattr(flight, name)
         inside = stream.t >= 0.0
         if inside.any() and not inside.all():
-            changed[name] = type(stream)(*(None if column is None else column[inside] for column in vars(stream).values()))
+            changed[name] = rows_of(stream, inside)
             said.append(f"{name}: {np.count_nonzero(~inside)} samples before 0 s, which a bag has no place for, are left out")
     return replace(flight, **changed, meta={**flight.meta, "remarks": said}) if changed else flight
 

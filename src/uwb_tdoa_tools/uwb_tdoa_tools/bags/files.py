@@ -157,13 +157,13 @@ def _connections() -> list[Any]:
 
 def _take_qos_of_metadata(reader: Reader) -> None:
     """Have data files offer each topic as metadata.yaml says: rosbags skips the messages of a topic of which they say another QoS."""
-    told = {
+    recorded = {
         (one.topic, one.msgtype): one.ext.offered_qos_profiles  # type: ignore[union-attr]  # a bag of ROS 2
         for one in reader.connections
     }
     for file in getattr(reader.storage, "storages", ()):
         for k, one in enumerate(file.connections):
-            qos = told.get((one.topic, one.msgtype), one.ext.offered_qos_profiles)
+            qos = recorded.get((one.topic, one.msgtype), one.ext.offered_qos_profiles)
             file.connections[k] = one._replace(ext=one.ext._replace(offered_qos_profiles=qos))
 
 

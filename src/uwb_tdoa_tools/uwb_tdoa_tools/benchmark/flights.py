@@ -7,8 +7,9 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_ekf.results import rows_of
 
+from ..calibrating.parts import between
 from ..simulation import SimulationConfig, simulate
 
 if TYPE_CHECKING:
@@ -31,17 +32,10 @@ def thinned(flight: Flight, rate: float) -> Flight:
     assert flight.imu is not None
     duration = flight.imu.t[-1] - flight.imu.t[0]
     kept = np.linspace(0, len(flight.tdoa) - 1, min(len(flight.tdoa), round(rate * duration))).astype(int)
-    return replace(flight, tdoa=_rows(flight.tdoa, kept))
+    return replace(flight, tdoa=rows_of(flight.tdoa, kept))
 
 
 def first(flight: Flight, seconds: float) -> Flight:
     """Its first seconds."""
     assert flight.imu is not None
-    end = flight.imu.t[0] + seconds
-    streams = {name: getattr(flight, name) for name in ("tdoa", "imu", "truth", *AIDS)}
-    kept = {name: _rows(stream, stream.t < end) for name, stream in streams.items() if stream is not None}
-    return replace(flight, **kept)
-
-
-def _rows(stream: Any, chosen: np.ndarray) -> Any:
-    return type(stream)(**{name: values[chosen] for name, values in vars(stream).items()})
+    return replace(between(flight, -np.inf, flight.imu.t[0] + seconds), extra=flight.extra)

@@ -13,7 +13,6 @@ from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, mos
 from ..readers.streams import protocol
 from . import coverage, imu_rules, labels, tdoa_rules, wiring
 from .ordered import OrderedRecording
-from .sensor_rules import sensors
 from .survey_fit import displacement
 from .tdoa_rules import SAME, furthest
 
@@ -112,6 +111,14 @@ def fed(recording: Recording) -> StreamRules:
     streams.feed_tdoa(tdoa.t, recording.tdoa_arrival, tdoa.a, tdoa.b, tdoa.d)
     streams.finish()
     return streams
+
+
+def sensors(recording: Recording) -> Iterator[Finding]:
+    """Findings about the Streams of a Recording, by the rules of their SENSORS."""
+    for name, stream in recording.sensors.items():
+        for rule in SENSORS[name].rules:
+            if (found := rule(stream, recording.anchors)) is not None:
+                yield Finding(found.rule, ERROR, found.cause, found.evidence, found.remedy, found.value)
 
 
 def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:

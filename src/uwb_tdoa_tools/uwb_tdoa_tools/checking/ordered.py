@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
+from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_ekf.streams.explain import unexplained
 
 if TYPE_CHECKING:
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
     from .recording import Recording
 
 LONG, SHORT = 60.0, 14.0  # s of the recording that are tried: to be sure, and to choose what is worth being sure of
-Part = TypeVar("Part")  # a stream of arrays
-
 PERIOD = 1.0  # s over which the motion is measured that says which part is tried
 
 
@@ -34,10 +33,10 @@ class OrderedRecording:
         """OrderedRecording of a Recording."""
         tdoa, imu = recording.tdoa, recording.imu
         good = np.flatnonzero(np.isfinite(tdoa.t) & np.isfinite(tdoa.d))
-        tdoa = _rows(tdoa, good[np.argsort(tdoa.t[good], kind="stable")])
+        tdoa = rows_of(tdoa, good[np.argsort(tdoa.t[good], kind="stable")])
         if imu is not None:
             good = np.flatnonzero(np.isfinite(np.column_stack([imu.t, imu.gyro, imu.accel])).all(axis=1))
-            imu = _rows(imu, good[np.argsort(imu.t[good], kind="stable")])
+            imu = rows_of(imu, good[np.argsort(imu.t[good], kind="stable")])
         return cls(recording.anchors, tdoa, imu if imu is not None and len(imu) else None)
 
     def part(self, length: float) -> OrderedRecording:
@@ -49,9 +48,9 @@ class OrderedRecording:
         first, end = np.searchsorted(t, [begin, begin + length])
         imu = self.imu
         if imu is not None:
-            imu = _rows(imu, slice(*np.searchsorted(imu.t, [begin, begin + length])))
+            imu = rows_of(imu, slice(*np.searchsorted(imu.t, [begin, begin + length])))
         return replace(
-            self, tdoa=_rows(self.tdoa, slice(first, end)), imu=imu if imu is not None and len(imu) else None
+            self, tdoa=rows_of(self.tdoa, slice(first, end)), imu=imu if imu is not None and len(imu) else None
         )
 
     def with_tdoa(self, **columns: np.ndarray) -> OrderedRecording:
@@ -74,11 +73,6 @@ class OrderedRecording:
     def flight(self) -> Flight:
         """Flight without ground truth."""
         return Flight("checked", self.anchors, self.tdoa, self.imu)
-
-
-def _rows(stream: Part, rows: np.ndarray | slice) -> Part:
-    """Some rows of a stream of arrays."""
-    return type(stream)(*(np.ascontiguousarray(column[rows]) for column in vars(stream).values()))
 
 
 def _busiest(recording: OrderedRecording, length: float) -> float:

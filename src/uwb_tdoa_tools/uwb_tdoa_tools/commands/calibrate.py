@@ -50,7 +50,7 @@ def parser() -> ArgumentParser:
     options.add_recordings(made)
     options.add_filter(made, "effects.yaml: what is in the model already; without ground truth its covariance is the prior")
     add = made.add_argument
-    add("--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit")
+    options.add_holdout(made)
     add("--no-truth", action="store_true", help="do without ground truth, and leave it unread")
     options.add_tape(made)
     add("--quick", action="store_true", help="say within a minute what to expect, and whether the flights are exciting enough")
@@ -66,8 +66,7 @@ def _calibrate(args: Namespace) -> int:
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     reading = options.reading_of(args, truth=not args.no_truth)
     found, held = reading.find(args.flights), reading.find(args.holdout)
-    if shared := {path.resolve() for path, _ in found} & {path.resolve() for path, _ in held}:
-        raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
+    options.check_holdout((path.resolve() for path, _ in found), (path.resolve() for path, _ in held))
     if not _checked(reading, found + held, tape.std):
         return _stop("check finds an error: put it right first, as said above")
     flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)

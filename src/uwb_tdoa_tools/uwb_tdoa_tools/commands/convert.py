@@ -12,7 +12,6 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
 from ..bags.convert import SENSORS, convert, shifted
-from ..bags.files import STORAGES
 from ..progress import Progress
 from ..readers import columns
 from ..readers.names import read_named
@@ -57,8 +56,7 @@ def parser() -> ArgumentParser:
         help=f"add this to the stamps of a sensor with a clock of its own: {', '.join(SENSORS)}; may be repeated",
     )  # fmt: skip
     made.add_argument("--out", metavar="BAG", required=True, help="the bag to write, a new directory")
-    made.add_argument("--storage", choices=STORAGES, default="mcap", help="default: mcap")
-    made.add_argument("--force", action="store_true", help="replace an existing bag")
+    options.add_bag(made)
     made.add_argument("--json", action="store_true", help="print the summary as JSON")
     return made
 

@@ -12,8 +12,7 @@ from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 from .. import cli, options, parallel
 from ..debiasing import report
 from ..debiasing.evaluation import Estimator
-from ..debiasing.mapping import fit_map
-from ..debiasing.shrinking import bear_out
+from ..debiasing.mapping import cross_validated, fit_map
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -53,7 +52,7 @@ def parser() -> ArgumentParser:
         "--static", nargs="+", default=[], metavar="FILE",
         help="of a tag that stood still: CSV with true_x, true_y, true_z, x, y, z in metres, or recordings with truth",
     )  # fmt: skip
-    add("--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit")
+    options.add_holdout(fitting)
     add("--out", metavar="FILE", type=Path, required=True, help="the map to write (.npz)")
     add("--step", metavar="M", type=float, default=0.35, help="of the grid of markers, m (default: 0.35)")
     add("--planar", action="store_true", help="map x and y only, whatever the height")
@@ -69,12 +68,10 @@ def _fit(args: Namespace) -> None:
         raise InputError(f"--step: {args.step!r} is outside 0.01 ... 10 m.")
     estimator = Estimator(options.reading_of(args), *options.filter_of(args), args.align)
     recordings, held = (estimator.reading.find(paths, bool(args.dask)) for paths in (args.flights, args.holdout))
-    shared = {path.resolve() for path, _ in recordings} & {path.resolve() for path, _ in held}
-    if shared:
-        raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
+    options.check_holdout((path.resolve() for path, _ in recordings), (path.resolve() for path, _ in held))
     fitted = list(parallel.over(estimator, recordings, args.jobs, args.dask))
     settings = {"step": args.step, "planar": args.planar, "interpolator": args.interpolator}
-    borne_out = bear_out(fitted, args.static, estimator, **settings)
+    borne_out = cross_validated(fitted, args.static, estimator, **settings)
     made = fit_map(fitted, args.static, estimator, **settings)
     made = made.scaled(borne_out.share) if borne_out else made
     made.save(args.out)

@@ -8,7 +8,6 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_bias.correction.network import UNPROVEN
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
@@ -48,7 +47,7 @@ def parser() -> ArgumentParser:
     add("--rate", metavar="R", type=float, default=1.0, help="replay R times as fast as flown (default 1)")
     add("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="for all files (default out/demo)")
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
-    add("--model", metavar="FILE", help=f'ONNX bias network to correct with; "default" is the one shipped: {UNPROVEN}'.replace("%", "%%"))
+    options.add_model(made)
     options.add_rerun(made)
     return made
 

@@ -59,7 +59,7 @@ def parser() -> ArgumentParser:
     options.add_recordings(made)
     options.add_filter(made, "effects.yaml: what is in the model already; without ground truth its covariance is the prior")
     add = made.add_argument
-    add("--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit")
+    options.add_holdout(made)
     known = made.add_mutually_exclusive_group().add_argument
     known(
         "--reference", choices=tuple(REFERENCES), default="truth",
@@ -91,9 +91,7 @@ def _diagnose(args: Namespace) -> None:
     rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
     jobs, dask = parallel.asked(args, len(found), FEW)
     flights, holdout = (reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout))
-    shared = {f.name for f in flights} & {f.name for f in holdout}
-    if shared:
-        raise InputError(f"--holdout: {sorted(shared)[0]} is also a FLIGHT to fit; leave it out of one of them.")
+    options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
     for remark in remarks_on([*flights, *holdout]):
         cli.say("diagnose", remark)
     for option in ("marks", "odometry"):

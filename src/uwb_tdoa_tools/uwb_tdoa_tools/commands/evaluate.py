@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import cli, options, parallel
 from ..results_file import asked_of
 from ..scoring import table
-from ..scoring.judge import Judge, results
+from ..scoring.evaluator import Evaluator, results
 from ..scoring.metrics import FIGURES, Pool, as_json
 
 if TYPE_CHECKING:
@@ -75,13 +75,13 @@ def _evaluate(args: Namespace) -> int:
             raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
     trajectories = cli.output_folder(args.tum, "--tum").absolute() if args.tum else None
     rerun = options.rerun_of(args, len(found), partial(cli.say, "evaluate"))
-    judge = Judge(reading, estimator, args.odometry, args.plot, trajectories, rerun, args.align)
+    evaluator = Evaluator(reading, estimator, args.odometry, args.plot, trajectories, rerun, args.align)
     if not args.odometry:
         cli.show(f"correcting with: {estimator.correction}")
     cli.show(table.head())
     told, pool = [], Pool()
     asked = asked_of(args, NO_MATTER, ("effects", "config", "model")) | {"version of the figures": FIGURES}
-    for result in results(judge, found, args.resume, asked, args.jobs, args.dask):
+    for result in results(evaluator, found, args.resume, asked, args.jobs, args.dask):
         pool.add(result)
         told += [result] if args.json or args.markdown else []  # else nothing grows with the number of flights
         cli.show(table.line(result.row))
@@ -97,7 +97,7 @@ def _evaluate(args: Namespace) -> int:
     if args.markdown:
         others = table.read_others(args.beside) if args.beside else {}
         Path(args.markdown).write_text(table.markdown_of(told, pool, others))
-    if late := judge.late_tdoas():
+    if late := evaluator.late_tdoas():
         cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
                 "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip
     return int(late > 0)

@@ -9,7 +9,6 @@ from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
-from ..bags.files import STORAGES
 from ..progress import Progress
 from ..simulation.inject import catalogue, inject, parse_effect
 
@@ -41,8 +40,7 @@ def parser() -> ArgumentParser:
     add("--value", metavar="KEY=NUMBER", nargs="+", default=[], help="its parameters")
     add("--seed", metavar="N", type=int, default=0, help="of effects that are random (default: 0)")
     add("--out", metavar="BAG", help="the bag to write: a new directory")
-    add("--storage", choices=STORAGES, default="mcap", help="default: mcap")
-    add("--force", action="store_true", help="replace an existing bag")
+    options.add_bag(made)
     return made
 
 

@@ -72,7 +72,7 @@ def _train(args: Namespace) -> None:
         flights = reading.flights(args.flights, args.most, jobs, dask)
         flights = list(parallel.over(partial(with_settled_truth, align=args.align), flights, jobs, dask))
         with Progress("train") as progress:
-            _write(args, flights, resumed(over, args.resume, done) if done else over, progress)
+            _write(args, flights, resumed(over, done) if done else over, progress)
 
 
 def _kept(args: Namespace, reading: Reading) -> AbstractContextManager[ResultsFile | None]:

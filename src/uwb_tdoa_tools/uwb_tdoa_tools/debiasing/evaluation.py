@@ -13,7 +13,7 @@ from uwb_tdoa_ekf.results import Odometry
 
 from ..readers.inputs import Reading
 from ..scoring.alignment import NONE
-from ..scoring.evaluation import evaluate, judging_truth
+from ..scoring.evaluation import evaluate, corrected_truth
 from ..scoring.metrics import Score
 from ..scoring.settling import with_settled_truth
 
@@ -67,4 +67,4 @@ class Estimator:
 def evaluate_map(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = None) -> Score:
     """Score of a flight from `fly` with its positions corrected by a BiasMap. effects : those it was flown with."""
     flight, _, odometry = flown
-    return Score(flight.name, debiased(odometry, bias_map), judging_truth(flight, effects))
+    return Score(flight.name, debiased(odometry, bias_map), corrected_truth(flight, effects))

@@ -1,19 +1,23 @@
-"""A bias map from flights and from places where a tag stood still."""
+"""A bias map from flights and from places where a tag stood still, and as much of it as flights left out of it bear out."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import fit
 
+from ..scoring.shrinkage import SHARES, Shrinkage, best_share
+from .evaluation import evaluate_map
 from .parts import LEAST, part_of, static_parts
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from uwb_tdoa_ekf.debias import BiasMap
     from .evaluation import Estimator, Scored
+
+FEWEST = 2  # flights; one alone leaves none to judge
 
 
 def fit_map(
@@ -34,3 +38,21 @@ def fit_map(
         )
     source = ", ".join([flight.name for flight, _, _ in flown] + [Path(path).name for path in static])
     return fit(parts, step, LEAST if flown else 1, planar, interpolator, frames.pop(), source)
+
+
+def cross_validated(
+    flown: Sequence[Scored], static: Sequence[str | Path], estimator: Estimator, **options: Any
+) -> Shrinkage | None:
+    """Shrinkage of maps, each made without one of the flights that an Estimator gave and judged on it; None for fewer than
+    FEWEST. static, options : as of `fit_map`."""
+    if len(flown) < FEWEST:
+        return None
+    errors: dict[str, dict[float | None, float]] = {}
+    for number, one in enumerate(flown, start=1):
+        made = fit_map([other for other in flown if other is not one], static, estimator, **options)
+        flight, score, _ = one
+        name = flight.name if flight.name not in errors else f"{flight.name} ({number})"
+        errors[name] = {None: score.row()["rmse_3d"]}
+        for share in SHARES:
+            errors[name][share] = evaluate_map(one, made.scaled(share), estimator.effects).row()["rmse_3d"]
+    return Shrinkage(best_share(errors), errors)

@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.debias import Part
 from uwb_tdoa_ekf.offline import run_offline
 
 from ..readers.tables import read_numbers
-from ..scoring.evaluation import judging_truth
+from ..scoring.evaluation import corrected_truth
 from ..scoring.metrics import position_at
 from .evaluation import Estimator
 
@@ -48,7 +48,7 @@ def static_parts(path: str | Path, estimator: Estimator = Estimator(), planar: b
     if flight.truth is None:
         raise InputError(f"{path}: holds no ground truth; record where the tag stood as ground_truth/pose.")
     odometry = run_offline(flight, estimator.config, Corrector(flight.anchors, estimator.effects)).odometry
-    truth = judging_truth(flight, estimator.effects)
+    truth = corrected_truth(flight, estimator.effects)
     true, t = position_at(odometry.t, truth), odometry.t
     moved = np.linalg.norm(true - position_at(t - SETTLE, truth), axis=1)
     resting = (moved < REST) & (t > np.min(t, initial=np.inf) + SETTLE)

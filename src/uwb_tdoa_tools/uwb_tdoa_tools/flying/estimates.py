@@ -10,7 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector, LabelCorrector
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.results import Odometry
+from uwb_tdoa_ekf.results import Odometry, concatenated
 from uwb_tdoa_ekf.offline import poses_of
 
 from ..benchmark.peer import EVENT, Peer
@@ -116,7 +116,7 @@ class OurFilter:
     @property
     def odometry(self) -> Odometry:
         """Odometry, all that came out."""
-        return Odometry(*(np.concatenate([getattr(part, name) for part in self._parts]) for name in vars(NOTHING)))
+        return concatenated(self._parts)
 
 
 class TheirFilter:

@@ -13,7 +13,7 @@ from ..results_file import ResultsFile
 from .plots import drawn
 from .report import summary, text
 from .trial import fly
-from .verdict import judge
+from .verdict import verdict_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -38,7 +38,7 @@ def flown(
     record : folder for a bag of each, or None; draw : give what is drawn; jobs, dask : as of `parallel.over`.
     """
     missing = [task for task in tasks if str(task.seed) not in done]
-    made = parallel.over(partial(judged, record, draw), missing, jobs, dask)
+    made = parallel.over(partial(fly_one, record, draw), missing, jobs, dask)
     for task in tasks:
         key, picture = str(task.seed), None
         if key not in done:
@@ -53,10 +53,10 @@ def _sound(verdict: dict[str, Any]) -> dict[str, Any]:
     return verdict
 
 
-def judged(record: str | Path | None, draw: bool, task: Task) -> tuple[dict[str, Any], Drawn | None]:
+def fly_one(record: str | Path | None, draw: bool, task: Task) -> tuple[dict[str, Any], Drawn | None]:
     """(verdict, Drawn or None) of a Task that is flown; record, draw : as of `flown`."""
     one = fly(task)
-    verdict = judge(one)
+    verdict = verdict_of(one)
     if record is not None:
         write_bag(one.flight, Path(record) / one.flight.name, "mcap", False)
     return verdict, drawn(one, verdict) if draw else None

@@ -21,7 +21,7 @@ SPACING = 0.05  # s
 @dataclass(frozen=True)
 class Drawn:
     """What is drawn of a flight: t (n,) s, p (n, 3) m, the truth; wanted (n, 3) m, NaN where nothing was; error and sigma (k, 3) m of the
-    estimate at stamps (k,) s; verdict : as of `judge`."""
+    estimate at stamps (k,) s; verdict : as of `verdict_of`."""
 
     t: np.ndarray
     p: np.ndarray

@@ -17,7 +17,7 @@ MEDIANS = "tracking", "estimation", "place", "touchdown"
 
 
 def summary(verdicts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """dict for JSON, of verdicts as of `judge`: counts, medians and largest of the figures, per phase too."""
+    """dict for JSON, of verdicts as of `verdict_of`: counts, medians and largest of the figures, per phase too."""
     out = {"flights": len(verdicts), "landed": sum(one["landed"] for one in verdicts)}
     out["why"] = dict(Counter(one["why"] for one in verdicts if one["why"]).most_common())
     out["safe"] = sum(one["safe"] for one in verdicts)

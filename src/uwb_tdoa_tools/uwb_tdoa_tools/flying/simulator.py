@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_ekf.results import rows_of
 
 from .loop import IMU_RATE, interval, poses_at
 from .sensors import AIDS, Inertial, Radio, gusts, random
@@ -157,8 +158,7 @@ class Simulator:
         for effect in self.world.effects.effects:
             flight = effect.inject(flight, self._rng)
         assert flight.imu is not None  # as no effect takes it away
-        tdoa = Tdoas(*(column[1:] for column in vars(flight.tdoa).values()))
-        return replace(measured, tdoa=tdoa, imu=flight.imu, aids={name: getattr(flight, name) for name in measured.aids})
+        return replace(measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, aids={name: getattr(flight, name) for name in measured.aids})
 
 
 def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_ekf.results import concatenated, rows_of
+
 from .simulator import Measured
 
 
@@ -30,12 +32,8 @@ class Transport:
         held, arrival, last = self._waiting.get(stream, (None, np.empty(0), 0.0))
         delay = self._latency + self._rng.exponential(self._jitter, len(part)) if self._jitter else np.full(len(part), self._latency)
         came = np.maximum.accumulate(np.maximum(part.t + delay, last))
-        part = part if held is None else type(part)(*map(np.concatenate, zip(vars(held).values(), vars(part).values())))
+        part = part if held is None else concatenated([held, part])
         arrival = np.concatenate([arrival, came])
         due = int(np.searchsorted(arrival, now, side="right"))
-        self._waiting[stream] = _rows(part, slice(due, None)), arrival[due:], came[-1] if len(came) else last
-        return _rows(part, slice(0, due))
-
-
-def _rows(part: Any, rows: slice) -> Any:
-    return type(part)(*(column[rows] for column in vars(part).values()))
+        self._waiting[stream] = rows_of(part, slice(due, None)), arrival[due:], came[-1] if len(came) else last
+        return rows_of(part, slice(0, due))

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.results import Odometry
+from uwb_tdoa_ekf.results import Odometry, concatenated
 
 from .controller import FELT, Controller, Gains, turned
 from .estimates import OurFilter, TheirFilter
@@ -26,7 +26,6 @@ from .vehicle import ATTITUDE, POSITION
 from .world import World
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from .estimates import Source
     from .mission import Route
     from .simulator import Measured
@@ -162,8 +161,8 @@ class Trial:
         simulator, world = self.simulator, self.task.world
         end = simulator.done + 1
         states = simulator.states[:end]
-        parts = [_joined([getattr(one, name) for one in self._arrived]) for name in ("imu", "tdoa")]
-        aids = {name: _joined([one.aids[name] for one in self._arrived]) for name in world.aids}
+        parts = [concatenated([getattr(one, name) for one in self._arrived]) for name in ("imu", "tdoa")]
+        aids: dict[str, Any] = {name: concatenated([one.aids[name] for one in self._arrived]) for name in world.aids}
         truth = Truth(simulator.times[:end], states[:, POSITION], states[:, ATTITUDE])
         meta = {"source": "fly", "format": "simulation", "protocol": world.protocol}
         flight = Flight(f"flown-{self.task.seed}", world.anchors, parts[1], parts[0], truth, meta=meta, **aids)
@@ -214,8 +213,3 @@ def _crash(simulator: Simulator, world: World) -> str:
     if z > world.size[2] + OUTSIDE:
         return "flew into the ceiling"
     return ""
-
-
-def _joined(parts: Sequence[Any]) -> Any:
-    """One stream of its parts."""
-    return type(parts[0])(*map(np.concatenate, zip(*(vars(part).values() for part in parts))))

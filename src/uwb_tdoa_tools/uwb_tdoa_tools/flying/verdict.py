@@ -7,8 +7,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import Truth
-from uwb_tdoa_ekf.results import Odometry
+from uwb_tdoa_ekf.results import rows_of
 
 from ..scoring.metrics import nees, position_at
 from .mission import DONE, REFUSED
@@ -16,6 +15,8 @@ from .trial import REST_AFTER
 from .vehicle import POSITION, VELOCITY
 
 if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Truth
+    from uwb_tdoa_ekf.results import Odometry
     from .mission import Mission
     from .trial import Flown
 
@@ -28,7 +29,7 @@ SPACING = 0.02  # s between the estimates that are judged
 PHASES = "before", "lift_off", "air", "landing", "after"
 
 
-def judge(flown: Flown) -> dict[str, Any]:
+def verdict_of(flown: Flown) -> dict[str, Any]:
     """dict for JSON, of a Flown: the verdict and its figures; None where there is nothing to say. Of several flights the last one's; what
     kept an earlier one from landing counts for all.
 
@@ -40,7 +41,7 @@ def judge(flown: Flown) -> dict[str, Any]:
     figures of the estimate}.
     """
     ends = [(mission.ended or math.inf) + REST_AFTER for mission in flown.missions]
-    verdicts = [_judge(flown, mission, end) for mission, end in zip(flown.missions, ends)]
+    verdicts = [_of_mission(flown, mission, end) for mission, end in zip(flown.missions, ends)]
     failed = [one["why"] for one in verdicts if one["why"]]
     if flown.task.again and len(verdicts) == 1:
         failed = failed or ["did not fly again"]
@@ -50,14 +51,14 @@ def judge(flown: Flown) -> dict[str, Any]:
     return {"seed": flown.task.seed, "landed": not why, **verdicts[-1], "why": why}
 
 
-def _judge(flown: Flown, mission: Mission, end: float) -> dict[str, Any]:
+def _of_mission(flown: Flown, mission: Mission, end: float) -> dict[str, Any]:
     """Figures of one Mission, until `end`, s."""
     assert flown.flight.truth is not None
     truth = flown.flight.truth
     inside = slice(*np.searchsorted(truth.t, (mission.begin, end)))
-    truth = Truth(truth.t[inside], truth.p[inside], truth.q[inside])
+    truth = rows_of(truth, inside)
     states, contact = flown.states[inside], flown.contact[inside]
-    odometry = _between(flown.odometry, mission.begin, end)
+    odometry = rows_of(flown.odometry, slice(*np.searchsorted(flown.odometry.t, (mission.begin, end))))
     crash = flown.crash if mission is flown.missions[-1] else ""
     t, height = truth.t, states[:, 2] - mission.ground
     tilt = np.arccos(np.clip(1.0 - 2.0 * (states[:, 6] ** 2 + states[:, 7] ** 2), -1.0, 1.0))
@@ -96,12 +97,6 @@ def _judge(flown: Flown, mission: Mission, end: float) -> dict[str, Any]:
     gentle = not took_off or (mission.state == DONE and touchdown is not None and touchdown < GENTLE)
     figures["safe"] = bool(gentle and figures["upright"] and not crash)
     return figures
-
-
-def _between(odometry: Odometry, begin: float, end: float) -> Odometry:
-    """The part of an Odometry."""
-    inside = slice(*np.searchsorted(odometry.t, (begin, end)))
-    return Odometry(*(column[inside] for column in vars(odometry).values()))
 
 
 def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:

@@ -19,7 +19,7 @@ from ..bags.bag import read_odometry, write_bag
 from ..flying import trial
 from ..flying.report import sentence
 from ..flying.sensors import Radio
-from ..flying.verdict import judge
+from ..flying.verdict import verdict_of
 from ..flying.world import HALL
 from ..localizing.rerun_file import write_rerun
 from ..scoring.metrics import Score, airborne
@@ -70,7 +70,7 @@ def simulated(folder: str | Path, effects_file: str | Path | None = None, model:
         EffectSet((AnchorDelay(values, source="the simulation's own values"),)).to_yaml(effects_file)
     effects = EffectSet.from_yaml(effects_file) if effects_file else None
     flown = trial.fly(replace(SIMULATED, effects=effects))
-    return DemoFlight(flown.flight, effects_file, model, sentence(judge(flown)))
+    return DemoFlight(flown.flight, effects_file, model, sentence(verdict_of(flown)))
 
 
 def measured(

@@ -12,14 +12,13 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.files import new_bag
 from ..checking.wiring import End
-from .record import DISCOVERY_PERIOD, POLL_PERIOD, Recorder
+from .record import Recorder
 from .session import session
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
     from rclpy.node import Node
-    from .session import Stop
 
 FIRST_LIMIT = 20.0  # s until there must be a message on the first topic
 
@@ -36,25 +35,17 @@ def listen(
         recorder = Recorder(node, writer, set(topics), say)
         say(f"waiting for {topics[0]}")
         heard = partial(recorder.counts.get, topics[0], 0)
-        _take(recorder, stop, FIRST_LIMIT, heard)
+        until = time.monotonic() + FIRST_LIMIT
+        recorder.run(lambda: stop or heard() or time.monotonic() > until)
         kinds = {topic: types[0] for topic, types in node.get_topic_names_and_types()}
         if not heard():
             raise InputError(f"no message on {topics[0]} within {FIRST_LIMIT:g} s; {_elsewhere(topics[0], kinds)}.")
         say(f"listening for {seconds:g} s; carry the tag through the room, turn, lift and lower it (Ctrl-C ends it earlier)")
-        _take(recorder, stop, seconds)
+        until = time.monotonic() + seconds
+        recorder.run(lambda: stop or time.monotonic() > until)
         kinds = {topic: types[0] for topic, types in node.get_topic_names_and_types()}
         ends = [end for topic in topics for end in _ends(node, topic) if end.node != node.get_fully_qualified_name()]
     return kinds, ends
-
-
-def _take(recorder: Recorder, stop: Stop, seconds: float, enough: Callable[[], object] = lambda: False) -> None:
-    until, look_again = time.monotonic() + seconds, 0.0
-    while not stop and not enough() and time.monotonic() < until:
-        if time.monotonic() >= look_again:
-            recorder.discover()
-            look_again = time.monotonic() + DISCOVERY_PERIOD
-        recorder.take()
-        time.sleep(POLL_PERIOD)
 
 
 def _ends(node: Node, topic: str) -> Iterator[End]:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from rclpy.subscription import Subscription
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Writer
-    from .session import Stop
 
 REMEDY = "build and source the workspace that has it, and name the package with --package"
 DISCOVERY_PERIOD = 0.1  # s between two looks for new topics
@@ -57,23 +56,13 @@ def record(
         error = None
         try:
             with tqdm(unit=" messages", disable=None) as progress:
-                _take_until(stop, recorder, progress)
+                recorder.run(lambda: bool(stop), progress.update)
+                progress.update(recorder.take())
         except Exception as caught:  # what was recorded is worth keeping whatever happened
             error = caught
         if not any(recorder.counts.values()) and error is None:
             raise Failure(f"no message came on {names or 'any topic'}; there is no bag")
     return Recorded(recorder.counts, sorted(recorder.missing()), error)
-
-
-def _take_until(stop: Stop, recorder: Recorder, progress: tqdm) -> None:
-    look_again = 0.0
-    while not stop:
-        if time.monotonic() >= look_again:
-            recorder.discover()
-            look_again = time.monotonic() + DISCOVERY_PERIOD
-        progress.update(recorder.take())
-        time.sleep(POLL_PERIOD)
-    progress.update(recorder.take())
 
 
 class Recorder:
@@ -101,6 +90,16 @@ class Recorder:
             if publishers:
                 msgtype = next(filter(self._class, types), types[0])  # others may tell other types of it
                 self._subscribe(topic, msgtype, [each.qos_profile for each in publishers if each.topic_type == msgtype])
+
+    def run(self, enough: Callable[[], object], taken: Callable[[int], object] = lambda count: None) -> None:
+        """Discover topics and take messages until enough(). taken(count) : told how many came."""
+        look_again = 0.0
+        while not enough():
+            if time.monotonic() >= look_again:
+                self.discover()
+                look_again = time.monotonic() + DISCOVERY_PERIOD
+            taken(self.take())
+            time.sleep(POLL_PERIOD)
 
     def take(self) -> int:
         """Move all messages that have arrived to the bag; returns how many."""

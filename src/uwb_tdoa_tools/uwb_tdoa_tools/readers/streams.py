@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
@@ -92,11 +94,11 @@ def make_flight(
 def _sound(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> Columns:
     """The columns of a stream without what is not finite."""
     columns = {name: np.asarray(values) for name, values in columns.items()}
-    judged = dict(columns)
+    numbers = dict(columns)
     if key == "pose" and all(np.isnan(columns[name]).all() for name in ("qx", "qy", "qz", "qw")):
-        judged = {name: values for name, values in columns.items() if not name.startswith("q")}  # not recorded
+        numbers = {name: values for name, values in columns.items() if not name.startswith("q")}  # not recorded
     bad = np.zeros(len(columns["t"]), dtype=bool)
-    for name, values in judged.items():
+    for name, values in numbers.items():
         values, largest = values.astype(float), LARGEST.get(name, LARGEST_NUMBER)
         wrong = ~(np.abs(values) <= largest)
         if wrong.any() and not salvage:
@@ -147,17 +149,9 @@ def protocol(tdoas: Tdoas) -> str:
 
 
 def _is_ring(sides: np.ndarray, n: int) -> bool:
-    """Whether n sides (n, 2) of n corners close to one ring."""
-    neighbours = {corner: [int(other) for side in sides for other in side if corner in side and other != corner] for corner in range(n)}
-    if any(len(two) != 2 for two in neighbours.values()):
-        return False
-    passed, at = {0}, neighbours[0][0]
-    before = 0
-    while at not in passed:
-        passed.add(at)
-        first, second = neighbours[at]
-        before, at = at, second if first == before else first
-    return len(passed) == n
+    """Whether n sides (n, 2) of n corners close to one ring: each corner is on two of them, and all hang together."""
+    meets = coo_array((np.ones(len(sides)), tuple(sides.T)), (n, n))
+    return bool((np.bincount(sides.ravel(), minlength=n) == 2).all() and connected_components(meets, directed=False)[0] == 1)
 
 
 def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:

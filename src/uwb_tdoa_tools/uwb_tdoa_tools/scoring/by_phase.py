@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
     Spans = Sequence[tuple[float, float]]  # from when to when, s
 
-FRESH = 0.1  # s, and SPARSE times the usual interval of the odometry, that an estimate stands for
+VALID_FOR = 0.1  # s, and SPARSE times the usual interval of the odometry, that an estimate stands for
 SPARSE = 4.0
 EVERYTHING = ((-math.inf, math.inf),)  # spans, s
 
 
-class Judged:
+class ErrorSeries:
     """Errors of an odometry wherever there is ground truth. t (n,) s; error (n, 3) m; nees (n,); covariance (n, 3, 3) m^2; step (n,)
     m, by how much the error differs from that of the estimate before, 0 for the first; known : [(begin, end)], s, with ground truth;
-    told : [(begin, end)], s, for which there is an estimate."""
+    covered : [(begin, end)], s, for which there is an estimate."""
 
     def __init__(
         self, t: np.ndarray, error: np.ndarray, covariance: np.ndarray, normalised: np.ndarray, stamps: np.ndarray,
@@ -33,8 +33,8 @@ class Judged:
         self.t, self.error, self.covariance, self.nees, self.known = t, error, covariance, normalised, known
         self.step = np.linalg.norm(np.diff(error, axis=0, prepend=error[:1]), axis=1)
         usual = np.median(np.diff(stamps)) if len(stamps) > 1 else 0.0
-        ends = stamps + max(FRESH, SPARSE * usual)
-        self.told = np.column_stack([stamps, np.minimum(ends, np.append(stamps[1:], np.inf))])
+        ends = stamps + max(VALID_FOR, SPARSE * usual)
+        self.covered = np.column_stack([stamps, np.minimum(ends, np.append(stamps[1:], np.inf))])
 
     def figures(self, begin: float, end: float, spans: Spans = EVERYTHING) -> dict[str, Any]:
         """A dict of one phase, from `begin` to `end`, s; what is not in `spans`, ((first, last), ...) s, does not count."""
@@ -48,12 +48,12 @@ class Judged:
         out |= {"rmse_3d": _rms(distance), "max_3d": _of(np.max, distance)}
         out["std_3d"] = _of(lambda P: np.sqrt(np.mean(np.einsum("nii->n", P))), self.covariance[chosen])
         out["nees_mean"], out["step"] = _of(np.mean, self.nees[chosen]), _of(np.max, self.step[chosen])
-        for name, covered in (("without_estimate", self.told), ("without_truth", self.known)):
+        for name, covered in (("without_estimate", self.covered), ("without_truth", self.known)):
             out[name] = max(0.0, duration - sum(_overlap(covered, first, last) for first, last in parts))
         return out
 
 
-class Together:
+class PooledErrors:
     """The figures of one phase of several runs, one run after the other."""
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class Together:
         self._sums.update(added)
 
     def figures(self) -> dict[str, Any]:
-        """A dict: those of `Judged.figures` of all samples, and median and largest of the runs'. Medians are right to 1 %."""
+        """A dict: those of `ErrorSeries.figures` of all samples, and median and largest of the runs'. Medians are right to 1 %."""
         sums, count = self._sums, self._sums["count"]
         out: dict[str, Any] = {"runs": self._runs, "duration": sums["duration"], "count": count}
         for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "std_3d"):

@@ -29,10 +29,10 @@ def score_of(flight: Flight, estimator: Estimator) -> tuple[Score, Run]:
     another clock."""
     need_truth(flight)
     run = estimator(flight)
-    return Score(flight.name, run.odometry, judging_truth(flight, estimator.effects), run.residuals, flight.tdoa.t), run
+    return Score(flight.name, run.odometry, corrected_truth(flight, estimator.effects), run.residuals, flight.tdoa.t), run
 
 
-def judging_truth(flight: Flight, effects: EffectSet | None = None) -> Truth:
+def corrected_truth(flight: Flight, effects: EffectSet | None = None) -> Truth:
     """The Truth to compare estimates with: that of the Flight, which has one, without what the EffectSet says is wrong
     with it."""
     truth = effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth

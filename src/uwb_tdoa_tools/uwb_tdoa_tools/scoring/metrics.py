@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 import math
 from typing import Any, Protocol, TYPE_CHECKING
@@ -13,8 +13,9 @@ import numpy as np
 from uwb_tdoa_bias.effects.samples import Poses
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
+from uwb_tdoa_ekf.results import rows_of
 
-from .by_phase import EVERYTHING, Judged, Together
+from .by_phase import EVERYTHING, ErrorSeries, PooledErrors
 from .distribution import Distribution
 from .phases import AIRBORNE, TITLES, in_the_air, motion, phases
 
@@ -98,7 +99,7 @@ def _known_spans(known: np.ndarray) -> np.ndarray:
 def _inside(part: Any, spans: Spans) -> Any:
     """What of a Truth or an Odometry is stamped within spans ((first, last), ...), s."""
     inside = np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0)
-    return replace(part, **{name: values[inside] for name, values in vars(part).items()})
+    return rows_of(part, inside)
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -160,15 +161,15 @@ class Score:
         self.nis = nis(residuals) if residuals is not None else np.empty(0)
 
     @cached_property
-    def judged(self) -> Judged:
-        """Judged: the errors of all of the recording."""
+    def series(self) -> ErrorSeries:
+        """ErrorSeries: the errors of all of the recording."""
         odometry, truth = self._whole
         t, error, covariance = position_errors(odometry, truth, truth.t[0], truth.t[-1])
-        return Judged(t, error, covariance, nees(error, covariance), odometry.t, _known_spans(truth.t))
+        return ErrorSeries(t, error, covariance, nees(error, covariance), odometry.t, _known_spans(truth.t))
 
     def phases(self) -> dict[str, dict[str, Any]]:
-        """The figures of each phase of this run: {name: dict of `Judged.figures`}."""
-        return {name: self.judged.figures(*span, self._reach) for name, span in phases(self._whole[1]).items()}
+        """The figures of each phase of this run: {name: dict of `ErrorSeries.figures`}."""
+        return {name: self.series.figures(*span, self._reach) for name, span in phases(self._whole[1]).items()}
 
     def row(self) -> dict[str, Any]:
         """The figures of this run, of its part: a dict. "late_start": nothing but that has made it a diverged run; "ready_delay": s
@@ -244,7 +245,7 @@ class Pool:
         self._runs, self._total, self._largest = 0, 0.0, 0.0
         self._row: dict[str, Any] = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
         self._ready = math.nan
-        self._phases: dict[str, Together] = {}
+        self._phases: dict[str, PooledErrors] = {}
         self._aligned: dict[str, Any] = Counter()
 
     def add(self, result: Result) -> None:
@@ -263,7 +264,7 @@ class Pool:
             error = result.aligned[f"rmse_3d_{how}"]
             self._aligned[how] += math.nan if error is None else error
         for name, figures in result.phases.items():
-            self._phases.setdefault(name, Together()).add(figures)
+            self._phases.setdefault(name, PooledErrors()).add(figures)
 
     @property
     def aligned(self) -> dict[str, float]:
@@ -271,7 +272,7 @@ class Pool:
         return {how: total / self._runs for how, total in self._aligned.items()}
 
     def phases(self) -> dict[str, dict[str, Any]]:
-        """{name of a phase: dict of `Together.figures`}, of those that any of the runs has."""
+        """{name of a phase: dict of `PooledErrors.figures`}, of those that any of the runs has."""
         return {name: self._phases[name].figures() for name in TITLES if name in self._phases}
 
     def figures(self) -> dict[str, Any]:

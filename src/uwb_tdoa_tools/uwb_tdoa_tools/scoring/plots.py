@@ -28,17 +28,17 @@ def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path,
     """Error per axis with its 3-sigma band over all of the recording, its phases shaded, and the path from above and from the side,
     to an image file."""
     figure, axes = plt.subplots(3, 2, figsize=(13, 8), width_ratios=(3, 2), layout="constrained")
-    judged, found = score.judged, score.phases()
-    std = np.sqrt(np.einsum("nii->ni", judged.covariance))
-    since = judged.t - truth.t[0]
+    series, found = score.series, score.phases()
+    std = np.sqrt(np.einsum("nii->ni", series.covariance))
+    since = series.t - truth.t[0]
     for k, axis in enumerate("xyz"):
         ax = axes[k, 0]
         for name in (name for name in SHADES if name in found):
             begin = found[name]["begin"] - truth.t[0]
             ax.axvspan(begin, begin + found[name]["duration"], color=SHADES[name], alpha=0.2, lw=0, label=TITLES[name] if not k else None)
         ax.fill_between(since, -3 * std[:, k], 3 * std[:, k], color="tab:red", alpha=0.2, lw=0, label=None if k else "3 sigma")
-        ax.plot(since, judged.error[:, k], lw=0.8, label=None if k else "error")
-        sizes = np.abs(judged.error[np.isfinite(judged.error[:, k]), k])
+        ax.plot(since, series.error[:, k], lw=0.8, label=None if k else "error")
+        sizes = np.abs(series.error[np.isfinite(series.error[:, k]), k])
         limit = max(0.5, 1.2 * sizes.max(initial=0.0))
         ax.set(ylabel=f"{axis} [m]", ylim=(-limit, limit))
         ax.grid(alpha=0.3)

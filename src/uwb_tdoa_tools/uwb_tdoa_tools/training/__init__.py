@@ -8,8 +8,5 @@ physics    the effects that diagnose can name
 shrinking  as much of a model as flights left out bear out
 linear     robust Bayesian regression on sparse designs: what structured is fitted with
 export     ONNX files with metadata
-study      what any model could reach at most, and how alike flights are
-simulated  flights of constellations to train on, and of others
-default    makes the model that bias_node ships
-plots      pictures
+plots      the learning curve
 """

@@ -108,7 +108,7 @@ def train(
         meta["trained_with"] = [effect.name for effect in effects.effects]
     if model:
         learned_from = groups[0] if kind.startswith("paper") else everything
-        meta |= {"validity": _validity(learned_from, model.judged), "fade_std": _rms(one.error for one in groups[1])}
+        meta |= {"validity": _validity(learned_from, model.validity_features), "fade_std": _rms(one.error for one in groups[1])}
         heads = [meta["validity"][name] for name in ("forward_x", "forward_y")]
         if model.sees_attitude and any(high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads):
             meta["largest_yaw_std"] = LARGEST_YAW_STD  # before the yaw is known, it cannot tell
@@ -223,10 +223,10 @@ def _rms(parts: Iterable[np.ndarray]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) if parts else float("nan")
 
 
-def _validity(learned_from: Sequence[Labels], judged: Sequence[str]) -> dict[str, list[float]]:
+def _validity(learned_from: Sequence[Labels], features: Sequence[str]) -> dict[str, list[float]]:
     """{feature: [lowest, highest, margin]} of Labels."""
     limits = {}
-    for names, more in ((_ATTITUDE, SLACK), (judged, 0.0)):
+    for names, more in ((_ATTITUDE, SLACK), (features, 0.0)):
         if not names:
             continue
         table = np.concatenate([columns(one.samples, names) for one in learned_from])

@@ -40,7 +40,7 @@ class Paper:
     ) -> None:  # fmt: skip
         """names : features; offset, scale : (k,); layers : list of (weights (i, o), biases (o,)); std : m."""
         self.names, self.offset, self.scale, self.layers, self.std = names, offset, scale, layers, std
-        self.judged = tuple(name for name in names if name[0] == "d")
+        self.validity_features = tuple(name for name in names if name[0] == "d")
 
     def mean(self, samples: Samples) -> np.ndarray:
         """Predicted error, (n,) m."""

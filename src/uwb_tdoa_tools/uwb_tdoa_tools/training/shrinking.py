@@ -19,7 +19,7 @@ from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ..parallel import in_one_thread
-from ..scoring.borne_out import SHARES, BorneOut, choose
+from ..scoring.shrinkage import SHARES, Shrinkage, best_share
 from ..scoring.evaluation import evaluate
 from . import models, physics
 
@@ -34,11 +34,11 @@ FOLDS = 5
 
 
 @in_one_thread
-def bear_out(
+def cross_validated(
     recipe: Recipe, flights: Sequence[Flight], plain: Mapping[str, float], found: physics.Physics | None = None,
     progress: Callable[[str], object] = lambda text: None, map_function: MapFunction = map,
-) -> BorneOut:  # fmt: skip
-    """BorneOut of the model of a Recipe trained on Flights.
+) -> Shrinkage:  # fmt: skip
+    """Shrinkage of the model of a Recipe trained on Flights.
 
     plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with effects;
     map_function(function, folds) : as map, but for the time and the process in which each is done.
@@ -53,12 +53,12 @@ def bear_out(
         for name, of in of_fold.items():
             progress("{} left out: {:.3f} m without, {:.3f} m with all".format(name, of[None], of[1.0]))
         errors |= of_fold
-    return BorneOut(choose(errors), errors)
+    return Shrinkage(best_share(errors), errors)
 
 
 def uncorrected(flights: Sequence[Flight], map_function: MapFunction = map) -> dict[str, float]:
     """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction. map_function : as
-    of `bear_out`."""
+    of `cross_validated`."""
     return {flight.name: error for error, flight in zip(map_function(_error, flights), flights)}
 
 
@@ -80,8 +80,8 @@ def errors_by_share(
 def train(
     recipe: Recipe, training: Sequence[Flight], validation: Sequence[Flight], name: str,
     progress: Callable[[str], object] = lambda text: None, map_function: MapFunction = map,
-) -> tuple[models.Trained, BorneOut]:  # fmt: skip
-    """(Trained, BorneOut): `models.train`, and as much of it as is borne out. map_function : as of `bear_out`."""
+) -> tuple[models.Trained, Shrinkage]:  # fmt: skip
+    """(Trained, Shrinkage): `models.train`, and as much of it as is borne out. map_function : as of `cross_validated`."""
     flights = [*training, *validation]
     found = None
     if recipe.kind.startswith("physics"):
@@ -89,7 +89,7 @@ def train(
         found = physics.find(flights)
     trained = models.train(recipe, training, validation, name, progress, found)
     plain = uncorrected(flights, map_function)
-    borne_out = bear_out(recipe, flights, plain, found, progress, map_function)
+    borne_out = cross_validated(recipe, flights, plain, found, progress, map_function)
     if trained.model:
         trained = replace(trained, meta={**trained.meta, "share": borne_out.share})
     return trained, borne_out

@@ -113,7 +113,7 @@ def make_map(
 class Structured:
     """The model; `prepare` makes one without weights, `set_posterior` gives it them."""
 
-    judged = ()  # it fades over positions by itself
+    validity_features = ()  # it fades over positions by itself
 
     def __init__(self, options: Options, site: Map, site_ids: np.ndarray, site_positions: np.ndarray) -> None:
         """site : Map over scaled positions; site_ids (s,), site_positions (s, 3) m : the anchors and where they

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-import sys
 from typing import Any, TYPE_CHECKING
-
-from tqdm import tqdm
 
 from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
@@ -19,12 +16,12 @@ from ..readers.inputs import Reading, report_remarks
 from ..results_file import ResultsFile, state_of
 from . import table
 from .alignment import ALIGN, NONE, alignment_of, need_truth
-from .evaluation import judging_truth
+from .evaluation import corrected_truth
 from .metrics import Pool, Result, Score
 from .tum import write_tum
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.results import Odometry, Residuals
     from ..bags.bag import RecordedOdometry
@@ -33,8 +30,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Judge:
-    """judge((path, survey)) is the Result of a recording: of the filter run over it, or of the odometry in a bag.
+class Evaluator:
+    """evaluator((path, survey)) is the Result of a recording: of the filter run over it, or of the odometry in a bag.
 
     reading : Reading; estimator : Estimator; odometry : path of a bag whose odometry is judged instead, or None; picture :
     file to draw the errors to, or None; trajectories : folder for TUM files, or None; rerun : file for Rerun, or None; align : of
@@ -63,7 +60,7 @@ class Judge:
         else:
             run = self.estimator(flight)
             odometry, residuals = run.odometry, run.residuals
-            flight = replace(flight, truth=judging_truth(flight, self.estimator.effects))
+            flight = replace(flight, truth=corrected_truth(flight, self.estimator.effects))
         assert flight.truth is not None  # need_truth
         found = alignment_of(flight, odometry)
         report_remarks(flight.name, self._of_truth(flight, found))
@@ -102,7 +99,7 @@ class Judge:
 
 
 def results(
-    judge: Judge, recordings: Sequence[Recording], path: str | Path | None, asked: dict[str, Any],
+    evaluator: Evaluator, recordings: Sequence[Recording], path: str | Path | None, asked: dict[str, Any],
     jobs: int | None = None, dask: str | None = None,
 ) -> Iterator[Result]:  # fmt: skip
     """Generator of the Result of each of some recordings, in turn; those that are in the file `path` are not made again.
@@ -111,17 +108,14 @@ def results(
     dask : as of `parallel.over`.
     """
     if path is None:
-        yield from parallel.over(judge, recordings, jobs, dask)
+        yield from parallel.over(evaluator, recordings, jobs, dask)
         return
     keys = [" ".join(map(state_of, recording)) for recording in recordings]
     with ResultsFile(path, asked) as done:
-        missing = {key: recording for key, recording in zip(keys, recordings) if key not in done}
-        if len(missing) < len(recordings):
-            tqdm.write(f"{path} holds {len(recordings) - len(missing)} of {len(recordings)} flights; going on with the others", sys.stderr)
-        made = parallel.over(judge, missing.values(), jobs, dask)
-        for key in keys:
-            if key not in done:
-                done[key] = next(made).as_dict()
+        def make(missing: Iterable[Recording]) -> Iterator[dict[str, Any]]:
+            return (result.as_dict() for result in parallel.over(evaluator, missing, jobs, dask))
+
+        for key in done.keys_done(keys, recordings, make, "flights"):
             yield done.read(key, _sound)
 
 

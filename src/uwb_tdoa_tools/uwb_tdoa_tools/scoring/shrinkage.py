@@ -14,7 +14,7 @@ SHARES = 0.0, 0.5, 0.75, 1.0
 
 
 @dataclass(frozen=True)
-class BorneOut:
+class Shrinkage:
     """What flights left out say. share : of the prediction that is to be taken out; errors : {flight: {share: 3D RMSE of the
     filter, m}}, under None without any correction."""
 
@@ -41,9 +41,9 @@ class BorneOut:
         return {"share": self.share, "gain": gains.mean(), "spread": _spread(gains), "worst": gains.min(), "left_out": errors}
 
 
-def choose(errors: Errors) -> float:
+def best_share(errors: Errors) -> float:
     """The share whose error, relative to that without correction, is smallest a standard deviation above its mean over the
-    flights left out. errors : as of BorneOut.
+    flights left out. errors : as of Shrinkage.
 
     The mean alone takes all of a model that gains much on three flights and loses a little on the fourth; the flights to come
     are more varied than these.
