@@ -9,7 +9,7 @@ from test_flying_verdict import made_up
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.flying.plots import drawn
-from uwb_tdoa_tools.flying.verdict import judge
+from uwb_tdoa_tools.flying.verdict import verdict_of
 
 from studies import __main__ as study
 from studies.closed_loop import experiment
@@ -42,9 +42,9 @@ def test_it_trains_flies_tells_and_draws(tmp_path, monkeypatch, capsys):
                   and one.config == task.config and one.diagnosed == (task.effects is not None))  # fmt: skip
         flown.append((by, task.seed, task.path.swing))
         one = made_up(off=OFF[by])
-        return judge(one), drawn(one, judge(one))
+        return verdict_of(one), drawn(one, verdict_of(one))
 
-    monkeypatch.setattr(experiment.fleet, "judged", judged)
+    monkeypatch.setattr(experiment.fleet, "fly_one", judged)
     arguments = ["closed-loop", "--flights", "2", "--seed", "5", "--jobs", "1", "--trained", str(trained), "--out", str(tmp_path)]
     assert study.main(arguments) == 0
     assert sorted(set(flown)) == sorted((by, seed, swing) for by in ESTIMATORS for seed in (5, 6) for swing in (0.0, 0.4))

@@ -11,7 +11,7 @@ from uwb_tdoa_tools.flying.estimates import OurFilter
 from uwb_tdoa_tools.flying.mission import DONE
 from uwb_tdoa_tools.flying.pilot import Pilot
 from uwb_tdoa_tools.flying.trial import Task, Trial
-from uwb_tdoa_tools.flying.verdict import judge
+from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL
 from uwb_tdoa_tools.simulation.imu import NO_IMU_ERRORS
 
@@ -54,7 +54,7 @@ def test_up_to_a_place_and_down_twice(flight):
     pilot.land(0, 0.0, 2.0)
     while not trial.over:
         trial.turn()
-    verdict = judge(trial.flown)
+    verdict = verdict_of(trial.flown)
     assert verdict["landed"] and verdict["place"] < 0.15 and trial.missions[0].state == DONE
     assert verdict["started"] == pytest.approx(1.0, abs=0.02)
     pilot.take_off(0, 0.5, 2.0)
@@ -96,5 +96,5 @@ def test_lost_it_sinks_and_takes_no_commands(flight):
         pilot.land(0, 0.0, 2.0)
     while not trial.over:
         trial.turn()
-    verdict = judge(trial.flown)
+    verdict = verdict_of(trial.flown)
     assert verdict["said_lost"] == pytest.approx(3.0, abs=0.05) and verdict["safe"]
