@@ -119,14 +119,26 @@ def test_the_container_runs_as_an_ordinary_user_beside_the_host_and_with_pins():
     ]
 
 
+def setup_of(folder, *names):
+    """What setup.py of a package says of some names: {name: value}."""
+    code = f"import json, runpy, setuptools; kept = {{}}; setuptools.setup = kept.update; runpy.run_path('setup.py'); names = {names}; "
+    code += "print(json.dumps({name: kept.get(name, {}) for name in names}))"
+    return json.loads(subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True).stdout)
+
+
 @pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
 def test_colcon_finds_tests(folder):
     """By the rule of colcon itself, on what setup.py says."""
     rule = pytest.importorskip("colcon_core.task.python.test")
-    code = "import json, runpy, setuptools; kept = {}; setuptools.setup = kept.update; "
-    code += "runpy.run_path('setup.py'); print(json.dumps(kept.get('extras_require', {})))"
-    told = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True).stdout
-    assert rule.has_test_dependency({"extras_require": json.loads(told)}, "pytest")
+    assert rule.has_test_dependency(setup_of(folder, "extras_require"), "pytest")
+
+
+@pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
+def test_models_and_templates_are_installed_too(folder):
+    package = folder / folder.name
+    patterns = setup_of(folder, "package_data")["package_data"].get(folder.name, [])
+    given = {path for pattern in patterns for path in package.glob(pattern)}
+    assert {path for path in package.rglob("[!.]*.*") if path.suffix not in (".py", ".pyc") and not path.parent.name.startswith(".")} == given
 
 
 @pytest.mark.slow

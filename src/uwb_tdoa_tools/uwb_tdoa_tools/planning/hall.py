@@ -16,8 +16,10 @@ from ..checking.sides import sides_of, to_copy
 from ..scoring.plots import plt
 from ..simulation.walls import heard_at
 from .bifurcation import CLEAR, Subsets
+from .layout import with_one
 from .maps import Chart
 from .precision import bound, dilution, information, position_error
+from .report import quantiles
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -117,7 +119,7 @@ class Hall:
             position = np.array([*points[cell, :2].round(1), floor + ANCHOR_HEIGHT])
             near = holes[tree.query_ball_point(position, self.reach)]
             near = near[np.linspace(0, len(near) - 1, min(len(near), LOOKED_AT)).astype(int)] if len(near) else near
-            more = Hall(self.goal, _with(self.anchors, position), self.reach, self.walls)
+            more = Hall(self.goal, with_one(self.anchors, position), self.reach, self.walls)
             gained = 0
             for rows, point in zip(more.heard(points[near]), points[near]):
                 nearest = sorted(rows[:MOST_HEARD].tolist())
@@ -128,26 +130,16 @@ class Hall:
         return {"position": best[1], "gain": float(best[0] / len(chart.flyable))}
 
 
-def _with(anchors: Anchors, position: np.ndarray) -> Anchors:
-    """Anchors with one more at a position (3,) m."""
-    ids = np.append(anchors.ids, anchors.ids.max() + 1 if anchors.ids.max() < 65535 else np.setdiff1d(np.arange(65536), anchors.ids)[0])
-    orientations = np.vstack([anchors.orientations, [np.nan] * 4])
-    return type(anchors)(ids, np.vstack([anchors.positions, position]), orientations, anchors.frame)
-
-
 def summary(chart: Chart, heard: np.ndarray) -> dict[str, Any]:
     """Figures of a Chart and heard (n,): {"heard": {number: share of the cells}, "flyable_share", "bound_flyable": quantiles, m}."""
     numbers, counts = np.unique(heard, return_counts=True)
-    errors = chart.error[chart.flyable]
     return {
         "cells": list(chart.grid.shape),
         "step": chart.grid.step,
         "heard": dict(zip(map(str, numbers.tolist()), (counts / len(heard)).tolist())),
         "flyable_share": float(chart.flyable.mean()),
         "too_few_share": float(np.mean(~np.isfinite(chart.error) & ~chart.hull)),
-        "bound_flyable": dict(zip(("best", "median", "95 %", "worst"), np.quantile(errors, [0.0, 0.5, 0.95, 1.0]).tolist()))
-        if len(errors)
-        else None,
+        "bound_flyable": quantiles(chart.error[chart.flyable]),
     }
 
 

@@ -33,11 +33,11 @@ def summary(chart: Chart) -> dict[str, Any]:
         "two_solutions_share": float(np.mean(chart.hull & ~chart.flyable)),
         "flyable_size": float(chart.flyable.sum() * cell),
         "size": float(chart.flyable.size * cell),
-        "bound_in_hull": _quantiles(chart.error[inside]),
+        "bound_in_hull": quantiles(chart.error[inside]),
         "bound_99_per_axis_in_hull": {
-            axis: _quantiles(column) for axis, column in zip("xyz", NORMAL_99 * chart.std[inside].T)
+            axis: quantiles(column) for axis, column in zip("xyz", NORMAL_99 * chart.std[inside].T)
         },
-        "pdop_in_hull": _quantiles(chart.dop[inside]),
+        "pdop_in_hull": quantiles(chart.dop[inside]),
     }
 
 
@@ -113,7 +113,8 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
-def _quantiles(values: np.ndarray) -> dict[str, float] | None:
+def quantiles(values: np.ndarray) -> dict[str, float] | None:
+    """{"best", "median", "95 %", "worst"} of values (n,); None without any."""
     if not len(values):
         return None
     return dict(zip(("best", "median", "95 %", "worst"), np.quantile(values, [0.0, 0.5, 0.95, 1.0]).tolist()))
