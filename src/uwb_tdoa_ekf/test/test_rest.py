@@ -107,7 +107,7 @@ def test_live_the_delays_of_the_floor_do_the_same():
     delays = np.where(np.array(corners().positions)[:, 2] < 1.0, 3.3, 0.3)
     flight = on_floor(0, 3.0, known=delays)
     known = EffectSet((EFFECTS["floor_multipath"]({f"{i}.delay": delay for i, delay in zip(flight.anchors.ids, delays)}),))
-    estimator = Estimator(flight.anchors, reorder=0.0, floor=known.on_floor(flight.anchors))
+    estimator = Estimator(flight.anchors, reorder=0.0, effects=known)
     estimator.add_imu(flight.imu.t, flight.imu.gyro, flight.imu.accel)
     estimator.add_tdoa(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
     assert_same(estimator.finish()[0], run_offline(flight, None, Corrector(flight.anchors, known)).odometry)

@@ -85,7 +85,7 @@ def test_live_it_is_the_same_and_the_recording_stays_as_it_is():
     flight, effect = fly(22, 4.0), function()
     known, accel = EffectSet((effect,)), flight.imu.accel.copy()
     offline = run_offline(flight, None, Corrector(flight.anchors, known))
-    estimator = Estimator(flight.anchors, reorder=0.0, functions=known.sensor_functions)
+    estimator = Estimator(flight.anchors, reorder=0.0, effects=known)
     estimator.add_imu(flight.imu.t, flight.imu.gyro, flight.imu.accel)
     estimator.add_tdoa(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
     assert_same(estimator.finish()[0], offline.odometry)

@@ -145,15 +145,13 @@ class EkfNode(ros.StreamNode):
 
     def _on_anchors(self, anchors: Anchors) -> None:
         if self._estimator is not None and self._estimator.stay(anchors):
-            self._estimator.change_anchors(anchors, self._effects.on_floor(anchors))
+            self._estimator.change_anchors(anchors)
             self._watch = self._new_watch(anchors)
             return
         if self._estimator is not None:
             self._publish(*self._estimator.finish())
             self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
-        self._estimator = Estimator(
-            anchors, self._config, self._reorder, self._lag, self._effects.sensor_functions, self._effects.on_floor(anchors)
-        )
+        self._estimator = Estimator(anchors, self._config, self._reorder, self._lag, self._effects)
         self._imu_corrector = ImuCorrector(self._effects.effects)
         self._watch, self._restarts = self._new_watch(anchors), 0
         self.outputs.set_world(self._world or anchors.frame)

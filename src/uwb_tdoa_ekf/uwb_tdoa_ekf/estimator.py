@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BACK
@@ -26,13 +27,9 @@ from .results import VERDICTS, Odometry, Residuals, concatenated
 from .rows import aid_rows, imu_rows, usable_tdoas
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import ArrayLike
-    from uwb_tdoa_bias.effects.sensor_function import SensorFunction
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.sensors import Stream
-    from .core.memory import Floor
     from .pipeline import Fed
     from .streams.finding import Finding
 
@@ -49,11 +46,11 @@ class Estimator:
 
     def __init__(
         self, anchors: Anchors, config: FilterConfig | None = None, reorder: float = 0.003, lag: float = 0.25,
-        functions: Sequence[SensorFunction] = (), floor: Floor | None = None,
+        effects: EffectSet = EffectSet(),
     ) -> None:  # fmt: skip
-        """anchors : Anchors; config : FilterConfig; reorder, lag : s, see ReorderBuffer; functions : SensorFunctions that are known; floor
-        : what is known of the anchors at a tag on the floor, see `EffectSet.on_floor`."""
-        self._installed, self._known = Installed(anchors), (functions, floor)
+        """anchors : Anchors; config : FilterConfig; reorder, lag : s, see ReorderBuffer; effects : EffectSet that is known, as of a
+        Pipeline; streams that are added are free of the rest (ImuCorrector, AidCorrector, bias_node)."""
+        self._installed, self._effects = Installed(anchors), effects
         self.config = config or FilterConfig()
         of_aids = [f"{stream}_{verdict}" for stream in aids.STREAMS for verdict in VERDICTS.values()]
         names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_aids]
@@ -64,7 +61,7 @@ class Estimator:
         self._clear()
 
     def _clear(self) -> None:
-        self._pipeline = Pipeline(self._installed, self.config, *self._known)
+        self._pipeline = Pipeline(self._installed, self.config, self._effects)
         self._poses: list[np.ndarray] = []  # (1,) of POSE, set and not reached yet
         self._begun = False  # there was a measurement
         self.refused_pose: str | None = None  # sentence on a pose that was set before the first measurement, and is of another time
@@ -199,12 +196,10 @@ class Estimator:
         stay = self._installed.stay(anchors)
         return anchors.frame == self.anchors.frame and bool(stay.any()) and len(self._installed) + int(np.sum(~stay)) <= MOST_ROWS
 
-    def change_anchors(self, anchors: Anchors, floor: Floor | None = None) -> None:
+    def change_anchors(self, anchors: Anchors) -> None:
         """Go on among other Anchors: those that are new are used from now on, those that are gone no more, and one that stands elsewhere as
-        a new one. Nothing is forgotten of those that stay. TDOAs that wait are used, as far as their anchors were there when they came.
-        floor : as of the start."""
-        self._known = (self._known[0], floor)
-        self._pipeline.change_anchors(self._installed.change(anchors), *self._known)
+        a new one. Nothing is forgotten of those that stay. TDOAs that wait are used, as far as their anchors were there when they came."""
+        self._pipeline.change_anchors(self._installed.change(anchors))
 
     def reset(self) -> tuple[Odometry, Residuals]:
         """Use everything that still waits, and forget it: what comes next starts the filter anew. Returns

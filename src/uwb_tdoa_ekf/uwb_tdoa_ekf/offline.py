@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.poses import known_yaw_std
+from uwb_tdoa_bias.effects import EffectSet
 
 from .core.aids import STREAMS as AIDS
 from .core.config import FilterConfig
 from .core.hypotheses import yaw_offset
 from .core.memory import AID, RESIDUAL, TDOA, joined, structured
 from .core.verdicts import INVALID
-from .frames import rotation_std
 from .installed import Installed
-from .pipeline import Pipeline, odometry_of
+from .pipeline import Pipeline, odometry_of, poses_of
 from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals
 from .rows import aid_rows, imu_rows, usable_tdoas
@@ -68,8 +67,8 @@ def run_offline(
     flight = corrector.effects.correct_streams(flight)
     tdoa, anchors = flight.tdoa, flight.anchors
     raw = tdoa.t, anchors.index(tdoa.a), anchors.index(tdoa.b), tdoa.d
-    functions, floor = corrector.effects.sensor_functions, corrector.weighed.on_floor(anchors)
-    pipeline = Pipeline(Installed(anchors), config, functions, floor, watched=False, records=records)
+    effects = EffectSet((*corrector.effects, *corrector.weighed))
+    pipeline = Pipeline(Installed(anchors), config, effects, watched=False, records=records)
     buffer, places = loaded(flight, config)
     bias, std = np.zeros((2, len(tdoa)))
     parts: list[Fed] = []
@@ -142,8 +141,3 @@ def _batches(
         yield known[first:end], math.nextafter(stamps[end], -math.inf) if end < len(known) else math.inf
         first = end
 
-
-def poses_of(odometry: Odometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4), v (n, 3) m/s, yaw_std
-    (n,) rad)."""
-    return odometry.t, odometry.p, odometry.q, odometry.v, known_yaw_std(rotation_std(odometry.q, odometry.covariance))

@@ -7,17 +7,21 @@ from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.correction.poses import known_yaw_std
+from uwb_tdoa_bias.effects import EffectSet
+
 from .core.engine import feed, set_pose
-from .core.memory import ODOMETRY, RESIDUAL, TDOA, Floor, Measurements, joined
+from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined
+from .frames import rotation_std
 from .installed import Installed, forget, new_state_of
 from .monitoring.monitor import Monitor
 from .monitoring.slices import LENGTH
+from .radio_corrections import RadioCorrections
 from .results import Odometry, Residuals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.effects.sensor_function import SensorFunction
     from .core.config import FilterConfig
     from .reorder_buffer import ReorderBuffer
 
@@ -36,13 +40,15 @@ class Pipeline:
     """Takes what a ReorderBuffer releases. state : FilterState; monitor : Monitor, or None, if nobody asks what has changed."""
 
     def __init__(
-        self, anchors: Installed, config: FilterConfig, functions: Sequence[SensorFunction] = (),
-        floor: Floor | None = None, watched: bool = True, records: list[np.ndarray] | None = None,
+        self, anchors: Installed, config: FilterConfig, effects: EffectSet = EffectSet(), watched: bool = True,
+        records: list[np.ndarray] | None = None,
     ) -> None:  # fmt: skip
-        """anchors : Installed; config : FilterConfig; functions, floor : as of `new_state`, of the anchors that are there; watched : have a
-        Monitor in any case; records : list to which the history is appended (see engine.feed), or None."""
-        self._anchors, self._records = anchors, records
-        self.state = new_state_of(anchors, functions, floor)
+        """anchors : Installed; config : FilterConfig; effects : EffectSet that is known, of which the filter itself is told, or that is
+        taken out of distances to anchors; watched : have a Monitor in any case; records : list to which the history is appended (see
+        engine.feed), or None."""
+        self._anchors, self._effects, self._records = anchors, effects, records
+        self.state = self._new_state()
+        self._corrections = RadioCorrections(effects, anchors)
         self.monitor = Monitor(anchors) if watched or config.compensate_changes else None
         self.configure(config)
 
@@ -52,9 +58,12 @@ class Pipeline:
         if not config.compensate_changes:
             self.state.anchors["delay"] = self.state.anchors["delay_variance"] = 0.0
 
-    def change_anchors(self, gone: np.ndarray, functions: Sequence[SensorFunction], floor: Floor | None) -> None:
+    def _new_state(self) -> FilterState:
+        return new_state_of(self._anchors, self._effects.sensor_functions, self._effects.on_floor(self._anchors.anchors))
+
+    def change_anchors(self, gone: np.ndarray) -> None:
         """Go on after a change of the Installed: with what is known of its new rows, and without the rows `gone` (k,)."""
-        more, first = new_state_of(self._anchors, functions, floor), len(self.state.anchors)
+        more, first = self._new_state(), len(self.state.anchors)
         self.state = self.state._replace(anchors=np.concatenate([self.state.anchors, more.anchors[first:]]))
         self.state.record.extent[:] = more.record.extent
         forget(self.state, gone)
@@ -89,11 +98,16 @@ class Pipeline:
     def _feed(self, measured: Measurements) -> list[Fed]:
         if not any(map(len, measured)):
             return []
-        used = measured if self._config.use_imu else measured._replace(imu=measured.imu[:0])
-        fed = Fed(measured, *feed(self.state, self._parameters, used, self._records))
+        parts = []
+        for part in [measured] if self._corrections.idle else self._corrections.slices(measured):
+            used = part if self._config.use_imu else part._replace(imu=part.imu[:0])
+            fed = Fed(part, *feed(self.state, self._parameters, used, self._records))
+            if not self._corrections.idle:
+                self._corrections.add_pose(*poses_of(Odometry.from_rows(fed.odometry)))
+            parts.append(fed)
         if self.monitor is not None:
-            self.monitor.add(Odometry.from_rows(fed.odometry), self.residuals([fed]))
-        return [fed]
+            self.monitor.add(odometry_of(parts), self.residuals(parts))
+        return parts
 
     def residuals(self, parts: Sequence[Fed]) -> Residuals:
         """What became of the TDOAs of several Fed, in the order in which they were used."""
@@ -105,3 +119,9 @@ class Pipeline:
 def odometry_of(parts: Sequence[Fed]) -> Odometry:
     """What came of several Fed."""
     return Odometry.from_rows(joined(ODOMETRY, [part.odometry for part in parts]))
+
+
+def poses_of(odometry: Odometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4), v (n, 3) m/s, yaw_std
+    (n,) rad)."""
+    return odometry.t, odometry.p, odometry.q, odometry.v, known_yaw_std(rotation_std(odometry.q, odometry.covariance))

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..foundation.errors import InputError
-from ..foundation.geometry import ranges, tdoa
+from ..foundation.geometry import ranges
 from .base import Effect, check_anchor, known_anchors, once_per_anchors
 from .marks import Shift
+from .samples import RADIO, tile
 from .wording import counted, listed, significant, size
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ class AnchorPosition(Effect):
     }
     reference = "geometry; survey repeatability of a total station is millimetres, of a tape some centimetres"
     portable = False
+    channels = tuple(RADIO)
 
     @classmethod
     def check_key(cls, key: str) -> None:
@@ -62,20 +64,15 @@ class AnchorPosition(Effect):
         return positions
 
     def bias(self, samples: Samples) -> np.ndarray:
-        moved = self._moved(samples.anchors)
-        after = tdoa(samples.p, moved[samples.a], moved[samples.b])
-        return after - tdoa(samples.p, samples.position_a, samples.position_b)
+        return samples.true(positions=self._moved(samples.anchors)) - samples.true()
 
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
-        moved, ids = self._moved(samples.anchors), samples.anchors.ids
-        unit_a, unit_b = (-ranges(samples.p, moved[rows])[1] for rows in (samples.a, samples.b))
+        ids, rows = samples.anchors.ids[samples.rows], samples.rows
+        unit = -ranges(tile(samples, samples.p), self._moved(samples.anchors)[rows])[1]
         out = np.empty((len(samples), len(keys)))
         for column, key in enumerate(keys):
             anchor, axis = key.split(".")
-            k = "xyz".index(axis)
-            out[:, column] = (ids[samples.b] == int(anchor)) * unit_b[:, k] - (ids[samples.a] == int(anchor)) * unit_a[
-                :, k
-            ]
+            out[:, column] = samples.difference((ids == int(anchor)) * unit[:, "xyz".index(axis)])
         return out
 
     def advice(self) -> tuple[str, ...]:

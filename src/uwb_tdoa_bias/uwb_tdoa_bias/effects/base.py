@@ -11,7 +11,7 @@ import numpy as np
 from ..foundation.errors import InputError
 from .affine import IDENTITY
 from .domain import checked
-from .samples import Samples, true_samples
+from .samples import RADIO, Samples, true_samples
 from .wording import LARGEST, listed, measured, significant
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["ArrivalEffect", "Effect", "Samples"]
 
 Made = TypeVar("Made")
+
 
 
 def once_per_anchors(method: Callable[[Any, Anchors], Made]) -> Callable[[Any, Anchors], Made]:
@@ -148,8 +149,8 @@ class Effect:
         return all(abs(value) <= cls.bound_of(key) for key, value in values.items())
 
     def bias(self, samples: Samples) -> np.ndarray:
-        """Contribution to what `samples.channel` measures, (n,): of Samples to d_ab, metres; NaN where it cannot be told
-        (unknown pose)."""
+        """Contribution to what `samples.channel` measures, (n,) metres: of Samples to d_ab, of RangeSamples to the distance; NaN where it
+        cannot be told (unknown pose)."""
         return np.zeros(len(samples))
 
     @property
@@ -171,13 +172,15 @@ class Effect:
         """The Flight that would have been recorded with this effect on top. Raises InputError where that needs a ground
         truth, or an attitude, that the flight does not have. rng : numpy Generator, for random effects."""
         need_truth(self, flight)
-        samples, rows = true_samples(flight)
-        bias = self.bias(samples)
-        if not np.isfinite(bias).all():
-            raise InputError(f"{flight.name}: has no attitude in its ground truth, which {self.name} needs.")
-        d = flight.tdoa.d.copy()
-        d[rows] += bias
-        return replace(flight, tdoa=replace(flight.tdoa, d=d))
+        for channel in [channel for channel in self.channels if channel in RADIO and getattr(flight, channel) is not None]:
+            stream, (samples, rows) = getattr(flight, channel), true_samples(flight, RADIO[channel])
+            bias = self.bias(samples)
+            if not np.isfinite(bias).all():
+                raise InputError(f"{flight.name}: has no attitude in its ground truth, which {self.name} needs.")
+            d = stream.d.copy()
+            d[rows] += bias
+            flight = flight.replaced(**{channel: replace(stream, d=d)})
+        return flight
 
     def advice(self) -> tuple[str, ...]:
         """What a person can do about it in the hall: imperative sentences, the most important first; () if nothing but
@@ -220,7 +223,9 @@ class Effect:
 
 
 class ArrivalEffect(Effect):
-    """An effect that makes the signals of single anchors arrive late: bias of d_ab = delay_b - delay_a."""
+    """An effect that makes the signals of single anchors arrive late: bias of d_ab = delay_b - delay_a, of a range to b delay_b."""
+
+    channels = tuple(RADIO)
 
     def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
         """By how much the anchors in `rows` (k * n,), the samples repeated k times, seem too far: (k * n,) m."""
@@ -231,16 +236,16 @@ class ArrivalEffect(Effect):
         raise NotImplementedError
 
     def bias(self, samples: Samples) -> np.ndarray:
-        both = self.delays(samples, np.concatenate([samples.a, samples.b]))
-        return both[len(samples) :] - both[: len(samples)]
+        return samples.difference(self.delays(samples, samples.rows))
 
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
-        both = self.delay_regressors(samples, np.concatenate([samples.a, samples.b]), keys)
-        return both[len(samples) :] - both[: len(samples)]
+        return samples.difference(self.delay_regressors(samples, samples.rows, keys))
 
 
 class AnchorEffect(Effect):
     """An effect with one parameter for each anchor, named by its id, that makes its arrivals late in proportion."""
+
+    channels = tuple(RADIO)
 
     @classmethod
     def check_key(cls, key: str) -> None:
@@ -257,7 +262,7 @@ class AnchorEffect(Effect):
 
     def bias(self, samples: Samples) -> np.ndarray:
         values = self._of_each(samples.anchors)
-        return (values[samples.b] - values[samples.a]) * self.delay_per_unit(samples)
+        return samples.difference(values[samples.rows]) * self.delay_per_unit(samples)
 
     @once_per_anchors
     def _of_each(self, anchors: Anchors) -> np.ndarray:
@@ -265,7 +270,7 @@ class AnchorEffect(Effect):
 
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         ids, wanted = samples.anchors.ids, np.array([int(key) for key in keys])
-        sign = (ids[samples.b][:, None] == wanted).astype(float) - (ids[samples.a][:, None] == wanted)
+        sign = samples.difference((ids[samples.rows][:, None] == wanted).astype(float))
         return sign * np.reshape(self.delay_per_unit(samples), (-1, 1))
 
 

@@ -23,6 +23,7 @@ from .outlier_rate import OutlierRate
 from .pair_offset import PairOffset
 from .pair_sign import PairSign
 from .range_bias import RangeBias
+from .range_delay import RangeDelay
 from .range_scale import RangeScale
 from .received_power_bias import ReceivedPowerBias
 from .tag_lever_arm import TagLeverArm
@@ -41,6 +42,6 @@ EFFECTS = {
         RangeBias, ReceivedPowerBias, AntennaPattern, AnchorClockDrift, Nlos, FloorMultipath, GyroBias, GyroScale,
         AccelBias, AccelScale, ImuMisalignment, ImuGravity, NoiseLevel, NoiseCorrelation, OutlierRate,
         HeightOffset, HeightScale, FloorStep, BarometerDrift, VelocityScale, VelocityMisalignment, VelocityDelay,
-        VelocitySlip, AnchorIds, PairSign,
+        VelocitySlip, RangeDelay, AnchorIds, PairSign,
     )
 }  # fmt: skip

@@ -60,8 +60,7 @@ def faded(effect: Effect, samples: Samples) -> tuple[np.ndarray, np.ndarray | fl
     left, n = np.ones(len(samples)), len(samples)
     for covariate, limits in effect.domain.items():
         if covariate in OF_ARRIVAL:
-            both = share(OF_ARRIVAL[covariate](samples, np.concatenate([samples.a, samples.b])), limits)
-            left *= np.minimum(both[:n], both[n:])
+            left *= share(OF_ARRIVAL[covariate](samples, samples.rows), limits).reshape(-1, n).min(axis=0)
         elif (values := OF_TDOA[covariate](samples)) is not None:
             left *= share(values, limits)
     bias = effect.bias(samples.until(samples.start + effect.domain["time"][1]) if "time" in effect.domain else samples)

@@ -21,6 +21,7 @@ from .covariance import Covariance
 from .domain import LITTLE, faded, in_words
 from .imu_corrector import ImuCorrector
 from .label_error import LabelCorrector
+from .samples import RADIO
 from .smooth_term import SmoothTerm
 from .stamp_error import shifted
 
@@ -55,8 +56,7 @@ class EffectSet:
         return iter(self.effects)
 
     def bias(self, samples: Samples) -> np.ndarray:
-        """Sum of all contributions to what `samples.channel` measures, (n,): of Samples to d_ab, metres, faded where they were not
-        seen. An effect that cannot tell (unknown attitude) adds nothing."""
+        """Sum of all contributions to what `samples.channel` measures, (n,) metres, faded where they were not seen. An effect that cannot tell (unknown attitude) adds nothing."""
         total = np.zeros(len(samples))
         for effect in (effect for effect in self.effects if samples.channel in effect.channels):
             part = faded(effect, samples)[0]
@@ -76,22 +76,25 @@ class EffectSet:
         return sum(parts, np.zeros(samples.reading.shape))
 
     def noise_std(self, samples: Samples) -> np.ndarray:
-        """Standard deviation that the effects add to d_ab, (n,) metres, with what of them is not taken out because they were not
+        """Standard deviation that the effects add to what `samples.channel` measures, (n,) metres, with what of them is not taken out because they were not
         seen there."""
         total = np.zeros(len(samples))
         for effect in self._noisy:
-            total += effect.noise_std(samples) ** 2
+            if samples.channel in effect.channels:
+                total += effect.noise_std(samples) ** 2
         for effect in self._limited:
-            total += faded(effect, samples)[1] ** 2
+            if samples.channel in effect.channels:
+                total += faded(effect, samples)[1] ** 2
         return np.sqrt(total)
 
     def outside(self, samples: Samples) -> list[str]:
         """Of Samples: phrases on those effects of which less than half is taken out of some, because they were not seen there."""
-        return [in_words(effect) for effect in self._limited if np.min(faded(effect, samples)[2], initial=1.0) < LITTLE]
+        mine = (effect for effect in self._limited if samples.channel in effect.channels)
+        return [in_words(effect) for effect in mine if np.min(faded(effect, samples)[2], initial=1.0) < LITTLE]
 
     @cached_property
     def _limited(self) -> list[Effect]:
-        return [effect for effect in self.effects if effect.domain and "tdoa" in effect.channels]
+        return [effect for effect in self.effects if effect.domain and RADIO.keys() & set(effect.channels)]
 
     @cached_property
     def _noisy(self) -> list[Effect]:
@@ -101,6 +104,10 @@ class EffectSet:
     def of_attitude(self) -> EffectSet:
         """EffectSet of those whose part of a TDOA changes with the attitude of the tag."""
         return EffectSet(tuple(effect for effect in self.effects if effect.uses_attitude))
+
+    def acting_on(self, channel: str) -> EffectSet:
+        """EffectSet of those that add something to what a channel of RADIO measures."""
+        return EffectSet(tuple(effect for effect in self.effects if channel in effect.channels and type(effect).bias is not Effect.bias))
 
     @cached_property
     def needs_motion(self) -> bool:

@@ -29,6 +29,7 @@ class FloorMultipath(ArrivalEffect):
     "i.noise" metres where it is late by several echoes in turn."""
 
     name = "floor_multipath"
+    channels = ("tdoa",)
     unit = "m"
     bound = 20.0
     negligible = 0.05

@@ -25,6 +25,7 @@ class Nlos(ArrivalEffect):
     within "i.radius" metres of ("i.x", "i.y", "i.z"); what is not given does not limit it."""
 
     name = "nlos"
+    channels = ("tdoa",)
     unit = "m, s"
     bound = 100.0
     negligible = 0.02

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..foundation.geometry import tdoa
 from .base import Effect
+from .samples import RADIO
 from .wording import significant, size
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class RangeScale(Effect):
-    """d_ab is measured as (1 + scale) d_ab."""
+    """d_ab is measured as (1 + scale) d_ab, and so are ranges."""
 
     name = "range_scale"
     unit = "1"
@@ -30,6 +30,7 @@ class RangeScale(Effect):
     )
     confounded_with = ("range_bias", "anchor_position", "truth_frame")
     covariates = ("range",)
+    channels = tuple(RADIO)
     reference = "DW1000 user manual: one tick is 15.65 ps, 4.69 mm"
 
     @classmethod
@@ -37,15 +38,15 @@ class RangeScale(Effect):
         return [("scale",)]
 
     def bias(self, samples: Samples) -> np.ndarray:
-        return self.values.get("scale", 0.0) * tdoa(samples.p, samples.position_a, samples.position_b)
+        return self.values.get("scale", 0.0) * samples.true()
 
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
-        return np.repeat(tdoa(samples.p, samples.position_a, samples.position_b)[:, None], len(keys), axis=1)
+        return np.repeat(samples.true()[:, None], len(keys), axis=1)
 
     def advice(self) -> tuple[str, ...]:
         if not significant(self):
             return ()
         sign = "large" if self.values["scale"] > 0.0 else "small"
         return (
-            f"Check how the tag turns ticks into metres: every TDOA is {size(self, 'scale', '%', 100.0)} too {sign}.",
+            f"Check how the tag turns ticks into metres: everything is {size(self, 'scale', '%', 100.0)} too {sign}.",
         )

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Protocol, TYPE_CHECKING
 import numpy as np
 
 from ..foundation.anchors import Anchors
+from ..foundation.geometry import ranges, tdoa_each
 from ..foundation.later import rotations
 from ..foundation.sensors import SENSORS
 from .motion import POSE_LAG, Motion, motion_at, preceding
@@ -49,18 +50,52 @@ class Samples:
     yaw_std: np.ndarray | None = None
 
     channel: ClassVar[str] = "tdoa"
+    ends: ClassVar[int] = 2  # anchors that each is measured to
 
     def __len__(self) -> int:
         return len(self.t)
 
     def repeated(self, times: int) -> Samples:
-        """Samples of the same TDOAs, all of them so many times one after the other."""
-        kept: dict[str, Any] = {"anchors": self.anchors, "start": self.start}
-        return Samples(**{name: _repeated(value, times) for name, value in vars(self).items() if name not in kept}, **kept)
+        """Samples of the same measurements, all of them so many times one after the other."""
+        kept = "anchors", "start"
+        return replace(self, **{name: _repeated(value, times) for name, value in vars(self).items() if name not in kept})
 
     def until(self, t: float) -> Samples:
         """Samples as if none were later than t, s."""
         return replace(self, t=np.minimum(self.t, t))
+
+    @classmethod
+    def measured(cls, flight: Flight) -> tuple[Any, np.ndarray, np.ndarray]:
+        """(stream of a Flight, a (n,), b (n,)): what is measured, and rows of its anchors, -1 for what is no measurement between them."""
+        tdoa, anchors = flight.tdoa, flight.anchors
+        a, b = anchors.index(tdoa.a), anchors.index(tdoa.b)
+        return tdoa, np.where(a == b, -1, a), b
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(ends * n,) rows of `anchors`: of all arrivals, those from the first anchors, then those from the second."""
+        return np.concatenate([self.a, self.b])
+
+    def difference(self, of_arrivals: np.ndarray) -> np.ndarray:
+        """(n, ...): what arrivals (ends * n, ...) that are late by so much add to what is measured."""
+        return of_arrivals[len(self) :] - of_arrivals[: len(self)]
+
+    def true(self, p: np.ndarray | None = None, positions: np.ndarray | None = None) -> np.ndarray:
+        """What is measured when nothing is wrong, (n,) m; with the antenna at p (n, 3) m, or anchors at positions (N, 3) m instead."""
+        out, at = np.empty(len(self)), np.ascontiguousarray(self.p if p is None else p, dtype=float)
+        positions = self.anchors.positions if positions is None else positions
+        tdoa_each(at, positions[self.a], positions[self.b], out)
+        return out
+
+    def direction(self, p: np.ndarray | None = None) -> np.ndarray:
+        """Derivative of `true` by the place of the antenna, (n, 3)."""
+        p = self.p if p is None else p
+        return self.difference(ranges(tile(self, p), self.anchors.positions[self.rows])[1])
+
+    @property
+    def change(self) -> np.ndarray:
+        """How fast `true` changes as the tag moves, (n,) m/s, where its velocity is known."""
+        return np.sum(self.direction() * self.velocity, axis=1)
 
     @property
     def position_a(self) -> np.ndarray:
@@ -73,9 +108,38 @@ class Samples:
         return self.anchors.positions[self.b]
 
 
+@dataclass(frozen=True)
+class RangeSamples(Samples):
+    """A batch of distances to anchors in rows b, as effects see them; a is the same. start : s, as of a Flight; no `interval`, no
+    `previous`."""
+
+    channel: ClassVar[str] = "range"
+    ends: ClassVar[int] = 1
+
+    @classmethod
+    def measured(cls, flight: Flight) -> tuple[Any, np.ndarray, np.ndarray]:
+        stream = getattr(flight, cls.channel)
+        b = flight.anchors.index(stream.anchor)
+        return stream, b, b
+
+    @property
+    def rows(self) -> np.ndarray:
+        return self.b
+
+    def difference(self, of_arrivals: np.ndarray) -> np.ndarray:
+        return of_arrivals
+
+    def true(self, p: np.ndarray | None = None, positions: np.ndarray | None = None) -> np.ndarray:
+        positions = self.anchors.positions if positions is None else positions
+        return np.linalg.norm((self.p if p is None else p) - positions[self.b], axis=1)
+
+
+RADIO: dict[str, type[Samples]] = {kind.channel: kind for kind in (Samples, RangeSamples)}  # measured between the tag and anchors
+
+
 def tile(samples: Samples, values: np.ndarray) -> np.ndarray:
-    """Per-sample values (n, ...) repeated for both anchors: (2n, ...)."""
-    return np.concatenate([values, values])
+    """Per-sample values (n, ...) repeated for all anchors that each is measured to: (ends * n, ...)."""
+    return np.concatenate([values] * samples.ends)
 
 
 def _repeated(value: Any, times: int) -> Any:
@@ -201,14 +265,12 @@ def samples_at(
     return replace(samples, velocity=track.velocities(t), motion=track.motion(preceding(t) - lag))
 
 
-def true_samples(flight: Flight) -> tuple[Samples, np.ndarray]:
-    """(Samples, rows): the usable TDOAs of a Flight at its ground truth, and which rows of flight.tdoa they are."""
-    tdoa = flight.tdoa
-    a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
-    rows = np.flatnonzero((a >= 0) & (b >= 0) & (a != b) & np.isfinite(tdoa.d) & np.isfinite(tdoa.t))
-    start = float(tdoa.t[0]) if len(tdoa) else 0.0
+def true_samples(flight: Flight, kind: type[Samples] = Samples) -> tuple[Samples, np.ndarray]:
+    """(Samples, rows): the usable measurements of a kind in a Flight at its ground truth, and which rows of their stream they are."""
+    stream, a, b = kind.measured(flight)
+    rows = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(stream.d) & np.isfinite(stream.t))
     truth: Any = flight.truth  # who asks has seen that there is one
-    return samples_at(tdoa.t[rows], a[rows], b[rows], truth, flight.anchors, start), rows
+    return kind(**vars(samples_at(stream.t[rows], a[rows], b[rows], truth, flight.anchors, flight.start))), rows
 
 
 def aid_samples(

@@ -11,9 +11,9 @@ import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
-from ..foundation.sensors import DIAGNOSED, SENSORS
+from ..foundation.sensors import BY_POSE, SENSORS
 from .base import Effect, known_anchors, once_per_anchors
-from .samples import tile
+from .samples import RADIO, tile
 from .domain import FADE, bounded, share
 from .covariates import (
     CATEGORIES, EXTRA, OF_AIDS, OF_ARRIVAL, OF_IMU, OF_MOTION, OF_STATE, OF_TDOA, STATES, sensor_covariate,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 DEGREE = 2
 GONE = 4 * FADE  # share of the width of a domain beyond which nothing is left of a function
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
-AID_CHANNELS = tuple(name + axis for name in DIAGNOSED for axis in SENSORS[name].compared.axes)
+AID_CHANNELS = tuple(name + axis for name in BY_POSE for axis in SENSORS[name].compared.axes)
 FORMS = ("common", "arrival", "anchor", "pair", "direction")
 OF_LINKS = ("pair", "direction")  # forms with a function for a pair of anchors
 TYPICAL = {"tdoa": 0.1, "gyro": 0.1, "accel": 0.5}  # m, rad/s, m/s^2
@@ -44,12 +44,12 @@ OLD_NAMES = {"force": "accel", **{f"force_{axis}": f"accel_{axis}" for axis in "
 class SmoothTerm(Effect):
     """A function of one covariate, held constant beyond its knots; `values` are its coefficients c0, c1, ...
 
-    channel : "tdoa", "gyro.x" ... "accel.z", or of AID_CHANNELS
-    covariate : for "tdoa" a name of covariates.OF_TDOA or OF_ARRIVAL, for other channels of OF_AIDS, for the inertial ones
+    channel : one of RADIO, "gyro.x" ... "accel.z", or of AID_CHANNELS
+    covariate : of RADIO a name of covariates.OF_TDOA or OF_ARRIVAL, of "range" none that needs the TDOAs before, for other channels of OF_AIDS, for the inertial ones
         of OF_IMU too; or, but for AID_CHANNELS, "extra.STREAM.COLUMN". Where a recording does not hold it, it adds nothing
-    form : for "tdoa" only: "common", the same f(covariate) on every d_ab; "arrival", f of each anchor's own
+    form : of RADIO only: "common", the same f(covariate) on every d_ab; "arrival", f of each anchor's own
         covariate, as d_ab = f_b - f_a; "anchor", the same with a function for each anchor, coefficients "3.c0", ...;
-        "pair": f on d_ab and -f on d_ba, coefficients "0-1.c0", ...; "direction": f on d_ab alone
+        of "tdoa" alone "pair": f on d_ab and -f on d_ba, coefficients "0-1.c0", ...; "direction": f on d_ab alone
     knots : where the pieces meet, ends included, rising; for a covariate of names: the names, one coefficient each
     shape : "spline", quadratic, or one of `shapes.SHAPES`
     """
@@ -82,6 +82,7 @@ class SmoothTerm(Effect):
         if len(self.knots) < 2 or not (np.diff(self.knots) > 0.0).all():
             raise InputError(f"effects: smooth_term: knots: {self.knots!r} are not two or more rising numbers.")
         known: dict[str, tuple[str, ...]] = {"tdoa": (*OF_TDOA, *OF_ARRIVAL)}
+        known |= {channel: (*(name for name in OF_TDOA if name not in OF_MOTION), *OF_ARRIVAL) for channel in RADIO if channel != "tdoa"}
         known |= dict.fromkeys(IMU_CHANNELS, tuple(dict.fromkeys((*OF_IMU, *OF_AIDS))))
         known |= dict.fromkeys(AID_CHANNELS, OF_AIDS)
         extra = self.covariate.startswith(EXTRA) and self.channel not in AID_CHANNELS
@@ -98,6 +99,8 @@ class SmoothTerm(Effect):
                 f"effects: smooth_term: shape: {self.shape!r} with {len(self.knots)} knots is not spline or one of "
                 f"{shapes}."
             )
+        if self.form in OF_LINKS and self.channel in RADIO and RADIO[self.channel].ends < 2:
+            raise InputError(f"effects: smooth_term: form: {self.form} acts on two anchors, {self.channel} is of one; write form: anchor.")
         if self.form in OF_LINKS and self.covariate in OF_ARRIVAL:
             raise InputError(
                 f"effects: smooth_term: form: {self.form} acts on both anchors, {self.covariate} is of one; write form: anchor."
@@ -116,7 +119,7 @@ class SmoothTerm(Effect):
     # In other effects the following are of the class; here they follow from the settings of each term.
     def typical_of(self, key: str) -> float:  # type: ignore[override]  # of a term
         if self.shape != "spline" or self.form in OF_LINKS:
-            return ALONE if self.channel == "tdoa" else TYPICAL.get(self.channel.partition(".")[0], self.typical)
+            return ALONE if self.channel in RADIO else TYPICAL.get(self.channel.partition(".")[0], self.typical)
         return 0.5 * self.typical if "." in key else self.typical  # a function for each anchor: many, hence small
 
     @property
@@ -148,7 +151,7 @@ class SmoothTerm(Effect):
     @property
     def usable(self) -> bool:  # type: ignore[override]  # of a term
         """Whether the nodes, and the filter off line, have the covariate at hand."""
-        if self.channel == "tdoa":
+        if self.channel in RADIO:
             return self.covariate in (*OF_TDOA, *OF_ARRIVAL) and self.covariate != "vibration"
         return self.channel in IMU_CHANNELS and self.covariate in (*OF_IMU, *OF_STATE)
 
@@ -210,7 +213,7 @@ class SmoothTerm(Effect):
     def _covariate(self, samples: Samples) -> tuple[Any, np.ndarray | None]:
         """(values per TDOA or None, values per arrival or None)"""
         if self.covariate in OF_ARRIVAL:
-            return None, OF_ARRIVAL[self.covariate](samples, np.concatenate([samples.a, samples.b]))
+            return None, OF_ARRIVAL[self.covariate](samples, samples.rows)
         if self.covariate in OF_TDOA:
             values = OF_TDOA[self.covariate](samples)
         else:
@@ -220,15 +223,14 @@ class SmoothTerm(Effect):
     def bias(self, samples: Samples) -> np.ndarray:
         n = len(samples)
         values, both = self._covariate(samples)
-        if self.channel != "tdoa" or both is None:
+        if self.channel != samples.channel or both is None:
             return np.zeros(n)
         if self.form == "common":
             return self.curve(values)
         if self.form in OF_LINKS:
             links = dict.fromkeys(key.rpartition(".")[0] for key in self.values)
             return sum((self._of_link(samples, link) * self.curve(values, f"{link}.") for link in links), np.zeros(n))
-        late = self._functions(both, self._weights(samples.anchors), np.concatenate([samples.a, samples.b]))
-        return late[n:] - late[:n]
+        return samples.difference(self._functions(both, self._weights(samples.anchors), samples.rows))
 
     def _of_link(self, samples: Samples, link: str) -> np.ndarray:
         """By how much the function of the pair "0-1" counts in each d_ab: (n,) 1, -1 or 0."""
@@ -269,15 +271,15 @@ class SmoothTerm(Effect):
         return self.regressors(samples, keys) @ np.array([self.values.get(key, 0.0) for key in keys])
 
     def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
-        if samples.channel != "tdoa":
+        if samples.channel not in RADIO:
             out = np.zeros((*samples.reading.shape, len(keys)))
             values = sensor_covariate(self.covariate, samples)
             if values is not None:
                 out[:, self._axis] = self.basis(values)[:, [int(key[1:]) for key in keys]]
             return out
-        n, out = len(samples), np.zeros((len(samples), len(keys)))
+        out = np.zeros((len(samples), len(keys)))
         values, both = self._covariate(samples)
-        if self.channel != "tdoa" or both is None:
+        if self.channel != samples.channel or both is None:
             return out
         if self.form == "common":
             return self.basis(values)[:, [int(key[1:]) for key in keys]]
@@ -285,11 +287,10 @@ class SmoothTerm(Effect):
             basis = self.basis(values)
             parts = [(basis[:, int(c[1:])], link) for link, _, c in (key.rpartition(".") for key in keys)]
             return np.stack([part * self._of_link(samples, link) for part, link in parts], axis=1)
-        basis, ids = self.basis(both), samples.anchors.ids[np.concatenate([samples.a, samples.b])]
+        basis, ids = self.basis(both), samples.anchors.ids[samples.rows]
         for column, key in enumerate(keys):
             anchor, _, c = key.rpartition(".")
-            late = basis[:, int(c[1:])] * (1.0 if not anchor else ids == int(anchor))
-            out[:, column] = late[n:] - late[:n]
+            out[:, column] = samples.difference(basis[:, int(c[1:])] * (1.0 if not anchor else ids == int(anchor)))
         return out
 
     def groups(  # type: ignore[override]  # of a term

@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from .aid_error import need_stream
 from .base import Effect
 
 if TYPE_CHECKING:
-    import numpy as np
+    from collections.abc import Sequence
     from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight
+    from .samples import AidSamples, Samples
 
 
 class StampEffect(Effect):
@@ -25,7 +29,11 @@ class StampEffect(Effect):
     def stamp_offset(self, stream: str) -> float:
         return self.values.get("offset", 0.0) if stream == self.stream else 0.0
 
+    def regressors(self, samples: Samples | AidSamples, keys: Sequence[str]) -> np.ndarray:
+        return np.repeat(-samples.change[..., None], len(keys), axis=-1)
+
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
+        need_stream(self, flight, self.stream)
         return shifted(flight, self.stream, self.stamp_offset(self.stream))
 
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..foundation.compiled import compiled
-from ..foundation.geometry import rotate_each, tdoa_each, tdoa_jacobian
+from ..foundation.geometry import rotate_each
 from .base import Effect
+from .samples import RADIO
 from .wording import listed, significant, size
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ class TagLeverArm(Effect):
     }
     reference = "any text on strapdown navigation: lever arm compensation"
     uses_attitude = True
+    channels = tuple(RADIO)
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
@@ -42,14 +43,10 @@ class TagLeverArm(Effect):
         return np.array([self.values.get(key, 0.0) for key in "xyz"])
 
     def bias(self, samples: Samples) -> np.ndarray:
-        out = np.empty(len(samples))
-        q = np.ascontiguousarray(samples.q, dtype=float)
-        _moved(samples.p, q, self._arm(), samples.a, samples.b, samples.anchors.positions, out)
-        return out
+        return samples.true(samples.p + _rotate(samples.q, self._arm())) - samples.true()
 
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
-        antenna = samples.p + _rotate(samples.q, self._arm())
-        jacobian = tdoa_jacobian(antenna, samples.position_a, samples.position_b)
+        jacobian = samples.direction(samples.p + _rotate(samples.q, self._arm()))
         axes = np.eye(3)[["xyz".index(key) for key in keys]]
         return np.stack([np.sum(jacobian * _rotate(samples.q, axis), axis=1) for axis in axes], axis=1)
 
@@ -61,17 +58,6 @@ class TagLeverArm(Effect):
         return (
             f"Measure where the tag's antenna sits on the vehicle: it is {parts} from the origin of the body frame.",
         )
-
-
-@compiled
-def _moved(
-    p: np.ndarray, q: np.ndarray, arm: np.ndarray, a: np.ndarray, b: np.ndarray, positions: np.ndarray, out: np.ndarray
-) -> None:
-    antenna, of_body = np.empty((len(p), 3)), np.empty(len(p))
-    rotate_each(q, arm, antenna)
-    tdoa_each(p + antenna, positions[a], positions[b], out)
-    tdoa_each(p, positions[a], positions[b], of_body)
-    out -= of_body
 
 
 def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -2,17 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from ..foundation.geometry import tdoa_jacobian
 from .stamp_error import StampEffect
 from .wording import significant, size
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from .samples import Samples
 
 
 class TdoaTimeOffset(StampEffect):
@@ -33,10 +24,6 @@ class TdoaTimeOffset(StampEffect):
     witnesses = ("gyro", "accel")  # without an inertial sensor the ground truth may as well be late
     reference = "UTIL web page: about 10 ms of radio latency"
     needs_reference = True
-
-    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
-        jacobian = tdoa_jacobian(samples.p, samples.position_a, samples.position_b)
-        return np.repeat(-np.sum(jacobian * samples.velocity, axis=1)[:, None], len(keys), axis=1)
 
     def advice(self) -> tuple[str, ...]:
         if not significant(self):

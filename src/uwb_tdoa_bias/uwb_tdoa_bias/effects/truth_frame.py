@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..foundation.geometry import tdoa
 from ..foundation.later import rotations
 from .base import Effect
 from .marks import Shift
+from .samples import RADIO
 from .wording import listed, measured, significant
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ class TruthFrame(Effect):
     needs_reference = True
     portable = False
     usable = False
+    channels = tuple(RADIO)
     unused = "whether the survey or the ground truth is turned or shifted nobody can tell, so that nothing goes to the nodes"
 
     @classmethod
@@ -57,9 +58,7 @@ class TruthFrame(Effect):
         return anchors.positions @ rotations.Rotation.from_rotvec(at[3:]).as_matrix().T + at[:3]
 
     def bias(self, samples: Samples) -> np.ndarray:
-        moved = self._moved(samples.anchors)
-        after = tdoa(samples.p, moved[samples.a], moved[samples.b])
-        return after - tdoa(samples.p, samples.position_a, samples.position_b)
+        return samples.true(positions=self._moved(samples.anchors)) - samples.true()
 
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         out, step = np.empty((len(samples), len(keys))), 1e-5

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any, TYPE_CHECKING
 
-import numpy as np
-
-from ..foundation.geometry import tdoa_jacobian
 from ..foundation.sensors import DIAGNOSED
 from .base import need_truth
 from .stamp_error import StampEffect
@@ -14,6 +11,7 @@ from .wording import significant, size
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    import numpy as np
     from ..foundation.flight import Flight
 
 
@@ -29,18 +27,14 @@ class TruthTimeOffset(StampEffect):
     typical = 0.05
     example = "offset"
     physics = "motion-capture poses reach the log late, over a radio link"
-    confounded_with = ("tdoa_time_offset",)
+    confounded_with = ("tdoa_time_offset", "range_delay")
     reference = "UTIL web page: motion-capture poses logged on board have about 10 ms of radio latency"
     needs_reference = True
     portable = False
     channels = ("tdoa", "gyro", *DIAGNOSED)  # on the accelerometer it is less than its vibration
 
     def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
-        if samples.channel != "tdoa":  # the truth of that stamp is an earlier one: the sensor reads what comes later
-            return np.repeat(samples.change[:, :, None], len(keys), axis=2)
-        # the tag is already farther on its way than the truth of that stamp says
-        jacobian = tdoa_jacobian(samples.p, samples.position_a, samples.position_b)
-        return np.repeat(np.sum(jacobian * samples.velocity, axis=1)[:, None], len(keys), axis=1)
+        return -super().regressors(samples, keys)  # the tag is already farther on its way than the truth of that stamp says
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         need_truth(self, flight)

@@ -2,18 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from .aid_error import need_stream
 from .stamp_error import StampEffect
 from .wording import significant, size
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from ..foundation.flight import Flight
-    from .samples import AidSamples
 
 
 class VelocityDelay(StampEffect):
@@ -31,13 +21,6 @@ class VelocityDelay(StampEffect):
     distinguished_by = {"truth_time_offset": "a late truth shows in the gyroscope and the TDOAs too"}
     reference = "Li and Mourikis, Int. J. Robotics Research 33, 2014: online temporal calibration of camera and IMU"
     channels = ("velocity",)
-
-    def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
-        return np.repeat(-samples.change[:, :, None], len(keys), axis=2)
-
-    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
-        need_stream(self, flight, self.stream)
-        return super().inject(flight, rng)
 
     def advice(self) -> tuple[str, ...]:
         if not significant(self):

@@ -9,7 +9,7 @@ import numpy as np
 
 from .anchors import Anchors
 from .foreign_text import harmless
-from .sensors import SENSORS
+from .sensors import LOCATING, SENSORS
 
 AIDS = tuple(SENSORS)  # streams of a Flight that the filter can do without
 
@@ -89,6 +89,12 @@ class Flight(_SensorStreams):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", harmless(self.name))
+
+    @property
+    def start(self) -> float:
+        """Stamp from which slow changes count, s: of the first TDOA; without any, of what else locates first; 0 without anything."""
+        located = [stream for name in LOCATING if (stream := getattr(self, name)) is not None and len(stream)]
+        return float(min((part.t[0] for part in ([self.tdoa] if len(self.tdoa) else located)), default=0.0))
 
     def replaced(self, **streams: Any) -> Flight:
         """The Flight with other streams, by their names, or with None instead of these."""

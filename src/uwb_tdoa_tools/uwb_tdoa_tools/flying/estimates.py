@@ -69,7 +69,7 @@ class OurFilter:
         self._labels, self._of_imu = LabelCorrector(effects.effects), ImuCorrector(effects.effects)
         self._of_aids = AidCorrector(effects.effects)
         self._offset = effects.stamp_offset
-        self._estimator = Estimator(anchors, config, functions=effects.sensor_functions, floor=effects.on_floor(anchors))
+        self._estimator = Estimator(anchors, config, effects=effects)
         self._parts = [NOTHING]
         self._newest: Odometry | None = None
 

@@ -12,6 +12,7 @@ SENSORS = {
 }  # by name, in the order of their kinds in the filter
 
 LOCATING = tuple(name for name, sensor in SENSORS.items() if sensor.locates)  # from which alone the filter can start
-DIAGNOSED = tuple(name for name, sensor in SENSORS.items() if sensor.compared is not None)  # channels of the diagnosis
+DIAGNOSED = tuple(name for name, sensor in SENSORS.items() if sensor.compared is not None)  # channels of the diagnosis, of which
+BY_POSE = tuple(name for name in DIAGNOSED if SENSORS[name].compared.reading)  # these are compared with poses, others with anchors too
 
-__all__ = ["DIAGNOSED", "LOCATING", "SENSORS", "Height", "Pressure", "Ranges", "Sensor", "Stream", "Velocity"]
+__all__ = ["BY_POSE", "DIAGNOSED", "LOCATING", "SENSORS", "Height", "Pressure", "Ranges", "Sensor", "Stream", "Velocity"]

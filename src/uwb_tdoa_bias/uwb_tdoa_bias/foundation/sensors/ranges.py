@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..anchors import Anchors
-from .sensor import Mistake, Sensor, Stream, finite, parameter
+from .sensor import Compared, Mistake, Sensor, Stream, finite, parameter
 
 FARTHEST = 1000.0  # m
 BEYOND = 5.0  # times the extent of the anchors that most distances are at most
@@ -104,6 +104,9 @@ SENSOR = Sensor(
     },
     invalid="give ids of uwb/anchors, and distances in metres, 0 or more",
     remedy="its unit, and the anchors' positions",
+    compared=Compared(
+        None, "ranges, and ground truth of the position", negligible=0.004, of_attitude=False, positions=(0, 1, 2)
+    ),
     topic="uwb/range",
     rate=100.0,
     locates=True,

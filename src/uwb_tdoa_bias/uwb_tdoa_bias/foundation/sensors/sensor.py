@@ -43,9 +43,9 @@ class Stream:
 
 @dataclass(frozen=True)
 class Compared:
-    """How the diagnosis compares a sensor with poses; see diagnosis/channels/aid.py of uwb_tdoa_tools.
+    """How the diagnosis compares a sensor with poses; see diagnosis/channels/aid.py and radio.py of uwb_tdoa_tools.
 
-    reading : callable of (Track, t (n,)) -> (n, k), what should have been read
+    reading : callable of (Track, t (n,)) -> (n, k), what should have been read; None for distances to anchors
     needs : what a flight must have for it, words
     negligible : unit of the stream, a constant error below it is nothing
     floating : a constant tells nothing
@@ -54,7 +54,7 @@ class Compared:
     positions : coordinates that the reference must know
     """
 
-    reading: Callable
+    reading: Callable | None
     needs: str
     negligible: float
     unit: str = "m"
