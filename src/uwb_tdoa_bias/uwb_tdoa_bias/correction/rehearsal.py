@@ -30,5 +30,7 @@ class RehearsedCorrector(Corrector):
         self.add_pose(*self._known)
 
     def correct(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> Correction:
+        if len(t) == 0:
+            return Correction.none(d)
         bias, noise, slope, state = self.contribution(self.samples(t, a, b))
         return Correction(bias, noise, d - bias, np.full(len(t), EFFECTS, dtype=np.uint8), slope, state)

@@ -7,9 +7,9 @@ from .wording import counted, listed, significant, size
 
 
 class AnchorDelay(AnchorEffect):
-    """Everything heard from anchor i arrives `values[i]` metres late: bias of d_ab = delay_b - delay_a.
+    """Everything heard from anchor i arrives `values[i]` metres late: bias of d_ab = delay_b - delay_a, of a range to b delay_b.
 
-    Only differences of delays are observable: the sum over all anchors is not.
+    In TDOAs only differences of delays are observable: the sum over all anchors is not.
     """
 
     name = "anchor_delay"
@@ -19,7 +19,7 @@ class AnchorDelay(AnchorEffect):
     typical = 0.3
     example = "0"
     physics = "the antenna delay of an anchor is not calibrated: it always seems farther away by the same distance"
-    confounded_with = ("anchor_position", "pair_offset")
+    confounded_with = ("anchor_position", "pair_offset", "range_offset")
     distinguished_by = {
         "pair_offset": "TDoA3, where each anchor is heard in many pairs",
         "anchor_position": "a flight that passes the anchor on several sides, near and far",

@@ -24,6 +24,7 @@ from .pair_offset import PairOffset
 from .pair_sign import PairSign
 from .range_bias import RangeBias
 from .range_delay import RangeDelay
+from .range_offset import RangeOffset
 from .range_scale import RangeScale
 from .received_power_bias import ReceivedPowerBias
 from .tag_lever_arm import TagLeverArm
@@ -42,6 +43,6 @@ EFFECTS = {
         RangeBias, ReceivedPowerBias, AntennaPattern, AnchorClockDrift, Nlos, FloorMultipath, GyroBias, GyroScale,
         AccelBias, AccelScale, ImuMisalignment, ImuGravity, NoiseLevel, NoiseCorrelation, OutlierRate,
         HeightOffset, HeightScale, FloorStep, BarometerDrift, VelocityScale, VelocityMisalignment, VelocityDelay,
-        VelocitySlip, RangeDelay, AnchorIds, PairSign,
+        VelocitySlip, RangeOffset, RangeDelay, AnchorIds, PairSign,
     )
 }  # fmt: skip

@@ -10,6 +10,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.covariates import UPWARDS
+from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
 
 from ..parallel import in_one_thread
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 
 FOR_MAPS = 3  # flights: a map of fewer is of their paths, and misleads others; two that fly alike bear each other out
 ON_FLOOR = 0.5  # m by which a function of UPWARDS changes at least near the floor, to be told
+RANGED = tuple(name for name, kind in RADIO.items() if kind.ends == 1)  # streams of distances to anchors
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,14 +118,15 @@ def attribute(
     progress() is called now and then; map_function(function, items) : as map, but for the time and the process in
     which each is done.
     """
-    wanted = [detector for name, detector in DETECTORS.items() if kinds is None or name in kinds]
-    detectors = [detector for detector in wanted if not detector.on_floor]
 
     def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
         return residuals_of(flights, reference, EffectSet((*base.effects, *model)), progress, map_function)
 
-    search = partial(_search, detectors)
     under_base = at(())
+    shown = {name for flight in under_base for name in flight}
+    wanted = [one for name, one in DETECTORS.items() if (kinds is None or name in kinds) and shown & set(one.effect.channels)]
+    detectors = [detector for detector in wanted if not detector.on_floor]
+    search = partial(_search, detectors)
     installation = _installation(flights)
     declared = _declared(under_base, reference, kinds, installation)
     unmoved = linearised(under_base, declared, ())
@@ -229,7 +232,9 @@ def _installation(flights: Sequence[Flight]) -> tuple[Anchors, np.ndarray]:
     heard = heard[np.isin(heard, ids).all(axis=1) & (heard[:, 0] != heard[:, 1])]
     pairs, count = np.unique(heard, axis=0, return_counts=True)
     first = np.unique(ids, return_index=True)[1]
-    first = first[np.isin(ids[first], heard)] if len(heard) else first
+    ranged = [stream.anchor for flight in flights for name in RANGED if (stream := getattr(flight, name)) is not None]
+    alone = np.concatenate([heard.ravel(), *ranged])
+    first = first[np.isin(ids[first], alone)] if len(alone) else first
     anchors = Anchors(ids[first], positions[first], orientations[first], several[0].frame)
     return anchors, pairs[np.argsort(-count, kind="stable")[:MOST_LINKS]]
 

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.effects.samples import RADIO
+
 from .regression.algebra import beside_each_other, counts, each_times, product, weighted
 from .regression.fit import prior_sizes
 from .self_calibration.equations import features
@@ -37,7 +39,7 @@ def with_deviations(selection: Selection) -> Selection:
     the path is not known."""
     table, model = selection.table, selection.fit
     places = [k for k, column in enumerate(model.columns) if column.effect[0] in OF_ANCHORS]
-    if not places or any(part.innovations is not None for part in table.tdoa_parts):
+    if not places or any(part.innovations is not None for part in table.radio_parts):
         return selection
     values, std = _beside_others(table, model)
     fitted = np.sqrt(np.diag(model.cov))
@@ -48,15 +50,16 @@ def with_deviations(selection: Selection) -> Selection:
 
 def _beside_others(table: Table, model: Fit) -> tuple[np.ndarray, np.ndarray]:
     """(values (k,), standard deviations (k,)) of the columns of a Fit, with what can take the place of anchors integrated out."""
-    rows, known, near = table.rows_of("tdoa"), {column.effect for column in model.columns}, _heard_with(table, model)
+    rows, known, near = table.radio_rows, {column.effect for column in model.columns}, _heard_with(table, model)
     mine = table.matrix(model.columns, rows)
     beside = [column for column in table.columns if column.effect in ((POSITION,), (DELAY,)) and (near is None or _anchor(column) in near)]
     others = [column for column in beside if column not in model.columns]
     sizes = [column.typical if column.effect in known else UNSAID for column in others]
     late = table.matrix([column for column in beside if column.effect == (DELAY,)], rows)
     if table.sparse:  # other rows have nothing to do with these anchors
-        inside = np.flatnonzero(counts(late, 1) == 2)
-        rows, late, mine = rows.start + inside, late[inside], mine[inside]
+        ends = np.array([RADIO[name].ends if name in RADIO else 0 for name in table.channels])
+        inside = np.flatnonzero(counts(late, 1) == ends[table.channel[rows]])
+        rows, late, mine = rows[inside], late[inside], mine[inside]
     functions = each_times(late, features(table.place[rows], LENGTH))
     lasting = 1.0 + LASTING * (model.inflation[table.group[rows]] - 1.0)
     weight = model.information(table)[rows] * (model.inflation[table.group[rows]] / lasting)
@@ -79,11 +82,11 @@ def _anchor(column: Column) -> str:
 def _heard_with(table: Table, model: Fit) -> set[str] | None:
     """Ids of the anchors whose positions or delays a Fit tells, and of all that are heard in the same blocks as any of them: set of
     texts. None for all anchors: of few, or of several installations."""
-    parts = table.tdoa_parts
+    parts = table.radio_parts
     ids = parts[0].samples.anchors.ids
     if not table.sparse or not all(np.array_equal(part.samples.anchors.ids, ids) for part in parts):
         return None
-    known, rows = {_anchor(column) for column in model.columns if column.effect[0] in OF_ANCHORS}, table.rows_of("tdoa")
+    known, rows = {_anchor(column) for column in model.columns if column.effect[0] in OF_ANCHORS}, table.radio_rows
     ends, block, names = np.stack(parts[0].arrivals(table.series[rows])), table.block[rows], ids.astype(str)
     mine = np.isin(names, list(known))[ends].any(axis=0)
     return known | set(names[np.unique(ends[:, np.isin(block, block[mine])])].tolist())

@@ -6,6 +6,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.sensors import LOCATING
 from uwb_tdoa_ekf.results import VERDICTS
 
 from .channels import CHANNELS
@@ -34,8 +35,11 @@ def health(residuals: Sequence[ChannelResiduals], runs: Sequence[Run] = (), scor
 
 
 def _filter(run: Run, score: Score) -> dict[str, Any]:
-    reached = np.isin(run.residuals.verdict, REACHED)
-    nis = run.residuals.innovation[reached] ** 2 / run.residuals.variance[reached]
+    of_tdoas = run.residuals.verdict, run.residuals.innovation, run.residuals.variance
+    of_aids = [[run.aids[name][field] for field in ("verdict", "innovation", "variance")] for name in LOCATING if name in run.aids]
+    verdict, innovation, variance = map(np.concatenate, zip(of_tdoas, *of_aids))
+    reached = np.isin(verdict, REACHED)
+    nis = innovation[reached] ** 2 / variance[reached]
     return {
         "flight": score.name,
         "nis_mean": float(nis.mean()),

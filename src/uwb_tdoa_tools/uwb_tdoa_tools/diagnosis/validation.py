@@ -68,7 +68,7 @@ def cross_fitted(
         parts = [(ValidationCase(flights[k], base), k, table.flight != k) for k in range(len(flights))]
     else:
         # in turns, so that both parts are of all of the flight
-        start, since = float(flights[0].tdoa.t[0]), table.t - table.t.min()
+        start, since = flights[0].start, table.t - table.t.min()
         length = min(BLOCK, 0.5 * since.max())
         number = np.minimum((since / length).astype(int), int(since.max() / length) - 1)
         edges = start + table.t.min() + length * np.arange(number.max() + 2)

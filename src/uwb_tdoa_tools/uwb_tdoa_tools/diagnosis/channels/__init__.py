@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any, TYPE_CHECKING
 
-from uwb_tdoa_bias.foundation.sensors import DIAGNOSED
+from uwb_tdoa_bias.foundation.sensors import BY_POSE, DIAGNOSED
 
 from .accel import Accel
 from .aid import Aid
 from .base import Channel, ChannelResidual, ChannelResiduals, Comparison, Rows
 from .gyro import Gyro
-from .tdoa import Tdoa, TdoaResidual
+from .ranging import Ranging
+from .tdoa import RadioResidual, Tdoa, TdoaResidual
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import EffectSet
@@ -18,12 +19,12 @@ if TYPE_CHECKING:
     from ..references import Reference
     from collections.abc import Iterable
 
-_ALL: tuple[Channel[Any], ...] = (Tdoa(), Gyro(), Accel(), *map(Aid, DIAGNOSED))
+_ALL: tuple[Channel[Any], ...] = (Tdoa(), Gyro(), Accel(), *(Aid(name) if name in BY_POSE else Ranging(name) for name in DIAGNOSED))
 CHANNELS = {channel.name: channel for channel in _ALL}
 
 __all__ = [
-    "CHANNELS", "Channel", "ChannelResidual", "ChannelResiduals", "Comparison", "Rows", "TdoaResidual", "residuals",
-    "tdoa_parts",
+    "CHANNELS", "Channel", "ChannelResidual", "ChannelResiduals", "Comparison", "RadioResidual", "Rows", "TdoaResidual",
+    "residuals", "tdoa_parts",
 ]  # fmt: skip
 
 

@@ -55,8 +55,8 @@ class Comparison:
 
     @property
     def start(self) -> float:
-        """Stamp of the first TDOA, s, from which slow changes count."""
-        return float(self.flight.tdoa.t[0])
+        """Stamp, s, from which slow changes count."""
+        return self.flight.start
 
 
 @dataclass(frozen=True)

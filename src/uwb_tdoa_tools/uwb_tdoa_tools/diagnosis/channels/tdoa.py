@@ -1,4 +1,4 @@
-"""TDOAs.
+"""TDOAs, and what distances to anchors share with them.
 
 Neighbouring TDOAs are alike, so that hundreds a second are not hundreds of facts. They are averaged, pair by pair, over
 cells of half a second, near the floor of half the height at most, without the outliers of the cell; what likeness is left between cells is
@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import ClassVar, TYPE_CHECKING, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from uwb_tdoa_bias.effects import Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
-from uwb_tdoa_bias.foundation.geometry import tdoa
-
 from uwb_tdoa_ekf.sensitivity import Innovations
 
 from ...checking.known_path import MANY
@@ -44,12 +42,17 @@ WILD = 20.0  # m; a larger residual is no measurement
 FEWEST_ON_FLOOR = 50  # TDOAs
 
 
+Radio = TypeVar("Radio", bound="RadioResidual")
+
+
 @dataclass(frozen=True)
-class TdoaResidual(ChannelResidual):
+class RadioResidual(ChannelResidual):
     """samples : Samples, of the whole recording; residual (n,) m; airborne (n,) bool, False for those near the floor before
     and after; fitted (n,) bool, those that are looked at: in the air, but for `of_floor`; floor_known : whether the reference knows
     the path near the floor too; innovations : Innovations where the path is only an estimate: these are the residual, and what the path
     follows is taken out of regressors."""
+
+    label: ClassVar[str]  # of what is plotted, with unit
 
     samples: Samples
     residual: np.ndarray
@@ -58,8 +61,8 @@ class TdoaResidual(ChannelResidual):
     floor_known: bool = False
     innovations: Innovations | None = None
 
-    def of_floor(self) -> TdoaResidual | None:
-        """The TdoaResidual that looks at those near the floor alone; None if there is no telling of them, or they are few."""
+    def of_floor(self: Radio) -> Radio | None:
+        """The residual that looks at those near the floor alone; None if there is no telling of them, or they are few."""
         near = ~self.airborne & (np.abs(self.residual) < WILD)
         return replace(self, fitted=near) if self.floor_known and near.sum() >= FEWEST_ON_FLOOR else None
 
@@ -75,11 +78,11 @@ class TdoaResidual(ChannelResidual):
 
     def columns(self, effect: Effect, keys: Sequence[str]) -> np.ndarray:
         samples, rows = self.samples, None
-        if _many([self]) and self.innovations is None and effect.name in OF_ANCHORS:  # nothing else has to do with these anchors
+        if are_many([self]) and self.innovations is None and effect.name in OF_ANCHORS:  # nothing else has to do with these anchors
             named = np.isin(samples.anchors.ids, [int(i) for key in keys for i in key.partition(".")[0].split("-")])
             rows = np.flatnonzero(named[samples.a] | named[samples.b])
             t, a, b, p, q = (values[rows] for values in (samples.t, samples.a, samples.b, samples.p, samples.q))
-            samples = Samples(t, a, b, p, q, samples.anchors, samples.start)
+            samples = type(samples)(t, a, b, p, q, samples.anchors, samples.start)
         values = np.nan_to_num(effect.regressors(samples, list(keys)))
         if self.innovations is not None:
             values = self.innovations.by_bias(values)
@@ -87,25 +90,31 @@ class TdoaResidual(ChannelResidual):
 
     def covariate(self, name: str) -> np.ndarray | None:
         if name in OF_ARRIVAL:
-            return _of_arrivals(OF_ARRIVAL[name], self.samples)[:, self.fitted].ravel()
-        values = _covariate(name, self.samples)
+            return of_arrivals(OF_ARRIVAL[name], self.samples)[:, self.fitted].ravel()
+        values = covariate_at(name, self.samples)
         return None if values is None else values[self.fitted]
 
     def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        return {"TDOA [m]": (self.samples.t[self.airborne], self.residual[self.airborne])}
-
-    def place_in_room(self, series: int) -> str:
-        return "-".join(str(self.samples.anchors.ids[row]) for row in divmod(series, len(self.samples.anchors)))
+        return {self.label: (self.samples.t[self.airborne], self.residual[self.airborne])}
 
     def arrivals(self, series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Anchor rows (a, b) of series numbers (m,) in Rows."""
         return np.divmod(series, len(self.samples.anchors))
 
 
+class TdoaResidual(RadioResidual):
+    """Residuals of TDOAs."""
+
+    label = "TDOA [m]"
+
+    def place_in_room(self, series: int) -> str:
+        return "-".join(str(self.samples.anchors.ids[row]) for row in divmod(series, len(self.samples.anchors)))
+
+
 class Cells:
     """The cells of one flight, and the averages over them."""
 
-    def __init__(self, part: TdoaResidual) -> None:
+    def __init__(self, part: RadioResidual) -> None:
         samples, chosen = part.samples, np.flatnonzero(part.fitted)
         n = len(samples.anchors)
         t = samples.t[chosen]
@@ -146,6 +155,33 @@ class Cells:
         return np.bincount(self.group, values[self.chosen]) / self.size
 
 
+def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> Radio | None:
+    """What measurements of a kind in the flight of a Comparison leave of the geometry; None without any in the air."""
+    flight, anchors, poses = comparison.flight, comparison.flight.anchors, comparison.poses
+    raw, a, b = kind.measured(flight)
+    innovations = comparison.view.innovations
+    if innovations is None:
+        inside = (raw.t >= poses.t[0]) & (raw.t <= poses.t[-1])
+        usable = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(raw.d) & inside)
+    else:
+        usable = innovations.rows
+    t, a, b = raw.t[usable], a[usable], b[usable]
+    first, last = comparison.span
+    airborne = (t >= first) & (t <= last)
+    if not airborne.any():
+        return None
+    samples = kind(**vars(samples_at(t, a, b, poses, anchors, comparison.start)))
+    samples = replace(samples, vibration=_vibration(flight.imu, t), extra=extra_at(flight, t))
+    if kind is Samples:
+        previous = np.concatenate([[-1], anchors.ids[b[:-1]]])
+        samples = replace(samples, interval=np.diff(t, prepend=t[:1]), previous=previous)
+    if innovations is None:
+        residual = raw.d[usable] - samples.true() - comparison.effects.bias(samples)
+    else:
+        residual = innovations.value
+    return made(samples, residual, airborne, airborne, comparison.reference.knows_floor, innovations)
+
+
 class Tdoa(Channel[TdoaResidual]):
     """Differences of the distances to two anchors."""
 
@@ -156,34 +192,10 @@ class Tdoa(Channel[TdoaResidual]):
     maps = ("x", "y", "height", "range")
 
     def residual(self, comparison: Comparison) -> TdoaResidual | None:
-        flight, anchors, poses = comparison.flight, comparison.flight.anchors, comparison.poses
-        raw = flight.tdoa
-        a, b = anchors.index(raw.a), anchors.index(raw.b)
-        innovations = comparison.view.innovations
-        if innovations is None:
-            inside = (raw.t >= poses.t[0]) & (raw.t <= poses.t[-1])
-            usable = np.flatnonzero((a >= 0) & (b >= 0) & (a != b) & np.isfinite(raw.d) & inside)
-        else:
-            usable = innovations.rows
-        t, a, b = raw.t[usable], a[usable], b[usable]
-        samples = replace(
-            samples_at(t, a, b, poses, anchors, comparison.start),
-            interval=np.diff(t, prepend=t[:1]),
-            previous=np.concatenate([[-1], anchors.ids[b[:-1]]]),
-            vibration=_vibration(flight.imu, t),
-            extra=extra_at(flight, t),
-        )
-        at_a, at_b = samples.position_a, samples.position_b
-        if innovations is None:
-            residual = raw.d[usable] - tdoa(samples.p, at_a, at_b) - comparison.effects.bias(samples)
-        else:
-            residual = innovations.value
-        first, last = comparison.span
-        airborne = (t >= first) & (t <= last)
-        return TdoaResidual(samples, residual, airborne, airborne, comparison.reference.knows_floor, innovations)
+        return compared(comparison, Samples, TdoaResidual)
 
     def smooth_terms(self, residuals: Sequence[TdoaResidual]) -> list[SmoothTerm]:
-        out, many = [], _many(residuals)
+        out, many = [], are_many(residuals)
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
             values = covariate_of(name, residuals)
             knots = None if values is None else knots_of(values, name)
@@ -201,13 +213,13 @@ class Tdoa(Channel[TdoaResidual]):
     def views(self, residuals: Sequence[TdoaResidual]) -> list[CovariateView]:
         if any(part.innovations is not None for part in residuals):
             return []  # what the path follows is not left in them
-        cells, many = [part.cells for part in residuals], _many(residuals)
+        cells, many = [part.cells for part in residuals], are_many(residuals)
         ends = [np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)]) for part in residuals]
         of_tdoa, of_arrival, quick = {}, {}, {}
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
             if many and name in CATEGORIES:
                 continue
-            known = [v for v in (_covariate(name, part.samples) for part in residuals) if v is not None]
+            known = [v for v in (covariate_at(name, part.samples) for part in residuals) if v is not None]
             if len(known) < len(residuals):
                 continue
             if name in QUICK:
@@ -215,7 +227,7 @@ class Tdoa(Channel[TdoaResidual]):
             else:
                 of_tdoa[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
         for name, function in OF_ARRIVAL.items():
-            both = [_of_arrivals(function, part.samples) for part in residuals]
+            both = [of_arrivals(function, part.samples) for part in residuals]
             means = [[cell.mean(v) for v in values] for cell, values in zip(cells, both)]
             of_arrival[name] = np.concatenate(means, axis=1)
         a, b = np.concatenate(ends, axis=1)
@@ -228,20 +240,20 @@ class Tdoa(Channel[TdoaResidual]):
         return pairs.health(residuals)
 
 
-def _many(residuals: Sequence[TdoaResidual]) -> bool:
-    """Whether functions of each anchor of some TdoaResiduals are too many to be looked for: what a few parameters tell is found, and
+def are_many(residuals: Sequence[RadioResidual]) -> bool:
+    """Whether functions of each anchor of some residuals are too many to be looked for: what a few parameters tell is found, and
     those of all anchors alike."""
     return any(len(part.samples.anchors) > MANY for part in residuals)
 
 
-def _covariate(name: str, samples: Samples) -> np.ndarray | None:
+def covariate_at(name: str, samples: Samples) -> np.ndarray | None:
     """One of OF_TDOA, or "extra.STREAM.COLUMN": (n,); None where the samples do not hold it."""
     return OF_TDOA[name](samples) if name in OF_TDOA else (samples.extra or {}).get(name.removeprefix(EXTRA))
 
 
-def _of_arrivals(function: Callable[[Samples, np.ndarray], np.ndarray], samples: Samples) -> np.ndarray:
-    """(2, n): of the first and of the second anchor."""
-    return function(samples, np.concatenate([samples.a, samples.b])).reshape(2, -1)
+def of_arrivals(function: Callable[[Samples, np.ndarray], np.ndarray], samples: Samples) -> np.ndarray:
+    """(ends, n): of the first and, where there are two, of the second anchor."""
+    return function(samples, samples.rows).reshape(samples.ends, -1)
 
 
 def _vibration(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:

@@ -44,6 +44,23 @@ def views_of_axes(
     ]
 
 
+def views_of_anchors(
+    channel: str, anchor: np.ndarray, alike: Mapping[str, np.ndarray], of_each: Mapping[str, np.ndarray], many: bool = False
+) -> list[CovariateView]:
+    """[CovariateView] of distances to anchors of ids `anchor` (n,). alike, of_each : {name: (n,)}, of the tag, and of the anchor; many : as
+    of `views_of_pairs`."""
+    everywhere, ones, both = np.arange(len(anchor)), np.ones(len(anchor)), {**alike, **of_each}
+    out = [
+        CovariateView(channel, "common" if name in alike else "arrival", "", name, ((ones, values),), everywhere)
+        for name, values in both.items()
+    ]
+    for i in np.unique(anchor).tolist():
+        chosen = np.flatnonzero(anchor == i)
+        names = [name for name in both if name in OF_EACH or not many]
+        out += [CovariateView(channel, "anchor", str(i), name, ((ones[chosen], both[name][chosen]),), chosen) for name in names]
+    return out
+
+
 def views_of_pairs(
     a: np.ndarray, b: np.ndarray, of_tdoa: Mapping[str, np.ndarray], of_arrival: Mapping[str, np.ndarray],
     cell: np.ndarray | None = None, many: bool = False,

@@ -8,8 +8,10 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.effects.samples import RADIO
+
 from ...checking.known_path import MANY
-from ..channels import CHANNELS, TdoaResidual
+from ..channels import CHANNELS, RadioResidual, TdoaResidual
 from .algebra import stacked
 
 if TYPE_CHECKING:
@@ -73,6 +75,16 @@ class Table:
     def flights(self) -> int:
         """How many."""
         return int(self.flight.max()) + 1
+
+    @property
+    def radio_parts(self) -> list[RadioResidual]:
+        """Of its parts those of what is measured between the tag and anchors."""
+        return [part for *_, part in self.parts if isinstance(part, RadioResidual)]
+
+    @property
+    def radio_rows(self) -> np.ndarray:
+        """(m,) rows of these, of one channel after the other."""
+        return np.flatnonzero(np.isin(self.channel, [self.channels.index(name) for name in RADIO]))
 
     def rows_of(self, channel: str) -> slice:
         """Slice of the rows of a channel, by its name."""
@@ -157,5 +169,5 @@ def table_of(residuals: Sequence[ChannelResiduals]) -> Table:
             for key in ("y", "series", "t", "count", "place"):
                 pieces[key].append(getattr(part, key))
     merged = {key: np.concatenate(several) for key, several in pieces.items()}
-    many = any(len(part.samples.anchors) > MANY for *_, part in parts if isinstance(part, TdoaResidual))
+    many = any(len(part.samples.anchors) > MANY for *_, part in parts if isinstance(part, RadioResidual))
     return Table(channels, **merged, parts=tuple(parts), columns={}, sparse=many)

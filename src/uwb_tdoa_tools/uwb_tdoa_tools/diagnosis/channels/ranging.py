@@ -1,0 +1,86 @@
+"""Distances to anchors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from uwb_tdoa_bias.effects import SmoothTerm
+from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_MOTION, OF_TDOA
+from uwb_tdoa_bias.effects.samples import RADIO
+from uwb_tdoa_bias.foundation.sensors import SENSORS
+
+from .base import Channel, covariate_of
+from .extra import extra_names
+from .figures import figures
+from .knots import knots_of
+from .pairs import APART
+from .tdoa import RadioResidual, are_many, compared, covariate_at, of_arrivals
+from .views import views_of_anchors
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .base import Comparison, Figures
+    from .views import CovariateView
+
+COVARIATES = tuple(name for name in OF_TDOA if name not in OF_MOTION)  # a node corrects them without the past of the motion
+
+
+class RangeResidual(RadioResidual):
+    """Residuals of distances to anchors."""
+
+    label = "range [m]"
+
+    def place_in_room(self, series: int) -> str:
+        return str(self.samples.anchors.ids[self.arrivals(np.array(series))[1]])
+
+    def of_floor(self) -> None:
+        """Nothing: that anchors are late near the floor is looked for in TDOAs alone."""
+
+
+class Ranging(Channel[RangeResidual]):
+    """The channel of one of the SENSORS that measure distances to anchors."""
+
+    unit: str
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        vars(self).update(vars(SENSORS[name].compared))
+
+    def residual(self, comparison: Comparison) -> RangeResidual | None:
+        reference = comparison.reference
+        known = all(reference.positions_known) and comparison.view.innovations is None
+        if getattr(comparison.flight, self.name) is None or not known:
+            return None
+        return compared(comparison, RADIO[self.name], RangeResidual)
+
+    def smooth_terms(self, residuals: Sequence[RangeResidual]) -> list[SmoothTerm]:
+        out = []
+        for name in (*COVARIATES, *extra_names([part.samples for part in residuals]), *OF_ARRIVAL):
+            values = covariate_of(name, residuals)
+            knots = None if values is None else knots_of(values, name)
+            if knots is not None:
+                forms = ("arrival" if name in OF_ARRIVAL else "common", "anchor")[: 1 if are_many(residuals) else 2]
+                out += [SmoothTerm(channel=self.name, covariate=name, form=form, knots=knots) for form in forms]
+        return out
+
+    def views(self, residuals: Sequence[RangeResidual]) -> list[CovariateView]:
+        cells = [part.cells for part in residuals]
+        anchor = np.concatenate([part.samples.anchors.ids[part.arrivals(part.cells.pair)[1]] for part in residuals])
+        alike, of_each = {}, {}
+        for name in (*COVARIATES, *extra_names([part.samples for part in residuals])):
+            known = [v for v in (covariate_at(name, part.samples) for part in residuals) if v is not None]
+            if len(known) == len(residuals):
+                alike[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
+        for name, function in OF_ARRIVAL.items():
+            of_each[name] = np.concatenate([cell.mean(of_arrivals(function, part.samples)[0]) for cell, part in zip(cells, residuals)])
+        return views_of_anchors(self.name, anchor, alike, of_each, are_many(residuals))
+
+    def health(self, residuals: Sequence[RangeResidual]) -> Figures:
+        flown = [part.airborne for part in residuals]
+        t = np.concatenate([part.samples.t[air] + APART * k for k, (part, air) in enumerate(zip(residuals, flown))])
+        r = np.concatenate([part.residual[air] for part, air in zip(residuals, flown)])
+        anchor = np.concatenate([part.samples.anchors.ids[part.samples.b[air]] for part, air in zip(residuals, flown)])
+        each = np.unique(anchor).tolist()
+        return {"axes": [{"axis": f"{self.name} {i}", **figures(t[anchor == i], r[anchor == i])} for i in each]}
