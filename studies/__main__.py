@@ -11,6 +11,7 @@ from studies.checking import in_flight
 from studies.closed_loop import experiment
 from studies.debiasing import measured, set_up
 from studies.diagnosis import figures
+from studies.diagnosis import ranges as diagnosed_ranges
 from studies.training import compare, default, spin, splits
 
 STUDIES = {
@@ -23,6 +24,7 @@ STUDIES = {
     "debias-measured": measured,
     "debias-set-up": set_up,
     "default-model": default,
+    "diagnose-ranges": diagnosed_ranges,
     "diagnosis": figures,
     "in-flight": in_flight,
     "localizing": localizing,
@@ -47,6 +49,7 @@ of measured flights: flights/, util/, surveys/.
   debias-measured  bias maps of positions on measured flights (docs/debiasing.md)
   debias-set-up    a simulated copy of the set-up of Grasso et al. (docs/debiasing.md)
   default-model    the model that bias_node ships
+  diagnose-ranges  errors put into simulated distances to anchors, and what diagnose makes of them (docs/sensors.md)
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
@@ -81,6 +84,7 @@ def parser():
         "./dev study debias-measured --data DATA --diagnosed bench/ --out measured/",
         "./dev study debias-set-up --out set_up/",
         "./dev study default-model DATA/flights --survey DATA/surveys --out default.onnx",
+        "./dev study diagnose-ranges --flights 5",
         "./dev study diagnosis bank --out bench/",
         "./dev study diagnosis measured --data DATA --out bench/",
         "./dev study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.effects import Samples
+from uwb_tdoa_bias.effects import RangeSamples, Samples
 
 
 def random_rotation(rng):
@@ -23,3 +23,8 @@ def random_samples(seed, n=20, n_anchors=5):
     q = Rotation.from_quat(rng.standard_normal((n, 4))).as_quat() if n else np.empty((0, 4))
     p, v = rng.uniform(-5, 5, (n, 3)), rng.standard_normal((n, 3))
     return Samples(np.arange(n) / 100.0, a, b, p, q, anchors, velocity=v)
+
+
+def ranges_of(samples, rows):
+    """RangeSamples of Samples: the distances to anchors in rows (n,)."""
+    return RangeSamples(**{**vars(samples), "a": rows, "b": rows})

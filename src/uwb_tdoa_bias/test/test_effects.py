@@ -5,17 +5,18 @@ from finite_differences import numerical_jacobian
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
-from random_samples import random_samples
+from random_samples import random_samples, ranges_of
 from scipy.spatial.transform import Rotation
 import yaml
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import (
-    EFFECTS, AidCorrector, AnchorDelay, EffectSet, ImuCorrector, LabelEffect, Samples, SmoothTerm, TagLeverArm, Track, aid_samples,
+    EFFECTS, RADIO, AidCorrector, AnchorDelay, EffectSet, ImuCorrector, LabelEffect, Samples, SmoothTerm, TagLeverArm, Track,
+    aid_samples, true_samples,
 )  # fmt: skip
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import DIAGNOSED, Height, Pressure, Velocity
+from uwb_tdoa_bias.foundation.sensors import BY_POSE, Height, Pressure, Ranges, Velocity
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
@@ -24,7 +25,9 @@ seeds = st.integers(0, 2**32 - 1)
 
 FITTED = [effect for effect in EFFECTS.values() if effect.fitted and "tdoa" in effect.channels]
 SCALABLE = [effect for effect in EFFECTS.values() if not issubclass(effect, LabelEffect)]  # not whole numbers
-STAMPS = ("tdoa_time_offset", "truth_time_offset")  # act on stamps: their bias is zero, their regressors are not
+STAMPS = ("tdoa_time_offset", "truth_time_offset", "range_delay")  # act on stamps: their bias is zero, their regressors are not
+OF_RADIO = [(effect, channel) for effect in EFFECTS.values() if effect.fitted for channel in effect.channels if channel in RADIO]
+OF_BOTH = [effect for effect, channel in OF_RADIO if channel == "range" and effect in FITTED]
 
 
 def parameters(effect, samples, rng):
@@ -34,10 +37,11 @@ def parameters(effect, samples, rng):
     return {key: 0.1 * min(1.0, effect.bound_of(key)) * rng.uniform(-1.0, 1.0) for key in keys}
 
 
-@pytest.mark.parametrize("effect", [effect for effect in FITTED if effect.name not in STAMPS])
+@pytest.mark.parametrize("effect, channel", [(effect, channel) for effect, channel in OF_RADIO if effect.name not in STAMPS])
 @given(seeds)
-def test_regressors_against_finite_differences(effect, seed):
+def test_regressors_against_finite_differences(effect, channel, seed):
     samples = random_samples(seed)
+    samples = samples if channel == "tdoa" else ranges_of(samples, samples.b)
     values = parameters(effect, samples, np.random.default_rng(seed))
     keys = list(values)[::-1]
 
@@ -47,6 +51,51 @@ def test_regressors_against_finite_differences(effect, seed):
     found = effect(values).regressors(samples, keys)
     assert found.shape == (len(samples), len(keys))
     np.testing.assert_allclose(found, numerical_jacobian(bias, [values[k] for k in keys]), atol=1e-5)
+
+
+@pytest.mark.parametrize("effect", OF_BOTH)
+@given(seeds)
+def test_a_tdoa_errs_as_the_ranges_whose_difference_it_is(effect, seed):
+    samples = random_samples(seed)
+    made = effect(parameters(effect, samples, np.random.default_rng(seed)))
+    first, second = ranges_of(samples, samples.a), ranges_of(samples, samples.b)
+    np.testing.assert_allclose(samples.true(), second.true() - first.true(), atol=1e-12)
+    np.testing.assert_allclose(samples.direction(), second.direction() - first.direction(), atol=1e-12)
+    np.testing.assert_allclose(made.bias(samples), made.bias(second) - made.bias(first), atol=1e-9)
+    keys = list(made.values)
+    of_each = (made.regressors(part, keys) for part in (samples, second, first))
+    together, at_b, at_a = of_each
+    np.testing.assert_allclose(together, at_b - at_a, atol=1e-6)
+
+
+def ranged(moving):
+    """The same Flight with distances to anchors, one after the other."""
+    anchors = replace(random_samples(3).anchors, positions=random_samples(3).anchors.positions + 8.0)
+    t = np.linspace(moving.truth.t[0] + 0.5, moving.truth.t[-1] - 0.5, 60)
+    row = np.arange(len(t)) % len(anchors)
+    d = np.linalg.norm(Track(moving.truth).positions(t) - anchors.positions[row], axis=1)
+    return replace(moving, anchors=anchors, range=Ranges(t, anchors.ids[row], d, np.zeros(len(t))))
+
+
+@pytest.mark.parametrize("effect", [effect for effect, channel in OF_RADIO if channel == "range" and effect.name not in STAMPS])
+def test_is_injected_into_ranges_and_taken_out_of_them(effect):
+    before = ranged(felt(1)[0])
+    keys = effect.groups(before.anchors, np.array([[0, 1]]))[0]
+    made = effect(dict.fromkeys(keys, 0.2 * min(1.0, effect.bound)))
+    after = made.inject(before)
+    samples, rows = true_samples(after, RADIO["range"])
+    assert len(rows) == len(before.range) and np.abs(after.range.d - before.range.d).max() > 0.01
+    np.testing.assert_allclose(after.range.d - EffectSet((made,)).bias(samples), before.range.d, atol=1e-12)
+
+
+def test_late_stamps_of_ranges_are_moved_back():
+    flight = felt(1)[0]
+    before, late = ranged(flight), EFFECTS["range_delay"]({"offset": 0.05})
+    after = late.inject(before)
+    np.testing.assert_array_equal(after.range.t, before.range.t + 0.05)
+    np.testing.assert_allclose(EffectSet((late,)).correct_streams(after).range.t, before.range.t, atol=1e-12)
+    with pytest.raises(InputError, match="holds no range, which range_delay needs"):
+        late.inject(flight)
 
 
 @pytest.mark.parametrize("effect", SCALABLE)
@@ -240,14 +289,27 @@ def term(**changes):
 @pytest.mark.parametrize(
     "form, covariate", [("common", "height"), ("arrival", "elevation_in_anchor"), ("anchor", "range")]
 )
+@pytest.mark.parametrize("channel", RADIO)
 @given(seed=seeds)
-def test_smooth_term_is_linear_in_its_coefficients(form, covariate, seed):
+def test_smooth_term_is_linear_in_its_coefficients(channel, form, covariate, seed):
     samples, rng = random_samples(seed), np.random.default_rng(seed)
-    empty = term(form=form, covariate=covariate)
+    samples = samples if channel == "tdoa" else ranges_of(samples, samples.b)
+    empty = term(channel=channel, form=form, covariate=covariate)
     keys = empty.keys(samples.anchors)
     values = dict(zip(keys, rng.standard_normal(len(keys))))
-    full = SmoothTerm(values, {}, "", "tdoa", covariate, form, empty.knots)
+    full = SmoothTerm(values, {}, "", channel, covariate, form, empty.knots)
+    assert channel == "tdoa" or np.abs(full.bias(samples)).max() > 1e-3
     np.testing.assert_allclose(full.bias(samples), full.regressors(samples, keys) @ list(values.values()), atol=1e-12)
+
+
+def test_a_function_of_ranges_adds_nothing_to_tdoas_nor_the_other_way_round():
+    samples = random_samples(2)
+    np.testing.assert_array_equal(term(channel="range").bias(samples), 0.0)
+    np.testing.assert_array_equal(term().bias(ranges_of(samples, samples.b)), 0.0)
+    with pytest.raises(InputError, match="form: pair acts on two anchors"):
+        term(channel="range", form="pair", covariate="height")
+    with pytest.raises(InputError, match="'previous_anchor' acts on 'range'"):
+        term(channel="range", form="common", covariate="previous_anchor")
 
 
 def test_smooth_term_is_constant_beyond_its_knots_and_survives_a_file(tmp_path):
@@ -314,7 +376,7 @@ def test_several_effects_of_one_name_are_all_kept(tmp_path):
     np.testing.assert_array_equal(read.bias(samples), written.bias(samples))
 
 
-ON_AIDS = [effect for effect in EFFECTS.values() if set(effect.channels) <= set(AIDS)]
+ON_AIDS = [effect for effect in EFFECTS.values() if set(effect.channels) <= set(BY_POSE)]
 
 
 def felt(seed, n=400):
@@ -324,7 +386,7 @@ def felt(seed, n=400):
     p = np.stack([np.sin(0.7 * t + phase[0]), np.cos(0.5 * t + phase[1]), 1.5 + 0.5 * np.sin(0.9 * t + phase[2])], axis=1)
     angles = np.stack([0.1 * np.sin(t + phase[3]), 0.1 * np.cos(t + phase[4]), 0.3 * t], axis=1)
     truth = Truth(t, p, Rotation.from_euler("xyz", angles).as_quat())
-    samples = {stream: aid_samples(stream, t, Track(truth), t[0]) for stream in DIAGNOSED}
+    samples = {stream: aid_samples(stream, t, Track(truth), t[0]) for stream in BY_POSE}
     streams = {
         "height": Height(t, samples["height"].reading[:, 0]),
         "pressure": Pressure(t, pressure_at(samples["pressure"].reading[:, 0])),
@@ -401,5 +463,5 @@ def test_a_function_of_what_its_channel_does_not_have_is_refused_when_it_is_read
 
 
 def test_a_function_of_no_channel_is_refused_with_those_that_there_are():
-    with pytest.raises(InputError, match="acts on 'gyro'; channels are tdoa, gyro.x, .* and velocity.z"):
+    with pytest.raises(InputError, match="acts on 'gyro'; channels are tdoa, range, gyro.x, .* and velocity.z"):
         SmoothTerm(channel="gyro", covariate="time", knots=(0.0, 1.0))

@@ -45,15 +45,12 @@ class RadioCorrections:
 
     def slices(self, measured: Measurements) -> Iterator[Measurements]:
         """Measurements in parts, corrected. The poses that come of each are to be told by `add_pose` before the next is asked for."""
-        while stamps := [float(part["t"][0]) for part in measured if len(part)]:
-            number = math.floor(min(stamps) / SLICE)
+        of_rows = [np.floor(part["t"] / SLICE) for part in measured]
+        for number in np.unique(np.concatenate(of_rows)).tolist():
             if number != self._slice:
                 self._slice, self._pose = number, self._latest
-            ends = [int(np.searchsorted(part["t"], (number + 1) * SLICE)) for part in measured]
-            if not any(ends):  # the end of a slice may be rounded to its begin
-                ends = [int(np.searchsorted(part["t"], min(stamps), side="right")) for part in measured]
-            now = Measurements(*(part[:end] for part, end in zip(measured, ends)))
-            measured = Measurements(*(part[end:] for part, end in zip(measured, ends)))
+            inside = (slice(*np.searchsorted(numbers, [number, number + 1.0])) for numbers in of_rows)
+            now = Measurements(*(part[rows] for part, rows in zip(measured, inside)))
             yield now._replace(aids=self._corrected(now))
 
     def _corrected(self, measured: Measurements) -> np.ndarray:

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
-from uwb_tdoa_tools.planning.noise import RadioNoise
+from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise
 from uwb_tdoa_tools.planning.pairing import PAIRINGS, Pairing, all_pairs, common_reference, every_range, ring
 from uwb_tdoa_tools.planning.precision import NORMAL_99, bound, dilution, ellipses, information, position_error
 from uwb_tdoa_tools.readers import read_flight
@@ -78,6 +78,15 @@ def test_information_is_the_curvature_of_the_likelihood(case, dimensions):
     for point, matrix in zip(PLACES, got):
         wanted = numerical_information(point, installation, pairing)
         np.testing.assert_allclose(matrix, wanted, rtol=2e-3, atol=2e-3 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("noise", [NOISY, FixedNoise(0.1)])
+def test_what_tdoas_and_ranges_tell_adds_up(noise):
+    """They are measured one without the other."""
+    alone = [information(PLACES, Installation(corners(), noise, PAIRINGS[name](8), 0.05)) for name in ("ring", "every_range")]
+    both = information(PLACES, Installation(corners(), noise, PAIRINGS["ring+every_range"](8), 0.05))
+    np.testing.assert_allclose(both, sum(alone), rtol=1e-12)
+    assert (position_error(bound(both)) < 0.95 * np.minimum(*(position_error(bound(one)) for one in alone))).all()
 
 
 def test_the_second_term_of_eq_1_counts_here():

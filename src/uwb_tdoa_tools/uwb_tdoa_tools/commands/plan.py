@@ -28,7 +28,7 @@ def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "plan",
-        "Precision (Cramer-Rao bound), failure (two solutions) and accuracy of TDOA positions among given anchors,\n"
+        "Precision (Cramer-Rao bound), failure (two solutions) and accuracy of positions by TDOAs or ranges among given anchors,\n"
         "and better places for the anchors. Writes pictures, plan.json, flyable.npz (for the filter's node) and a bag\n"
         "with the maps (OccupancyGrid, MarkerArray) for RViz and Foxglove.",
         "plan anchors.yaml --height 1.2 --out plan/",
@@ -36,6 +36,7 @@ def parser() -> ArgumentParser:
         "plan square.yaml --planar --height 0.2 --check --out plan/",
         "plan survey.txt --volume --with height --flights flights/0425 --out plan/",
         "plan survey.txt --volume --improve add --out plan/",
+        "plan survey.txt --volume --protocol tdoa2+ranges --noise 0.1 --out plan/",
         "plan hall.yaml --radio-reach 18 --height 1.2 --walls walls.yaml --out plan/",
     )
     number: dict[str, Any] = {"type": float}
@@ -55,8 +56,8 @@ def parser() -> ArgumentParser:
     add("--planar", action="store_true", help="the height of the tag is known: x and y only")
 
     add, radio = made.add_argument_group("measurements").add_argument, RadioNoise
-    add("--protocol", choices=OF_PROTOCOL, default="tdoa2", help="which TDOAs a round holds (default: tdoa2)")
-    add("--covariance", choices=PAIRINGS, help="the TDOAs of a round and what they share (default: ring for tdoa2, all_pairs for tdoa3)")
+    add("--protocol", choices=OF_PROTOCOL, default="tdoa2", help="TDOAs, ranges (two-way), or both, that a round holds (default: tdoa2)")
+    add("--covariance", choices=PAIRINGS, help="what a round holds, and what its TDOAs share (default: as --protocol says)")
     add("--antenna", metavar="FILE", help="pattern, YAML: azimuth, elevation_1, elevation_2, gain_offset, in dBi")
     add("--tx-power", metavar="DBM", **number, default=radio.tx_power_dbm, help=f"at 25 C, 3.3 V {default}")
     add("--temperature", metavar="C", **number, default=radio.temperature, help=f"of the anchors {default}")
@@ -66,7 +67,7 @@ def parser() -> ArgumentParser:
     add("--with", dest="aids", action="append", default=[], choices=["height"], help="what the tag measures besides: a range finder that looks down")
     height_std = FilterConfig().height_std  # type: ignore[attr-defined]  # parameters of SENSORS are known at run time
     add("--height-std", metavar="M", **number, default=height_std, help=f"of that height {default}")
-    unique = "one solution by every pairing alone or by a whole round (default: pairings; with --radio-reach: round)"
+    unique = "one solution by every pairing alone or by a whole round (default: pairings; with --radio-reach or ranges: round)"
     add("--flyable", choices=FLYABLE, help=unique)
     add("--radio-reach", metavar="M", **number, help="a hall: the tag hears the anchors within that, not all; many more anchors are possible")
     add("--walls", metavar="FILE", **path, help="with --radio-reach: no signal comes through these, YAML, walls: [[x0, y0, x1, y1], ...]")
@@ -87,11 +88,11 @@ def parser() -> ArgumentParser:
 
 def _plan(args: Namespace) -> None:
     cli.check_folders(args.json)
-    args.flyable = args.flyable or ("pairings" if args.radio_reach is None else "round")
     anchors = read_survey(args.anchors)
     if args.walls is not None and args.radio_reach is None:
         raise InputError("walls: are for a hall of which a tag hears a part; give --radio-reach too.")
     installation = options.installation_of(args, anchors)
+    args.flyable = options.criterion_of(args, installation)
     room = options.room_for(args, anchors)
     grid = options.grid_of(args, room)
     if args.flights and args.planar:

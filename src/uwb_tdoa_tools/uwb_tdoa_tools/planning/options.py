@@ -55,6 +55,16 @@ def installation_of(args: Namespace, anchors: Anchors) -> Installation:
     return Installation(anchors, noise, pairing, args.link_noise, 2 if args.planar else 3, height_std)
 
 
+def criterion_of(args: Namespace, installation: Installation) -> str:
+    """Of FLYABLE, what is asked for. Raises InputError for what ranges do not tell."""
+    if installation.pairing.one_solution:
+        for name, asked in (("flyable", args.flyable == "pairings"), ("check", args.check)):
+            if asked:
+                raise InputError(f"{name}: looks for a second solution of TDOAs, and ranges have none; leave it out, or plan for --protocol tdoa2.")
+        return "round"
+    return args.flyable or ("pairings" if args.radio_reach is None else "round")
+
+
 def _some(anchors: Anchors, count: int) -> Anchors:
     """So many Anchors that are not in one plane, if there are."""
     far = [0]

@@ -1,10 +1,15 @@
-"""Which TDOAs one round of measurements holds, and how their errors hang together."""
+"""Which TDOAs and ranges one round of measurements holds, and how their errors hang together."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 @dataclass(frozen=True)
@@ -17,6 +22,7 @@ class Pairing:
     shared : the TDOAs of a round use one reception per anchor, whose error they share; otherwise every TDOA has its own
     times : how often each TDOA comes in a round (default 1)
     ranges : not differences but the distances to the anchors of `a` themselves, each measured once a round
+    beside : Pairing, what the round holds besides, measured independently; or None
     """
 
     a: np.ndarray
@@ -24,6 +30,17 @@ class Pairing:
     shared: bool
     times: float = 1.0
     ranges: bool = False
+    beside: Pairing | None = None
+
+    @property
+    def parts(self) -> tuple[Pairing, ...]:
+        """What it holds that is measured independently of each other: Pairings with nothing beside."""
+        return (replace(self, beside=None), *(self.beside.parts if self.beside else ()))
+
+    @property
+    def one_solution(self) -> bool:
+        """Whether it holds distances: among anchors that are not in a plane these are so from one place only."""
+        return any(part.ranges for part in self.parts)
 
     def incidence(self) -> np.ndarray:
         """(M, N) matrix of -1 at a and +1 at b; of ranges the identity."""
@@ -68,10 +85,20 @@ def every_range(n: int) -> Pairing:
     return Pairing(np.arange(n), np.arange(n), False, ranges=True)
 
 
-PAIRINGS = {
+def _beside_ranges(make: Callable[[int], Pairing]) -> Callable[[int], Pairing]:
+    """Of a maker of Pairings that of the same with the distance to every anchor beside."""
+    return lambda n: replace(make(n), beside=every_range(n))
+
+
+PAIRINGS: dict[str, Callable[[int], Pairing]] = {
     "ring": ring,
     "ring_uncorrelated": lambda n: ring(n, shared=False),
     "common_reference": common_reference,
     "all_pairs": all_pairs,
+    "every_range": every_range,
+    "ring+every_range": _beside_ranges(ring),
+    "all_pairs+every_range": _beside_ranges(all_pairs),
 }
-OF_PROTOCOL = {"tdoa2": "ring", "tdoa3": "all_pairs"}
+OF_PROTOCOL = {
+    "tdoa2": "ring", "tdoa3": "all_pairs", "ranges": "every_range", "tdoa2+ranges": "ring+every_range", "tdoa3+ranges": "all_pairs+every_range",
+}  # fmt: skip

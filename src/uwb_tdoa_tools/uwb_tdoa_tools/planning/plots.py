@@ -43,7 +43,7 @@ def plot_precision(installation: Installation, chart: Chart, path: str | Path) -
             _field(ax, chart, values, k, label)
             _room(ax, installation, chart.grid, k)
         row[0].set_title(f"{row[0].get_title()}, 99 % ellipses times {_ellipses(row[0], chart, k)}", **TITLE)
-    _save(figure, "Precision of one round of TDOAs", path)
+    _save(figure, "Precision of one round", path)
 
 
 def plot_failure(installation: Installation, chart: Chart, path: str | Path) -> None:

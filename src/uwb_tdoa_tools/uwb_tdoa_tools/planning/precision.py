@@ -20,7 +20,7 @@ _CHUNK = 200_000  # numbers in the largest array of one step: what a processor c
 
 
 def information(points: np.ndarray, installation: Installation, correction: bool = True) -> np.ndarray:
-    """Fisher information about the position from one round of TDOAs and, where the tag measures it, a height: (n, k, k)
+    """Fisher information about the position from one round of TDOAs or ranges and, where the tag measures it, a height: (n, k, k)
     1/m^2, k the installation's dimensions.
 
     points : (n, 3) m. correction : with the second term of eq. 1, the information that lies in the size of the errors.
@@ -40,7 +40,8 @@ def _information(points: np.ndarray, installation: Installation, correction: boo
     total = weigh(unit[..., :k], variance, installation.pairing, installation.link_std)
     if correction:
         gradient = variance_gradient(installation.noise, points, anchors, variance, k)
-        total += _from_sizes(gradient, variance, installation)
+        for part in installation.pairing.parts:
+            total += _from_sizes(gradient, variance, part, installation.link_std)
     return total
 
 
@@ -53,6 +54,8 @@ def weigh(ranges: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: 
     For one shared reception per anchor, whichever N - 1 pairs D connect the anchors, D' (D S D')^-1 D is the same
     matrix: W - w w' / sum(w) with W = S^-1, that of N ranges with one unknown offset, the tag's clock. A closed ring,
     whose covariance D S D' is singular, holds the same and nothing more."""
+    if pairing.beside:
+        return np.sum([weigh(ranges, variance, part, link_std) for part in pairing.parts], axis=0)
     own = link_std**2
     if pairing.ranges:
         return _product(ranges, ranges / (variance + own)[..., None])
@@ -67,12 +70,12 @@ def weigh(ranges: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: 
     return _product(centred, w * centred)
 
 
-def _from_sizes(gradient: np.ndarray, variance: np.ndarray, installation: Installation) -> np.ndarray:
+def _from_sizes(gradient: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: float) -> np.ndarray:
     """Second term of eq. 1, for the derivatives (n, N, k) of the variances.
 
     With F = D S D' + own, dF_i = D diag(g_i) D' and P = D' F^-1 D, half the trace is g_i' (P o P) g_j / 2.
     """
-    pairing, own = installation.pairing, installation.link_std**2
+    own = link_std**2
     if pairing.ranges:
         g = gradient / (variance + own)[..., None]
         return 0.5 * _product(g, g)
@@ -81,7 +84,7 @@ def _from_sizes(gradient: np.ndarray, variance: np.ndarray, installation: Instal
         g = (gradient[:, pairing.a] + gradient[:, pairing.b]) * weight[..., None]
         return 0.5 * pairing.times * _product(g, g)
     if own > 0.0:
-        return 0.5 * _product(gradient, _inverse(variance, pairing, installation.link_std) ** 2 @ gradient)
+        return 0.5 * _product(gradient, _inverse(variance, pairing, link_std) ** 2 @ gradient)
     w = 1.0 / variance[..., None]
     total, g = w.sum(axis=1, keepdims=True), w * gradient
     mean = (w * g).sum(axis=1, keepdims=True) / total

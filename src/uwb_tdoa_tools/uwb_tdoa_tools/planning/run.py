@@ -74,7 +74,8 @@ def end(args: Namespace, figures: dict[str, Any], outgoing: dict[str, Any]) -> N
 def draw_map(found: Chart, installation: Installation, out: Path) -> dict[str, Any]:
     """Pictures, flyable volume and bag of a Chart. Returns {topic: message}, see `messages.messages`."""
     plots.plot_precision(installation, found, out / "precision.png")
-    plots.plot_failure(installation, found, out / "failure.png")
+    if not installation.pairing.one_solution:
+        plots.plot_failure(installation, found, out / "failure.png")
     found.volume(installation.anchors, installation.dimensions).save(out / "flyable.npz")
     outgoing = messages.messages(found, installation.anchors)
     messages.write(outgoing, out / "plan.bag")
