@@ -9,7 +9,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_ekf.results import Odometry
+from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.monitoring.status import YAW_KNOWN
 from uwb_tdoa_ekf.offline import Run
@@ -50,38 +50,52 @@ class Belief:
             return [f"{self.level}: there is no estimate", *self.reasons, *self.remedies]
         spread = ", ".join(f"{axis} {100 * told[f'std_{axis}']:.0f}" for axis in "xyz")
         within = f"standard deviation {100 * told['std']:.0f} cm ({spread}): the position is within {100 * told['within']:.0f} cm for 95 % of the time"
-        fits = f"{told['explained']:.1%} of {told['tdoas']} TDOAs fit it within three standard deviations (NIS {told['nis']:.2f}, 1 or less is sound)"
+        fits = f"{told['explained']:.1%} of {_counted(told)} fit it within three standard deviations (NIS {told['nis']:.2f}, 1 or less is sound)"
         return [f"{self.level}: {within}; {fits}", *self.reasons, *self.remedies]
 
 
 def believe(flight: Flight, run: Run, corrected: bool = False) -> Belief:
     """Belief in a Run over a Flight, whose ground truth is not used. corrected : by effects that somebody calibrated."""
-    odometry, there = run.odometry, residuals.reached(run.residuals)
-    figures = {"seconds": _length(flight), "estimates": len(odometry), "tdoas": len(flight.tdoa), "recoveries": run.recoveries}
+    odometry, left = run.odometry, residuals.of_run(flight, run)
+    there = residuals.reached(left)
+    figures = {"seconds": _length(left), "estimates": len(odometry), "tdoas": len(flight.tdoa), "recoveries": run.recoveries}
+    if ranges := len(left) - len(flight.tdoa):
+        figures["ranges"] = ranges
     faults = [finding for finding in check(of_flight(flight)).findings if finding.severity == ERROR]
     reasons = [f"check: {finding.cause} ({finding.evidence})" for finding in faults]
     remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults]
     if not len(odometry) or not there.any():
-        reasons.append("the filter found no place that explains the TDOAs")
+        reasons.append(f"the filter found no place that explains the {_measured(figures)}")
         return Belief(BAD, figures, [], tuple(reasons), tuple(remedies))
     figures |= _deviation(odometry)
-    normalised = (run.residuals.innovation**2 / run.residuals.variance)[there]
-    figures["explained"] = float(residuals.explained(run.residuals)[there].mean())
+    normalised = (left.innovation**2 / left.variance)[there]
+    figures["explained"] = float(residuals.explained(left)[there].mean())
     figures["nis"] = float(np.mean(np.minimum(normalised, 9.0)))
-    lost = lost_spans(flight, odometry)
+    lost = lost_spans(left.t, odometry)
     figures["lost"] = float(sum(end - begin for begin, end in lost))
     worse = BAD if faults or figures["lost"] > 0.5 * figures["seconds"] else GOOD
-    for reason in _doubts(flight, figures, lost):
+    for reason in _doubts(flight, left, figures, lost):
         reasons.append(reason)
         worse = BAD if worse == BAD else DOUBTFUL
-    return Belief(worse, figures, lost, tuple(reasons), tuple([*remedies, *_remedies(flight, run, figures, corrected)]))
+    return Belief(worse, figures, lost, tuple(reasons), tuple([*remedies, *_remedies(flight, left, figures, corrected)]))
 
 
-def lost_spans(flight: Flight, odometry: Odometry) -> list[tuple[float, float]]:
-    """[(begin, end)] s, between the first estimate and the last TDOA, in which there is no estimate for GAP, or one whose deviation is
+def _measured(figures: Mapping[str, Any]) -> str:
+    """What locates, in words."""
+    return "TDOAs" if not figures.get("ranges") else "TDOAs and ranges" if figures["tdoas"] else "ranges"
+
+
+def _counted(figures: Mapping[str, Any]) -> str:
+    """The same with how many there are."""
+    counts = [f"{figures[name]} {words}" for name, words in (("tdoas", "TDOAs"), ("ranges", "ranges")) if figures.get(name)]
+    return " and ".join(counts) or "0 TDOAs"
+
+
+def lost_spans(heard: np.ndarray, odometry: Odometry) -> list[tuple[float, float]]:
+    """[(begin, end)] s, between the first estimate and the last that was heard, of stamps (n,) s, in which there is no estimate for GAP, or one whose deviation is
     more than LOST; spans that are less than GAP apart are one."""
     t, std = odometry.t, np.sqrt(np.einsum("nii->n", odometry.covariance[:, :3, :3]))
-    ends = np.append(t[1:], max(t[-1], flight.tdoa.t.max(initial=-math.inf)))
+    ends = np.append(t[1:], max(t[-1], heard.max(initial=-math.inf)))
     wide = (std > LOST) | (ends - t > GAP)
     spans: list[tuple[float, float]] = []
     for begin, end in zip(t[wide].tolist(), ends[wide].tolist()):
@@ -92,8 +106,8 @@ def lost_spans(flight: Flight, odometry: Odometry) -> list[tuple[float, float]]:
     return [(begin, end) for begin, end in spans if end > begin]
 
 
-def _length(flight: Flight) -> float:
-    return float(np.ptp(flight.tdoa.t)) if len(flight.tdoa) else 0.0
+def _length(left: Residuals) -> float:
+    return float(np.ptp(left.t)) if len(left) else 0.0
 
 
 def _deviation(odometry: Odometry) -> dict[str, float]:
@@ -108,30 +122,32 @@ def _deviation(odometry: Odometry) -> dict[str, float]:
     return out | {"std": std, "within": SIGMAS * std, "lasting": lasting, "yaw_std": float(yaw)}
 
 
-def _doubts(flight: Flight, figures: Mapping[str, Any], lost: Sequence[tuple[float, float]]) -> Iterator[str]:
+def _doubts(
+    flight: Flight, left: Residuals, figures: Mapping[str, Any], lost: Sequence[tuple[float, float]]
+) -> Iterator[str]:  # fmt: skip
     """Yield sentences."""
     if figures["lost"] > LONG * figures["seconds"]:
-        spans = ", ".join(f"{begin - flight.tdoa.t[0]:.0f} - {end - flight.tdoa.t[0]:.0f} s" for begin, end in lost[:5])
+        spans = ", ".join(f"{begin - left.t.min():.0f} - {end - left.t.min():.0f} s" for begin, end in lost[:5])
         yield f"the tag was lost for {figures['lost']:.0f} s of {figures['seconds']:.0f} s ({spans}{', ...' * (len(lost) > 5)})"
     if figures["recoveries"]:
         yield f"the filter found that it had been wrong, and began anew at another place, {figures['recoveries']} times"
     if figures["explained"] < FEW:
-        yield f"{1.0 - figures['explained']:.0%} of the TDOAs speak against it"
+        yield f"{1.0 - figures['explained']:.0%} of the {_measured(figures)} speak against it"
     if figures["std"] > LOST:
         yield f"the position is stated to no better than {figures['std']:.1f} m"
     if flight.imu is not None and figures["yaw_std"] > YAW_KNOWN:
         yield f"the yaw is not known in the end: +-{math.degrees(figures['yaw_std']):.0f} degrees"
 
 
-def _remedies(flight: Flight, run: Run, figures: Mapping[str, Any], corrected: bool) -> Iterator[str]:
+def _remedies(flight: Flight, left: Residuals, figures: Mapping[str, Any], corrected: bool) -> Iterator[str]:
     """Yield sentences."""
-    ids = np.unique(np.concatenate([flight.tdoa.a, flight.tdoa.b]))
+    ids = np.unique(np.concatenate([left.a, left.b]).astype(int))
     lacking = ids[flight.anchors.index(ids) < 0]
     if len(lacking):
-        yield f"survey anchor {', '.join(map(str, lacking.tolist()))}, which the tag hears: its TDOAs are not used"
+        yield f"survey anchor {', '.join(map(str, lacking.tolist()))}, which the tag hears: its {_measured(figures)} are not used"
     if flight.imu is None:
         yield "record the inertial sensor, too: the filter then knows the attitude, and bridges gaps"
-    if figures["std_z"] > TALL * max(figures["std_x"], figures["std_y"]) and not len(run.aids.get("height", ())):
+    if figures["std_z"] > TALL * max(figures["std_x"], figures["std_y"]) and flight.height is None:
         yield "the height is what is known worst: add a range finder that looks down, or put anchors further apart in height (plan says where)"
     if not corrected and figures["lasting"] > LASTING:
         yield f"{figures['lasting']:.0%} of the variance is of errors that last, as of delays and places of anchors: calibrate them"

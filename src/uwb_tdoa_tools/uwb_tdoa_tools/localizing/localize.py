@@ -64,7 +64,7 @@ class Localizer:
             written.append(self.folder / f"{name}{end}")
             return written[-1]
 
-        odometry = run.odometry
+        odometry, left = run.odometry, residuals.of_run(flight, run)
         write_tum(path(".tum"), odometry.t, odometry.p, odometry.q)
         files.write_csv(path(".csv"), odometry)
         title = f"{name}: {belief.sentences()[0].partition(';')[0]}"
@@ -72,13 +72,13 @@ class Localizer:
         if self.bag and len(odometry):
             write_odometry(odometry, flight.anchors, path(".bag"), force=True)
         if self.left:
-            residuals.write_csv(path("_residuals.csv"), run.residuals)
-            residuals.picture(path("_residuals.png"), run.residuals, name)
-        if self.zones is not None and (found := zones.zones_of(odometry, run.residuals, self.zones)):
+            residuals.write_csv(path("_residuals.csv"), left)
+            residuals.picture(path("_residuals.png"), left, name)
+        if self.zones is not None and (found := zones.zones_of(odometry, left, self.zones)):
             zones.write_csv(path("_zones.csv"), found)
             zones.draw(path("_zones.png"), found, flight.anchors, self.zones, f"{name}: squares of {self.zones:g} m")
         if self.rerun is not None:
-            rerun_file.write_rerun(self.rerun, flight, odometry, run.residuals, belief.sentences())
+            rerun_file.write_rerun(self.rerun, flight, odometry, left, belief.sentences())
             written.append(self.rerun)
         return Located(name, belief, tuple(file for file in written if file.exists()))
 

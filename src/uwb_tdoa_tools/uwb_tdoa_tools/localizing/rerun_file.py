@@ -50,7 +50,7 @@ def write_rerun(
     to be shown, and another Odometry, as it was before something was corrected, or None. Time is s since the first TDOA."""
     import rerun
 
-    begin = float(flight.tdoa.t[0])
+    begin = flight.start
     stream = rerun.RecordingStream("uwb_tdoa")
     stream.save(path)
     anchors = flight.anchors

@@ -1,15 +1,20 @@
-"""What is left of each TDOA after the estimate: a table, sums per pair of anchors, a picture."""
+"""What is left of each TDOA and range after the estimate: a table, sums per pair of anchors or per anchor, a picture."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.sensors import LOCATING
 from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
-from uwb_tdoa_ekf.results import VERDICTS, Residuals
+from uwb_tdoa_ekf.results import VERDICTS, Residuals, concatenated
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.offline import Run
 
 COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
 SHOWN, FEWEST = 20, 20  # pairs in the picture at most, those with the most TDOAs; TDOAs of a pair that is shown at least
@@ -18,8 +23,8 @@ SPREAD = 6.0  # robust standard deviations that the picture reaches; what is far
 
 @dataclass(frozen=True)
 class OfPair:
-    """Residuals of the TDOAs between two anchors, a before b. t (n,) s; value, std (n,) m, of d_ab; explained (n,) bool, within three
-    standard deviations."""
+    """Residuals of the TDOAs between two anchors, a before b, or of the ranges to one, which is both. t (n,) s; value, std (n,) m, of d_ab
+    or of the range; explained (n,) bool, within three standard deviations."""
 
     a: int
     b: int
@@ -28,12 +33,27 @@ class OfPair:
     std: np.ndarray
     explained: np.ndarray
 
+    @property
+    def name(self) -> str:
+        """What it is called in pictures."""
+        return f"{self.a} - {self.b}" if self.a != self.b else f"range {self.a}"
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "a": self.a, "b": self.b, "tdoas": len(self.t), "median": float(np.median(self.value)), "std": float(self.value.std()),
             "explained": float(self.explained.mean()),
         }  # fmt: skip
+
+
+def of_run(flight: Flight, run: Run) -> Residuals:
+    """Residuals of the TDOAs of a Run over a Flight, and of what else locates: of distances to anchors, of which a and b are the same."""
+    parts = [run.residuals]
+    for name in LOCATING:
+        if name in run.aids:
+            stream = getattr(flight, name)
+            parts.append(Residuals.from_rows(stream.t, stream.anchor, stream.anchor, run.aids[name]))
+    return concatenated(parts)
 
 
 def reached(residuals: Residuals) -> np.ndarray:
@@ -92,7 +112,7 @@ def picture(path: Path, residuals: Residuals, title: str) -> None:
         ax.plot((one.t - begin)[~one.explained], shown[~one.explained], ".", ms=3.0, color="tab:red")
         ax.set(ylim=(-limit, limit), yticks=(-tick, 0.0, tick))
         ax.set_yticklabels([f"{-100 * tick:.0f}", "0", f"{100 * tick:.0f}"], fontsize=7)
-        ax.set_ylabel(f"{one.a} - {one.b}", rotation=0, ha="right", va="center", fontsize=9)
+        ax.set_ylabel(one.name, rotation=0, ha="right", va="center", fontsize=9)
         told = f"{100 * np.median(one.value):+.0f} cm, {one.explained.mean():.0%} explained"
         ax.text(1.005, 0.5, told, transform=ax.transAxes, fontsize=8, va="center")
     axes[-1].set_xlabel("time of the recording [s]")

@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_bias.effects import EffectSet
+import numpy as np
+
+from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
 
 from ..checking.repairs import repairs
 from ..localizing.estimate import Estimator
@@ -69,6 +71,8 @@ def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) 
     straight, odometry = effects.correct_streams(flight), Estimator(config, effects)(flight).odometry
     assert straight.truth is not None
     found = alignment_of(straight, odometry)
+    if found.other_frame and _ranges_fit(straight, effects, found):
+        found = replace(found, axes=np.eye(3), turn=np.eye(3), shift=np.zeros(3))
     repair = EffectSet(repairs(replace(straight, truth=found.applied(straight.truth, TIME)))) if found.other_frame else EffectSet()
     if not len(repair):
         return found
@@ -76,3 +80,19 @@ def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) 
     error = apart(*paths(found.applied(straight.truth, TIME), of_labels))
     left = apart(*paths(found.applied(straight.truth, FRAME), odometry))
     return alignment_of(repair.correct_streams(straight), of_labels) if error < AS_WELL * left else found
+
+
+def _ranges_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
+    """Whether distances to anchors speak for the frame of the ground truth as it is, against that of an Alignment: delays of anchors, which
+    make the estimate bend, are constants of these. False without distances."""
+    assert flight.truth is not None
+    for channel in (name for name, kind in RADIO.items() if kind.ends == 1 and getattr(flight, name) is not None):
+        stream = getattr(flight, channel)
+        away = []
+        for how in (TIME, FRAME):
+            samples, rows = true_samples(replace(flight, truth=found.least().applied(flight.truth, how)), RADIO[channel])
+            left = stream.d[rows] - samples.true() - effects.bias(samples)
+            apart = [np.abs(left[samples.b == anchor] - np.median(left[samples.b == anchor])) for anchor in np.unique(samples.b)]
+            away.append(np.median(np.concatenate(apart)) if apart else np.nan)
+        return bool(away[0] <= away[1])
+    return False
