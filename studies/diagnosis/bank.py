@@ -1,6 +1,6 @@
 """The bank of simulated flights with known effects."""
 
-from known_effects import AIDED, SIZES, clean_flight, effect_of, names_found
+from known_effects import AIDED, RANGED, SIZES, clean_flight, effect_of, names_found
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
@@ -111,7 +111,7 @@ def cases(seeds, aided=False, first=0):
     """[(kind, effects, seed)] of the whole bank: small, large, pair, clean. aided : of effects on height, pressure and
     velocity, for flights that have these; first : of the seeds."""
     out = []
-    for name in (name for name in SIZES if (name in AIDED) == aided):
+    for name in (name for name in SIZES if name not in RANGED and (name in AIDED) == aided):
         out += [
             ("small" if not large else "large", (effect_of(name, large, s),), 100 + s)
             for large in (False, True)

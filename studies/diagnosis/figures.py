@@ -246,7 +246,7 @@ def _matrix(ax, count, rows, columns):
 
 def _confusion(results, path):
     """Rows: what was put in; columns: the first thing found; small and large together."""
-    names = [name for name in bank.SIZES if name not in bank.AIDED]
+    names = [name for name in bank.SIZES if name not in (*bank.AIDED, *bank.RANGED)]
     columns = [*names, "something without a name", "nothing"]
     count = np.zeros((len(names) + 1, len(columns)))
     for r in results:

@@ -4,7 +4,7 @@ import json
 import time
 
 from known_effects import AIDED as ON_AIDS
-from known_effects import SIZES, effect_of
+from known_effects import RANGED, SIZES, effect_of
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import AIDS
@@ -127,7 +127,7 @@ def run(data, name, out, aids=()):
 def injected(data, each):
     """Put large effects into measured flights whose own effects were diagnosed before: [dict], as of the bank, with "hit"
     and "imitators": what explains as much, less plausibly."""
-    cases = [(path, name) for path in INTO for name in SIZES if name not in (*PRESENT, *ON_AIDS)]
+    cases = [(path, name) for path in INTO for name in SIZES if name not in (*PRESENT, *ON_AIDS, *RANGED)]
     known = {}
 
     def one(path, name):

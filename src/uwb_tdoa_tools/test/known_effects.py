@@ -4,7 +4,7 @@ is found by name."""
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.foundation.sensors import BY_POSE
 from uwb_tdoa_tools.diagnosis.constraints import Mark
 from uwb_tdoa_tools.scoring.metrics import airborne
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
@@ -22,6 +22,8 @@ SIZES = {
     "tdoa_time_offset": ({"offset": 0.01}, {"offset": 0.05}),
     "truth_time_offset": ({"offset": 0.01}, {"offset": 0.05}),
     "truth_frame": ({"z": 0.04}, {"x": 0.1, "y": 0.1, "z": 0.1, "roll": 0.02, "pitch": 0.02, "yaw": 0.05}),
+    "range_offset": ({"N": 0.05}, {"N": 0.3}),
+    "range_delay": ({"offset": 0.02}, {"offset": 0.05}),
     "range_scale": ({"scale": 0.01}, {"scale": 0.05}),
     "range_bias": ({"quadratic": 0.002}, {"quadratic": 0.01}),
     "received_power_bias": ({"scale": 0.5}, {"scale": 2.0}),
@@ -54,13 +56,14 @@ SIZES = {
         {"1.share": 0.3, "1.start": 20.0, "1.end": 26.0}, {"1.share": 1.0, "1.start": 20.0, "1.end": 26.0},
     ),
 }  # fmt: skip
-AIDED = tuple(name for name in SIZES if set(EFFECTS[name].channels) <= set(AIDS))  # effects on height, pressure, velocity
+AIDED = tuple(name for name in SIZES if set(EFFECTS[name].channels) <= set(BY_POSE))  # effects on height, pressure, velocity
+RANGED = "range_offset", "range_delay"  # effects on ranges alone, of which `study diagnose-ranges` tells
 MARK_TIME, MARK_STD = 2.0, 0.05  # s, m
 NOISES = {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
 
 
-def clean_flight(seed, duration=50.0, aided=False):
-    """A simulated flight without any effect. aided : with height, pressure and velocity."""
+def clean_flight(seed, duration=50.0, aided=False, ranged=False):
+    """A simulated flight without any effect. aided : with height, pressure and velocity; ranged : with distances to anchors."""
     return simulate(
         SimulationConfig(
             seed=seed,
@@ -70,6 +73,7 @@ def clean_flight(seed, duration=50.0, aided=False):
             protocol=("tdoa2", "tdoa3")[seed // 2 % 2],
             **CLEAN,
             **(NOISES if aided else {}),
+            **({"range_noise": 0.1} if ranged else {}),
         )
     )
 

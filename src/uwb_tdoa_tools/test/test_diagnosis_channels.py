@@ -11,13 +11,15 @@ from known_effects import clean_flight
 
 @pytest.fixture(scope="module")
 def parts():
-    return residuals(clean_flight(100, 40.0, aided=True), GroundTruth(), EffectSet())
+    return residuals(clean_flight(100, 40.0, aided=True, ranged=True), GroundTruth(), EffectSet())
 
 
 def test_residuals_of_a_clean_flight_are_its_noise(parts):
     assert np.std(parts["gyro"].residual) < 0.002 and np.std(parts["accel"].residual) < 0.01
     for name, noise in (("height", 0.01), ("pressure", 0.1), ("velocity", 0.05)):  # medians of the 6 or 7 in a cell
         assert np.std(parts[name].residual) == pytest.approx(1.2 * noise / np.sqrt(6.25), rel=0.15)
+    ranges = parts["range"]
+    assert np.std(ranges.residual[ranges.airborne]) == pytest.approx(0.1, rel=0.05)
     tdoa = parts["tdoa"]
     assert 1.4826 * np.median(np.abs(tdoa.residual[tdoa.airborne])) == pytest.approx(0.06, rel=0.05)
 

@@ -135,6 +135,10 @@ def test_other_sensors_say_what_is_true_but_for_their_noise():
     np.testing.assert_allclose(speed.mean(axis=0), 1.0, atol=0.02)
     assert (std == 0.05).all()
     assert len(sensors["height"].t) == 200 and len(sensors["pressure"].t) == 250
+    ids, d, variance = sensors["range"].measured(slice(50, 150), p, q, v, p[:, 2])
+    assert len(sensors["range"].t) == 1000 and ids.tolist() == np.resize(world.anchors.ids, 150)[50:].tolist() and not variance.any()
+    off = d - np.linalg.norm(p - world.anchors.positions[world.anchors.index(ids)], axis=1)
+    assert abs(off.mean()) < 0.04 and off.std() == pytest.approx(0.1, rel=0.3)
 
 
 def test_what_takes_its_time_arrives_in_order_and_whole():

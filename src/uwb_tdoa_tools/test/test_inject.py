@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet, true_samples
+from uwb_tdoa_bias.effects import EFFECTS, RADIO, EffectSet, true_samples
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.sensors import DIAGNOSED
-from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.inject import main
 from uwb_tdoa_tools.readers import read_flight
@@ -26,6 +25,7 @@ def flight():
             height_noise=0.0,
             pressure_noise=0.0,
             velocity_noise=0.0,
+            range_noise=0.0,
         )
     )
 
@@ -50,9 +50,10 @@ def test_injected_effect_is_what_the_model_takes_out(flight, effect):
     if effect.name in ("noise_level", "noise_correlation", "outlier_rate"):
         return  # nothing to take out
     corrected = EffectSet((effect,)).correct_streams(changed)
-    samples, rows = true_samples(corrected)
-    d = corrected.tdoa.d[rows] - EffectSet((effect,)).bias(samples)
-    np.testing.assert_allclose(d, tdoa(samples.p, samples.position_a, samples.position_b), atol=2e-3)
+    for channel, kind in RADIO.items():
+        samples, rows = true_samples(corrected, kind)
+        d = getattr(corrected, channel).d[rows] - EffectSet((effect,)).bias(samples)
+        np.testing.assert_allclose(d, samples.true(), atol=2e-3)
     np.testing.assert_allclose(corrected.imu.gyro, flight.imu.gyro, atol=1e-9)
     tilt = 0.2 if effect.name == "imu_gravity" else 0.0  # rad, which its correction neglects
     np.testing.assert_allclose(corrected.imu.accel, flight.imu.accel, atol=1e-9 + 0.05 * tilt)

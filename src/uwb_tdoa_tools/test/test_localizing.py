@@ -108,6 +108,39 @@ def test_a_clean_flight_is_good_and_within_what_is_stated(flight):
     assert np.mean(np.linalg.norm(odometry.p - true, axis=1) <= told.figures["within"]) >= 0.95
 
 
+@pytest.fixture(scope="module")
+def ranged():
+    """A flight of ranges alone, without ground truth."""
+    made = simulate(SimulationConfig(seed=1, range_noise=0.1, **CLEAN))
+    return replace(made, tdoa=type(made.tdoa)(*(column[:0] for column in vars(made.tdoa).values())), truth=None)
+
+
+def test_ranges_alone_are_believed_as_tdoas_are(ranged, tmp_path):
+    told = believed(ranged)
+    assert told.level == belief.GOOD and not told.reasons and not told.lost
+    assert f"% of {len(ranged.range)} ranges fit it" in told.sentences()[0] and told.figures["seconds"] > 12.0
+    write_bag(ranged, tmp_path / "ranged.bag")
+    run([tmp_path / "ranged.bag", "--residuals", "--zones", "2", "--out", tmp_path / "out"])
+    lines = (tmp_path / "out" / "ranged_residuals.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(ranged.range)
+    assert {line.split(",")[1] for line in lines[1:]} == {line.split(",")[2] for line in lines[1:]} == {str(i) for i in ranged.anchors.ids}
+    assert (tmp_path / "out" / "ranged_residuals.png").exists() and (tmp_path / "out" / "ranged_zones.csv").exists()
+
+
+def test_ranges_that_contradict_each_other_are_not_good(ranged):
+    far = replace(ranged.range, d=ranged.range.d + 20.0 * (ranged.range.anchor % 3))
+    told = believed(replace(ranged, range=far))
+    assert told.level != belief.GOOD and "ranges" in " ".join(told.reasons)
+
+
+def test_silence_among_ranges_is_where_the_tag_was_lost(ranged):
+    begin, end = ranged.range.t[0] + 5.0, ranged.range.t[0] + 9.0
+    heard = (ranged.range.t < begin) | (ranged.range.t > end)
+    quiet = replace(ranged, imu=None, range=type(ranged.range)(*(column[heard] for column in ranged.range.columns)))
+    told = believed(quiet)
+    assert told.level == belief.DOUBTFUL and told.lost[0][0] == pytest.approx(begin, abs=1.0)
+
+
 def test_an_error_that_check_finds_is_bad_with_its_remedy(flight):
     told = believed(replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d)))
     assert told.level == belief.BAD and "sign" in " ".join(told.reasons) and told.remedies

@@ -49,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
     add("--installation", metavar="N", type=parallel.whole_number, help="the same anchors' errors in every flight (default: its own)")
     add("--told", choices=("nothing", "place"), default="nothing", help="at the start: its place, to 0.1 m (default: nothing)")
     add("--yaw", choices=("known", "unknown"), default="known", help="at the start, to 0.1 rad (default: known)")
-    add("--aid", action="append", default=[], choices=AIDS, help="what else it feels: a range finder, a barometer, its velocity")
+    add("--aid", action="append", default=[], choices=AIDS, help="what else it measures: a range finder, a barometer, its velocity, distances to anchors")
     add("--floor-effect", action=argparse.BooleanOptionalAction, help="low anchors are late near the floor (default: the world's)")
     add("--silence", metavar="MOMENT:S", help=f"nothing is heard for S seconds: MOMENT is one of {', '.join(MOMENTS)}")
     add("--hover", action="store_true", help="instead of circles")

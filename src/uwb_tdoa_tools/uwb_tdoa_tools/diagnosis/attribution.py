@@ -291,7 +291,7 @@ def _findings(selection: Selection, candidates: Sequence[Candidate], names: Sequ
             beside = [other.function for other in candidate.terms if other is not term] if term.function else []
             covariates = tuple(function.covariate for function in beside if function)
             finding = EffectFinding(
-                effects[identity], candidate.channels[0], evidence, score.explained, others, (candidate,),
+                effects[identity], _shown_on(candidate, selection), evidence, score.explained, others, (candidate,),
                 together_with=covariates, shares=shares(selection, candidate, names),
             )  # fmt: skip
             out[identity] = _merged(out[identity], finding) if identity in out else finding
@@ -310,6 +310,11 @@ def _merged(finding: EffectFinding, other: EffectFinding) -> EffectFinding:
         alternatives=(*finding.alternatives, *more),
         candidates=(*finding.candidates, *other.candidates),
     )
+
+
+def _shown_on(candidate: Candidate, selection: Selection) -> str:
+    """The first of the channels on which a Candidate acts that there is."""
+    return next(name for name in candidate.channels if name in selection.table.present)
 
 
 def _of_detection(detection: Detection) -> EffectFinding:

@@ -11,6 +11,7 @@ from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.effects.floor_multipath import FloorMultipath
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.radio import arrival_bias
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_bias.foundation.sensors.pressure import SITE, pressure_at
 from uwb_tdoa_bias.foundation.sensors.sensor import RATE
 from uwb_tdoa_bias.foundation.sensors.velocity import LEAST_STD
@@ -27,7 +28,7 @@ LOW = 1.0  # m, below which an anchor is one of the low ones
 GUST_TIME = 1.0  # s, correlation time of gusts
 PERSON = 0.25, 1.8, 1.0  # m, radius and height of a person; m/s
 BLOCKED, BLOCK_TIME = (0.2, 2.0), 0.5  # m, by which what passes through a person is late, drawn anew each so many s
-ALTITUDE_STD, VELOCITY_STD = 0.08, 0.05  # m and m/s, noise of a barometer and of a velocity
+ALTITUDE_STD, VELOCITY_STD, RANGE_STD = 0.08, 0.05, 0.1  # m, m/s and m, noise of a barometer, a velocity and distances to anchors
 NEVER = np.inf, np.inf
 
 
@@ -238,4 +239,18 @@ class Speedometer(Aid):
         return v + VELOCITY_STD * self.noise[rows], np.full(v.shape, max(VELOCITY_STD, LEAST_STD))
 
 
-AIDS = {"height": RangeFinder, "pressure": Barometer, "velocity": Speedometer}
+class TwoWayRanging(Aid):
+    """Distances to the anchors, each in its turn: ids, m, and a variance of 0, as nobody knows it. Nothing blocks them."""
+
+    rate = SENSORS["range"].rate
+
+    def measured(
+        self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        anchors = self.world.anchors
+        row = np.arange(rows.start, rows.stop) % len(anchors)
+        d = np.linalg.norm(p - anchors.positions[row], axis=1) + RANGE_STD * self.noise[rows, 0]
+        return anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(d))
+
+
+AIDS = {"height": RangeFinder, "pressure": Barometer, "velocity": Speedometer, "range": TwoWayRanging}

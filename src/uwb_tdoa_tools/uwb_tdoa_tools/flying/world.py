@@ -58,8 +58,8 @@ class World:
     mass : kg, least and most
     gust : m/s, standard deviation of the wind along each axis
     table : height of a table, 0.4 m around, from which it starts and on which it lands; 0 for none
-    aids : of "height" (a range finder along the body's -z), "pressure", "velocity"; rates and noises as `simulate` has them, but for
-        height_rate, height_noise, and height_range, beyond which the range finder sees nothing
+    aids : of "height" (a range finder along the body's -z), "pressure", "velocity", "range" (distances to anchors); rates and noises as
+        `simulate` has them, but for height_rate, height_noise, and height_range, beyond which the range finder sees nothing
     """
 
     size: tuple[float, float, float] = (6.4, 6.2, 3.0)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, RADIO, EffectSet
 
 from ..diagnosis.attribution import Attribution, attribute
 from ..diagnosis.comparison import Baseline
@@ -48,7 +48,10 @@ class Physics:
 
 def separate(effects: EffectSet) -> tuple[EffectSet, EffectSet]:
     """(EffectSet of those with parameters in which the error of a TDOA is linear, EffectSet of the others)."""
-    linear = [bool(effect.fitted and effect.channels == ("tdoa",) and effect.values) for effect in effects.effects]
+    linear = [
+        bool(effect.fitted and "tdoa" in effect.channels and set(effect.channels) <= RADIO.keys() and effect.values)
+        for effect in effects.effects
+    ]
     linear_ones, others = (tuple(e for e, one in zip(effects.effects, linear) if one is kind) for kind in (True, False))
     return EffectSet(linear_ones), EffectSet(others)
 
