@@ -1,12 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from recordings import ANCHORS, ROWS, SURVEY, log_bytes, small_flight
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.readers.inputs import Reading, find_flights, survey_for
+from uwb_tdoa_tools.readers.inputs import Reading, find_flights, need_tdoas, survey_for
 
 
 def make(folder, *names):
@@ -194,3 +197,10 @@ def test_ground_truth_that_is_not_wanted_is_not_read(tmp_path, kind):
         Reading(tmp_path / "survey.csv").one(tmp_path / "flight")
     blind = Reading(tmp_path / "survey.csv", truth=False).one(tmp_path / "flight")
     assert blind.truth is None and len(blind.tdoa) > 1
+
+
+def test_a_recording_without_tdoas_is_refused_where_they_are_needed():
+    flight = small_flight()
+    need_tdoas([flight], "survey")
+    with pytest.raises(InputError, match=f"{flight.name}: holds no TDOAs, which survey needs"):
+        need_tdoas([flight, replace(flight, tdoa=Tdoas(*np.empty((4, 0))))], "survey")

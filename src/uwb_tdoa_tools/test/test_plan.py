@@ -54,6 +54,23 @@ def test_a_volume(anchors, tmp_path, capsys):
     assert "what the anchors span; if yours is another: --room" in text
 
 
+def test_a_round_of_ranges_and_of_both(anchors, tmp_path, capsys):
+    """Ranges have one solution, and tell what TDOAs do not."""
+    bounds = {}
+    for protocol in ("tdoa2", "ranges", "tdoa2+ranges"):
+        out = tmp_path / protocol
+        options = ["--height", "1.2", "--step", "1", "--noise", "0.1", "--flyable", "round", "--protocol", protocol]
+        assert plan.main([anchors, *options, "--out", str(out)]) == 0
+        bounds[protocol] = report(out)["map"]["bound_in_hull"]["median"]
+        assert {path.name for path in out.iterdir()} == (FILES if protocol == "tdoa2" else FILES - {"failure.png"})
+    assert bounds["tdoa2+ranges"] < bounds["ranges"] < bounds["tdoa2"]
+    assert report(tmp_path / "ranges")["map"]["two_solutions_share"] == 0.0
+    capsys.readouterr()
+    for wrong in (["--flyable", "pairings"], ["--check"]):
+        assert plan.main([anchors, "--protocol", "ranges", *wrong, "--step", "1", "--out", str(tmp_path / "no")]) == 2
+        assert "ranges have none; leave it out" in capsys.readouterr().err
+
+
 def test_a_slice_of_known_height(square, tmp_path, capsys):
     out = tmp_path / "out"
     options = ["--planar", "--height", "0.2", "--room", "-1", "5", "-1", "5", "--tx-power", "-3", "--check", *COARSE]

@@ -16,6 +16,7 @@ from ..checking.check import check, different_surveys
 from ..checking.recording import read_recording
 from ..diagnosis.noise import write_parameters
 from ..progress import Progress
+from ..readers import inputs
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -70,6 +71,7 @@ def _calibrate(args: Namespace) -> int:
     if not _checked(reading, found + held, tape.std):
         return _stop("check finds an error: put it right first, as said above")
     flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)
+    inputs.need_tdoas(flights + holdout, "calibrate")
     known = [flight.truth is not None for flight in flights + holdout]
     if any(known) and not all(known):
         raise InputError(f"{(flights + holdout)[known.index(False)].name}: holds no ground truth, and others do; leave it out, or give --no-truth.")

@@ -19,6 +19,7 @@ from ..diagnosis.report.apply import applying
 from ..diagnosis.self_calibration.equations import measured_noise
 from ..localizing.rerun_file import write_diagnosis
 from ..progress import Progress
+from ..readers import inputs
 from ..surveying.paths import DRIFT, read_paths
 
 if TYPE_CHECKING:
@@ -92,6 +93,8 @@ def _diagnose(args: Namespace) -> None:
     jobs, dask = parallel.asked(args, len(found), FEW)
     flights, holdout = (reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout))
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
+    if args.reference != "truth":
+        inputs.need_tdoas([*flights, *holdout], f"--reference {args.reference}")
     for remark in remarks_on([*flights, *holdout]):
         cli.say("diagnose", remark)
     for option in ("marks", "odometry"):
@@ -105,7 +108,9 @@ def _diagnose(args: Namespace) -> None:
     with Progress("diagnose") as progress:
         result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress, over)
         progress("measuring the noise")
-        tdoa_std = measured_noise(result.flights, result.effects, config, over, partial(cli.say, "diagnose"))
+        tdoa_std = None  # of no TDOAs
+        if all(len(flight.tdoa) for flight in result.flights):
+            tdoa_std = measured_noise(result.flights, result.effects, config, over, partial(cli.say, "diagnose"))
     out.mkdir(parents=True, exist_ok=True)
     (_, its_survey), *_ = found
     truth = all(flight.truth is not None for flight in holdout or flights)

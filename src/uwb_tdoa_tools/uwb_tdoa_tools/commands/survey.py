@@ -11,6 +11,7 @@ from .. import cli, command_lines, options
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
 from ..progress import Progress
+from ..readers import inputs
 from ..surveying.blocked import with_blocked
 from ..surveying.report import as_dict, as_text, picture
 
@@ -58,6 +59,7 @@ def _survey(args: Namespace) -> int:
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     flights = options.reading_of(args).flights(args.flights)
+    inputs.need_tdoas(flights, "survey")
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
         result = self_calibrate(flights, tape, base, config, known, lambda: progress("solving"))

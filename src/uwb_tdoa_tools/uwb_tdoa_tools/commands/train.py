@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
 from ..progress import Progress
+from ..readers import inputs
 from ..results_file import ResultsFile, asked_of, resumed, state_of
 from ..scoring.settling import with_settled_truth
 from ..training import labels as labelling, models, shrinking
@@ -70,6 +71,7 @@ def _train(args: Namespace) -> None:
     with _kept(args, reading) as done:
         over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # no line beside that of Progress
         flights = reading.flights(args.flights, args.most, jobs, dask)
+        inputs.need_tdoas(flights, "train")
         flights = list(parallel.over(partial(with_settled_truth, align=args.align), flights, jobs, dask))
         with Progress("train") as progress:
             _write(args, flights, resumed(over, done) if done else over, progress)

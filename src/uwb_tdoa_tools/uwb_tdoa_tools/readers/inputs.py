@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.foreign_text import printable
+from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
 from . import read_flight
@@ -88,6 +89,13 @@ def survey_for(path: str | Path, survey: str | Path | None) -> str | Path | None
     return keys[fitting[-1]]
 
 
+def need_tdoas(flights: Iterable[Flight], what: str) -> None:
+    """Raise InputError for one of some Flights that holds no TDOAs. what : words, that needs them."""
+    for flight in flights:
+        if not len(flight.tdoa):
+            raise InputError(f"{flight.name}: holds no TDOAs, which {what} needs; ranges alone are for check, evaluate, localize and diagnose.")
+
+
 def report_remarks(path: str | Path, remarks: Iterable[str]) -> None:
     """Tell sentences on a recording, on stderr, beside a progress bar."""
     for remark in remarks:
@@ -141,14 +149,14 @@ class Reading:
     ) -> list[Flight]:
         """Flights of recordings and folders, with a progress bar: list. jobs, dask : as of `parallel.over`.
 
-        most : TDOAs that they may hold together, the first excepted; of more, as many whole flights as that are drawn at random, alike
+        most : TDOAs and ranges that they may hold together, the first excepted; of more, as many whole flights as that are drawn at random, alike
         at every call, and the others not held, so that memory and time are bounded.
         """
         found, count = self.find(paths, bool(dask)), 0
         read: dict[int, Flight] = {}
         order = range(len(found)) if most is None else np.random.default_rng(0).permutation(len(found)).tolist()
         for flight, number in zip(parallel.over(self.read, [found[number] for number in order], jobs, dask), order):
-            count += len(flight.tdoa)
+            count += len(flight.tdoa) + sum(len(getattr(flight, name) or ()) for name in LOCATING)
             if most is not None and read and count > most:
                 tqdm.write(
                     f"{len(read)} of {len(found)} flights, drawn at random, are taken: all would hold more than {most} TDOAs (--most); "
