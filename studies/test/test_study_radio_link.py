@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.crazyflie.log_blocks import PERIOD
+from uwb_tdoa_tools.crazyflie.log_blocks import PERIOD, LogBlock
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
@@ -65,31 +65,34 @@ from uwb_tdoa_msgs.msg import Tdoa
 
 rclpy.init()
 node = rclpy.create_node("player")
-tdoas, samples, deep = [], [], QoSProfile(depth=20000)
+tdoas, samples, hellos, deep = [], [], [], QoSProfile(depth=20000)
+seconds = lambda m: m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec
+sent = json.load(open(sys.argv[1]))
+late = sent[-1][0] + 10.0  # when a message arrives that tells whether the node knows us; of its delay no clock learns anything
 node.create_subscription(Tdoa, "uwb/tdoa", tdoas.append, deep)
-node.create_subscription(Imu, "imu/data", samples.append, deep)
+node.create_subscription(Imu, "imu/data", lambda m: (samples if seconds(m) < late - 5.0 else hellos).append(m), deep)
 topics = [node.create_publisher(LogDataGeneric, name, deep) for name in ("tdoa_a", "tdoa_b", "imu")]
-sent, expected = json.load(open(sys.argv[1]))
-while not all(topic.get_subscription_count() for topic in topics):
-    rclpy.spin_once(node, timeout_sec=0.1)
-seconds = lambda stamp: stamp.sec + 1e-9 * stamp.nanosec
-for number, (arrival, block, timestamp, values) in enumerate(sent):
+
+def publish(arrival, block, timestamp, values):
     message = LogDataGeneric(timestamp=timestamp, values=values)
     message.header.stamp.sec, message.header.stamp.nanosec = int(arrival), int(1e9 * (arrival % 1.0))
     topics[block].publish(message)
-    before, again = len(samples), time.monotonic() + 1.0
-    while block == 2 and len(samples) == before:  # in order over all topics: the next goes when this has come back
+
+def wait(condition, seconds=180.0):
+    until = time.monotonic() + seconds
+    while not condition() and time.monotonic() < until:
         rclpy.spin_once(node, timeout_sec=0.1)
-        if not before and time.monotonic() > again:  # the first, of which the answer was lost: the node did not know us yet
-            topics[block].publish(message)
-            again = time.monotonic() + 1.0
-    rclpy.spin_once(node, timeout_sec=0.002)
-until = time.monotonic() + 120.0
-while len(tdoas) < expected and time.monotonic() < until:
-    rclpy.spin_once(node, timeout_sec=0.05)
-samples = list({seconds(m.header.stamp): m for m in samples}.values())
-rows = [(seconds(m.header.stamp), m.anchor_a, m.anchor_b, m.distance_difference) for m in tdoas]
-print(json.dumps({"tdoas": rows, "samples": [(seconds(m.header.stamp), m.linear_acceleration.z) for m in samples]}))
+    return condition()
+
+wait(lambda: all(topic.get_subscription_count() for topic in topics))
+hello = next(message for message in sent if message[1] == 2)
+while not wait(lambda: hellos, 1.0):
+    publish(late, *hello[1:4])
+for *message, answers in sent:  # in order over all topics: the next goes when all answers have come
+    publish(*message)
+    assert wait(lambda: len(tdoas) + len(samples) >= answers), (len(tdoas), len(samples), answers)
+rows = [(seconds(m), m.anchor_a, m.anchor_b, m.distance_difference) for m in tdoas]
+print(json.dumps({"tdoas": rows, "samples": [(seconds(m), m.linear_acceleration.z) for m in samples]}))
 """
 CMAKE = """
 cmake_minimum_required(VERSION 3.8)
@@ -118,22 +121,21 @@ def test_the_example_over_topics_gives_what_the_converter_gives(flight, tmp_path
     build += ["--cmake-args", f"-DPython3_EXECUTABLE={sys.executable}"]
     subprocess.run(build, cwd=tmp_path, check=True, capture_output=True)
     short, link = replace(flight, tdoa=_until(flight.tdoa, 4.0), imu=_until(flight.imu, 4.0)), Link()
-    sent = [
-        (arrival, number, int(timestamp), values.tolist())
-        for arrival, number, timestamp, values in messages(short, link, np.random.default_rng(0))
-    ]
-    expected = streamed(short, link)
-    (tmp_path / "sent.json").write_text(json.dumps([sent, len(expected.tdoa)]))
+    blocks, sent, answers = [LogBlock(variables) for variables in BLOCKS], [], 0
+    for arrival, number, timestamp, values in messages(short, link, np.random.default_rng(0)):
+        pairs, sample = blocks[number].take(timestamp, values)
+        answers += len(pairs) + (sample is not None)
+        sent.append((arrival, number, int(timestamp), values.tolist(), answers))
+    (tmp_path / "sent.json").write_text(json.dumps(sent))
     (tmp_path / "player.py").write_text(PLAYER)
     script = f"source install/local_setup.bash; {sys.executable} {ROOT / 'docs/connect/crazyflie_node.py'} & node=$!; "
     script += f"{sys.executable} player.py sent.json; kill -INT $node; wait $node"
     done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.stderr == ""
-    got = json.loads(done.stdout)
+    got, expected = json.loads(done.stdout), streamed(short, link)
     t, a, b, d = (np.array(column) for column in zip(*sorted(got["tdoas"])))
     assert len(t) == len(expected.tdoa) and len(got["samples"]) == len(expected.imu)
-    # Topics overtake each other by a few messages, over which the clock drifts by microseconds.
-    np.testing.assert_allclose(np.sort(t), np.sort(expected.tdoa.t), atol=1e-4)
+    np.testing.assert_allclose(np.sort(t), np.sort(expected.tdoa.t), atol=1e-6)
     np.testing.assert_allclose(np.sort(d), np.sort(expected.tdoa.d), atol=1e-9)
     assert np.mean([z for _, z in got["samples"]]) == pytest.approx(expected.imu.accel[:, 2].mean(), abs=1e-6)
 

@@ -136,7 +136,7 @@ def test_no_text_is_a_command_that_does_not_run_as_it_stands():
 @pytest.mark.parametrize("name", ["survey", "calibrate", "diagnose"])
 def test_every_line_that_a_calibration_prints_runs_as_it_stands(desk, capsys, name):
     """From another folder than --out, with a survey in a file."""
-    flight = simulate(SimulationConfig(seed=1, duration=40.0, trajectory="sines", imu_rate=100.0, multipath=False, outlier_probability=0.0))
+    flight = simulate(SimulationConfig(seed=1, duration=60.0, trajectory="sines", imu_rate=100.0, multipath=False, outlier_probability=0.0))
     off = flight.anchors.at(flight.anchors.positions + 0.1 * np.random.default_rng(5).standard_normal(flight.anchors.positions.shape))
     off.to_yaml("tape.yaml")
     write_bag(flight, "a flight.bag")
