@@ -3,6 +3,7 @@
 from collections import deque
 from functools import cache
 import os
+import random
 import signal
 from pathlib import Path
 
@@ -20,7 +21,7 @@ _taken = deque()  # reservations of domains, oldest first; taken until this proc
 LONGEST = """waiting checking_check first_hour lockstep hall first_hour_without_truth diagnosis_diagnose launch_files measured_path demo
     bench localizing diagnosis_attribution diagnosis_validation diagnosis_references printed_lines diagnosis_deviations
     study_closed_loop replay_record connect plan executables checking_imu_rules""".split()  # files of tests: each takes half a minute or more
-KEPT = 20  # tests for which nobody gets the domain of a test that is over: others see a node that was killed for 20 s more
+KEPT = 3  # tests for which nobody gets the domain of a test that is over: others see a node that was killed for 20 s more
 
 
 def _take_domain():
@@ -28,11 +29,12 @@ def _take_domain():
     while len(_taken) > KEPT:
         _taken.popleft().__exit__(None, None, None)
     while True:
-        reservation = domain_id()
+        reservation = domain_id(lambda: random.randint(1, 100))  # by chance none of the last seconds
         try:
             os.environ["ROS_DOMAIN_ID"] = str(reservation.__enter__())
-        except RuntimeError:  # other sessions have all that are left
-            _taken.popleft().__exit__(None, None, None)
+        except RuntimeError:  # other sessions have those that are left
+            if _taken:
+                _taken.popleft().__exit__(None, None, None)
             continue
         _taken.append(reservation)
         return

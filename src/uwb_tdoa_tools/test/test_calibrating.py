@@ -105,12 +105,22 @@ def test_quick_says_what_is_to_be_expected(flights):
 # --- the command ---
 
 
-@pytest.fixture
-def room(flights, tmp_path, monkeypatch):
-    """A folder with flights as bags to work in."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def bags(flights, tmp_path_factory):
+    """A folder with flights as bags."""
+    folder = tmp_path_factory.mktemp("bags")
     for flight in flights:
-        write_bag(flight, f"{flight.name}.bag")
+        write_bag(flight, folder / f"{flight.name}.bag")
+    write_bag(replace(flights[0], truth=None, name="blind"), folder / "blind.bag")
+    return folder
+
+
+@pytest.fixture
+def room(bags, tmp_path, monkeypatch):
+    """A folder to work in, with flights as bags."""
+    monkeypatch.chdir(tmp_path)
+    for bag in bags.iterdir():
+        (tmp_path / bag.name).symlink_to(bag)
     return tmp_path
 
 
@@ -183,8 +193,7 @@ def test_a_tape_that_is_off_does_not_stop_it_and_another_room_does(flights):
         (["flight1.bag", "blind.bag", "--out", "out"], "blind: holds no ground truth, and others do"),
     ],
 )
-def test_bad_usage_is_one_sentence(room, flights, monkeypatch, capsys, words, sentence):
+def test_bad_usage_is_one_sentence(room, monkeypatch, capsys, words, sentence):
     stub(monkeypatch, GOOD, [])
-    write_bag(replace(flights[0], truth=None, name="blind"), "blind.bag")
     assert calibrate.main(words) == 2
     assert sentence in capsys.readouterr().err
