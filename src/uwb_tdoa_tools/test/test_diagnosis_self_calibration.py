@@ -58,6 +58,7 @@ def test_what_is_applied_is_found_with_its_evidence_and_the_same_in_all_flights(
     assert [finding.effect.name for finding in added] == ["anchor_position", "anchor_delay"]
     assert added[1].evidence == pytest.approx({"slow_before": late.before, "slow_left": late.left}, abs=1e-4)
     assert added[1].explained == late.explained
+    assert "pair_offset" in [other.effect for other in added[1].alternatives]
     shares = [(one.share, one.std) for one in added[1].shares]
     assert len(shares) == 2 and all(abs(share - 1.0) < 0.3 and std < 0.2 for share, std in shares)
     assert "The same in all 2 flights" in diagnosis.as_text()

@@ -202,7 +202,7 @@ def _by_error(
         selected = validation.ValidatedSelection(attribution.selection.only(()), (), (), selected.worth)
         model, after = attribution.of(selected), before
         effects = with_calibration(base, attribution.of_floor, None)
-    findings = _findings(model.findings(), attribution, selected.worth)
+    findings = _findings(model.findings(), attribution.findings(), attribution.detections, selected.worth)
     return _Outcome(findings, effects, refused, (before, after), judged_on, attribution, baseline)
 
 
@@ -216,7 +216,7 @@ def _by_self_calibration(work: _Work, found: Attribution, flights: tuple[Flights
     added: list[EffectFinding] = []
     refused: list[Refused] = []
     changes: tuple[str, ...] = ()
-    chosen = found.selection.chosen
+    chosen, others = found.selection.chosen, found.findings()
     if chosen or rest.covariance is not None or work.reference.constraints:
         calibration = _calibrated(work, sound, rest)
         if isinstance(calibration, str):
@@ -225,10 +225,14 @@ def _by_self_calibration(work: _Work, found: Attribution, flights: tuple[Flights
             several = calibration.found(calibration.shifts)
             effects = with_calibration(effects, several, calibration.covariance)
             evidence = {"slow_before": round(calibration.before, 4), "slow_left": round(calibration.left, 4)}
+            alternatives = {other.effect.name: other.alternatives for other in others}
             added = [
-                EffectFinding(effect, effect.channels[0], evidence, calibration.explained, shares=calibration.shares.get(effect.name, ()))
+                EffectFinding(
+                    effect, effect.channels[0], evidence, calibration.explained, alternatives.get(effect.name, ()),
+                    shares=calibration.shares.get(effect.name, ()),
+                )
                 for effect in several
-            ]
+            ]  # fmt: skip
             labels = [candidate.label for candidate in chosen if candidate.name not in OF_ANCHORS]
             refused = [Refused(label, NOT_TOLD) for label in (*labels, *(one.effect.label for one in found.detections))]
             changes = tuple(change.as_text() for change in calibration.changes)
@@ -236,7 +240,7 @@ def _by_self_calibration(work: _Work, found: Attribution, flights: tuple[Flights
     work.progress("judging")
     cases = [comparison.ValidationCase(flight, effects) for flight in held_out or fitted]
     sides = comparison.innovations(cases, baseline, work.saying("judging"), work.map_function)
-    return _Outcome(_findings(added, found, {}), effects, refused, sides, judged_on, found, baseline, changes)
+    return _Outcome(_findings(added, others, (), {}), effects, refused, sides, judged_on, found, baseline, changes)
 
 
 def _calibrated(work: _Work, flights: Flights, base: EffectSet) -> SelfCalibration | str:
@@ -251,10 +255,13 @@ def _calibrated(work: _Work, flights: Flights, base: EffectSet) -> SelfCalibrati
     return found.why_not or found
 
 
-def _findings(model: Sequence[EffectFinding], attribution: Attribution, worth: dict[Candidate | Detection, float]) -> list[EffectFinding]:
-    """[EffectFinding]: those of the model that is written, with the values that are written, then the others of an Attribution. worth : as
-    of ValidatedSelection."""
-    detected = {detection.effect.name: detection for detection in attribution.detections}
+def _findings(
+    model: Sequence[EffectFinding], others: Sequence[EffectFinding], detections: Sequence[Detection],
+    worth: dict[Candidate | Detection, float],
+) -> list[EffectFinding]:  # fmt: skip
+    """[EffectFinding]: those of the model that is written, with the values that are written, then others that were found. worth : as of
+    ValidatedSelection, of candidates and of detections."""
+    detected = {detection.effect.name: detection for detection in detections}
 
     def with_worth(finding: EffectFinding, added: bool) -> EffectFinding:
         tried = finding.candidates or [detected[name] for name in (finding.effect.name,) if name in detected]
@@ -266,4 +273,4 @@ def _findings(model: Sequence[EffectFinding], attribution: Attribution, worth: d
 
     out = [with_worth(finding, usable_there(finding)) for finding in model]
     added = {finding.key for finding in out}
-    return out + [with_worth(finding, False) for finding in attribution.findings() if finding.key not in added]
+    return out + [with_worth(finding, False) for finding in others if finding.key not in added]
