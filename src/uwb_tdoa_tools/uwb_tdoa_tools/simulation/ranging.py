@@ -80,9 +80,8 @@ def measure(
         bias = late_b - late_a
     multipath = zero
     if config.multipath:
-        late = floor_multipath(t, p_tag[:, 2] - room.lower[2], config.duration, len(anchors), random("multipath"))
-        rows = np.arange(len(t))
-        multipath = late[rows, b] - late[rows, a]
+        late = floor_multipath(t, p_tag[:, 2] - room.lower[2], np.stack([a, b]), len(anchors), random("multipath"), config.duration)
+        multipath = late[1] - late[0]
     noise = tdoa_noise(schedule, np.asarray(config.anchor_noise_std), config.shared_noise, random("tdoa noise"))
     outlier = outliers(len(t), config.outlier_probability, random("outliers"))
 
@@ -115,11 +114,11 @@ def outliers(n: int, probability: float, rng: np.random.Generator) -> np.ndarray
 
 
 def floor_multipath(
-    t: np.ndarray, height: np.ndarray, duration: float, n_anchors: int, rng: np.random.Generator
+    t: np.ndarray, height: np.ndarray, anchor: np.ndarray, n_anchors: int, rng: np.random.Generator, duration: float
 ) -> np.ndarray:
-    """Delay of every anchor's signal by reflection near the floor, (n, n_anchors) m, never negative.
+    """Delay of the signals of anchors by reflection near the floor, (k, n) m, never negative.
 
-    t : (n,) s in 0 ... duration; height : (n,) m of the tag above the floor. Own model: the positive part of a Gaussian
+    t : (n,) s in 0 ... duration; height : (n,) m of the tag above the floor; anchor : (k, n) rows of k of n_anchors at each t. Own model: the positive part of a Gaussian
     process with exponential correlation, one per anchor, fading out linearly with height.
     """
     from scipy.signal import lfilter  # takes a second to import
@@ -131,10 +130,10 @@ def floor_multipath(
     process = lfilter([1.0], [1.0, -decay], white, axis=0)
     low, high = MULTIPATH_HEIGHT
     strength = MULTIPATH_SIZE * np.clip((high - height) / (high - low), 0.0, 1.0)
-    late = np.zeros((len(t), n_anchors))
-    near = strength > 0.0
-    at = t[near] / dt
+    late = np.zeros(anchor.shape)
+    near = np.flatnonzero(strength > 0.0)
+    at, which = t[near] / dt, anchor[:, near]
     row = at.astype(int)
-    part = (at - row)[:, None]
-    late[near] = strength[near, None] * np.maximum((1.0 - part) * process[row] + part * process[row + 1], 0.0)
+    part = at - row
+    late[:, near] = strength[near] * np.maximum((1.0 - part) * process[row, which] + part * process[row + 1, which], 0.0)
     return late
