@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.effects import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas
-from uwb_tdoa_bias.foundation.sensors import DIAGNOSED, LOCATING, SENSORS, Height, Ranges, Velocity
+from uwb_tdoa_bias.foundation.sensors import BY_POSE, DIAGNOSED, LOCATING, SENSORS, Height, Ranges, Velocity
 from uwb_tdoa_bias.foundation.sensors.sensor import Stream
 
 N = 5
@@ -72,7 +73,8 @@ def test_its_parameters_begin_with_the_switch(name):
 
 
 def test_registries_of_a_part():
-    assert LOCATING == ("range",) and set(DIAGNOSED) == {"height", "pressure", "velocity"}
+    assert LOCATING == ("range",) and set(BY_POSE) == {"height", "pressure", "velocity"}
+    assert set(DIAGNOSED) - set(BY_POSE) == RADIO.keys() - {"tdoa"}  # distances to anchors, of which effects on arrivals know
 
 
 # --- two-way ranging ---

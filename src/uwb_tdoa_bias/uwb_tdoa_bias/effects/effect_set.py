@@ -56,7 +56,8 @@ class EffectSet:
         return iter(self.effects)
 
     def bias(self, samples: Samples) -> np.ndarray:
-        """Sum of all contributions to what `samples.channel` measures, (n,) metres, faded where they were not seen. An effect that cannot tell (unknown attitude) adds nothing."""
+        """Sum of all contributions to what `samples.channel` measures, (n,) metres, faded where they were not seen. An effect that cannot
+        tell (unknown attitude) adds nothing."""
         total = np.zeros(len(samples))
         for effect in (effect for effect in self.effects if samples.channel in effect.channels):
             part = faded(effect, samples)[0]
@@ -76,8 +77,8 @@ class EffectSet:
         return sum(parts, np.zeros(samples.reading.shape))
 
     def noise_std(self, samples: Samples) -> np.ndarray:
-        """Standard deviation that the effects add to what `samples.channel` measures, (n,) metres, with what of them is not taken out because they were not
-        seen there."""
+        """Standard deviation that the effects add to what `samples.channel` measures, (n,) metres, with what of them is not taken out
+        because they were not seen there."""
         total = np.zeros(len(samples))
         for effect in self._noisy:
             if samples.channel in effect.channels:

@@ -18,7 +18,8 @@ SOURCE = "numbers"
 
 
 def repairs(flight: Flight) -> tuple[LabelEffect, ...]:
-    """(LabelEffect, ...) that undo wrong ids and signs of a Flight, in the order in which they are undone; () without ground truth or TDOAs."""
+    """(LabelEffect, ...) that undo wrong ids and signs of a Flight, in the order in which they are undone; () without ground truth or
+    TDOAs."""
     return () if flight.truth is None or len(flight.truth) < 2 or not len(flight.tdoa) else repairs_of(KnownPath(flight))
 
 

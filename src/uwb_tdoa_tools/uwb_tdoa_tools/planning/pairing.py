@@ -100,5 +100,6 @@ PAIRINGS: dict[str, Callable[[int], Pairing]] = {
     "all_pairs+every_range": _beside_ranges(all_pairs),
 }
 OF_PROTOCOL = {
-    "tdoa2": "ring", "tdoa3": "all_pairs", "ranges": "every_range", "tdoa2+ranges": "ring+every_range", "tdoa3+ranges": "all_pairs+every_range",
+    "tdoa2": "ring", "tdoa3": "all_pairs", "ranges": "every_range", "tdoa2+ranges": "ring+every_range",
+    "tdoa3+ranges": "all_pairs+every_range",
 }  # fmt: skip
