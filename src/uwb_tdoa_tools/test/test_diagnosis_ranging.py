@@ -17,7 +17,7 @@ DELAY, MOVED = EFFECTS["anchor_delay"]({"3": 0.3}), EFFECTS["anchor_position"]({
 LATE, LONG = EFFECTS["range_delay"]({"offset": 0.05}), EFFECTS["range_scale"]({"scale": 0.03})
 OWN = EFFECTS["range_offset"]({"1": 0.3, "2": -0.2})
 KINDS = "anchor_delay", "anchor_position", "range_delay", "range_scale", "range_offset", "pair_offset"
-FLOWN = dict(duration=25.0, floor_time=1.0, imu_rate=200.0, truth_rate=100.0, noise_std=0.1, range_noise=0.1, bias=False, multipath=False)
+FLOWN = dict(duration=40.0, floor_time=1.0, imu_rate=200.0, truth_rate=100.0, noise_std=0.1, range_noise=0.1, bias=False, multipath=False)
 
 
 @pytest.fixture(scope="module")
