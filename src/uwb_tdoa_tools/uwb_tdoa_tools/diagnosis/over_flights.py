@@ -44,7 +44,7 @@ class Share:
         return cls(flight, float(score / power), float(power**-0.5)) if power > 0.0 else cls(flight, 0.0, np.inf)
 
     @property
-    def told(self) -> bool:
+    def determined(self) -> bool:
         """Whether the flight tells it."""
         return self.std < TOLD
 
@@ -67,7 +67,7 @@ def _shares(part: np.ndarray, y: np.ndarray, information: np.ndarray, flight: np
 
 def course(several: Sequence[Share]) -> str | None:
     """ALL, ALONE, GROWS or DIFFERS of (Share, ...) in the order of the flights; None where fewer than two tell it."""
-    told = [each for each in several if each.told]
+    told = [each for each in several if each.determined]
     if len(told) < 2:
         return None
     share, std = (np.array([getattr(each, name) for each in told]) for name in ("share", "std"))
@@ -90,7 +90,7 @@ def course(several: Sequence[Share]) -> str | None:
 
 def in_words(several: Sequence[Share]) -> str:
     """A sentence on (Share, ...); "" where flights do not tell."""
-    kind, told = course(several), [each for each in several if each.told]
+    kind, told = course(several), [each for each in several if each.determined]
     if kind is None:
         return ""
     if kind == ALL:
@@ -137,6 +137,6 @@ def _elsewhere(selection: Selection, candidate: Candidate, remaining: list[Chann
         part = table.matrix(candidate.columns) @ fit.values(candidate.columns)
         information = 1.0 / (fit.scale**2 * fit.inflation)[table.group]
         (share,) = _shares(part, table.y, information, table.flight, ("",))
-        if share.told and share.share > ALIKE:
+        if share.determined and share.share > ALIKE:
             return True
     return False

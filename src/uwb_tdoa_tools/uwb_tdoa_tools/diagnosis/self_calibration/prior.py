@@ -38,11 +38,11 @@ OF_ANCHORS = POSITION, DELAY = "anchor_position", "anchor_delay"
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """covariance (4N, 4N) m^2: of coordinates, anchor by anchor, and delays; told (4N,) bool: what the last calibration knows; ids
+    """covariance (4N, 4N) m^2: of coordinates, anchor by anchor, and delays; known (4N,) bool: what the last calibration knows; ids
     (N,)."""
 
     covariance: np.ndarray
-    told: np.ndarray
+    known: np.ndarray
     ids: tuple[str, ...]
 
     @classmethod
@@ -50,28 +50,28 @@ class Prior:
         """position_std (N, 3) m : of Anchors; last : Covariance of the last calibration, or None."""
         keys, n = keys_of(anchors.ids), len(anchors)
         covariance = np.diag(np.concatenate([position_std.ravel(), np.full(n, DELAY_STD)]) ** 2.0)
-        told = np.zeros(4 * n, dtype=bool)
+        known = np.zeros(4 * n, dtype=bool)
         if last is not None:
-            places, known = last.of(keys)
-            covariance[np.ix_(places, places)] = known + DRIFT**2 * np.eye(len(places))
-            told[places] = True
-        return cls(covariance, told, tuple(map(str, anchors.ids)))
+            places, of_last = last.of(keys)
+            covariance[np.ix_(places, places)] = of_last + DRIFT**2 * np.eye(len(places))
+            known[places] = True
+        return cls(covariance, known, tuple(map(str, anchors.ids)))
 
     @property
     def loose(self) -> np.ndarray:
         """(4N,) m: standard deviations that forbid nothing which may have happened."""
         n = len(self.ids)
-        std = np.hypot(np.sqrt(np.diag(self.covariance)), np.where(self.told, MOVED, 0.0))
+        std = np.hypot(np.sqrt(np.diag(self.covariance)), np.where(self.known, MOVED, 0.0))
         return np.concatenate([std[: 3 * n], np.full(n, LOOSE)])
 
     def changes(self) -> dict[ChangeKey, tuple[np.ndarray, float]]:
         """{(what, number of an anchor): (places, m, standard deviation)} of what may have changed; of MANY anchors without a calibration
         too: among so many there is one that does not stand where the tape says."""
         n, out = len(self.ids), {}
-        anything = n > MANY and not self.told.any()
+        anything = n > MANY and not self.known.any()
         for k in range(n):
             for what, places, std in ((POSITION, np.arange(3 * k, 3 * k + 3), MOVED), (DELAY, np.array([3 * n + k]), LATER)):
-                if anything or self.told[places].all():
+                if anything or self.known[places].all():
                     out[what, k] = places, std
         return out
 
@@ -136,7 +136,7 @@ def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray
         return max((_evidence(*part[:3], *known, offset), k) for k, part in enumerate(parts))
 
     unchanged, delay_std = prior.covariance, DELAY_STD
-    if not prior.told.any():
+    if not prior.known.any():
         evidences = [best(prior.with_delays(std))[0] for std in DELAY_STDS]
         delay_std = next(std for std, evidence in zip(DELAY_STDS, evidences) if evidence >= max(evidences) - np.log(ODDS))
         unchanged = prior.with_delays(delay_std)
