@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_tools.checking import pair_rules
+from uwb_tdoa_tools.checking import pair_rules, tdoa_rules
+from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.known_path import MANY, KnownPath
+from uwb_tdoa_tools.checking.ordered import SHORT, OrderedRecording
+from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
@@ -68,16 +71,21 @@ def test_an_anchor_that_is_late_and_one_that_was_moved_are_named_and_nothing_els
 
 def test_columns_of_some_anchors_are_made_of_their_tdoas_alone(sound):
     part = residuals(sound, GroundTruth(), EffectSet())["tdoa"]
-    for name, keys in (
-        ("anchor_delay", ("38", "40")),
-        ("anchor_position", ("38.x", "50.z")),
-        ("anchor_clock_drift", ("38",)),
-        ("pair_offset", ("38-39",)),
+    knots = (0.0, 60.0, 180.0)
+    for effect, keys in (
+        (EFFECTS["anchor_delay"](), ("38", "40")),
+        (EFFECTS["anchor_position"](), ("38.x", "50.z")),
+        (EFFECTS["anchor_clock_drift"](), ("38",)),
+        (EFFECTS["pair_offset"](), ("38-39",)),
+        (EFFECTS["nlos"]({"38.start": 20.0, "38.end": 150.0}), ("38.delay",)),
+        (SmoothTerm(covariate="range", form="anchor", knots=(0.0, 9.0, 18.0)), ("38.c0", "40.c1")),
+        (SmoothTerm(covariate="time", form="pair", knots=knots), ("38-39.c1",)),
+        (SmoothTerm(covariate="time", form="direction", knots=knots), ("38-39.c1",)),
     ):
-        effect = EFFECTS[name]()
         whole = np.nan_to_num(effect.regressors(part.samples, list(keys)))
-        np.testing.assert_allclose(part.columns(effect, keys), part.cells.means(whole), atol=1e-12)
-        assert np.abs(part.columns(effect, keys)).max() > 0.1
+        columns = part.columns(effect, keys).toarray()
+        np.testing.assert_allclose(columns, part.cells.means(whole), atol=1e-12)
+        assert np.abs(columns).max() > 0.1
 
 
 @pytest.mark.slow
@@ -104,6 +112,26 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
     assert apart(found) == [MOVED] and f"anchor {MOVED} does not stand where it was given" in as_text(found)
     still = np.delete(shifts, MOVED, axis=0)[[*range(MOVED), 0, *range(MOVED, len(given) - 1)]]
     assert not apart(replace(found, surveyed=given.at(given.positions + still)))
+
+
+def test_check_tries_few_exchanges_of_ids_in_a_hall(sound, monkeypatch):
+    runs, whole = [], OrderedRecording.of(of_flight(sound))
+    brief, judged = whole.part(SHORT), OrderedRecording.unexplained
+    monkeypatch.setattr(OrderedRecording, "unexplained", lambda recording: runs.append(recording) or judged(recording))
+    assert not list(tdoa_rules.swapped(whole)) and not runs
+    ids, times = np.unique(np.concatenate([brief.tdoa.a, brief.tdoa.b]), return_counts=True)
+    one, two = ids[np.argsort(-times)][[0, 5]].tolist()
+    swap = {one: two, two: one}
+    a, b = (np.array([swap.get(int(i), int(i)) for i in column]) for column in (whole.tdoa.a, whole.tdoa.b))
+    (trial,) = tdoa_rules.swapped(whole.with_tdoa(a=a, b=b))
+    assert trial.finding(0.5, 5.0).cause.endswith(f"{min(one, two)} is {max(one, two)}, {max(one, two)} is {min(one, two)}")
+    assert len(runs) < 0.5 * len(hall()) ** 2 / 2.0
+
+
+def test_check_says_in_one_line_who_is_not_heard_in_a_hall(sound):
+    found = [finding for finding in check(of_flight(sound)).findings if finding.rule.startswith("anchor_")]
+    heard = np.unique(np.concatenate([sound.tdoa.a, sound.tdoa.b]))
+    assert [finding.rule for finding in found] == (["anchor_missing"] if len(heard) < len(hall()) else [])
 
 
 def test_ids_that_are_exchanged_in_a_hall_are_found(sound):

@@ -10,6 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding
 
+from .known_path import MANY
 from .sides import sides_of, to_copy
 from .survey_fit import SPREAD, spread
 
@@ -23,6 +24,7 @@ FLAT = 0.08  # thickness of the constellation over its size; the measured rooms 
 OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the box of the anchors
 SHORT = 10.0  # s
 FEWEST = 3  # anchors that tell no plane
+SAID = 5  # anchors of many that are named
 PART = 0.2  # of the seconds in which the side is not told, beyond which that is said
 
 
@@ -44,6 +46,12 @@ def missing(view: CoverageView) -> Iterator[Finding]:
     heard = np.array([window.heard for window in view.windows])
     counts = heard.sum(axis=0)
     lost = view.anchors.ids[counts == 0].tolist()
+    if len(counts) > MANY:  # a tag leaves most of them behind
+        if lost:
+            cause = f"the tag never hears {len(lost)} of {len(counts)} anchors, such as {', '.join(map(str, lost[:SAID]))}"
+            remedy = "look whether they are on, if the tag was near them: localize --zones says who was heard where"
+            yield Finding("anchor_missing", NOTE, cause, f"{len(lost)} of {len(counts)}", remedy, float(len(lost)))
+        return
     if lost:
         cause = f"anchors of the survey that the tag never hears: {', '.join(map(str, lost))}"
         remedy = "switch them on, or take them out of the survey"

@@ -56,6 +56,12 @@ class SurveyFit:
         return len(self._windows)
 
     @property
+    def heard(self) -> list[int]:
+        """Rows of the anchors of which there are TDOAs in the windows."""
+        ends = [end for _, a, b, _ in self._windows for end in (a, b)]
+        return np.unique(np.concatenate(ends)).tolist() if ends else []
+
+    @property
     def places(self) -> np.ndarray:
         """(k, 3) m: where the tag was located in the windows."""
         return np.array([x[:3] for x in self._start]).reshape(-1, 3)
@@ -71,8 +77,7 @@ class SurveyFit:
             g = (self.positions - anchors).reshape(-1)[columns] / PRIOR**2
             eliminated = []
             for x, window in zip(start, self._windows):
-                by_tag, by_anchors, residual = _linearised(x, window, anchors)
-                by_anchors = by_anchors[:, columns]
+                by_tag, by_anchors, residual = _linearised(x, window, anchors, moved)
                 weight = min(1.0, TOGETHER / len(residual)) / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
                 left = by_tag * weight[:, None]
                 A = left.T @ by_tag + np.diag([TAG**-2] * 3 + [SPEED**-2] * 3)
@@ -124,12 +129,16 @@ def _residual(
     return d - (rb - ra), from_a / ra[:, None], from_b / rb[:, None], before
 
 
-def _linearised(x: np.ndarray, window: Window, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobians of the TDOAs by position and velocity (n, 6) and by the anchors (n, 3 N), and the residuals (n,)."""
+def _linearised(
+    x: np.ndarray, window: Window, anchors: np.ndarray, moved: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Jacobians of the TDOAs by position and velocity (n, 6) and by the k anchors of which `moved` (N,) is true (n, 3 k), and the
+    residuals (n,)."""
     residual, from_a, from_b, before = _residual(x, window, anchors)
     by_position = from_b - from_a
-    by_anchors, rows = np.zeros((len(residual), len(anchors), 3)), np.arange(len(residual))
-    by_anchors[rows, window[1]] += from_a
-    by_anchors[rows, window[2]] -= from_b
+    by_anchors, number = np.zeros((len(residual), int(moved.sum()), 3)), np.cumsum(moved) - 1
+    for ends, by_end in ((window[1], from_a), (window[2], -from_b)):
+        rows = np.flatnonzero(moved[ends])
+        by_anchors[rows, number[ends[rows]]] += by_end[rows]
     by_tag = np.column_stack([by_position, before[:, None] * by_position])
-    return by_tag, by_anchors.reshape(len(residual), -1), residual
+    return by_tag, np.asfortranarray(by_anchors.reshape(len(residual), -1)), residual

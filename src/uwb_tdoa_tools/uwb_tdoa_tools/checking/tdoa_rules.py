@@ -13,11 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, Finding
+from uwb_tdoa_ekf.streams.explain import SCALE, compare, innovations
 
+from .known_path import MANY
 from .ordered import LONG, SHORT, OrderedRecording
-from uwb_tdoa_ekf.streams.explain import SCALE, compare
+from .pair_rules import OFF
 from .survey_fit import SPREAD, SurveyFit, spread
 
 if TYPE_CHECKING:
@@ -137,10 +140,11 @@ def swapped(recording: OrderedRecording) -> Iterator[Trial]:
     table: dict[int, int] = {}
     trial, brief = recording, recording.part(SHORT)
     ids = np.intersect1d(recording.anchors.ids, np.r_[recording.tdoa.a, recording.tdoa.b]).tolist()
-    for _ in range(len(ids) - 1):
+    doubtful = ids if len(recording.anchors) <= MANY else _far_off(brief)
+    for _ in range(len(ids) - 1 if doubtful else 0):
         base = brief.unexplained()
         ratios = []
-        for one, two in combinations(ids, 2):
+        for one, two in ((one, two) for one, two in combinations(ids, 2) if one in doubtful or two in doubtful):
             swap = {one: two, two: one}
             ratios.append((compare(base, _relabelled(brief, swap).unexplained())[0], swap))
         ratio, swap = min(ratios, key=lambda entry: entry[0] if np.isfinite(entry[0]) else np.inf)
@@ -159,6 +163,16 @@ def swapped(recording: OrderedRecording) -> Iterator[Trial]:
             "ids_swapped", f"{cause}: what is called {names}", f"id = {table}.get(id, id)  # or swap them in the survey"
         ),
     )
+
+
+def _far_off(recording: OrderedRecording) -> list[int]:
+    """Ids of the anchors whose TDOAs are far from what the filter expects, in comparison with those of most anchors: what is called by the id
+    of another anchor of a hall is."""
+    (a, b), tdoa, positions = recording.rows(), recording.tdoa, recording.anchors.positions
+    off = np.abs(innovations(new_state(positions), tdoa.t, a, b, tdoa.d, positions))
+    rows = np.unique(np.concatenate([a, b])[np.tile(np.isfinite(off), 2)])
+    each = np.array([np.nanmedian(off[(a == row) | (b == row)]) for row in rows.tolist()])
+    return recording.anchors.ids[rows[each > OFF * np.median(each)]].tolist() if len(rows) else []
 
 
 def contrary(recording: OrderedRecording) -> Iterator[Trial]:
@@ -209,8 +223,9 @@ def moved(recording: OrderedRecording) -> Iterator[Trial]:
     gain = gained(fit)
     if gain is None:
         return
-    alone = [fit.solve([row]) for row in range(len(recording.anchors))]
-    row = int(np.argmin([loss for loss, _ in alone]))
+    heard = fit.heard if len(recording.anchors) > MANY else range(len(recording.anchors))
+    alone = {row: fit.solve([row]) for row in heard}
+    row = min(alone, key=lambda row: alone[row][0])
     share = (fit.before - alone[row][0]) / gain
     if share < ALONE:
         return

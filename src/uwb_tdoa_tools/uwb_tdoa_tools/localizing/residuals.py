@@ -73,8 +73,10 @@ def by_pair(residuals: Residuals) -> list[OfPair]:
     low, high = np.minimum(residuals.a, residuals.b), np.maximum(residuals.a, residuals.b)
     sign = np.where(residuals.a <= residuals.b, 1.0, -1.0)
     pairs = []
-    for a, b in np.unique(np.column_stack([low, high])[there].astype(int), axis=0).tolist():
-        rows = there & (low == a) & (high == b)
+    order = np.flatnonzero(there)[np.lexsort((high[there], low[there]))]
+    begins = np.flatnonzero((np.diff(low[order]) != 0) | (np.diff(high[order]) != 0)) + 1
+    for rows in np.split(order, begins) if len(order) else ():
+        a, b = int(low[rows[0]]), int(high[rows[0]])
         value, std = (sign * residuals.innovation)[rows], np.sqrt(residuals.variance[rows])
         pairs.append(OfPair(a, b, residuals.t[rows], value, std, fits[rows]))
     return pairs

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from uwb_tdoa_bias.effects import AidSamples, Effect, ImuSamples, Samples, SmoothTerm
     from uwb_tdoa_bias.foundation.flight import Truth
+    from ..regression.algebra import Matrix
     from .views import CovariateView
 
 Figures = dict[str, list[dict[str, Any]]]  # of the health of channels: {"pairs", "anchors", "axes", ...: rows}
@@ -89,8 +90,8 @@ class ChannelResidual:
         """Rows for a fit."""
         raise NotImplementedError
 
-    def columns(self, effect: Effect, keys: Sequence[str]) -> np.ndarray:
-        """Regressors of an Effect for the parameters `keys`, averaged as the rows are: (m, len(keys))."""
+    def columns(self, effect: Effect, keys: Sequence[str]) -> Matrix:
+        """Regressors of an Effect for the parameters `keys`, averaged as the rows are: (m, len(keys)), sparse where few are not zero."""
         raise NotImplementedError
 
     def covariate(self, name: str) -> np.ndarray | None:

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s
 TAIL = 4.0  # spreads
 FEWEST = 20  # pairs of samples that a correlation is told of
+
+
+def rows_by_value(values: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """(value, rows that have it, rising) of every whole number in values (n,), in their order."""
+    order = np.argsort(values, kind="stable")
+    names, first = np.unique(values[order], return_index=True)
+    return zip(names.tolist(), np.split(order, first[1:]))
 
 
 def figures(t: np.ndarray | None, r: np.ndarray) -> dict[str, Any]:

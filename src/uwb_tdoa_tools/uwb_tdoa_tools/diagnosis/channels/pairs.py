@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .figures import FEWEST, figures
+from .figures import FEWEST, figures, rows_by_value
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,15 +22,19 @@ def health(parts: Sequence[TdoaResidual]) -> Figures:
     ids = parts[0].samples.anchors.ids
     t, r, a, b = (np.concatenate(column) for column in zip(*map(_columns, enumerate(parts))))
     pairs, each = [], []
-    label = a * 1000 + b
-    for number in np.unique(label):
-        mine = label == number
-        pairs.append({"pair": f"{ids[number // 1000]}-{ids[number % 1000]}", **figures(t[mine], r[mine])})
+    label = a * len(ids) + b
+    for number, mine in rows_by_value(label):
+        pairs.append({"pair": _name(number, ids), **figures(t[mine], r[mine])})
     for row, anchor in enumerate(ids.tolist()):
         late = np.concatenate([r[b == row], -r[a == row]])
         if len(late):
             each.append({"anchor": anchor, **figures(None, late)})
     return {"pairs": pairs, "anchors": each, "cross_correlation": _crossed(t, r, label, ids)}
+
+
+def _name(label: int, ids: np.ndarray) -> str:
+    """A pair "1-2" by its number among anchors with these ids."""
+    return "-".join(str(ids[row]) for row in divmod(label, len(ids)))
 
 
 def _columns(numbered: tuple[int, TdoaResidual]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -41,9 +45,13 @@ def _columns(numbered: tuple[int, TdoaResidual]) -> tuple[np.ndarray, np.ndarray
 
 def _crossed(t: np.ndarray, r: np.ndarray, label: np.ndarray, anchors: np.ndarray) -> list[dict[str, Any]]:
     """The strongest correlations between half-second means of two pairs: [{"pairs", "correlation"}]."""
-    labels, place = np.unique(label, return_inverse=True)
     cell = np.unique((t * 2.0).astype(int), return_inverse=True)[1]
-    shape = (cell.max() + 1, len(labels))
+    together = np.unique(np.stack([label, cell]), axis=1)[0]  # once for every cell in which a pair was heard
+    often, times = np.unique(together, return_counts=True)
+    rows = np.isin(label, often[times > FEWEST])  # nothing is told of the others
+    r, cell = r[rows], cell[rows]
+    labels, place = np.unique(label[rows], return_inverse=True)
+    shape = (cell.max(initial=-1) + 1, len(labels))
     at = cell * len(labels) + place
     count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
     mean = np.bincount(at, r, shape[0] * shape[1]).reshape(shape) / np.maximum(count, 1)
@@ -53,6 +61,6 @@ def _crossed(t: np.ndarray, r: np.ndarray, label: np.ndarray, anchors: np.ndarra
             both = (count[:, i] > 0) & (count[:, k] > 0)
             if both.sum() > FEWEST and mean[both, i].std() > 0.0 and mean[both, k].std() > 0.0:
                 rho = float(np.corrcoef(mean[both, i], mean[both, k])[0, 1])
-                names = [f"{anchors[x // 1000]}-{anchors[x % 1000]}" for x in (labels[k], labels[i])]
+                names = [_name(x, anchors) for x in (labels[k], labels[i])]
                 out.append({"pairs": names, "correlation": round(rho, 3)})
     return sorted(out, key=lambda item: -abs(item["correlation"]))[:STRONGEST]

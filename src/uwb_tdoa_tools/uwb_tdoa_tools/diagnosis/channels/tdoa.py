@@ -12,18 +12,20 @@ from functools import cached_property
 from typing import ClassVar, TYPE_CHECKING, TypeVar
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from uwb_tdoa_bias.effects import Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
+from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
 from uwb_tdoa_ekf.sensitivity import Innovations
 
 from ...checking.known_path import MANY
+from ..regression.algebra import Matrix
 from . import pairs
 from .base import Channel, ChannelResidual, Rows, covariate_of
 from .extra import extra_at, extra_names
 from .knots import knots_of
-from .views import views_of_pairs
+from .views import OF_EACH, views_of_pairs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -37,7 +39,7 @@ LOWEST, LEVEL = 0.02, 0.5  # m, and by how much the logarithm of a height may di
 OUTLIER = 4.0  # spreads within a cell
 QUICK = ("interval", *CATEGORIES)  # covariates that change from one TDOA to the next
 # Effects, each of whose parameters acts on TDOAs of one or two anchors
-OF_ANCHORS = "anchor_delay", "anchor_position", "anchor_clock_drift", "pair_offset"
+OF_ANCHORS = "anchor_delay", "anchor_position", "anchor_clock_drift", "pair_offset", "nlos"
 WILD = 20.0  # m; a larger residual is no measurement
 FEWEST_ON_FLOOR = 50  # TDOAs
 
@@ -76,9 +78,9 @@ class RadioResidual(ChannelResidual):
         place = np.stack([cells.mean(column) for column in samples.p.T], axis=1)
         return Rows(cells.mean(self.residual), np.zeros_like(cells.pair), cells.pair, cells.t - samples.start, cells.size, place)
 
-    def columns(self, effect: Effect, keys: Sequence[str]) -> np.ndarray:
+    def columns(self, effect: Effect, keys: Sequence[str]) -> Matrix:
         samples, rows = self.samples, None
-        if are_many([self]) and self.innovations is None and effect.name in OF_ANCHORS:  # nothing else has to do with these anchors
+        if are_many([self]) and self.innovations is None and _of_single_anchors(effect):  # nothing else has to do with these anchors
             named = np.isin(samples.anchors.ids, [int(i) for key in keys for i in key.partition(".")[0].split("-")])
             rows = np.flatnonzero(named[samples.a] | named[samples.b])
             t, a, b, p, q = (values[rows] for values in (samples.t, samples.a, samples.b, samples.p, samples.q))
@@ -139,8 +141,8 @@ class Cells:
         start = np.searchsorted(self.group, np.arange(len(self.size)))
         self.pair = samples.a[self.chosen][start] * n + samples.b[self.chosen][start]
 
-    def means(self, values: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """The same of several (n, k): (m, k). rows (r,) : the TDOAs that values (r, k) are of, the others being zero."""
+    def means(self, values: np.ndarray, rows: np.ndarray | None = None) -> Matrix:
+        """The same of several (n, k): (m, k). rows (r,) : the TDOAs that values (r, k) are of, the others being zero; then it is sparse."""
         if rows is None:
             return np.stack([self.mean(column) for column in values.T], axis=1)
         place = np.full(self.chosen.max(initial=-1) + 1, -1)
@@ -148,7 +150,7 @@ class Cells:
         inside = np.flatnonzero(place[self.chosen] >= 0)
         group = self.group[inside]
         members = csr_array((1.0 / self.size[group], (group, place[self.chosen[inside]])), shape=(len(self.size), len(rows)))
-        return members @ values
+        return (members @ csc_array(values)).tocsc()
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """Means of values of all TDOAs (n,) over the cells: (m,)."""
@@ -238,6 +240,13 @@ class Tdoa(Channel[TdoaResidual]):
 
     def health(self, residuals: Sequence[TdoaResidual]) -> Figures:
         return pairs.health(residuals)
+
+
+def _of_single_anchors(effect: Effect) -> bool:
+    """Whether each parameter of an Effect acts on the TDOAs of the anchors that its name begins with alone, whatever the other TDOAs are."""
+    if isinstance(effect, SmoothTerm):
+        return effect.form in ("anchor", *OF_LINKS) and effect.covariate in OF_EACH
+    return effect.name in OF_ANCHORS
 
 
 def are_many(residuals: Sequence[RadioResidual]) -> bool:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.distance import cdist
+from scipy.sparse import csc_array, csr_array
+from scipy.spatial import cKDTree
 
 from uwb_tdoa_bias.effects import EFFECTS
 
@@ -34,19 +35,19 @@ class NlosDetector(Detector):
         a, b = part.arrivals(table.series[rows])
         information, residual = model.information(table)[rows], model.residual[rows]
         keys = {key for candidate in chosen if candidate.name == self.effect.name for key in candidate.terms[0].keys}
-        spheres, out = _Spheres(table.place[rows]), []
+        spheres, out, anchors = _Spheres(table.place[rows]), [], len(part.samples.anchors)
+        heard = csr_array(  # TDOAs (n, anchors), 1 where the anchor is the later one
+            (np.repeat([-1.0, 1.0], len(a)), (np.tile(np.arange(len(a)), 2), np.concatenate([a, b]))), shape=(len(a), anchors)
+        ).tocsc()
+        in_spheres = spheres.best(heard, information, residual)
         for row, anchor in enumerate(part.samples.anchors.ids.tolist()):
-            key = f"{anchor}.delay"
-            if key in keys:
+            key, its = f"{anchor}.delay", slice(*heard.indptr[row : row + 2])
+            if key in keys or its.start == its.stop:
                 continue
-            heard = np.flatnonzero((b == row) | (a == row))
-            if not len(heard):
-                continue
-            x = 1.0 * (b[heard] == row) - 1.0 * (a[heard] == row)
-            score, power = x * information[heard] * residual[heard], x * x * information[heard]
-            searches = [spheres.best(score, power, heard)]
+            searches, at, x = [in_spheres[row]], heard.indices[its], heard.data[its]
             if table.flights == 1:  # only a flight alone has a time of its own
-                searches.append(best_interval(table.t[rows], score, power, PRIOR, rows=heard))
+                score, power = x * information[at] * residual[at], x * x * information[at]
+                searches.append(best_interval(table.t[rows], score, power, PRIOR, rows=at))
             for gain, limits, price in searches:
                 if gain > LEAST_GAIN:
                     values = {f"{anchor}.{name}": value for name, value in limits.items()}
@@ -59,15 +60,24 @@ class _Spheres:
 
     def __init__(self, place: np.ndarray) -> None:
         self._centres = place[:: max(1, len(place) // CENTRES)]
-        away = cdist(self._centres, place)
-        self._inside = np.concatenate([away <= radius for radius in RADII]).astype(float)  # all of a radius after the other
-        self._constant = self._inside.mean(axis=1) > LONGEST
+        tree, inside = cKDTree(place), []
+        for radius in RADII:  # all of a radius after the other
+            inside.extend(tree.query_ball_point(self._centres, radius, return_sorted=True))
+        ends = np.cumsum([0, *map(len, inside)])
+        rows = np.concatenate([np.asarray(some, int) for some in inside])
+        self._inside = csr_array((np.ones(len(rows)), rows, ends), shape=(len(inside), len(place)))
+        self._constant = np.diff(ends) / len(place) > LONGEST
 
-    def best(self, score: np.ndarray, power: np.ndarray, heard: np.ndarray) -> tuple[float, dict[str, float], float]:
-        """Best (gain, {limit: value}, price of the search), as `best_interval`. score, power (m,) : of the places at `heard` (m,)."""
-        score, power = (self._inside[:, heard] @ np.stack([score, power], axis=1)).T
-        gain = np.where(self._constant, 0.0, np.maximum(score, 0.0) ** 2 / (power + PRIOR))
-        best = int(np.argmax(gain))
-        radius, centre = divmod(best, len(self._centres))
-        limits = {**dict(zip("xyz", self._centres[centre].tolist())), "radius": RADII[radius]}
-        return gain[best], limits, 2.0 * np.log(len(gain))
+    def best(self, heard: csc_array, information: np.ndarray, residual: np.ndarray) -> list[tuple[float, dict[str, float], float]]:
+        """Best (gain, {limit: value}, price of the search) of each anchor, as `best_interval` gives them. heard : sparse (n, anchors), 1
+        and -1; information, residual (n,)."""
+        inside = self._inside.multiply(information[None, :]).tocsr()
+        score, power = inside.multiply(residual[None, :]).tocsr() @ heard, inside @ abs(heard)
+        gain = np.maximum(score.toarray(), 0.0) ** 2 / (power.toarray() + PRIOR)
+        gain[self._constant] = 0.0
+        out, price = [], 2.0 * np.log(len(gain))
+        for number, its in zip(np.argmax(gain, axis=0).tolist(), gain.T):
+            radius, centre = divmod(number, len(self._centres))
+            limits = {**dict(zip("xyz", self._centres[centre].tolist())), "radius": RADII[radius]}
+            out.append((float(its[number]), limits, price))
+        return out

@@ -9,6 +9,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS
 
 from ..channels import tdoa_parts
+from ..channels.figures import rows_by_value
 from .base import Detection, Detector
 from .series import series_of
 
@@ -35,9 +36,9 @@ class NoiseLevelDetector(Detector):
             near = series.t[second] - series.t[first] < NEAR
             step = (series.residual[second] - series.residual[first])[near]
             a, b = series.a[first][near], series.b[first][near]
-            link = np.minimum(a, b) * 1000 + np.maximum(a, b)
-            for number in np.unique(link):
-                steps.setdefault(int(number), []).append(step[link == number])
+            link = np.minimum(a, b) * len(ids) + np.maximum(a, b)
+            for number, rows in rows_by_value(link):
+                steps.setdefault(number, []).append(step[rows])
         joined = {link: np.concatenate(several) for link, several in steps.items()}
         size = {
             link: (1.4826 * np.median(np.abs(s)) / np.sqrt(2.0), len(s)) for link, s in joined.items() if len(s) >= FEWEST
@@ -50,7 +51,7 @@ class NoiseLevelDetector(Detector):
             error = 1.17 * s / np.sqrt(count)  # of a MAD; steps share their samples, hence not sqrt(2 count)
             extra = np.sqrt(max(s**2 - level**2, 0.0))
             if s > RATIO * level and s - level > SURE * error and extra > self.effect.negligible:
-                key = f"{ids[link // 1000]}-{ids[link % 1000]}"
+                key = f"{ids[link // len(ids)]}-{ids[link % len(ids)]}"
                 values[key], std[key] = extra, s * error / max(extra, 1e-9)
                 evidence = max(evidence, (s - level) / error)
         if not values or len(values) > MOST * len(size):

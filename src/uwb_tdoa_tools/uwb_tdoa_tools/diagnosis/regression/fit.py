@@ -82,12 +82,14 @@ def prior_sizes(columns: Sequence[Column]) -> np.ndarray:
     return np.array([column.typical for column in columns])
 
 
-def fit(table: Table, columns: Sequence[Column], inflation: np.ndarray | None = None, covariance: bool = True) -> Fit:
+def fit(
+    table: Table, columns: Sequence[Column], inflation: np.ndarray | None = None, covariance: bool = True, near: Fit | None = None
+) -> Fit:
     """Fit of some Columns of a Table. inflation : (groups,), measured on this very fit if None; covariance : whether somebody asks for
-    it."""
+    it; near : Fit of nearly the same Columns, from which that of a sparse Table begins."""
     x, group, sizes = table.matrix(columns), table.group, prior_sizes(columns)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
-    residual = table.y.copy()
+    residual = table.y.copy() if near is None or not table.sparse else near.residual.copy()
     for step in range(ITERATIONS):
         scale = _scales(table, residual)
         weight = (NU + 1.0) / (NU + (residual / scale[group]) ** 2)

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from .fit import Fit
     from .table import Table
 
+    _Held = tuple[np.ndarray, np.ndarray, np.ndarray]  # as `_held` gives it
     _Item = tuple[float, "_Shapes", str, tuple[float, ...], int]  # gain, shapes, shape, knots, how many were tried
 
 BINS = 16  # between whose edges steps, intervals and rises begin and end
@@ -36,6 +38,7 @@ CROWDED = 0.02  # of the range; bins that are narrower would tell noise of the c
 NOISY = 1.5  # times the noise of most series that any may have
 FINER = 9  # places between two bins where a knot is tried again
 FEWEST = 12  # values of a subset
+MANY_VALUES, LEVELS = 4096, 256  # of more values levels are told apart, where there are MANY anchors
 PROPOSED = 16  # functions
 SHAPES_FIRST = 3  # of one CovariateView
 HUBER = 3.0  # scales; a larger residual counts as that of a heavy tail, but more than in Student's t
@@ -45,11 +48,18 @@ ANGLES = ("bearing", "bearing_in_tag", "bearing_in_anchor")
 
 
 class _Shapes:
-    """A CovariateView as columns x (k, columns) at `rows` of a Table; edges (bins + 1,)."""
+    """A CovariateView as columns x (k, columns) at `rows` of a Table; edges (bins + 1,). Of many values: x (levels, columns), of every
+    one of some levels of the covariate, and a sparse matrix `levels` (k, levels), whose product with x are the columns."""
 
-    def __init__(self, view: CovariateView, offset: int, edges: np.ndarray) -> None:
-        """offset : first row of the channel."""
-        self.view, self.offset, self.edges, rows = view, offset, edges, view.rows
+    def __init__(self, view: CovariateView, offset: int, edges: np.ndarray, many: bool) -> None:
+        """offset : first row of the channel; many : whether the Table has so many rows that values which are nearly the same count as the
+        same."""
+        self.view, self.offset, self.edges, self.many, rows = view, offset, edges, many, view.rows
+        self.levels: csr_array | None = None
+        if many and len(rows) > MANY_VALUES:
+            values, self.levels, rows = _levels(view, edges)
+            self.x, self.rows = _columns(values, edges, view.covariate), rows + offset
+            return
         x: np.ndarray = np.zeros(())
         for signs, values in view.sides:
             known = np.where(np.isfinite(values), signs, 0.0)
@@ -71,7 +81,7 @@ class Scan:
             for view, edges in ((view, _edges(view)) for view in some):
                 if edges is not None:
                     kind = len(edges), view.covariate in ANGLES, view.covariate in CATEGORIES
-                    groups.setdefault(kind, []).append(_Shapes(view, table.rows_of(channel).start, edges))
+                    groups.setdefault(kind, []).append(_Shapes(view, table.rows_of(channel).start, edges, table.sparse))
         self._groups = [_Group(several, WIDEST) for several in groups.values()]
         self.even = _noise_of_series(table) ** -2.0  # weights (n,) that are fair to noisy series, and know no outliers
         self._price = SmoothTerm.price + 2.0 * np.log(max(sum(len(several) for several in groups.values()), 1))
@@ -83,11 +93,12 @@ class Scan:
         weight = np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12)) * self.even
         everywhere = np.ones(len(table.y), dtype=bool)
         model = refit(table, columns_of(chosen), replace(model, weight=weight), everywhere)
-        found = self.gains(table, model, chosen)[:PROPOSED]
-        found = _best_first(table, [self._refined(table, model, chosen, item) for item in found])
+        held = _held(table, model, chosen)
+        found = self._gains(table, held)[:PROPOSED]
+        found = _best_first(table, [self._refined(held, item) for item in found])
         return [self._candidate(*item[1:]) for item in _various(found)]
 
-    def _refined(self, table: Table, model: Fit, chosen: Sequence[Candidate], item: _Item) -> _Item:
+    def _refined(self, held: _Held, item: _Item) -> _Item:
         """An item of `gains` with its inner knots moved by parts of a bin, if that gains more."""
         gain, shapes, shape, knots, tried = item
         if len(knots) < 3 or shapes.view.covariate in CATEGORIES:
@@ -95,17 +106,18 @@ class Scan:
         coarse = shapes.edges
         near = [coarse[max(k - 1, 0) : k + 2] for k in np.searchsorted(coarse, knots[1:-1])]
         edges = np.unique(np.concatenate([coarse[[0, -1]], *(np.linspace(some[0], some[-1], FINER) for some in near)]))
-        group = _Group([_Shapes(shapes.view, shapes.offset, edges)], len(edges))
-        moved = [each for each in group.best(*_held(table, model, chosen)) if each[2] == shape]
+        group = _Group([_Shapes(shapes.view, shapes.offset, edges, shapes.many)], len(edges))
+        moved = [each for each in group.best(*held) if each[2] == shape]
         best = max(moved, key=lambda each: each[0], default=item)
         return (*best[:4], tried * FINER) if best[0] > gain else item
 
     def gains(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[_Item]:
         """[(gain, _Shapes, shape, knots, how many were tried)], the best first after what its coefficients and its search cost: what a
         Fit of the chosen Candidates would gain, twice a log-likelihood, with the weights that it has."""
-        held = _held(table, model, chosen)
-        found = [item for group in self._groups for item in group.best(*held)]
-        return _best_first(table, found)
+        return self._gains(table, _held(table, model, chosen))
+
+    def _gains(self, table: Table, held: _Held) -> list[_Item]:
+        return _best_first(table, [item for group in self._groups for item in group.best(*held)])
 
     def _candidate(self, shapes: _Shapes, shape: str, knots: tuple[float, ...], tried: int) -> Candidate:
         view = shapes.view
@@ -233,12 +245,16 @@ def _products(
     shapes: _Shapes, held: np.ndarray, information: np.ndarray, residual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of the columns with the residual (columns,), and with each other (columns, columns) free of what is held."""
+    if shapes.levels is not None:
+        of_levels = shapes.levels.multiply(information[shapes.rows, None]).T.tocsr()
+        half = (of_levels @ held[shapes.rows]).T @ shapes.x
+        return shapes.x.T @ (of_levels @ residual[shapes.rows]), shapes.x.T @ (of_levels @ shapes.levels @ shapes.x) - half.T @ half
     weighted = shapes.x * information[shapes.rows, None]
     half = held[shapes.rows].T @ weighted
     return weighted.T @ residual[shapes.rows], weighted.T @ shapes.x - half.T @ half
 
 
-def _held(table: Table, model: Fit, chosen: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _held(table: Table, model: Fit, chosen: Sequence[Candidate]) -> _Held:
     """(orthonormal base, weighted, of what the chosen Candidates hold (n, k), information (n,), residual (n,))."""
     information, base = model.information(table), columns_of(chosen)
     b = dense(table.matrix(base))
@@ -261,6 +277,18 @@ def _edges(view: CovariateView) -> np.ndarray | None:
     width = (edges - edges[0]) // (CROWDED * (edges[-1] - edges[0]))
     edges = edges[np.unique(width, return_index=True)[1]]
     return edges if len(edges) > 2 * len(set(_ENDS[:, 0])) else None
+
+
+def _levels(view: CovariateView, edges: np.ndarray) -> tuple[np.ndarray, csr_array, np.ndarray]:
+    """(values (l,) of a covariate, each of which stands for those of its level, whose levels lie between the edges; sums of signs of each
+    level (k, l); rows (k,) of a view)."""
+    signs, values = (np.concatenate(each) for each in zip(*view.sides))
+    known = np.isfinite(values) & (signs != 0.0)
+    rows, place = np.unique(view.rows, return_inverse=True)
+    signs, values, cell = signs[known], values[known], np.tile(place, len(view.sides))[known]
+    finer = np.union1d(edges, np.quantile(values, np.linspace(0.0, 1.0, LEVELS + 1)))
+    _, first, level = np.unique(np.searchsorted(finer, values, side="right"), return_index=True, return_inverse=True)
+    return values[first], csr_array((signs / np.bincount(place)[cell], (cell, level)), shape=(len(rows), len(first))), rows
 
 
 def _columns(v: np.ndarray, edges: np.ndarray, covariate: str) -> np.ndarray:

@@ -7,16 +7,16 @@ All that candidates need of the rows is computed for all of them at once: produc
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .algebra import product, weighted
+from .algebra import Matrix, product, weighted
 from .fit import prior_sizes, solve
 from .table import AXES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Hashable, Sequence
     from .fit import Fit
     from .table import Table
     from .terms import Candidate, Column
@@ -44,11 +44,11 @@ class Scorer:
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
         self._base = np.arange(len(base))
         columns, root = list(self._place), model.information(table)
-        whole = table.matrix(columns) if table.sparse else None
-        self._parts = [
-            self._part(table, columns, root, rows) if whole is None else _sparse_part(table, whole, len(base), root, rows)
-            for _, rows in table.groups
-        ]
+        if table.sparse:
+            effects = _effects(columns, len(base))
+            self._parts = [_sparse_part(table, columns, effects, len(base), root, rows) for _, rows in table.groups]
+        else:
+            self._parts = [self._part(table, columns, root, rows) for _, rows in table.groups]
         self._group_sizes = [model.size[group] for group, _ in table.groups]
         self._channels = [table.channels[group // AXES] for group, _ in table.groups]
         self._sizes = prior_sizes(list(self._place))
@@ -77,7 +77,7 @@ class Scorer:
         cross = sum((part.cross for part in self._parts), start=np.zeros(()))
         left = (sum(part.vector for part in self._parts) - cross.T @ beta) * sizes
         cross = cross * np.outer(sizes[base], sizes)
-        own = sum((np.diagonal(part.whole) for part in self._parts if part.whole is not None), start=np.zeros(()))
+        own = sum((part.products.squares for part in self._parts if part.products is not None), start=np.zeros(()))
         own = own * sizes**2 + 1.0 - np.sum(cross * (self._inverse @ cross), axis=0)
         return left**2 / np.maximum(own, 1e-9)
 
@@ -118,7 +118,7 @@ class Scorer:
 @dataclass(frozen=True, eq=False)
 class _Part:
     """One group: its rows in a Table of some columns, with weights root (n,); cross (base, k) and vector (k,): X' W X and X' W y;
-    power : y' W y; whole (columns, columns) : X' W X of all, or None."""
+    power : y' W y; products : of columns of one effect, where they are sparse."""
 
     table: Table
     columns: list[Column]
@@ -127,11 +127,11 @@ class _Part:
     cross: np.ndarray
     vector: np.ndarray
     power: float
-    whole: np.ndarray | None = None
+    products: _Products | None = None
 
     def gram(self, places: np.ndarray) -> np.ndarray:
-        if self.whole is not None:
-            return self.whole[np.ix_(places, places)]
+        if self.products is not None:
+            return self.products.gram(places)
         x = self.table.matrix([self.columns[place] for place in places], self.rows)
         return x.T @ (x * self.root[:, None])
 
@@ -146,9 +146,61 @@ class _Part:
         return max(float(out), 1e-12)
 
 
-def _sparse_part(table: Table, x: Any, base: int, root: np.ndarray, rows: np.ndarray | slice) -> _Part:
-    """The _Part of some rows of a sparse matrix x of all columns, the first `base` those of the base: products of all with all at once,
-    which of so few entries cost less than to look for those of each candidate."""
-    root, y, x = root[rows], table.y[rows], x[rows]
-    whole = product(x, weighted(x, root))
-    return _Part(table, [], rows, root, whole[:base], x.T @ (root * y), float(root @ y**2), whole)
+def _effects(columns: Sequence[Column], base: int) -> list[np.ndarray]:
+    """Places of the columns of each effect, those of the base left out."""
+    places: dict[Hashable, list[int]] = {}
+    for place, column in enumerate(columns[base:], start=base):
+        places.setdefault(column.effect, []).append(place)
+    return list(map(np.array, places.values()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Products:
+    """X' W X of sparse columns x (n, k), with weights (n,), made once for what is asked of many candidates: squares (k,), its diagonal;
+    effect, number (k,) : of each column that of its effect, and its own among these; grams : of every effect of several columns."""
+
+    x: Matrix
+    weights: np.ndarray
+    squares: np.ndarray
+    effect: np.ndarray
+    number: np.ndarray
+    grams: dict[int, np.ndarray]
+
+    @classmethod
+    def of(cls, x: Matrix, weights: np.ndarray, effects: Sequence[np.ndarray]) -> _Products:
+        effect, number = np.full((2, x.shape[1]), -1)
+        for k, places in enumerate(effects):
+            effect[places], number[places] = k, np.arange(len(places))
+        squares = x.power(2).T @ weights
+        grams = {k: _gram(x[:, places], weights) for k, places in enumerate(effects) if len(places) > 1}
+        return cls(x, weights, squares, effect, number, grams)
+
+    def gram(self, places: np.ndarray) -> np.ndarray:
+        """Those of the columns at some places."""
+        first = int(self.effect[places[0]])
+        if len(places) == 1:
+            return self.squares[places][:, None]
+        if first >= 0 and (self.effect[places] == first).all():
+            numbers = self.number[places]
+            return self.grams[first][np.ix_(numbers, numbers)]
+        return _gram(self.x[:, places], self.weights)
+
+
+def _gram(x: Matrix, weights: np.ndarray) -> np.ndarray:
+    """X' W X of a sparse matrix (n, k), (k, k)."""
+    told = np.flatnonzero(np.diff(x.indptr))  # most columns are of TDOAs, or of an axis of another sensor
+    out = np.zeros((x.shape[1], x.shape[1]))
+    if len(told):
+        some = x[:, told]
+        out[np.ix_(told, told)] = product(some, weighted(some, weights))
+    return out
+
+
+def _sparse_part(
+    table: Table, columns: list[Column], effects: Sequence[np.ndarray], base: int, root: np.ndarray, rows: np.ndarray | slice
+) -> _Part:
+    """The _Part of some rows of a sparse Table, of all columns, the first `base` those of the base. effects : places of the columns of
+    each effect: of those of two effects products are made when they are asked for."""
+    root, y, x = root[rows], table.y[rows], table.matrix(columns, rows)
+    cross = product(x, weighted(x[:, :base], root)).T  # in this order x is multiplied as it lies in memory
+    return _Part(table, columns, rows, root, cross, x.T @ (root * y), float(root @ y**2), _Products.of(x, root, effects))

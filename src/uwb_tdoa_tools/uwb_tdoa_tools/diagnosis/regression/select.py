@@ -105,7 +105,7 @@ def select(
         best = _sparse_first(ranked) if scan else ranked[0][1]
         table = table.with_terms(best.terms)
         chosen.append(best)
-        model = fit(table, columns_of(chosen), inflation)
+        model = fit(table, columns_of(chosen), inflation, near=model)
         chosen, model = _backward(table, chosen, model, len(candidates))
     loss = _losses(table, chosen, model, len(candidates))
     progress()
@@ -127,7 +127,7 @@ def _fitted(
     says less: the one believes what noisy series show by chance, the other what outliers do. Minus infinity for what nobody would
     model."""
     table = table.with_terms(candidate.terms)
-    wider = fit(table, columns_of([*chosen, candidate]), model.inflation)
+    wider = fit(table, columns_of([*chosen, candidate]), model.inflation, covariance=False, near=model)
     if not acceptable(table, candidate, wider.values(candidate.columns)):
         return -np.inf
     scorer = Scorer(table, columns_of(chosen), wider, candidate.columns)
@@ -207,6 +207,16 @@ def _losses(table: Table, chosen: list[Candidate], model: Fit, choices: int) -> 
     return out
 
 
+def _beside(table: Table, candidate: Candidate, other: Candidate) -> bool:
+    """Whether another Candidate acts on any row that a Candidate acts on; where a Table is not sparse most do."""
+    if not table.sparse:
+        return True
+    touched = np.zeros(len(table.y), bool)
+    for column in candidate.columns:
+        touched[table.columns[column][0]] = True
+    return any(touched[table.columns[column][0]].any() for column in other.columns)
+
+
 def with_rivals(
     selection: Selection, candidates: list[Candidate], scan: Scan | None, progress: Callable[[], object]
 ) -> Selection:
@@ -215,12 +225,12 @@ def with_rivals(
     table, chosen, model, out = selection.table, list(selection.chosen), selection.fit, []
     for k, candidate in enumerate(chosen):
         others = chosen[:k] + chosen[k + 1 :]
-        rest, found = fit(table, columns_of(others), model.inflation), []
+        rest, found = fit(table, columns_of(others), model.inflation, near=model), []
         if scan and not candidate.declared:
             rest = replace(rest, weight=model.weight, scale=model.scale)  # what it explains is measured, not outliers
             found = scan(table, rest, others)
         wider = table.with_terms([term for one in found for term in one.terms])
-        several = [c for c in candidates + found if c.title != candidate.title]
+        several = [c for c in candidates + found if c.title != candidate.title and _beside(wider, candidate, c)]
         ranked = rank(wider, [*several, candidate], others, rest)
         own = next((score for score, ranked_one in ranked if ranked_one is candidate), None)
         near: dict[str, Rival] = {}

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csc_array
 
 from uwb_tdoa_bias.effects.samples import RADIO
 
@@ -15,7 +16,7 @@ from ..channels import CHANNELS, RadioResidual, TdoaResidual
 from .algebra import stacked
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Sequence
+    from collections.abc import Hashable, Iterable, Iterator, Sequence
     from uwb_tdoa_bias.effects import Effect
     from ..channels import ChannelResidual, ChannelResiduals
     from .terms import Column, Term
@@ -93,8 +94,13 @@ class Table:
 
     def matrix(self, columns: Sequence[Column], rows: slice | np.ndarray = slice(None)) -> Any:
         """X of some Columns, (n, k), or some of its rows; a sparse one if the Table is."""
+        if self.sparse and isinstance(rows, slice) and rows != slice(None):
+            edges, several = (rows.start, rows.stop), [self.columns[column] for column in columns]
+            parts = [(its, values, *np.searchsorted(its, edges)) for its, values in several]
+            return stacked([(its[i:j] - rows.start, values[i:j]) for its, values, i, j in parts], rows.stop - rows.start)
         if self.sparse:
-            return stacked([self.columns[column] for column in columns], len(self.y))[rows]
+            x = stacked([self.columns[column] for column in columns], len(self.y))
+            return x if isinstance(rows, slice) else x[rows]
         out = np.empty((len(self.y[rows]), len(columns)), order="F")
         for place, column in enumerate(columns):
             out[:, place] = self.columns[column][rows]
@@ -119,12 +125,13 @@ class Table:
 
     def _values(self, effect: Effect, keys: tuple[str, ...]) -> Any:
         """What `columns` hold of parameters of an Effect: iterable."""
+        made = ((row, part.columns(effect, keys)) for _, channel, row, part in self.parts if channel in effect.channels)
+        if self.sparse:
+            return _joined([(row, csc_array(np.nan_to_num(values)) if isinstance(values, np.ndarray) else values) for row, values in made], len(keys))
         x = np.zeros((len(self.y), len(keys)), order="F")
-        for _, channel, row, part in self.parts:
-            if channel in effect.channels:
-                values = part.columns(effect, keys)
-                x[row : row + len(values)] = np.nan_to_num(values)
-        return ((rows, column[rows]) for column in x.T for rows in [np.flatnonzero(column)]) if self.sparse else x.T
+        for row, values in made:
+            x[row : row + len(values)] = np.nan_to_num(values)
+        return x.T
 
     def rows(self, chosen: np.ndarray) -> Table:
         """Table of some rows, (n,) bool, with the columns that it has."""
@@ -143,6 +150,14 @@ class Table:
             values = np.array([effect.values[column.key] for column in columns])
             y += self.matrix(columns) @ values
         return replace(self, y=y)
+
+
+def _joined(parts: Sequence[tuple[int, Any]], k: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(rows, values) of each of k columns, of sparse matrices that begin at some rows, [(row, (n, k))]."""
+    for column in range(k):
+        some = [(row, x, slice(*x.indptr[column : column + 2])) for row, x in parts]
+        rows = [row + x.indices[its].astype(np.int64) for row, x, its in some]
+        yield np.concatenate([np.empty(0, np.int64), *rows]), np.concatenate([np.empty(0), *(x.data[its] for _, x, its in some)])
 
 
 def table_of(residuals: Sequence[ChannelResiduals]) -> Table:
