@@ -65,7 +65,7 @@ def test_without_truth(flight):
 @pytest.mark.slow
 @pytest.mark.parametrize("more", [(), ("--no-truth",)])
 def test_two_processes_give_the_same_to_the_bit(tmp_path, more):
-    flights = [effect_of("anchor_delay", True, 4).inject(clean_flight(seed, 16.0)) for seed in (100, 101, 102)]
+    flights = [effect_of("anchor_delay", True, 4).inject(clean_flight(seed, 20.0)) for seed in (100, 101, 102)]
     flights[1] = EFFECTS["pair_offset"]({"0-1": 0.3}).inject(flights[1])  # of one flight alone
     paths = [str(tmp_path / flight.name) for flight in flights]
     for flight, path in zip(flights, paths):
