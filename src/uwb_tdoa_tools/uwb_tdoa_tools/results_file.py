@@ -103,7 +103,7 @@ class ResultsFile:
     def keys_done(
         self, keys: Sequence[str], items: Sequence[Item], make: Callable[[Iterable[Item]], Iterable[object]], unit: str
     ) -> Iterator[str]:
-        """Generator of keys, in turn, each when its result is here: make(items) gives, in their order, the results of those that are not. unit :
+        """Generator of keys, in turn, each when its result is here. make(items) : results of those that are not there, in order; unit :
         what items are called, in words."""
         missing = {key: item for key, item in zip(keys, items) if key not in self}
         if len(missing) < len(items):

@@ -359,8 +359,8 @@ class TopicMessages:
 def read_topic(
     path: str | Path, reader: BagReader, topic: str, msgtype: str, row: Callable[[Any], tuple[float, ...]]
 ) -> TopicMessages:
-    """TopicMessages of a topic, none if it is not there. row(message) : its stamp, ns, and k other numbers. Raises InputError if its type is
-    another than msgtype."""
+    """TopicMessages of a topic, none if it is not there. row(message) : its stamp, ns, and k other numbers. Raises InputError if its type
+    is another than msgtype."""
     arrived, rows, frames = [], [], Counter[str]()
     for _, received, message in readable(path, reader, _connections(path, reader, topic, msgtype)):
         arrived.append(received)

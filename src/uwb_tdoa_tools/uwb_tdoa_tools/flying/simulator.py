@@ -158,7 +158,8 @@ class Simulator:
         for effect in self.world.effects.effects:
             flight = effect.inject(flight, self._rng)
         assert flight.imu is not None  # as no effect takes it away
-        return replace(measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, aids={name: getattr(flight, name) for name in measured.aids})
+        aids = {name: getattr(flight, name) for name in measured.aids}
+        return replace(measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, aids=aids)
 
 
 def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:
