@@ -1,2 +1,1 @@
-"""What `debias` does: positions to fit a bias map to, the map on flights, and the set-ups whose figures are in
-docs/debiasing.md."""
+"""What `debias` does: positions to fit a bias map to, and the map on flights."""
