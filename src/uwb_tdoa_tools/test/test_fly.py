@@ -57,7 +57,7 @@ def test_it_goes_on_from_what_is_there(tmp_path, capsys, monkeypatch):
 
     verdict = verdict_of(made_up())
     monkeypatch.setattr(fleet, "fly", one)
-    monkeypatch.setattr(fleet, "judge", lambda seed: {**verdict, "seed": seed})
+    monkeypatch.setattr(fleet, "verdict_of", lambda seed: {**verdict, "seed": seed})
     main(options)
     assert flown == [1, 2]
     main(["--no-floor-effect", "--flights", "3", *options[3:]])

@@ -149,8 +149,8 @@ class Reading:
     ) -> list[Flight]:
         """Flights of recordings and folders, with a progress bar: list. jobs, dask : as of `parallel.over`.
 
-        most : TDOAs and ranges that they may hold together, the first excepted; of more, as many whole flights as that are drawn at random, alike
-        at every call, and the others not held, so that memory and time are bounded.
+        most : TDOAs and ranges that they may hold together, the first excepted; of more, as many whole flights as that are drawn at random,
+        alike at every call, and the others not held, so that memory and time are bounded.
         """
         found, count = self.find(paths, bool(dask)), 0
         read: dict[int, Flight] = {}

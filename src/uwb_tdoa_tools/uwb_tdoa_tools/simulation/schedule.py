@@ -56,7 +56,7 @@ def among_heard(
     clock. Where fewer than two are heard there is nothing.
 
     TDOA2: those that are heard, in cells of one of them, send in turn, in the order of their rows, as cells that are out of each other's
-    reach use slots again. TDOA3: any two of those that are heard, in cells of one of them. Which cell it is is drawn, by how many are heard.
+    reach use slots again. TDOA3: any two of those that are heard, in cells of one of them. The cell is drawn, by how many are heard.
     """
     rows, pairs, numbers = [], [], []  # of measurements, (a, b) and their receptions
     senders: list[int] = []  # row of the anchor of each reception
