@@ -9,7 +9,7 @@ from test_diagnosis_regression import named, table_with
 from known_effects import clean_flight, effect_of
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.diagnosis import deviations
-from uwb_tdoa_tools.diagnosis.prior import MOVED, POSITION, Prior, _with_each_change, eliminated, posterior, solve
+from uwb_tdoa_tools.diagnosis.self_calibration.prior import MOVED, POSITION, Prior, _with_each_change, eliminated, posterior, solve
 from uwb_tdoa_tools.diagnosis.regression.confounding import alternatives, unobservable
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.regression.held_out import held_out
