@@ -15,7 +15,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from ...checking.known_path import MANY
 from ...parallel import in_one_thread
 from ..over_flights import Share
-from .equations import Runs
+from .equations import SYSTEMATIC, Runs
 from .placing import PLACED_STD, place
 from .prior import DELAY, POSITION, Prior, eliminated, keys_of, solve, to_keep, with_calibration
 from .tape import Tape
@@ -252,9 +252,9 @@ def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[Change,
 
 def _shares(equations: Equations, offset: np.ndarray, found: Solution, names: Sequence[str]) -> dict[str, tuple[Share, ...]]:
     """SelfCalibration.shares: a fit of one factor to what each flight alone tells in Equations that were made an offset (4N,) from the
-    mean of the prior."""
+    mean of the prior; with the information of `over_flights`, which errors that last do not make less."""
     n, whole, out = len(offset), offset + found.step, {}
-    told = [eliminated(one.gram, one.vector, n, found.function_std)[:2] for one in equations.flights]
+    told = [eliminated(SYSTEMATIC * one.gram, SYSTEMATIC * one.vector, n, found.function_std)[:2] for one in equations.flights]
     for name, columns in ((POSITION, slice(3 * n // 4)), (DELAY, slice(3 * n // 4, n))):
         part = np.zeros(n)
         part[columns] = whole[columns]
