@@ -46,6 +46,7 @@ def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alo
     assert errors[1] < 0.4 * errors[0] and moved == pytest.approx(errors[1], rel=0.02)  # shifts in effects.yaml, or in the anchors
 
 
+@pytest.mark.slow
 def test_who_asks_makes_no_difference(late, diagnosis):
     written = {effect.name: effect.values for effect in diagnosis.effects.effects}
     for effect in late.found(late.shifts):
@@ -53,6 +54,7 @@ def test_who_asks_makes_no_difference(late, diagnosis):
     np.testing.assert_array_equal(diagnosis.effects.covariance.matrix, late.effects.covariance.matrix)
 
 
+@pytest.mark.slow
 def test_what_is_applied_is_found_with_its_evidence_and_the_same_in_all_flights(late, diagnosis):
     added = [finding for finding in diagnosis.findings if finding.added]
     assert [finding.effect.name for finding in added] == ["anchor_position", "anchor_delay"]
