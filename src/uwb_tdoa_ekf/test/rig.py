@@ -264,7 +264,9 @@ class Rig:
                 values
                 and all(values[key.replace("_", " ")] == str(value) for key, value in expected.items())
                 and all(
-                    sum(int(values[key]) for key in keys) == len(self.received[topic]) for topic, keys in own.items() if topic in self.received
+                    sum(int(values[key]) for key in keys) == len(self.received[topic])
+                    for topic, keys in own.items()
+                    if topic in self.received
                 )
             )
 

@@ -23,7 +23,8 @@ def hall():
 
 
 def flown(**kind):
-    return simulate(SimulationConfig(anchors=hall(), bias=False, protocol="tdoa3", duration=20.0, start_in_air=True, radio_reach=12.0, **kind))
+    config = SimulationConfig(anchors=hall(), bias=False, protocol="tdoa3", duration=20.0, start_in_air=True, radio_reach=12.0, **kind)
+    return simulate(config)
 
 
 @pytest.mark.parametrize(

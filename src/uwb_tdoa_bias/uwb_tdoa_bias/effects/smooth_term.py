@@ -45,8 +45,9 @@ class SmoothTerm(Effect):
     """A function of one covariate, held constant beyond its knots; `values` are its coefficients c0, c1, ...
 
     channel : one of RADIO, "gyro.x" ... "accel.z", or of AID_CHANNELS
-    covariate : of RADIO a name of covariates.OF_TDOA or OF_ARRIVAL, of "range" none that needs the TDOAs before, for other channels of OF_AIDS, for the inertial ones
-        of OF_IMU too; or, but for AID_CHANNELS, "extra.STREAM.COLUMN". Where a recording does not hold it, it adds nothing
+    covariate : of RADIO a name of covariates.OF_TDOA or OF_ARRIVAL, of "range" none that needs the TDOAs before, for other
+        channels of OF_AIDS, for the inertial ones of OF_IMU too; or, but for AID_CHANNELS, "extra.STREAM.COLUMN".
+        Where a recording does not hold it, it adds nothing
     form : of RADIO only: "common", the same f(covariate) on every d_ab; "arrival", f of each anchor's own
         covariate, as d_ab = f_b - f_a; "anchor", the same with a function for each anchor, coefficients "3.c0", ...;
         of "tdoa" alone "pair": f on d_ab and -f on d_ba, coefficients "0-1.c0", ...; "direction": f on d_ab alone

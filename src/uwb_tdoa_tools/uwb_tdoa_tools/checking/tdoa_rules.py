@@ -166,8 +166,8 @@ def swapped(recording: OrderedRecording) -> Iterator[Trial]:
 
 
 def _far_off(recording: OrderedRecording) -> list[int]:
-    """Ids of the anchors whose TDOAs are far from what the filter expects, in comparison with those of most anchors: what is called by the id
-    of another anchor of a hall is."""
+    """Ids of the anchors whose TDOAs are far from what the filter expects, in comparison with those of most anchors: what is called by
+    the id of another anchor of a hall is."""
     (a, b), tdoa, positions = recording.rows(), recording.tdoa, recording.anchors.positions
     off = np.abs(innovations(new_state(positions), tdoa.t, a, b, tdoa.d, positions))
     rows = np.unique(np.concatenate([a, b])[np.tile(np.isfinite(off), 2)])

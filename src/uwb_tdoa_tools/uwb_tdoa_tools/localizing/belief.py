@@ -92,8 +92,8 @@ def _counted(figures: Mapping[str, Any]) -> str:
 
 
 def lost_spans(heard: np.ndarray, odometry: Odometry) -> list[tuple[float, float]]:
-    """[(begin, end)] s, between the first estimate and the last that was heard, of stamps (n,) s, in which there is no estimate for GAP, or one whose deviation is
-    more than LOST; spans that are less than GAP apart are one."""
+    """[(begin, end)] s, between the first estimate and the last that was heard, of stamps (n,) s, in which there is no
+    estimate for GAP, or one whose deviation is more than LOST; spans that are less than GAP apart are one."""
     t, std = odometry.t, np.sqrt(np.einsum("nii->n", odometry.covariance[:, :3, :3]))
     ends = np.append(t[1:], max(t[-1], heard.max(initial=-math.inf)))
     wide = (std > LOST) | (ends - t > GAP)

@@ -118,8 +118,8 @@ def floor_multipath(
 ) -> np.ndarray:
     """Delay of the signals of anchors by reflection near the floor, (k, n) m, never negative.
 
-    t : (n,) s in 0 ... duration; height : (n,) m of the tag above the floor; anchor : (k, n) rows of k of n_anchors at each t. Own model: the positive part of a Gaussian
-    process with exponential correlation, one per anchor, fading out linearly with height.
+    t : (n,) s in 0 ... duration; height : (n,) m of the tag above the floor; anchor : (k, n) rows of k of n_anchors at each t.
+    Own model: the positive part of a Gaussian process with exponential correlation, one per anchor, fading out linearly with height.
     """
     from scipy.signal import lfilter  # takes a second to import
 

@@ -127,7 +127,8 @@ class Table:
         """What `columns` hold of parameters of an Effect: iterable."""
         made = ((row, part.columns(effect, keys)) for _, channel, row, part in self.parts if channel in effect.channels)
         if self.sparse:
-            return _joined([(row, csc_array(np.nan_to_num(values)) if isinstance(values, np.ndarray) else values) for row, values in made], len(keys))
+            parts = [(row, csc_array(np.nan_to_num(values)) if isinstance(values, np.ndarray) else values) for row, values in made]
+            return _joined(parts, len(keys))
         x = np.zeros((len(self.y), len(keys)), order="F")
         for row, values in made:
             x[row : row + len(values)] = np.nan_to_num(values)
