@@ -40,7 +40,8 @@ WELL = 0.4  # of the loss; healthy 0.31 at most
 BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # of the loss: what systematic errors of 0.1 m leave unexplained
 GAIN = 0.08  # of the loss by moving all anchors; healthy 0.071 at most, with 0.3 m of delay of one of them, too
 ALONE = 0.85  # share of the gain that one anchor explains
-FEWEST = 10  # windows in which the tag was located
+FEWEST = 10  # windows in which the tag was located; TDOAs of an anchor that may be called by the id of another
+APART = 1.0  # m, by which TDOAs of such an anchor are off at least: anchors of a hall are farther from each other
 CONTRARY, FAR = 0.7, 0.5  # share of a pair's TDOAs that fit the other sign, of those longer than that, m
 MOST_PAIRS = 4  # that may be wrong by themselves
 MIXED_UP = "the ids of anchors are mixed up"  # of more than two
@@ -140,8 +141,10 @@ def swapped(recording: OrderedRecording) -> Iterator[Trial]:
     table: dict[int, int] = {}
     trial, brief = recording, recording.part(SHORT)
     ids = np.intersect1d(recording.anchors.ids, np.r_[recording.tdoa.a, recording.tdoa.b]).tolist()
-    doubtful = ids if len(recording.anchors) <= MANY else _far_off(brief)
-    for _ in range(len(ids) - 1 if doubtful else 0):
+    for _ in range(len(ids) - 1):
+        doubtful = ids if len(recording.anchors) <= MANY else _far_off(brief)
+        if not doubtful:
+            break
         base = brief.unexplained()
         ratios = []
         for one, two in ((one, two) for one, two in combinations(ids, 2) if one in doubtful or two in doubtful):
@@ -170,9 +173,11 @@ def _far_off(recording: OrderedRecording) -> list[int]:
     the id of another anchor of a hall is."""
     (a, b), tdoa, positions = recording.rows(), recording.tdoa, recording.anchors.positions
     off = np.abs(innovations(new_state(positions), tdoa.t, a, b, tdoa.d, positions))
-    rows = np.unique(np.concatenate([a, b])[np.tile(np.isfinite(off), 2)])
-    each = np.array([np.nanmedian(off[(a == row) | (b == row)]) for row in rows.tolist()])
-    return recording.anchors.ids[rows[each > OFF * np.median(each)]].tolist() if len(rows) else []
+    rows = np.unique(np.concatenate([a, b])[np.tile(np.isfinite(off), 2)])  # of known anchors
+    mine = [off[((a == row) | (b == row)) & np.isfinite(off)] for row in rows.tolist()]
+    each = np.array([np.median(some) if len(some) >= FEWEST else 0.0 for some in mine])
+    limit = max(OFF * np.median(each), APART) if len(each) else 0.0
+    return recording.anchors.ids[rows[each > limit]].tolist()
 
 
 def contrary(recording: OrderedRecording) -> Iterator[Trial]:

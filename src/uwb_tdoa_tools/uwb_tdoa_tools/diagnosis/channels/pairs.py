@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from .figures import FEWEST, figures, rows_by_value
 
@@ -50,17 +51,21 @@ def _crossed(t: np.ndarray, r: np.ndarray, label: np.ndarray, anchors: np.ndarra
     often, times = np.unique(together, return_counts=True)
     rows = np.isin(label, often[times > FEWEST])  # nothing is told of the others
     r, cell = r[rows], cell[rows]
+    if not len(r):
+        return []
     labels, place = np.unique(label[rows], return_inverse=True)
-    shape = (cell.max(initial=-1) + 1, len(labels))
+    shape = (cell.max() + 1, len(labels))
     at = cell * len(labels) + place
     count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
     mean = np.bincount(at, r, shape[0] * shape[1]).reshape(shape) / np.maximum(count, 1)
+    heard = csr_array(count > 0, dtype=float)
+    together = (heard.T @ heard).tocoo()  # half seconds in which two pairs were heard
+    often = np.flatnonzero((together.data > FEWEST) & (together.row > together.col))
     out: list[dict[str, Any]] = []
-    for i in range(len(labels)):
-        for k in range(i):
-            both = (count[:, i] > 0) & (count[:, k] > 0)
-            if both.sum() > FEWEST and mean[both, i].std() > 0.0 and mean[both, k].std() > 0.0:
-                rho = float(np.corrcoef(mean[both, i], mean[both, k])[0, 1])
-                names = [_name(x, anchors) for x in (labels[k], labels[i])]
-                out.append({"pairs": names, "correlation": round(rho, 3)})
+    for i, k in sorted(zip(together.row[often].tolist(), together.col[often].tolist())):
+        both = (count[:, i] > 0) & (count[:, k] > 0)
+        if mean[both, i].std() > 0.0 and mean[both, k].std() > 0.0:
+            rho = float(np.corrcoef(mean[both, i], mean[both, k])[0, 1])
+            names = [_name(x, anchors) for x in (labels[k], labels[i])]
+            out.append({"pairs": names, "correlation": round(rho, 3)})
     return sorted(out, key=lambda item: -abs(item["correlation"]))[:STRONGEST]
