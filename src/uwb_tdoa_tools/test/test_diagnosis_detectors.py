@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.diagnosis.attribution import attribute, near_floor, on_floor
 from uwb_tdoa_tools.diagnosis.refinement import effects_of
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
@@ -37,6 +40,19 @@ def test_what_is_there_is_detected_with_its_size(clean, name):
 @pytest.mark.parametrize("name", OF_NOISE)
 def test_nothing_is_detected_in_a_clean_flight(clean, name):
     assert DETECTORS[name].detect(seen(clean)) is None
+
+
+def test_pairs_among_more_than_a_thousand_anchors_are_called_by_their_ids(clean):
+    effect, anchors = effect_of("noise_level", True, 3), clean.anchors
+    far = np.column_stack([1000.0 + np.arange(1100), np.zeros((1100, 2))])
+    among = Anchors.from_positions(np.concatenate([far, anchors.positions]), np.concatenate([5000 + np.arange(1100), anchors.ids]))
+    noisy = effect.inject(replace(clean, anchors=among), np.random.default_rng(1))
+    assert set(DETECTORS["noise_level"].detect(seen(noisy)).effect.values) == set(effect.values)
+    (part,) = (one["tdoa"] for one in seen(noisy))
+    told = CHANNELS["tdoa"].health([part])
+    heard = {f"{a}-{b}" for a, b in zip(noisy.tdoa.a.tolist(), noisy.tdoa.b.tolist())}
+    assert {row["pair"] for row in told["pairs"]} <= heard
+    assert {pair for row in told["cross_correlation"] for pair in row["pairs"]} <= heard
 
 
 def searched(*flights):
