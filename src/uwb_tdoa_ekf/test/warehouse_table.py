@@ -108,7 +108,8 @@ def say_walks(name, where, seeds, config):
         sure.append(float(np.sum((found["off"] > WRONG) & (deviations > CERTAIN)) * np.median(np.diff(found["odometry"].t))))
         wrong.append(max(gaps)), nees.append(found["nees"])
         if sure[-1] or wrong[-1] > AGAIN:
-            print(f"{name}, seed {seed}: wrong and certain for {sure[-1]:.2f} s, wrong after silences for {', '.join(f'{gap:.2f}' for gap in gaps)} s", flush=True)
+            after = ", ".join(f"{gap:.2f}" for gap in gaps)
+            print(f"{name}, seed {seed}: wrong and certain for {sure[-1]:.2f} s, wrong after silences for {after} s", flush=True)
     print(
         f"{name}, {seeds} seeds: NEES {np.mean(nees):.2f}, at most {max(nees):.2f}; largest error {max(worst):.1f} deviations; wrong and certain in "
         f"{np.count_nonzero(sure)}; wrong after silences for {max(wrong):.2f} s at most",

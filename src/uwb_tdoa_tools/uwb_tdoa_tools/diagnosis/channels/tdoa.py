@@ -243,7 +243,7 @@ class Tdoa(Channel[TdoaResidual]):
 
 
 def _of_single_anchors(effect: Effect) -> bool:
-    """Whether each parameter of an Effect acts on the TDOAs of the anchors that its name begins with alone, whatever the other TDOAs are."""
+    """Whether each parameter of an Effect acts on TDOAs of the anchors that its name begins with alone, whatever the others are."""
     if isinstance(effect, SmoothTerm):
         return effect.form in ("anchor", *OF_LINKS) and effect.covariate in OF_EACH
     return effect.name in OF_ANCHORS
