@@ -9,6 +9,7 @@ from scipy.optimize import nnls
 
 from uwb_tdoa_bias.effects import EFFECTS
 
+from ...checking.known_path import MANY
 from ..regression.terms import Candidate, Term
 from .base import Detector
 
@@ -47,14 +48,15 @@ class FloorMultipathDetector(Detector):
             return []  # it was not there, or nobody knows where it was
         ids = parts[0].samples.anchors.ids.tolist()
         mine = {key for candidate in chosen if candidate.name == self.effect.name for key in candidate.terms[0].keys}
-        new = [k for k, i in enumerate(ids) if f"{i}.delay" not in mine]
+        heard = np.unique(parts[0].arrivals(table.series[rows][low])) if len(ids) > MANY else np.arange(len(ids))
+        new = [k for k in heard.tolist() if f"{ids[k]}.delay" not in mine]
         if not new:
             return []
         lowest = place[low[place[low, 2] < max(HEIGHTS[0], 2.0 * place[low, 2].min())], :2]
         middle = np.median(lowest, axis=0)
         one_place = np.hypot(*(lowest - middle).T).max() < ONE_PLACE
         where = dict(zip("xy", middle.tolist())) if one_place else {}  # seen at several places, it may be like that at others
-        columns = [np.concatenate([_below(height, part)[:, new] for part in parts])[low] for height in HEIGHTS]
+        columns = [np.concatenate([_below(height, part, new) for part in parts])[low] for height in HEIGHTS]
         trials = _Trials(np.stack(columns), model.residual[rows][low], table.count[rows][low])
         delays, at = trials.best()
         late = delays > (self.effect.negligible if mine else max(LEAST, GOOD_PART * delays.max()))
@@ -68,11 +70,10 @@ class FloorMultipathDetector(Detector):
         return [Candidate((term,), 2.0 * np.log(len(HEIGHTS)) * len(some))]
 
 
-def _below(height: float, part: TdoaResidual) -> np.ndarray:
-    """What a delay of each anchor adds to the rows of a TdoaResidual if it is late below a height, m, and never above: (n, anchors). A row
+def _below(height: float, part: TdoaResidual, anchors: Sequence[int]) -> np.ndarray:
+    """What a delay of each of some anchors, by their rows, adds to the rows of a TdoaResidual if it is late below a height, m, and never above: (n, anchors). A row
     of which nobody knows whether it is late would fit neither."""
     samples, low = part.samples, part.samples.p[:, 2] < height
-    anchors = range(len(samples.anchors))
     return np.stack([part.cells.mean(low * (1.0 * (samples.b == k) - (samples.a == k))) for k in anchors], axis=1)
 
 
