@@ -1,3 +1,5 @@
+"""Paths of any kind: where they lead, and how fast."""
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,3 +1,5 @@
+"""Flights in sines, to train on."""
+
 import numpy as np
 import pytest
 

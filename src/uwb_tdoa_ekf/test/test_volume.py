@@ -17,7 +17,7 @@ def volume(planar=False):
 
 @pytest.mark.parametrize(("planar", "claimed", "efficiency"), [(False, "0.400 m", "0.25"), (True, "0.200 m", "1")])
 def test_the_covariance_is_compared_with_the_bound(planar, claimed, efficiency):
-    trouble, values = VolumeCheck(volume(planar)).check(ANCHORS, np.array([0.5, 0.5, 0.5]), COVARIANCE)
+    trouble, values = VolumeCheck(volume(planar)).trouble_at(ANCHORS, np.array([0.5, 0.5, 0.5]), COVARIANCE)
     assert trouble is None and values == {
         "flyable": "yes", "bound of one round": "0.200 m", "claimed by the filter": claimed, "efficiency": efficiency,
     }  # fmt: skip
@@ -25,15 +25,15 @@ def test_the_covariance_is_compared_with_the_bound(planar, claimed, efficiency):
 
 @pytest.mark.parametrize("p", [[1.5, 0.5, 0.5], [0.5, 0.5, 9.0], [np.nan, 0.5, 0.5]])
 def test_outside_is_told(p):
-    trouble, values = VolumeCheck(volume()).check(ANCHORS, np.array(p), COVARIANCE)
+    trouble, values = VolumeCheck(volume()).trouble_at(ANCHORS, np.array(p), COVARIANCE)
     assert "outside of the flyable volume" in trouble and values == {"flyable": "no"}
 
 
 def test_a_volume_of_other_anchors_is_told():
     moved = Anchors.from_positions(ANCHORS.positions + 0.5)
-    trouble, values = VolumeCheck(volume()).check(moved, np.array([0.5, 0.5, 0.5]), COVARIANCE)
+    trouble, values = VolumeCheck(volume()).trouble_at(moved, np.array([0.5, 0.5, 0.5]), COVARIANCE)
     assert "other anchors" in trouble and values == {"flyable": "unknown"}
 
 
 def test_without_a_volume_nothing_is_said():
-    assert VolumeCheck().check(ANCHORS, np.zeros(3), COVARIANCE) == (None, {})
+    assert VolumeCheck().trouble_at(ANCHORS, np.zeros(3), COVARIANCE) == (None, {})

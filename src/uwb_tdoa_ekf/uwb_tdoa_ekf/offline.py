@@ -140,4 +140,3 @@ def _batches(
         end = min(int(np.searchsorted(stamps, stamps[first] + lag)), first + longest) if len(known) else 1
         yield known[first:end], math.nextafter(stamps[end], -math.inf) if end < len(known) else math.inf
         first = end
-

@@ -15,7 +15,7 @@ SAYING = {
     "_silence",
     "_swap",
     "_axis_alarms",
-    "judge",
+    "trouble_at",
     "lost",
     "side_unknown",
 }

@@ -125,16 +125,20 @@ def test_outliers_come_in_three_kinds():
 
 def test_multipath_is_late_near_the_floor_only_and_correlated_in_time():
     t = np.arange(0.0, 500.0, 0.02)
-    late = floor_multipath(t, np.full(len(t), 0.03), 500.0, 6, np.random.default_rng(3))
+
+    def late_at(height):
+        each = np.repeat(np.arange(6)[:, None], len(t), axis=1)
+        return floor_multipath(t, np.full(len(t), height), each, 6, np.random.default_rng(3), 500.0).T
+
+    late = late_at(0.03)
     assert late.min() == 0.0 and 0.2 < late.max() < 2.0
     assert 0.3 < np.mean(late > 0.0) < 0.7
     centred = late - late.mean(axis=0)
     correlation = [np.mean(centred[k:] * centred[: len(t) - k]) / np.mean(centred**2) for k in (1, 25, 250)]
     assert correlation[0] > 0.9 and 0.1 < correlation[1] < 0.6 and abs(correlation[2]) < 0.1
     assert np.abs(np.corrcoef(late.T) - np.eye(6)).max() < 0.2
-    lifted = floor_multipath(t, np.full(len(t), 0.25), 500.0, 6, np.random.default_rng(3))
-    np.testing.assert_allclose(lifted, 0.5 * late, atol=1e-12)
-    np.testing.assert_array_equal(floor_multipath(t, np.full(len(t), 0.5), 500.0, 6, np.random.default_rng(3)), 0.0)
+    np.testing.assert_allclose(late_at(0.25), 0.5 * late, atol=1e-12)
+    np.testing.assert_array_equal(late_at(0.5), 0.0)
 
 
 def test_in_flight_there_is_no_multipath():

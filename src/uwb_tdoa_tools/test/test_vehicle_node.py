@@ -39,7 +39,7 @@ def test_requests_are_those_that_users_of_crazyswarm2_know(name):
 
 @pytest.mark.parametrize(
     "given, why",
-    [("aids:=[sonar]", "aids: 'sonar' is not one of height, pressure, velocity."), ("world:=moon", "world: 'moon' is not one of hall,")],
+    [("aids:=[sonar]", "aids: 'sonar' is not one of height, pressure, velocity, range."), ("world:=moon", "world: 'moon' is not one of hall,")],
 )
 def test_what_it_does_not_know_is_refused(given, why):
     rclpy.init(args=["--ros-args", "-p", given])

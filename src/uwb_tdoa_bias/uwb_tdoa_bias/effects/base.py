@@ -27,7 +27,6 @@ __all__ = ["ArrivalEffect", "Effect", "Samples"]
 Made = TypeVar("Made")
 
 
-
 def once_per_anchors(method: Callable[[Any, Anchors], Made]) -> Callable[[Any, Anchors], Made]:
     """A method(self, anchors) that is computed once as long as it is asked for the same Anchors object."""
     name = f"_{method.__name__}_of"

@@ -94,7 +94,7 @@ class Health:
             status = WARN, estimator.side_unknown
         at_position: dict[str, str] = {}
         if estimator is not None and running and self.last_position is not None:
-            trouble, at_position = self._volume.check(estimator.anchors, *self.last_position)
+            trouble, at_position = self._volume.trouble_at(estimator.anchors, *self.last_position)
             if trouble and status[0] == OK:
                 status = WARN, trouble
         if running and self.behind is not None and BEHIND[0] < self.behind < BEHIND[1] and status[0] == OK:

@@ -17,7 +17,7 @@ class VolumeCheck:
     def __init__(self, volume: FlyableVolume | None = None) -> None:
         self._volume = volume
 
-    def check(
+    def trouble_at(
         self, anchors: Anchors, position: np.ndarray, covariance: np.ndarray
     ) -> tuple[str | None, dict[str, str]]:
         """(what is wrong, or None; {key: text}). anchors : Anchors; position (3,) m; covariance (3, 3) m^2 of it.

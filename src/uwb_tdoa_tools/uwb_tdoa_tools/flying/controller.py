@@ -85,8 +85,8 @@ def outer(
 ) -> float:  # fmt: skip
     """See Controller.fly. estimate : (p, v, q); known : (weight, N, gains). integral (3,) and rates (3,) are written to. Returns the
     thrust, N."""
-    p, v, q = estimate
-    weight, gains = known
+    p, v, q = estimate[0], estimate[1], estimate[2]
+    weight, gains = known[0], known[1]
     a, error = np.empty(3), np.empty(3)
     far = 0.0
     for k in range(3):

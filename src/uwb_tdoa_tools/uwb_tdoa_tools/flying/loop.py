@@ -36,10 +36,10 @@ def interval(
     felt, written to : truth (n, 17), the states at the samples; samples (n, 6), rates and specific force: means since the sample
     before; contact (n,): the number of feet on the ground.
     """
-    thrust, rates = wanted
-    gains, known = controller
-    wind, errors, shaking = disturbances
-    truth, samples, contact = felt
+    thrust, rates = wanted[0], wanted[1]
+    gains, known = controller[0], controller[1]
+    wind, errors, shaking = disturbances[0], disturbances[1], disturbances[2]
+    truth, samples, contact = felt[0], felt[1], felt[2]
     dt = STEP * STEPS
     speeds, scratch, force, earlier = np.empty(4), np.empty((2, STATE)), np.empty(3), np.empty(STATE)
     for i in range(len(truth)):

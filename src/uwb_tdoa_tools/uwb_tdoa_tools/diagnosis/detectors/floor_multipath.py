@@ -71,8 +71,8 @@ class FloorMultipathDetector(Detector):
 
 
 def _below(height: float, part: TdoaResidual, anchors: Sequence[int]) -> np.ndarray:
-    """What a delay of each of some anchors, by their rows, adds to the rows of a TdoaResidual if it is late below a height, m, and never above: (n, anchors). A row
-    of which nobody knows whether it is late would fit neither."""
+    """What a delay of each of some anchors, by their rows, adds to the rows of a TdoaResidual if it is late below a height, m, and never
+    above: (n, anchors). A row of which nobody knows whether it is late would fit neither."""
     samples, low = part.samples, part.samples.p[:, 2] < height
     return np.stack([part.cells.mean(low * (1.0 * (samples.b == k) - (samples.a == k))) for k in anchors], axis=1)
 
