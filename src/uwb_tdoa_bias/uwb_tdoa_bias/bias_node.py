@@ -108,7 +108,7 @@ class BiasNode(ros.StreamNode):
         if member is None:
             say_unused([self], files_of(arguments))
             self.turns = RoundRobin([self.streams])
-        self.get_logger().info(f"ready; correcting with: {self._model[NETWORK]}")
+        self.ready = f"ready; correcting with: {self._model[NETWORK]}"
 
     @property
     def holds(self) -> int:

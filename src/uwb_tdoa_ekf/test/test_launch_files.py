@@ -184,7 +184,8 @@ def test_a_node_that_crashes_is_started_again_each_time_later(make_rig, launch):
         launched.wait(f"ekf_node has ended with exit code -9: it is started again in {crashes} s")
         launched.wait(READY, 1 + crashes)
     assert values_of(rig, "/ekf_node", "use_sim_time") == [False]  # it lives
-    assert launched.interrupt() == 0 and launched.said.count("has died") == 2 and left_behind(launched) == []
+    assert launched.interrupt() == 0 and launched.said.count("has died") == 2, launched.said
+    assert left_behind(launched) == []
 
 
 @pytest.mark.parametrize("on_exit", ["shutdown", "stay"])

@@ -71,7 +71,7 @@ class DebiasNode(ros.StreamNode):
         )
         say_unused([self], files_of(arguments))
         self._diagnostics = ros.Diagnostics(self, self._report)
-        self.get_logger().info(f"ready; {len(self._map.at)} markers, {self._map.interpolator}")
+        self.ready = f"ready; {len(self._map.at)} markers, {self._map.interpolator}"
 
     def _on_odometry(self, message: Odometry) -> None:
         self._counts["received"] += 1

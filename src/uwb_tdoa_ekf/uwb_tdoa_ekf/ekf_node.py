@@ -125,7 +125,7 @@ class EkfNode(ros.StreamNode):
         if member is None:
             say_unused([self], files_of(arguments))
             self.turns = RoundRobin([self.streams])
-        self.get_logger().info("ready")
+        self.ready = "ready"
 
     def _subscribe(self, handed: Collection[str]) -> Streams:
         """Streams of everything that the filter takes. handed : topics that a node of this process hands over."""

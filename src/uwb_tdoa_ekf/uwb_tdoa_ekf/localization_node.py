@@ -63,7 +63,7 @@ class LocalizationNode(ros.StreamNode):
         say_unused([self, *self.members], files_of(arguments))
         self.turns = RoundRobin(self._tags)
         self._diagnostics = ros.Diagnostics(self, self._report)
-        self.get_logger().info(f"ready; tags: {', '.join(tags) or 'one'}")
+        self.ready = f"ready; tags: {', '.join(tags) or 'one'}"
 
     def _report(self) -> Report:
         troubles = [tag.trouble for tag in self._tags if tag.trouble]
@@ -124,6 +124,8 @@ class Tag:
                 return False
             self.begin()
             self._replace([])
+            for node in self.members:
+                node.say_ready()
             return False
         try:
             return self._pair.take()

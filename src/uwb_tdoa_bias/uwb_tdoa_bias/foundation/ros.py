@@ -72,11 +72,12 @@ def publish_stream(node: Node, kind: type, topic: str) -> Publisher:
 
 class StreamNode(ParameterNode):
     """A node whose streams and /clock are not served by an executor (see Spinner). members : nodes that live and end with it;
-    spinner : the Spinner that serves it, once there is one; on_failure(error) : is called with what a callback raises, instead of
-    raising it."""
+    spinner : the Spinner that serves it, once there is one; ready : what it says on the log when it begins to be served;
+    on_failure(error) : is called with what a callback raises, instead of raising it."""
 
     members: Sequence[StreamNode] = ()
     spinner: Spinner | None = None
+    ready: str = ""
     on_failure: Callable[[Exception], None] | None = None
 
     def create_subscription(
@@ -91,6 +92,11 @@ class StreamNode(ParameterNode):
     ) -> Timer:
         """Of rclpy."""
         return super().create_timer(timer_period_sec, self._contained(callback), **options)
+
+    def say_ready(self) -> None:
+        """Say on the log that it is served from now on, and ends in good order."""
+        if self.ready:
+            self.get_logger().info(self.ready)
 
     def _contained(self, callback: Callable[..., None]) -> Callable[..., None]:
         @wraps(callback)
@@ -453,6 +459,8 @@ def run(node_class: type[StreamNode], description: str | None, argv: Sequence[st
         interruptible = False
         if stop.done():
             raise KeyboardInterrupt
+        for each in reversed(nodes):  # from here on a signal ends it in good order
+            each.say_ready()
         spinner.spin(stop)
     except SystemExit as ended:  # argparse has said it already
         return ended.code or 0  # type: ignore[return-value]  # argparse ends with a number
