@@ -16,7 +16,7 @@ from uwb_tdoa_tools.benchmark.figures import Figure, as_json, table  # noqa: E40
 from uwb_tdoa_tools.benchmark.flights import TDOA_RATE, make_flight  # noqa: E402
 from uwb_tdoa_tools.commands import bench  # noqa: E402
 
-CROWD = 4.0  # processes that want each core, from which on nothing can be asked of what is played in real time
+OTHERS = 0.2  # of the CPU time, from which on nothing can be asked of what is played in real time
 KEYS = {"section", "name", "unit", "median", "low", "high", "count", "target", "met"}
 
 
@@ -143,7 +143,7 @@ def test_a_quick_run_of_the_real_nodes(tmp_path, capsys):
     assert None not in value.values()
     printed = capsys.readouterr().out
     assert all(name in printed for name in value)
-    if os.getloadavg()[0] < CROWD * os.cpu_count():  # else they may not get the share of a core that 1400 messages a second take
+    if told["machine"]["others"] < OTHERS:  # else they may not get the share of a core that 1400 messages a second take
         assert all(value[f"lost, {what}"] == 0 for what in ("TDOAs", "IMU samples")), value
         assert value["latency p50, TDOA published to odometry arrived"] < 1000.0
     # What must hold however slow the machine is
