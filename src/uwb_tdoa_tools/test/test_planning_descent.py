@@ -81,7 +81,7 @@ def test_a_descent_goes_down_and_stays_in_bounds(objective):
     found = descend(goal, layout, POINTS, x, 15)
     low, high = np.transpose(layout.bounds)
     assert (found >= low).all() and (found <= high).all()
-    before, after = (goal.judge(layout.anchors(y))[objective] for y in (x, found))
+    before, after = (goal.figures(layout.anchors(y))[objective] for y in (x, found))
     assert after < 0.9 * before
 
 
@@ -115,7 +115,7 @@ def test_a_descent_leaves_a_start_at_which_the_goal_cannot_be_told(objective):
 def test_a_descent_does_not_end_where_the_goal_cannot_be_told(objective, monkeypatch):
     """Told only within 0.02 of the start, which the first step leaves."""
     goal, layout, x = case(objective=objective, criterion="round")
-    before = goal.judge(layout.anchors(x))[objective]
+    before = goal.figures(layout.anchors(x))[objective]
 
     def told_near(goal, layout, at, points):
         if np.abs(at - x).max() > 0.02:
@@ -125,7 +125,7 @@ def test_a_descent_does_not_end_where_the_goal_cannot_be_told(objective, monkeyp
     monkeypatch.setattr(descent, "failing_and_slopes", told_near)
     found = descend(goal, layout, POINTS, x, 15)
     assert 1e-4 < np.abs(found - x).max() <= 0.02
-    assert goal.judge(layout.anchors(found))[objective] < before
+    assert goal.figures(layout.anchors(found))[objective] < before
 
 
 def test_a_start_that_no_shaking_helps_is_given_back():

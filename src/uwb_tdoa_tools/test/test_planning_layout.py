@@ -27,7 +27,7 @@ def bad_anchors():
 def test_a_layout_gets_better(objective):
     aim = goal(Installation(bad_anchors()), "round", objective)
     better = optimise(aim, Places.walls(*ROOM), 5, starts=2)
-    before, after = aim.judge(bad_anchors()), aim.judge(better)
+    before, after = aim.figures(bad_anchors()), aim.figures(better)
     assert after[objective] < 0.7 * before[objective] and after["failing"] <= before["failing"]
     p = better.positions
     assert (np.isin(p[:, 0], (0.0, 6.0)) | np.isin(p[:, 1], (0.0, 5.0))).all()
@@ -38,7 +38,7 @@ def test_failure_is_avoided_where_the_bound_would_not_mind():
     """With the same bound, the layout that mirrors fewer positions has the better score."""
     aim = goal(Installation(bad_anchors(), FixedNoise(0.05)))
     for seed in range(40):
-        a, b = (aim.judge(constellation(f"random-{s}-5")) for s in (seed, seed + 100))
+        a, b = (aim.figures(constellation(f"random-{s}-5")) for s in (seed, seed + 100))
         if a["failing"] != b["failing"]:
             break
     assert a["failing"] > 0 or b["failing"] > 0
@@ -84,6 +84,6 @@ def test_the_surveyed_layout_is_beaten_by_a_fifth(where, shared_data):
     aim = Goal(lattice(*flown, step), Installation(survey), criterion="round")
     better = optimise(aim, Places.walls(lower, upper, depth=depth), 8, starts=8)
     fine = Goal(lattice(*flown, 0.6 * step), Installation(survey), criterion="round")
-    before, after = fine.judge(survey), fine.judge(better)
+    before, after = fine.figures(survey), fine.figures(better)
     assert after["worst"] < 0.8 * before["worst"] and after["mean"] < before["mean"]
     assert after["failing"] <= before["failing"] + 0.02

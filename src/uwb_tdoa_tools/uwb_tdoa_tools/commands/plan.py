@@ -121,7 +121,7 @@ def _plan(args: Namespace) -> None:
         report.say_check(figures["check"])
     if recordings:
         flown = parallel.over(run.Fly(reading, tuple(args.aids)), recordings, args.jobs, args.dask)
-        figures["flights"] = run.judge_flights(flown, installation, room, args.step or 0.4, args.out)
+        figures["flights"] = run.evaluate_flights(flown, installation, room, args.step or 0.4, args.out)
         report.say_flights(figures["flights"])
     if aim:
         figures["improve"] = run.improve(found, aim, args.improve, args.starts, args.flyable, args.out)

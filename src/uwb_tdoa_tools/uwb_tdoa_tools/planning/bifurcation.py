@@ -116,6 +116,13 @@ class Subsets:
         other = squared / ((np.einsum("mk,mk->m", q, q) - 1.0) * np.maximum(r, 1e-12))
         return row, subset, np.hstack([reference[:, :k] + p + q * other[:, None], points[row, k:]])
 
+    def unique(self, points: np.ndarray, installation: Installation, criterion: str, ambiguous: np.ndarray | None = None) -> np.ndarray:
+        """(n,) bool: whether a tag at points (n, 3) m has one position, by a criterion of maps.FLYABLE. ambiguous : what `ambiguous` gives
+        there, if it is known."""
+        if criterion == "pairings":
+            return (self.ambiguous(points) if ambiguous is None else ambiguous) == 0.0
+        return self.separation(points, installation) > CLEAR
+
     def separation(self, points: np.ndarray, installation: Installation) -> np.ndarray:
         """How clearly a whole round tells each point from its nearest mirrored position: (n,) standard deviations.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .bifurcation import CLEAR, Subsets
+from .bifurcation import Subsets
 from .pairing import PAIRINGS
 from .precision import bound, information, position_error
 
@@ -46,21 +46,17 @@ class Goal:
         found = position_error(bound(information(self.points, self.installed(anchors), correction=False)))
         return np.minimum(found, UNUSABLE)
 
-    def judge(self, anchors: Anchors) -> dict[str, float]:
+    def figures(self, anchors: Anchors) -> dict[str, float]:
         """{"worst", "mean": m, bound over the points; "failing": share of the points that are not flyable}."""
         errors, installation = self.errors(anchors), self.installed(anchors)
-        subsets = Subsets(anchors, installation.unknowns)
-        if self.criterion == "pairings":
-            unique = subsets.ambiguous(self.points) == 0.0
-        else:
-            unique = subsets.separation(self.points, installation) > CLEAR
+        unique = Subsets(anchors, installation.unknowns).unique(self.points, installation, self.criterion)
         failing = 1.0 - np.mean(unique & installation.inside_hull(self.points))
         return {"worst": float(errors.max()), "mean": float(errors.mean()), "failing": float(failing)}
 
     def score(self, anchors: Anchors) -> float:
         """What is minimised: the objective, m, twice that where the tag fails at all points."""
         try:
-            found = self.judge(anchors)
+            found = self.figures(anchors)
         except InputError:
             return 2.0 * UNUSABLE
         return found[self.objective] * (1.0 + found["failing"])

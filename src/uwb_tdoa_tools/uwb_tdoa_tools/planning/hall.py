@@ -15,7 +15,7 @@ from .. import parallel
 from ..checking.sides import sides_of, to_copy
 from ..scoring.plots import plt
 from ..simulation.walls import heard_at
-from .bifurcation import CLEAR, Subsets
+from .bifurcation import Subsets
 from .layout import with_one
 from .maps import Chart
 from .precision import bound, dilution, information, position_error
@@ -88,7 +88,7 @@ class Hall:
             k = self.goal.installation.dimensions
             return np.full((n, k, k), np.inf), np.full(n, np.inf), np.zeros(n, bool), np.ones(n), np.zeros(n, bool)
         inside, ambiguous = above.find_simplex(points[:, :2]) >= 0, subsets.ambiguous(points)
-        unique = ambiguous == 0.0 if self.goal.criterion == "pairings" else subsets.separation(points, installation) > CLEAR
+        unique = subsets.unique(points, installation, self.goal.criterion, ambiguous)
         covariance = bound(information(points, installation))
         return covariance, np.linalg.norm(dilution(points, installation), axis=1), inside, ambiguous, inside & unique
 

@@ -10,7 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 
-from .bifurcation import CLEAR, Subsets
+from .bifurcation import Subsets
 from .precision import bound, dilution, information, position_error
 
 if TYPE_CHECKING:
@@ -124,5 +124,4 @@ def flyable(
     """hull, ambiguous, flyable of a Chart, (n,) each, at points (n, 3) m."""
     subsets = Subsets(installation.anchors, installation.unknowns)
     hull, ambiguous = installation.inside_hull(points), subsets.ambiguous(points)
-    unique = ambiguous == 0.0 if criterion == "pairings" else subsets.separation(points, installation) > CLEAR
-    return hull, ambiguous, hull & unique
+    return hull, ambiguous, hull & subsets.unique(points, installation, criterion, ambiguous)

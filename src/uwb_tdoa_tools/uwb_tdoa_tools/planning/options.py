@@ -30,11 +30,11 @@ SEARCHED = 300  # cells of the flown volume whose corners are looked at while be
 
 @dataclass(frozen=True)
 class Aim:
-    """What --improve asks for. goal : Goal to search with; judge : Goal at more points, to report; places : Places;
+    """What --improve asks for. goal : Goal to search with; reported : Goal at more points, to report; places : Places;
     count : how many anchors."""
 
     goal: Goal
-    judge: Goal
+    reported: Goal
     places: Places
     count: int
 

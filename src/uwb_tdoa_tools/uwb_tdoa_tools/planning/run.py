@@ -106,7 +106,7 @@ class Fly:
         return flight.name, accuracy.fly(flight, self.aids)
 
 
-def judge_flights(
+def evaluate_flights(
     flown: Iterable[tuple[str, accuracy.Samples]], installation: Installation, room: Room, step: float, out: Path
 ) -> list[dict[str, Any]]:
     """Rows of `accuracy.comparison`, one for each of what a Fly gave, and one for all. step : m, of the picture."""
@@ -173,7 +173,7 @@ def improve(before: Chart, aim: options.Aim, how: str, starts: int, criterion: s
         charts = [("before, ", installation, before), ("after, ", after, charted)]
     plots.plot_layouts(charts, out / "layout.png", candidates)
     judged = {
-        when: {"flyable_share": float(one.flyable.mean()), **aim.judge.judge(those)}
+        when: {"flyable_share": float(one.flyable.mean()), **aim.reported.figures(those)}
         for when, one, those in (("before", before, anchors), ("after", charted, better))
     }
-    return {"points": len(aim.judge.points), **judged, "placed": layout.placed(better, anchors)}
+    return {"points": len(aim.reported.points), **judged, "placed": layout.placed(better, anchors)}
