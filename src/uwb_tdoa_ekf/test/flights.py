@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
+from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Ranges, Velocity
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, structured
@@ -106,6 +106,14 @@ def with_aids(flight, seed=0, rate=25.0, height_std=0.01, pressure_std=0.05, dri
             t, attitude.inv().apply(v) + velocity_std * rng.standard_normal((n, 3)), np.full((n, 3), velocity_std)
         ),
     )
+
+
+def with_ranges(flight, seed=0, rate=200.0, std=0.02):
+    """The flight of `fly` with distances to its anchors, each in its turn; standard deviation in m, white."""
+    t = np.arange(flight.truth.t[0], flight.truth.t[-1], 1.0 / rate)
+    row, p = np.arange(len(t)) % len(flight.anchors), position_at(flight, t)
+    d = np.linalg.norm(p - flight.anchors.positions[row], axis=1) + std * np.random.default_rng(seed).standard_normal(len(t))
+    return replace(flight, range=Ranges(t, flight.anchors.ids[row], d, np.zeros(len(t))))
 
 
 def _inertial_error(rng, n, rate, noise, bias, walk):

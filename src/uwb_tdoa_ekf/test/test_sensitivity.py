@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from flights import fly, with_aids
+from flights import fly, with_aids, with_ranges
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, samples_at
+from uwb_tdoa_bias.effects.samples import RADIO
+from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.sensitivity import FORGOTTEN, record_innovations
 
@@ -88,3 +90,36 @@ def test_what_is_not_heard_any_more_is_forgotten():
     whole = found.by_bias(regressors)[:, 0]
     share = np.sqrt(np.mean(whole[t > 2.0 + FORGOTTEN] ** 2) / np.mean(whole[t < 2.0] ** 2))
     assert share < 0.05  # of an error of all TDOAs at the start, which the bias of the accelerometer takes up: 0.04; a fit weighs squares
+
+
+@pytest.mark.parametrize("streams", [("range",), ("tdoa", "range")])
+def test_derivatives_of_distances_beside_tdoas_are_those_of_two_runs(streams):
+    """An anchor that is late is late for both."""
+    flight, step, keys = with_ranges(fly(seed=3, duration=8.0, tdoa_std=0.02)), 1e-4, ["11", "14"]
+    flight = flight if "tdoa" in streams else replace(flight, tdoa=Tdoas(*(column[:0] for column in vars(flight.tdoa).values())))
+    found = record_innovations(flight, PLAIN, streams=streams)
+    assert np.all(np.diff(found.t) >= 0.0) and [len(found.places(name)) > 500 for name in streams] == [True] * len(streams)
+    regressors = np.zeros((len(found.t), len(keys)))
+    for name in streams:
+        places = found.places(name)
+        stream, a, b = RADIO[name].measured(flight)
+        rows = found.rows[places]
+        np.testing.assert_array_equal(stream.t[rows], found.t[places])
+        samples = RADIO[name](**vars(samples_at(stream.t[rows], a[rows], b[rows], flight.truth, flight.anchors)))
+        regressors[places] = AnchorDelay().regressors(samples, keys)
+    derivative, late = found.by_bias(regressors), found.t > SETTLED
+    for column, key in enumerate(keys):
+        ends = [record_innovations(AnchorDelay({key: s}).inject(flight), PLAIN, streams=streams) for s in (-step, step)]
+        assert all(np.array_equal(end.rows, found.rows) for end in ends)
+        numeric = (ends[1].value - ends[0].value) / (2.0 * step)
+        error = numeric[late] - derivative[late, column]
+        assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(numeric[late] ** 2))
+
+
+def test_what_is_recorded_of_tdoas_does_not_depend_on_what_else_is():
+    flight = with_ranges(fly(seed=6, duration=6.0))
+    alone, both = record_innovations(flight), record_innovations(flight, streams=("tdoa", "range"))
+    places = both.places("tdoa")
+    np.testing.assert_array_equal(alone.rows, both.rows[places])
+    np.testing.assert_array_equal(alone.value, both.value[places])
+    np.testing.assert_array_equal(alone.variance, both.variance[places])

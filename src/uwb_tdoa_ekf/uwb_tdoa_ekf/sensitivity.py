@@ -1,4 +1,4 @@
-"""What constant errors of the TDOAs would have done to the innovations of a run: the path integrated out.
+"""What constant errors of TDOAs, and of distances to anchors, would have done to the innovations of a run: the path integrated out.
 
 The derivative of the state by every parameter goes through the recorded transitions and gains as the state itself does
 (B. Friedland, Treatment of bias in recursive filtering, IEEE Trans. Automatic Control 14, 1969). A fit of innovations to
@@ -12,45 +12,55 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .core.config import FilterConfig
 from .core.history import RESET
+from .core.memory import RESIDUAL, joined, structured
 from .core.state import ERROR_STATES, MOVING_STATES
 from .core.verdicts import USED
 from .offline import Run, run_offline
+from .results import OF_ROW
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import ArrayLike
     from scipy.sparse import csr_array
-    from uwb_tdoa_bias.correction.corrector import Corrector
     from uwb_tdoa_bias.foundation.flight import Flight
 
-FORGOTTEN = 10.0  # s after which a parameter that no TDOA depends on any more has left the estimate
+TDOAS = "tdoa"  # the stream of TDOAs, beside those of the SENSORS
+FORGOTTEN = 10.0  # s after which a parameter that no measurement depends on any more has left the estimate
 
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """Those of one run.
+    """Those of one run, of some streams.
 
-    rows (n,) places in flight.tdoa of the TDOAs that were used, in the order of their stamps; value (n,) m; variance (n,)
-    m^2, prior and one measurement; run : Run; records, of : history of the run, and for each record its place in `rows`,
-    -1 for what is no TDOA.
+    streams : their names; stream (n,) int, which of them, and rows (n,) places in it of the measurements that were used, in the order of
+    their stamps t (n,) s; value (n,) m; variance (n,) m^2, prior and one measurement; run : Run; records, of : history of the run, and
+    for each record its place in `rows`, -1 for what is not of these streams.
     """
 
+    streams: tuple[str, ...]
+    stream: np.ndarray
     rows: np.ndarray
+    t: np.ndarray
     value: np.ndarray
     variance: np.ndarray
     run: Run
     records: list
     of: list
 
+    def places(self, stream: str) -> np.ndarray:
+        """(m,) places, among all, of those of one of the streams."""
+        return np.flatnonzero(self.stream == self.streams.index(stream))
+
     def by_bias(self, regressors: np.ndarray) -> np.ndarray:
         """Derivative of minus the innovations by parameters: (n, k).
 
-        regressors (n, k): derivative of the measured TDOAs by the parameters, of which the run knew nothing. A bias that
+        regressors (n, k): derivative of what was measured by the parameters, of which the run knew nothing. A bias that
         the position can follow leaves no trace.
         """
         return self.and_positions(regressors, ())[0]
@@ -67,13 +77,13 @@ class Innovations:
     def in_blocks(
         self, regressors: csr_array, block: np.ndarray, stamps: ArrayLike = (), positions: np.ndarray | None = None
     ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """What `by_bias` gives, a block of TDOAs at a time, at the cost of those parameters that matter there: yields (rows, a slice;
+        """What `by_bias` gives, a block of measurements at a time, at the cost of those parameters that matter there: yields (rows, a slice;
         columns (c,); derivative (rows, c)).
 
         regressors : sparse, in rows, (n, k); block (n,) int, rising: number of the block of each row. A parameter matters until FORGOTTEN s
-        after the last TDOA that depends on it. positions (m, 3, k) : filled with what `and_positions` gives at stamps (m,).
+        after the last measurement that depends on it. positions (m, 3, k) : filled with what `and_positions` gives at stamps (m,).
         """
-        stamps, t = np.asarray(stamps, dtype=float), self.run.residuals.t[self.rows]
+        stamps, t = np.asarray(stamps, dtype=float), self.t
         ends = np.append(np.flatnonzero(np.diff(block)) + 1, len(block))
         state, last = np.zeros((ERROR_STATES, regressors.shape[1])), np.full(regressors.shape[1], -np.inf)
         pieces, passed, first = _pieces(self.records, self.of, ends), 0, 0
@@ -97,7 +107,7 @@ class Innovations:
 def _pieces(
     records: Sequence[np.ndarray], of: Sequence[np.ndarray], ends: np.ndarray
 ) -> list[list[tuple[np.ndarray, np.ndarray]]]:
-    """[[(records, of)]] of each block of rows, which end before `ends` (b,): whatever comes before the first TDOA of the next block."""
+    """[[(records, of)]] of each block of rows, which end before `ends` (b,): whatever comes before the first row of the next block."""
     out: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in ends]
     now = 0
     for some, places in zip(records, of):
@@ -110,26 +120,34 @@ def _pieces(
 
 
 def record_innovations(
-    flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None
+    flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None, streams: Sequence[str] = (TDOAS,)
 ) -> Innovations:
-    """Run a Flight through bias correction and filter, without its pressure, and keep what `Innovations` need. Takes what
-    run_offline takes."""
+    """Run a Flight through bias correction and filter, without its pressure, and keep what `Innovations` of some streams need, TDOAS or
+    SENSORS that the flight has. Takes what run_offline takes."""
+    corrector = corrector or Corrector(flight.anchors)
     # Its offset is not among the states of the history.
     config = replace(config or FilterConfig(), use_pressure=False)  # type: ignore[call-arg]  # parameters of SENSORS are known at run time
     records: list[np.ndarray] = []
     run = run_offline(flight, config, corrector, records)
-    residuals = run.residuals
-    used = np.flatnonzero(residuals.verdict == USED)
-    rows = used[np.argsort(residuals.t[used], kind="stable")]
+    corrected = corrector.effects.correct_streams(flight)
+    of_tdoas = structured(RESIDUAL, *(getattr(run.residuals, name) for name in OF_ROW))
+    sources = [of_tdoas if name == TDOAS else run.aids[name] for name in streams]
+    outcomes = joined(RESIDUAL, sources)
+    stamps = np.concatenate([getattr(corrected, name).t for name in streams])
+    used = np.flatnonzero(outcomes["verdict"] == USED)
+    used = used[np.argsort(stamps[used], kind="stable")]
+    t, value = stamps[used], outcomes["innovation"][used]
     waiting: dict[tuple[float, float], list[int]] = {}
-    for place, row in enumerate(rows.tolist()):
-        waiting.setdefault((residuals.t[row], residuals.innovation[row]), []).append(place)
+    for place, key in enumerate(zip(t.tolist(), value.tolist())):
+        waiting.setdefault(key, []).append(place)
     of = []
     for some in records:
         keys = zip(some["t"].tolist(), some["innovation"].tolist())
         of.append(np.array([waiting[key].pop(0) if waiting.get(key) else -1 for key in keys], dtype=np.int64))
     records = [np.ascontiguousarray(some) for some in records]
-    return Innovations(rows, residuals.innovation[rows], residuals.variance[rows], run, records, of)
+    first = np.cumsum([0, *map(len, sources[:-1])])
+    stream = np.searchsorted(first, used, side="right") - 1
+    return Innovations(tuple(streams), stream, used - first[stream], t, value, outcomes["variance"][used], run, records, of)
 
 
 @compiled

@@ -219,3 +219,23 @@ def test_an_offset_that_cannot_be_is_one_sentence(files, offset, said, capsys):
     words = ["ranging.csv", "--columns", TDOA, "--survey", "survey.csv", "--out", "our.bag", "--time-offset", offset]
     assert main(words) == 2
     assert said in capsys.readouterr().err
+
+
+def test_ranges_need_no_tdoas(files, capsys):
+    (files / "twr.csv").write_text("t,tag,to,mm,sigma,px,py,pz\n0.5,9,1,2500,100,1,2,3\n0.6,9,5,,100,1,2,3\n0.7,9,0,750,50,1,2,3\n0.8,9,0,760,50,1,2,3\n0.9,9,1,760,50,1,2,3\n")
+    flight = read_columns(["twr.csv"], parse_columns("time=t,anchor=to,range=mm:mm,range_std=sigma:mm"), NAMED)
+    assert len(flight.tdoa) == 0 and flight.range.anchor.tolist() == [1, 0, 0, 1] and (flight.start, flight.end) == (0.5, 0.9)
+    np.testing.assert_allclose(flight.range.d, [2.5, 0.75, 0.76, 0.76])
+    np.testing.assert_allclose(flight.range.variance, [0.01, 0.0025, 0.0025, 0.0025])
+    assert "1 of 5 records left out" in flight.meta["remarks"][0]
+    words = ["twr.csv", "--columns", "time=t,anchor=to,range=mm:mm,pose_x=px,pose_y=py,pose_z=pz", "--survey", "survey.csv", "--out", "twr.bag"]
+    assert main(words) == 0 and "uwb/range: 4" in capsys.readouterr().out
+    back = read_flight("twr.bag", survey=None)
+    np.testing.assert_allclose(back.range.d, flight.range.d)
+    assert len(back.tdoa) == 0 and len(back.truth) == 5
+
+
+def test_tdoas_and_ranges_of_one_file(files):
+    (files / "both.csv").write_text("t,a,b,d,to,r\n0.1,0,1,0.5,,\n0.2,,,,5,2.5\n")
+    flight = read_columns(["both.csv"], parse_columns("time=t,anchor_a=a,anchor_b=b,tdoa=d,anchor=to,range=r"), NAMED)
+    assert flight.tdoa.d.tolist() == [0.5] and flight.range.d.tolist() == [2.5] and flight.start == flight.end == 0.1

@@ -9,6 +9,7 @@ import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.bags.bag import write_bag
@@ -19,6 +20,7 @@ from uwb_tdoa_tools.diagnosis.self_calibration.placing import place
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from known_effects import clean_flight
 from uwb_tdoa_tools.surveying.marks import read_marks
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.surveying.report import as_dict, as_text
 
 TRUSTED = ("0", "6", "1.z", "2.z")
@@ -179,3 +181,47 @@ def test_the_command_writes_surveys_that_are_read(flights, tmp_path, capsys):
     np.testing.assert_allclose(*found, atol=1e-4)
     assert (out / "survey.png").stat().st_size > 5000 and np.abs(found[0] - measured).max() > 0.01
     assert main([str(tmp_path / "flight.bag"), *words[:-2], "--out", str(tmp_path / "tape.yaml")]) == 2
+
+
+TAG = 0.25  # m, that all ranges are too long by
+
+
+@pytest.fixture(scope="module")
+def ranged():
+    """Two flights of ranges alone, with delays of anchors and of the tag."""
+    flown = dict(duration=40.0, floor_time=1.0, trajectory="sines", imu_rate=200.0, truth_rate=100.0, range_noise=0.1, bias=False, multipath=False)
+    flights = [simulate(SimulationConfig(seed=seed, **flown)) for seed in (400, 401)]
+    late = EFFECTS["anchor_delay"]({str(i): TAG + 0.03 * (-1) ** i for i in flights[0].anchors.ids})
+    flights = [replace(late.inject(flight, np.random.default_rng(0)), tdoa=Tdoas(*np.empty((4, 0)))) for flight in flights]
+    return [at(flight, shaken(flight.anchors, 0.1, 1)) for flight in flights], flights
+
+
+def test_ranges_tell_of_anchors_and_of_the_delay_of_the_tag(ranged):
+    given, true = ranged
+    found = self_calibrate(given[:1], Tape(0.1, trusted=TRUSTED))
+    assert found.why_not is None and found.tdoa_std is None
+    assert np.mean(found.delays) == pytest.approx(TAG, abs=0.06)
+    effects = EffectSet((delay_effect(found.surveyed, found.delays),))
+    before, after = error(given[1]), error(at(given[1], found.surveyed.positions), effects=effects)
+    assert after < 0.3 * before and after < 0.6 * error(true[1])
+    assert "TDOAs" not in as_text(found)
+
+
+def test_only_tdoas_place_an_anchor(ranged):
+    with pytest.raises(InputError, match="--unknown 3: only TDOAs place an anchor"):
+        self_calibrate(ranged[0][:1], Tape(0.1, unknown=("3",)))
+
+
+def test_tdoas_know_nothing_of_the_delay_of_the_tag(flights, result):
+    assert abs(np.mean(result.delays)) < 0.05 and result.prior.common == 0.0
+
+
+def test_survey_of_a_recording_of_ranges(ranged, tmp_path, capsys):
+    bag, out = tmp_path / "ranged.bag", tmp_path / "out"
+    write_bag(ranged[0][0], bag)
+    out.mkdir()
+    (out / "ekf_node.yaml").write_text("of another day")
+    assert main([str(bag), "--trusted", *TRUSTED, "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "wrote anchors.yaml, anchors.csv, effects.yaml, survey.json and survey.png" in said and "ekf_node.yaml" not in said
+    assert not (out / "ekf_node.yaml").exists() and json.loads((out / "survey.json").read_text())["tdoa_std"] is None

@@ -93,8 +93,18 @@ class Flight(_SensorStreams):
     @property
     def start(self) -> float:
         """Stamp from which slow changes count, s: of the first TDOA; without any, of what else locates first; 0 without anything."""
-        located = [stream for name in LOCATING if (stream := getattr(self, name)) is not None and len(stream)]
-        return float(min((part.t[0] for part in ([self.tdoa] if len(self.tdoa) else located)), default=0.0))
+        return float(min((part.t[0] for part in self._located), default=0.0))
+
+    @property
+    def end(self) -> float:
+        """Stamp of the last of these, s; 0 without any."""
+        return float(max((part.t[-1] for part in self._located), default=0.0))
+
+    @property
+    def _located(self) -> list[Any]:
+        """The TDOAs; without any, the other streams that locate."""
+        streams = [self.tdoa] if len(self.tdoa) else [getattr(self, name) for name in LOCATING]
+        return [stream for stream in streams if stream is not None and len(stream)]
 
     def replaced(self, **streams: Any) -> Flight:
         """The Flight with other streams, by their names, or with None instead of these."""

@@ -28,7 +28,7 @@ SENSORS = "tdoa", "imu", "truth", *AIDS  # streams of a Flight, each on its own 
 class Converted:
     """flight : name; bag : path; messages : {topic: count}; start, end : s; anchors : how many; tdoa_unknown_anchor :
     measurements of anchors that the survey does not have; left_out : {stream that a bag has no place for: events};
-    meta : of the Flight; apart : sentences on sensors that never overlap with the TDOAs in time."""
+    meta : of the Flight; apart : sentences on sensors that never overlap with the TDOAs, or ranges, in time."""
 
     flight: str
     bag: str
@@ -48,8 +48,9 @@ def convert(read: Callable[[], Flight], out: str | Path, storage: str = "mcap", 
     check_output(out, force)  # before the work, not after it
     flight = _from_zero_on(read())
     counts = write_bag(flight, out, storage, force)
-    together = [stream for name in _held(flight) if _overlaps(stream := getattr(flight, name), flight.tdoa)]
+    together = [stream for name in _held(flight) if _overlaps(stream := getattr(flight, name), flight)]
     known = (flight.anchors.index(flight.tdoa.a) >= 0) & (flight.anchors.index(flight.tdoa.b) >= 0)
+    ranges_known = np.ones(0, bool) if flight.range is None else flight.anchors.index(flight.range.anchor) >= 0
     return Converted(
         flight=flight.name,
         bag=str(out),
@@ -57,7 +58,7 @@ def convert(read: Callable[[], Flight], out: str | Path, storage: str = "mcap", 
         start=min(float(stream.t[0]) for stream in together),
         end=max(float(stream.t[-1]) for stream in together),
         anchors=len(flight.anchors),
-        tdoa_unknown_anchor=int(np.count_nonzero(~known)),
+        tdoa_unknown_anchor=int(np.count_nonzero(~known) + np.count_nonzero(~ranges_known)),
         left_out={name: len(columns["t"]) for name, columns in flight.extra.items()},
         meta=flight.meta,
         apart=_apart(flight),
@@ -77,10 +78,10 @@ def shifted(flight: Flight, offsets: dict[str, float]) -> Flight:
 
 
 def _from_zero_on(flight: Flight) -> Flight:
-    """The Flight without what its other sensors say before 0 s, where the TDOAs are not: a clock that was moved may begin there, and a bag
+    """The Flight without what its other sensors say before 0 s, where what locates the tag is not: a clock that was moved may begin there, and a bag
     has no place for it."""
     changed, said = {}, list(flight.meta.get("remarks", ()))
-    for name in _held(flight) if (flight.tdoa.t >= 0.0).all() else ():
+    for name in _held(flight) if flight.start >= 0.0 else ():
         stream = getattr(flight, name)
         inside = stream.t >= 0.0
         if inside.any() and not inside.all():
@@ -93,18 +94,20 @@ def _held(flight: Flight) -> list[str]:
     return [name for name in SENSORS if getattr(flight, name) is not None and len(getattr(flight, name).t)]
 
 
-def _overlaps(one: Timed, other: Timed) -> bool:
-    return one.t[-1] >= other.t[0] and one.t[0] <= other.t[-1]
+def _overlaps(one: Timed, flight: Flight) -> bool:
+    """Whether a stream has time in common with what locates the tag."""
+    return one.t[-1] >= flight.start and one.t[0] <= flight.end
 
 
 def _apart(flight: Flight) -> list[str]:
-    """Sentences on sensors whose stamps have no time in common with those of the TDOAs: they are on another clock."""
-    begin, end, said = flight.tdoa.t[0], flight.tdoa.t[-1], []
+    """Sentences on sensors whose stamps have no time in common with those of the TDOAs, or ranges: they are on another clock."""
+    begin, end, said = flight.start, flight.end, []
+    radio = "TDOAs" if len(flight.tdoa) else "ranges"
     for name in _held(flight):
         t = getattr(flight, name).t
-        if not _overlaps(getattr(flight, name), flight.tdoa):
+        if not _overlaps(getattr(flight, name), flight):
             said.append(
-                f"{name} runs from {t[0]:.1f} to {t[-1]:.1f} s, the TDOAs from {begin:.1f} to {end:.1f} s: clocks that have no time in common; "
+                f"{name} runs from {t[0]:.1f} to {t[-1]:.1f} s, the {radio} from {begin:.1f} to {end:.1f} s: clocks that have no time in common; "
                 f"--time-offset {name}={begin - t[0]:.3f} lets both begin together, if they did."
             )
     return said

@@ -21,7 +21,6 @@ def between(flight: Flight, first: float, last: float) -> Flight:
 
 
 def split(flight: Flight, share: float) -> tuple[Flight, Flight]:
-    """A Flight until a share of its TDOAs' time, and from there on."""
-    begin, end = float(flight.tdoa.t[0]), float(flight.tdoa.t[-1])
-    middle = begin + share * (end - begin)
+    """A Flight until a share of the time in which it is located, and from there on."""
+    middle = flight.start + share * (flight.end - flight.start)
     return between(flight, -np.inf, middle), between(flight, middle, np.inf)

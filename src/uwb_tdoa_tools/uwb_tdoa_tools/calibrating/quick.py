@@ -77,18 +77,23 @@ def prospect(
     progress: Callable[[], object] = lambda: None,
 ) -> Prospect:  # fmt: skip
     """Prospect of a calibration of Flights without their ground truth. Raises InputError where they are too short to say."""
-    longest = max(flights, key=lambda one: np.ptp(one.tdoa.t))
-    middle = 0.5 * float(longest.tdoa.t[0] + longest.tdoa.t[-1])
+    longest = max(flights, key=_duration)
+    middle = 0.5 * (longest.start + longest.end)
     part = between(longest, middle - 0.5 * SECONDS, middle + 0.5 * SECONDS)
     found = self_calibrate([part], tape, base, config, (), progress)
     seconds = found.seconds
-    total = max(seconds, sum(float(np.ptp(one.tdoa.t)) for one in flights) * seconds / max(float(np.ptp(part.tdoa.t)), 1e-9))
+    total = max(seconds, sum(map(_duration, flights)) * seconds / max(_duration(part), 1e-9))
     path = np.quantile(Estimator(config, base)(part).odometry.p, [0.02, 0.98], axis=0)
     anchors = longest.anchors
     return Prospect(
         seconds, total, found.given_std, _expected(found, total / seconds), found.before, found.left,
         np.ptp(path, axis=0), np.ptp(anchors.positions, axis=0), tuple(anchors.ids.tolist()), found.why_not,
     )  # fmt: skip
+
+
+def _duration(flight: Flight) -> float:
+    """s in which a Flight is located."""
+    return flight.end - flight.start
 
 
 def _expected(found: SelfCalibration, more: float) -> np.ndarray:

@@ -16,7 +16,6 @@ from ..checking.check import check, different_surveys
 from ..checking.recording import read_recording
 from ..diagnosis.noise import write_parameters
 from ..progress import Progress
-from ..readers import inputs
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -71,7 +70,6 @@ def _calibrate(args: Namespace) -> int:
     if not _checked(reading, found + held, tape.std):
         return _stop("check finds an error: put it right first, as said above")
     flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)
-    inputs.need_tdoas(flights + holdout, "calibrate")
     known = [flight.truth is not None for flight in flights + holdout]
     if any(known) and not all(known):
         raise InputError(f"{(flights + holdout)[known.index(False)].name}: holds no ground truth, and others do; leave it out, or give --no-truth.")
@@ -121,7 +119,7 @@ def _write(made: Calibration, out: Path, recordings: Sequence[str | Path], truth
     files = anchors, effects, config = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
     made.anchors.to_yaml(anchors)
     made.effects.to_yaml(effects)
-    write_parameters(config, made.tdoa_std) if made.tdoa_std is not None else config.unlink(missing_ok=True)
+    write_parameters(config, made.tdoa_std)
     survey, corrected, tuned = (file if file.exists() else None for file in files)
     cli.show(f"wrote {', '.join(file.name for file in files if file.exists())} and calibration.json to {out}")
     cli.show(f"judge it:   {command_lines.judging(recordings, survey, corrected, tuned, truth)}")

@@ -118,8 +118,7 @@ def _diagnose(args: Namespace) -> None:
     cli.write_json(out / "diagnosis.json", result.as_json())
     result.effects.to_yaml(out / "effects.yaml")
     (out / "report.html").write_text(result.as_html())
-    if tdoa_std is not None:
-        write_parameters(out / "ekf_node.yaml", tdoa_std)
+    write_parameters(out / "ekf_node.yaml", tdoa_std)
     if rerun is not None:
         write_diagnosis(rerun, result, effects or EffectSet(), config)
     cli.show(result.as_text())

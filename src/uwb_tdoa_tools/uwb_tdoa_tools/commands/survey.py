@@ -11,7 +11,6 @@ from .. import cli, command_lines, options
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
 from ..progress import Progress
-from ..readers import inputs
 from ..surveying.blocked import with_blocked
 from ..surveying.report import as_dict, as_text, picture
 
@@ -20,15 +19,15 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """Make a tape-measured survey better, from flights alone.
 
-Nobody needs to know where the tag flew: the flights tell which shifts of anchors, and which delays, make their TDOAs
-agree with each other and with the IMU (and with a range finder, where there is one). The frame is that of the
+Nobody needs to know where the tag flew: the flights tell which shifts of anchors, and which delays, make their TDOAs or
+ranges agree with each other and with the IMU (and with a range finder, where there is one). The frame is that of the
 coordinates that are known best: name some with --trusted, or all stays where it is on average. Ground truth is not used.
 
 With the anchors.yaml and effects.yaml (--effects) of last week it starts from what was known then, says what has changed
 since, and makes the rest better.
 
 Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the
-anchors, and how well all is known), ekf_node.yaml (noise that the filter should assume with them), survey.json
+anchors, and how well all is known), ekf_node.yaml (noise of TDOAs that the filter should assume with them), survey.json
 (covariance) and survey.png (before and after) to --out.
 
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
@@ -59,7 +58,6 @@ def _survey(args: Namespace) -> int:
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     flights = options.reading_of(args).flights(args.flights)
-    inputs.need_tdoas(flights, "survey")
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
         result = self_calibrate(flights, tape, base, config, known, lambda: progress("solving"))
@@ -70,13 +68,13 @@ def _survey(args: Namespace) -> int:
     rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
     (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
     result.effects.to_yaml(out / "effects.yaml")
-    write_parameters(out / "ekf_node.yaml", result.tdoa_std)
+    config_file = write_parameters(out / "ekf_node.yaml", result.tdoa_std)
     cli.write_json(out / "survey.json", as_dict(result))
     picture(result, out / "survey.png")
     cli.show(as_text(result))
-    cli.show(f"wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png to {out}")
+    cli.show(f"wrote anchors.yaml, anchors.csv, effects.yaml, {'ekf_node.yaml, ' if config_file else ''}survey.json and survey.png to {out}")
     if result.why_not is None:
-        files = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
+        files = out / "anchors.yaml", out / "effects.yaml", config_file
         cli.show(f"next: {command_lines.judging(args.flights, *files, all(flight.truth is not None for flight in flights))}")
     return 0 if result.why_not is None else 1
 

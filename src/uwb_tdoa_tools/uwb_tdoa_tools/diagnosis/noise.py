@@ -13,6 +13,11 @@ PARAMETERS = """/**:
 """
 
 
-def write_parameters(path: Path, tdoa_std: float) -> None:
-    """Write the parameters of ekf_node. tdoa_std : m."""
+def write_parameters(path: Path, tdoa_std: float | None) -> Path | None:
+    """Write the parameters of ekf_node, and return the path. tdoa_std : m; where it is None nothing is written, and what was there is
+    removed."""
+    if tdoa_std is None:
+        path.unlink(missing_ok=True)
+        return None
     path.write_text(PARAMETERS.format(tdoa_std))
+    return path

@@ -33,23 +33,26 @@ FORCE = {"m/s^2": 1.0 / GRAVITY, "g": 1.0}
 NUMBER = {"": 1.0}
 STREAMS = {  # stream: {our column: (column of the stream, {unit: factor}, the first is the default)}
     "tdoa": {"anchor_a": ("a", NUMBER), "anchor_b": ("b", NUMBER), "tdoa": ("d", LENGTH), "tdoa_std": ("std", LENGTH)},
+    "range": {"anchor": ("anchor", NUMBER), "range": ("d", LENGTH), "range_std": ("std", LENGTH)},
     "gyro": {f"gyro_{axis}": (axis, RATE) for axis in "xyz"},
     "acc": {f"accel_{axis}": (axis, FORCE) for axis in "xyz"},
     "pose": {f"pose_{axis}": (axis, LENGTH) for axis in "xyz"} | {f"pose_q{k}": (f"q{k}", NUMBER) for k in "xyzw"},
 }
 TIMES = {  # of each stream: the first that is given, else "time"
-    "tdoa": ("tdoa_time",), "gyro": ("gyro_time", "imu_time"), "acc": ("accel_time", "imu_time"), "pose": ("pose_time",),
+    "tdoa": ("tdoa_time",), "range": ("range_time",), "gyro": ("gyro_time", "imu_time"), "acc": ("accel_time", "imu_time"),
+    "pose": ("pose_time",),
 }  # fmt: skip
-ANCHORS = "anchor_a", "anchor_b"  # columns that name anchors
+RADIO = "tdoa", "range"  # of which there must be one
+ANCHORS = "anchor_a", "anchor_b", "anchor"  # columns that name anchors
 EMPTY = {"", "-", "--", "n/a", "na", "nan", "none", "null"}  # what tools write where they have nothing
 MOST_SKIPPED = 0.25  # of the records of a stream, that are empty or no numbers
 ATTITUDE = {f"pose_q{k}" for k in "xyzw"}
-OPTIONAL = {*ATTITUDE, "tdoa_std"}
+OPTIONAL = {*ATTITUDE, "tdoa_std", "range_std"}
 UNITS = {name: units for columns in STREAMS.values() for name, (_, units) in columns.items()}
 UNITS |= {name: TIME for name in ("time", *sorted({name for names in TIMES.values() for name in names}))}
 HELP = (
-    "for CSV files of other tools: their columns, OURS=THEIRS[:UNIT],... (anchor_a, anchor_b, tdoa; gyro_x ...; "
-    "accel_x ...; pose_x ...; time, or tdoa_time, imu_time, gyro_time, accel_time, pose_time where a sensor has its own)"
+    "for CSV files of other tools: their columns, OURS=THEIRS[:UNIT],... (anchor_a, anchor_b, tdoa; or anchor, range; "
+    "gyro_x ...; accel_x ...; pose_x ...; time, or tdoa_time, range_time, imu_time, gyro_time, accel_time, pose_time where a sensor has its own)"
 )
 
 
@@ -70,7 +73,8 @@ def parse_columns(text: str) -> dict[str, tuple[str, float]]:
             usual = " or ".join(filter(None, units)) or "none"
             raise InputError(f"--columns: {entry!r}: {unit!r} is no unit of {ours}; use {usual}.")
         columns[ours] = name, units[unit]
-    for stream in (stream for stream, mine in STREAMS.items() if stream == "tdoa" or mine.keys() & columns.keys()):
+    given = [stream for stream, mine in STREAMS.items() if mine.keys() & columns.keys()]
+    for stream in given if {*RADIO} & {*given} else ["tdoa", *given]:
         needed = [*(name for name in STREAMS[stream] if name not in OPTIONAL)]
         if missing := [name for name in needed if name not in columns]:
             raise InputError(f"--columns: {missing[0]} is missing; {', '.join(needed)} belong together.")
@@ -103,7 +107,8 @@ def read_columns(
     for path, of_file in wanted.items():
         for stream, values in _values(path, tables[path], of_file, named, remarks, salvage).items():
             streams[stream] = {"t" if name == "t" else STREAMS[stream][name][0]: column for name, column in values.items()}
-    streams["tdoa"].update({name: streams["tdoa"][name].astype(np.int64) for name in "ab"})
+    for ids in (streams.get("tdoa", {}), streams.get("range", {})):
+        ids.update({name: ids[name].astype(np.int64) for name in ids.keys() & {"a", "b", "anchor"}})
     if "pose" in streams and "qx" not in streams["pose"]:
         streams["pose"].update({f"q{k}": np.full(len(streams["pose"]["t"]), np.nan) for k in "xyzw"})
     meta = {"source": ", ".join(map(str, paths)), "format": "CSV, columns as given", "remarks": remarks}

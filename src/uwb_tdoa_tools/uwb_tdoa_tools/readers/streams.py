@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import Height, Pressure
+from uwb_tdoa_bias.foundation.sensors.ranges import Ranges
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
@@ -37,7 +38,7 @@ def make_flight(
     """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams left out.
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
-        "tdoa": a, b, d (m), and std (m) if the tag knows it; "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz,
+        "tdoa": a, b, d (m), and std (m) if the tag knows it; "range": anchor, d (m), and std (m); "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz,
         qw. "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow": x, y (pixel counts),
         which become a velocity where "tof" and IMU are.
     extra : the same of everything else, for `Flight.extra`.
@@ -62,12 +63,14 @@ def make_flight(
                 reordered[key] = falls
     if reordered:
         meta["reordered"] = reordered
-    tdoa = streams.get("tdoa")
-    if tdoa is None:
+    if not streams.keys() & {"tdoa", "range"}:
         raise InputError(f"{meta['source']}: holds no TDOA measurement; record the tag's TDOAs with the flight.")
-    variance = tdoa["std"] ** 2 if "std" in tdoa else np.zeros(len(tdoa["t"]))
-    tdoas = Tdoas(tdoa["t"], tdoa["a"], tdoa["b"], tdoa["d"], variance)
-    meta["protocol"] = protocol(tdoas)
+    tdoas, distances = Tdoas(*np.empty((4, 0))), None
+    if "tdoa" in streams:
+        tdoas = Tdoas(*_measured(streams["tdoa"], "a", "b"))
+        meta["protocol"] = protocol(tdoas)
+    if "range" in streams:
+        distances = Ranges(*_measured(streams["range"], "anchor"))
     imu = poses = None
     if "gyro" in streams and "acc" in streams:
         imu = _imu(streams["gyro"], streams["acc"], meta)
@@ -88,7 +91,13 @@ def make_flight(
         velocity = velocity if len(velocity.t) else None
     if not meta["remarks"]:
         del meta["remarks"]
-    return Flight(name, anchors, tdoas, imu, poses, extra, meta, height=height, pressure=pressure, velocity=velocity)
+    return Flight(name, anchors, tdoas, imu, poses, extra, meta, height=height, pressure=pressure, velocity=velocity, range=distances)
+
+
+def _measured(columns: Columns, *ids: str) -> tuple[np.ndarray, ...]:
+    """(stamps s, ids of each anchor, values m, variances m^2, 0 where the tag does not know them), (n,) each."""
+    variance = columns["std"] ** 2 if "std" in columns else np.zeros(len(columns["t"]))
+    return columns["t"], *(columns[name] for name in ids), columns["d"], variance
 
 
 def _sound(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> Columns:

@@ -24,7 +24,10 @@ def with_blocked(
     result: SelfCalibration, flights: Sequence[Flight], config: FilterConfig | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> SelfCalibration:  # fmt: skip
-    """The SelfCalibration of Flights with what blocks its anchors, looked for beside all that was found."""
+    """The SelfCalibration of Flights with what blocks its anchors, looked for in TDOAs beside all that was found."""
+    flights = [flight for flight in flights if len(flight.tdoa)]
+    if not flights:
+        return result
     reference = Nothing(config)
     moved = [reference.prepare(replace(flight, anchors=result.surveyed)) for flight in flights]
     base = EffectSet((*result.base.effects, result.found(result.shifts)[1]))

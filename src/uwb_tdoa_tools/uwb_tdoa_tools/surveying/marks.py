@@ -21,13 +21,13 @@ EXAMPLE = "{flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], st
 def read_marks(path: str | Path, flights: Sequence[Flight]) -> list[Mark]:
     """[Mark] of a YAML file, for Flights. Raises InputError for one that is not as EXAMPLE, or of no or too short a flight.
 
-    `from` and `to`: s since the first TDOA of the flight; position: m, of the tag, on average between them.
+    `from` and `to`: s since the first TDOA of the flight, or its first range where it has no TDOAs; position: m, of the tag, on average between them.
     """
     content = read_yaml(path)
     entries = content.get("marks") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path}: expected a list 'marks', each as {EXAMPLE}.")
-    lengths = {flight.name: flight.tdoa.t[-1] - flight.tdoa.t[0] for flight in flights}
+    lengths = {flight.name: flight.end - flight.start for flight in flights}
     return [_mark(f"{path}: mark {number}", entry, lengths) for number, entry in enumerate(entries, start=1)]
 
 

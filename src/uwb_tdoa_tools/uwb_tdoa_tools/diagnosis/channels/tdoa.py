@@ -166,7 +166,8 @@ def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> 
         inside = (raw.t >= poses.t[0]) & (raw.t <= poses.t[-1])
         usable = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(raw.d) & inside)
     else:
-        usable = innovations.rows
+        places = innovations.places(kind.channel)
+        usable = innovations.rows[places]
     t, a, b = raw.t[usable], a[usable], b[usable]
     first, last = comparison.span
     airborne = (t >= first) & (t <= last)
@@ -180,7 +181,7 @@ def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> 
     if innovations is None:
         residual = raw.d[usable] - samples.true() - comparison.effects.bias(samples)
     else:
-        residual = innovations.value
+        residual = innovations.value[places]
     return made(samples, residual, airborne, airborne, comparison.reference.knows_floor, innovations)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.flight import Truth
-from uwb_tdoa_ekf.sensitivity import record_innovations
+from uwb_tdoa_ekf.sensitivity import TDOAS, record_innovations
 
 from .base import Reference, ReferenceView
 
@@ -36,14 +36,18 @@ class Nothing(Reference):
     tells_errors = False
     words = "nothing but the flights themselves"
 
-    def __init__(self, config: FilterConfig | None = None, constraints: Sequence[Constraint] = ()) -> None:
-        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`)."""
-        self._config, self.constraints = config, tuple(constraints)
+    def __init__(
+        self, config: FilterConfig | None = None, constraints: Sequence[Constraint] = (), streams: Sequence[str] = (TDOAS,)
+    ) -> None:
+        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`); streams : of which, where a flight has them,
+        innovations are kept."""
+        self._config, self.constraints, self._streams = config, tuple(constraints), tuple(streams)
 
     def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
-        innovations = record_innovations(flight, self._config, Corrector(flight.anchors, effects))
+        streams = [name for name in self._streams if name == TDOAS or getattr(flight, name) is not None]
+        innovations = record_innovations(flight, self._config, Corrector(flight.anchors, effects), streams)
         estimate = innovations.run.odometry
         return ReferenceView(Truth(estimate.t, estimate.p, estimate.q), innovations)

@@ -18,14 +18,18 @@ from scipy.sparse import csr_array, hstack
 
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
+from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.sensitivity import TDOAS
 
 from ...checking.known_path import MANY
 from ...parallel import in_one_thread
 from ...scoring.metrics import AIRBORNE
-from ..channels import CHANNELS, Comparison
+from ..channels import Comparison, RadioResidual
+from ..channels.ranging import RangeResidual
+from ..channels.tdoa import TdoaResidual, compared
 from ..constraints import Distance, Mark
 from ..references.nothing import Nothing
 from ..regression.fit import NU, student_scale
@@ -37,14 +41,14 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.results import Odometry
     from ...parallel import MapFunction
-    from ..channels.tdoa import TdoaResidual
     from ..constraints import Constraint
 
 BLOCK = 3.0  # s over which sums of scores show how alike errors are
 SYSTEMATIC = 12.0  # by which the information is divided beside that: errors that last are no noise
 PRELIMINARY = 20.0  # the same for the solution about which that is measured
 DETERMINED = 1e-4  # share of the largest eigenvalue that a direction must have to count there
-FEWEST = 4  # TDOAs in a cell; noise of fewer hides what is slow
+FEWEST = 4  # measurements in a cell; noise of fewer hides what is slow
+RESIDUALS = {kind.channel: RangeResidual if kind.ends == 1 else TdoaResidual for kind in RADIO.values()}
 FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 AT_ONCE = 32  # regressors that are made together
 
@@ -57,7 +61,7 @@ def tdoa_std_of(
     not used. map_function : as of `attribution.attribute`."""
     config, anchors = config or FilterConfig(), flights[0].anchors
     loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
-    runs, no_delays = Runs(flights, effects, config), np.zeros(len(anchors))
+    runs, no_delays = Runs(flights, effects, config, streams=(TDOAS,)), np.zeros(len(anchors))
     return runs.equations(anchors, no_delays, loose, map_function=map_function).tdoa_std(config)
 
 
@@ -118,10 +122,10 @@ class Runs:
 
     def __init__(
         self, flights: Sequence[Flight], base: EffectSet, config: FilterConfig | None,
-        constraints: Sequence[Constraint] = (),
+        constraints: Sequence[Constraint] = (), streams: Sequence[str] = tuple(RADIO),
     ) -> None:  # fmt: skip
-        """base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known."""
-        self._base, self._reference = base, Nothing(config)
+        """base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known; streams : of RADIO, that tell."""
+        self._base, self._reference = base, Nothing(config, streams=streams)
         self.spans: dict[str, tuple[float, float]] = {}
         self.flights = [self._reference.prepare(flight) for flight in flights]
         self._of_anchors = [one for one in constraints if isinstance(one, Distance)]
@@ -132,7 +136,7 @@ class Runs:
     def slow_innovations(self, anchors: Anchors, delays: np.ndarray) -> float:
         """m, scale of the slow innovations of all flights with Anchors that are late by delays (N,) m."""
         about = self._base, self._reference, anchors, delays
-        return student_scale(np.concatenate([_slow(_residual(*about, one, self.spans.get(one.name))[0]) for one in self.flights]))
+        return _scale([_slow(_residuals(*about, one, self.spans.get(one.name))[0]) for one in self.flights])
 
     def equations(
         self, anchors: Anchors, delays: np.ndarray, loose: np.ndarray, progress: Callable[[], object] = lambda: None,
@@ -155,22 +159,34 @@ class Runs:
         of_anchors = [one.equations(anchors, len(vector)) for one in self._of_anchors]
         for more, right in [*((mark.gram, mark.vector) for mark in marks), *of_anchors]:
             gram, vector = gram + more, vector + right
-        slow = student_scale(np.concatenate([one.slow for one in several]))
+        slow = _scale([one.slow for one in several])
         inflation, seconds = float(np.mean([one.inflation for one in several])), sum(one.seconds for one in several)
         return Equations(gram, vector, marks, slow, inflation, seconds, several if len(anchors) <= MANY else [])
 
 
-def _residual(
+def _scale(slow: Sequence[np.ndarray]) -> float:
+    """m, scale of the slow innovations of flights. Raises InputError where there are none."""
+    together = np.concatenate(slow)
+    if not len(together):
+        raise InputError(f"no pair of anchors, and no anchor, is measured {FEWEST} times in half a second: raise the rate of the radio.")
+    return student_scale(together)
+
+
+def _residuals(
     base: EffectSet, reference: Nothing, anchors: Anchors, delays: np.ndarray, flight: Flight,
     span: tuple[float, float] | None,
-) -> tuple[TdoaResidual, tuple[float, float]]:  # fmt: skip
-    """(TdoaResidual, span) of a Flight: the innovations of a run with Anchors that are late by delays (N,) m."""
+) -> tuple[list[RadioResidual], tuple[float, float]]:  # fmt: skip
+    """([RadioResidual] of each stream in the air, span) of a Flight: the innovations of a run with Anchors that are late by delays (N,)
+    m."""
     effects = EffectSet((*base.effects, delay_effect(anchors, delays))) if delays.any() else base
     comparison = Comparison.of(replace(flight, anchors=anchors), reference, effects, span)
-    part = CHANNELS["tdoa"].residual(comparison)
-    if part is None:
-        raise InputError(f"{flight.name}: has no TDOAs in the air to survey with; fly for half a minute at least.")
-    return part, comparison.span
+    innovations = comparison.view.innovations
+    assert innovations is not None  # as of a Reference that does not know the path
+    found = [compared(comparison, RADIO[name], RESIDUALS[name]) for name in innovations.streams]
+    parts = [part for part in found if part is not None]
+    if not parts:
+        raise InputError(f"{flight.name}: has no TDOAs or ranges in the air to survey with; fly for half a minute at least.")
+    return parts, comparison.span
 
 
 def _of_flight(
@@ -179,12 +195,12 @@ def _of_flight(
 ) -> tuple[FlightEquations, tuple[float, float]]:  # fmt: skip
     """(FlightEquations, span) of (Flight, span or None, marks of it)."""
     flight, known_span, marks = item
-    part, span = _residual(base, reference, anchors, delays, flight, known_span)
-    gram, vector, blocks, known = _equations(part, flight, marks)
+    parts, span = _residuals(base, reference, anchors, delays, flight, known_span)
+    gram, vector, blocks, known = _equations(parts, flight, marks)
     n = len(loose)
     inflation = _inflation(gram[:n, :n], vector[:n], blocks, loose)
     less = SYSTEMATIC * inflation
-    return FlightEquations(gram / less, vector / less, known, _slow(part), inflation, BLOCK * len(blocks)), span
+    return FlightEquations(gram / less, vector / less, known, _slow(parts), inflation, BLOCK * len(blocks)), span
 
 
 def delay_effect(anchors: Anchors, delays: np.ndarray) -> Effect:
@@ -192,24 +208,31 @@ def delay_effect(anchors: Anchors, delays: np.ndarray) -> Effect:
     return AnchorDelay({str(i): float(delay) for i, delay in zip(anchors.ids, delays)})
 
 
-def _slow(part: TdoaResidual) -> np.ndarray:
+def _slow(parts: Sequence[RadioResidual]) -> np.ndarray:
     """Innovations averaged over cells of half a second, (n,) m, those of which hold enough to hide the noise."""
-    rows = part.rows()
-    return rows.y[rows.count >= FEWEST]
+    rows = [part.rows() for part in parts]
+    return np.concatenate([one.y[one.count >= FEWEST] for one in rows])
 
 
-def _equations(part: TdoaResidual, flight: Flight, constraints: Sequence[Mark]) -> tuple[np.ndarray, np.ndarray, list[_Told], list[_Mark]]:
-    """(gram (k, k), vector (k,), [_Told] of each block) of the normal equations that a TdoaResidual gives, and [_Mark] of constraints of
-    its Flight."""
-    samples, air, innovations = part.samples, part.airborne, part.innovations
+def _equations(
+    parts: Sequence[RadioResidual], flight: Flight, constraints: Sequence[Mark]
+) -> tuple[np.ndarray, np.ndarray, list[_Told], list[_Mark]]:
+    """(gram (k, k), vector (k,), [_Told] of each block) of the normal equations that the RadioResiduals of a Flight give, and [_Mark] of
+    constraints of it."""
+    innovations = parts[0].innovations
     assert innovations is not None  # as of a Reference that does not know the path
-    n, regressors = 4 * len(samples.anchors), _regressors(samples)
-    stamps = [one.stamps(flight.tdoa.t[0]) for one in constraints]
+    n, t, air, own = 4 * len(flight.anchors), innovations.t, np.zeros(len(innovations.t), bool), []
+    for part in parts:
+        places = innovations.places(part.samples.channel)
+        air[places] = part.airborne
+        own.append(_selection(places, len(t)) @ _regressors(part.samples))
+    regressors = sum(own[1:], own[0])
+    stamps = [one.stamps(flight.start) for one in constraints]
     moved = np.zeros((sum(map(len, stamps)), 3, regressors.shape[1]))
     error = innovations.value[air] / np.sqrt(innovations.variance[air])
     scale = max(1.4826 * np.median(np.abs(error)), 1e-3)
     gram, vector, blocks = np.zeros((regressors.shape[1],) * 2), np.zeros(regressors.shape[1]), []
-    number = np.floor((samples.t - samples.t[air][0]) / BLOCK).astype(int)
+    number = np.floor((t - t[air][0]) / BLOCK).astype(int)
     for rows, columns, derivative in innovations.in_blocks(regressors, number, np.sort(np.concatenate([[], *stamps])), moved):
         inside = air[rows]
         if not inside.any():
@@ -240,6 +263,11 @@ def _regressors(samples: Samples) -> csr_array:
     )
     positions = _sparse(AnchorPosition(), samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
     return hstack([positions, late, each], format="csr")
+
+
+def _selection(places: np.ndarray, n: int) -> csr_array:
+    """What puts rows (m, ...) to places (m,) among n: (n, m)."""
+    return csr_array((np.ones(len(places)), (places, np.arange(len(places)))), shape=(n, len(places)))
 
 
 def _sparse(effect: Effect, samples: Samples, keys: list[str]) -> csr_array:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 DELAY_STDS = 0.02, 0.05, 0.1, 0.2, 0.4  # m, that the evidence chooses from where nothing is known of delays
 DELAY_STD = 0.1  # m, of the delay of an anchor that the last calibration did not have
+TAG_DELAY = 0.5  # m, of what all ranges are too long by, the antenna delay of the tag: a TDOA does not know of it
 FUNCTION_STDS = 0.003, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3  # m, the same of functions of the place
 DRIFT = 0.005  # m, by which anything may be off since the last calibration without having changed
 MOVED, LATER = 0.3, 0.2  # m, standard deviations of changes: of each coordinate, of a delay
@@ -39,30 +40,32 @@ OF_ANCHORS = POSITION, DELAY = "anchor_position", "anchor_delay"
 @dataclass(frozen=True, eq=False)
 class Prior:
     """covariance (4N, 4N) m^2: of coordinates, anchor by anchor, and delays; known (4N,) bool: what the last calibration knows; ids
-    (N,)."""
+    (N,); common : m, standard deviation of what delays that nothing is known of have in common."""
 
     covariance: np.ndarray
     known: np.ndarray
     ids: tuple[str, ...]
+    common: float = 0.0
 
     @classmethod
-    def of(cls, anchors: Anchors, position_std: np.ndarray, last: Covariance | None = None) -> Prior:
-        """position_std (N, 3) m : of Anchors; last : Covariance of the last calibration, or None."""
+    def of(cls, anchors: Anchors, position_std: np.ndarray, last: Covariance | None = None, common: float = 0.0) -> Prior:
+        """position_std (N, 3) m : of Anchors; last : Covariance of the last calibration, or None; common : as of a Prior."""
         keys, n = keys_of(anchors.ids), len(anchors)
         covariance = np.diag(np.concatenate([position_std.ravel(), np.full(n, DELAY_STD)]) ** 2.0)
+        covariance[3 * n :, 3 * n :] += common**2
         known = np.zeros(4 * n, dtype=bool)
         if last is not None:
             places, of_last = last.of(keys)
             covariance[np.ix_(places, places)] = of_last + DRIFT**2 * np.eye(len(places))
             known[places] = True
-        return cls(covariance, known, tuple(map(str, anchors.ids)))
+        return cls(covariance, known, tuple(map(str, anchors.ids)), common)
 
     @property
     def loose(self) -> np.ndarray:
         """(4N,) m: standard deviations that forbid nothing which may have happened."""
         n = len(self.ids)
         std = np.hypot(np.sqrt(np.diag(self.covariance)), np.where(self.known, MOVED, 0.0))
-        return np.concatenate([std[: 3 * n], np.full(n, LOOSE)])
+        return np.concatenate([std[: 3 * n], np.full(n, np.hypot(LOOSE, self.common))])
 
     def changes(self) -> dict[ChangeKey, tuple[np.ndarray, float]]:
         """{(what, number of an anchor): (places, m, standard deviation)} of what may have changed; of MANY anchors without a calibration
@@ -76,10 +79,9 @@ class Prior:
         return out
 
     def with_delays(self, std: float) -> np.ndarray:
-        """(4N, 4N) m^2, the covariance with another standard deviation of all delays."""
-        out = self.covariance.copy()
-        rows = np.arange(3 * len(self.ids), len(out))
-        out[rows, rows] = std**2
+        """(4N, 4N) m^2, the covariance with another standard deviation of all delays, beside what they have in common."""
+        out, first = self.covariance.copy(), 3 * len(self.ids)
+        out[first:, first:] = self.common**2 + std**2 * np.eye(len(self.ids))
         return out
 
 

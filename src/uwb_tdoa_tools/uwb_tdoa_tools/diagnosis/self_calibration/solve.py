@@ -17,7 +17,7 @@ from ...parallel import in_one_thread
 from ..over_flights import Share
 from .equations import SYSTEMATIC, Runs
 from .placing import PLACED_STD, place
-from .prior import DELAY, POSITION, Prior, eliminated, keys_of, solve, to_keep, with_calibration
+from .prior import DELAY, POSITION, TAG_DELAY, Prior, eliminated, keys_of, solve, to_keep, with_calibration
 from .tape import Tape
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class SelfCalibration:
     surveyed : Anchors where the flights put them; delays (N,) m; solution : Solution, whose covariance is of positions, anchor by anchor,
     and then of delays; seconds : s in the air that tell;
     before, left : m, scale of the slow innovations with the anchors as given, and with these;
-    tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are;
+    tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are; None without any;
     changes : (Change, ...) since the last calibration;
     marks : (before, after, nearer), root mean square of what estimates at marks in the air are off by, m, and share of marks that they
     come nearer to, each after a fit without it; None where there are none;
@@ -85,7 +85,7 @@ class SelfCalibration:
     seconds: float
     before: float
     left: float
-    tdoa_std: float
+    tdoa_std: float | None
     changes: tuple[Change, ...]
     marks: tuple[float, float, float] | None
     grounded: int
@@ -179,7 +179,9 @@ def self_calibrate(
     """
     same_anchors(flights)
     given, config, names = flights[0].anchors, config or FilterConfig(), tuple(flight.name for flight in flights)
-    std, rows = tape.position_std(given), tape.unknown_rows(given)
+    std, rows, tdoas = tape.position_std(given), tape.unknown_rows(given), any(len(flight.tdoa) for flight in flights)
+    if rows and not tdoas:
+        raise InputError(f"--unknown {given.ids[rows[0]]}: only TDOAs place an anchor; measure it roughly, and give --std.")
     start, start_std = given, std.copy()
     if rows:
         start = place(flights, rows, config)
@@ -187,7 +189,8 @@ def self_calibrate(
         if base.covariance is not None:
             base = replace(base, covariance=base.covariance.without(tape.unknown))
     runs = Runs([replace(flight, anchors=start) for flight in flights], base, config, constraints)
-    n, prior = len(given), Prior.of(given, start_std, base.covariance)
+    common = TAG_DELAY if any(flight.range is not None for flight in flights) else 0.0
+    n, prior = len(given), Prior.of(given, start_std, base.covariance, common)
     mean = np.concatenate([start.positions.ravel(), np.zeros(n)])
 
     def linearised(about: np.ndarray) -> Equations:
@@ -206,8 +209,8 @@ def self_calibrate(
     best = best + found.step
     moved, delays = given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :]
     return SelfCalibration(
-        given, Prior.of(given, std, base.covariance), names, base, moved, delays, found, last.seconds, first.slow,
-        runs.slow_innovations(moved, delays), last.tdoa_std(config), _changes(prior, found, best - mean), _left_out(first, prior),
+        given, Prior.of(given, std, base.covariance, common), names, base, moved, delays, found, last.seconds, first.slow,
+        runs.slow_innovations(moved, delays), last.tdoa_std(config) if tdoas else None, _changes(prior, found, best - mean), _left_out(first, prior),
         runs.grounded, shares,
     )  # fmt: skip
 
