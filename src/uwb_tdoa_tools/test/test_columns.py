@@ -63,7 +63,9 @@ def test_rows_of_several_sensors_in_one_file(files):
     "text, said",
     [
         ("time", "is not OURS=THEIRS"),
-        ("range=r", "is not OURS=THEIRS"),
+        ("distance=r", "is not OURS=THEIRS"),
+        ("range=r", "anchor is missing"),
+        ("anchor=a,range=r", "range_time, or time, is missing"),
         ("time=t,time=u", "OURS, once"),
         ("tdoa=d:feet", "'feet' is no unit of tdoa"),
         ("anchor_a=a:m", "'m' is no unit of anchor_a; use none"),
@@ -239,3 +241,8 @@ def test_tdoas_and_ranges_of_one_file(files):
     (files / "both.csv").write_text("t,a,b,d,to,r\n0.1,0,1,0.5,,\n0.2,,,,5,2.5\n")
     flight = read_columns(["both.csv"], parse_columns("time=t,anchor_a=a,anchor_b=b,tdoa=d,anchor=to,range=r"), NAMED)
     assert flight.tdoa.d.tolist() == [0.5] and flight.range.d.tolist() == [2.5] and flight.start == flight.end == 0.1
+
+
+def test_a_survey_of_pandas_has_no_name_for_its_ids(files):
+    (files / "anchors.csv").write_text(SURVEY.replace("id,x,y,z", ",x,y,z"))
+    np.testing.assert_array_equal(read_survey(files / "anchors.csv").positions, ANCHORS.positions)

@@ -47,6 +47,7 @@ def test_bag_brings_its_anchors_unless_others_are_given(tmp_path, survey):
     [
         (b"", "is empty"),
         (b"\x00\x01binary", "of no known kind"),
+        (b"#ROSBAG V2.0\n", "is a bag of ROS 1: make a ROS 2 bag of it, rosbags-convert"),
         (b"time,value\n1,2\n", "of no known kind"),
         (b"\x1f\x8bnothing that unpacks", "gzip data is damaged"),
         (gzip.compress(b"time,value\n", mtime=0), "of no known kind"),

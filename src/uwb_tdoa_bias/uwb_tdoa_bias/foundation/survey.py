@@ -35,7 +35,7 @@ def read_survey(path: str | Path) -> Anchors:
 
     - total station: lines `name,x,y,z` in metres; `anchorAntN` is the antenna of anchor N, `anchorN_1/_2/_3` the arm
       tips of its stand (up, left, forward), from which the orientation follows; other names are ignored;
-    - `id,x,y,z` with that header line: positions only;
+    - `id,x,y,z` with that header line, or `,x,y,z`: positions only;
     - YAML, see `Anchors.from_yaml`.
 
     Orientation: antenna stand to world; x forward, z up the stand, y completes a right-handed frame. NaN without tips.
@@ -54,7 +54,7 @@ def read_survey(path: str | Path) -> Anchors:
     if not lines:
         raise InputError(f"{path}: is empty; give a survey file (.txt, .csv or .yaml).")
     try:
-        if lines[0][1] == ["id", "x", "y", "z"]:
+        if lines[0][1] in (["id", "x", "y", "z"], ["", "x", "y", "z"]):  # the second as pandas writes it
             return _positions(path, lines[1:])
         return _total_station(path, lines)
     except InputError as error:

@@ -197,6 +197,7 @@ def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
             facts[name] = f"{1.0 / step:.0f} {unit}" if step > 0.0 else "no rate"
     for name, stream in recording.sensors.items():
         step = float(np.median(np.diff(stream.t))) if len(stream) > 1 else 0.0
+        step = step or float(np.ptp(stream.t)) / max(len(stream) - 1, 1)  # several of one stamp
         facts[name] = f"{SENSORS[name].plural} {1.0 / step:.0f} Hz" if step > 0.0 else f"{SENSORS[name].plural}, no rate"
     if streams.tdoa:
         windows = list(streams.tdoa)

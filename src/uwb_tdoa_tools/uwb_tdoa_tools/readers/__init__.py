@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
 
 __all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
+ROS_1 = b"#ROSBAG V2.0"  # what a bag of ROS 1 begins with
 
 
 def read_flight(
@@ -67,6 +68,11 @@ def _reader(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:
     first = head.split(b"\n", 1)[0]
     if is_util_csv(first.decode("utf-8", "replace")):
         return read_util_csv
+    if head.startswith(ROS_1):
+        raise InputError(
+            f"{path}: is a bag of ROS 1: make a ROS 2 bag of it, rosbags-convert --src {path} --dst NAME, or of messages that only their makers "
+            "have CSV files for convert --columns."
+        )
     raise InputError(
         f"{path}: is of no known kind (it starts with {head[:16]!r}); a micro-SD log starts with byte 0xBC, a UTIL CSV "
         "file with a header line with t_tdoa, and a bag is a directory with metadata.yaml."
