@@ -77,8 +77,8 @@ class Innovations:
     def in_blocks(
         self, regressors: csr_array, block: np.ndarray, stamps: ArrayLike = (), positions: np.ndarray | None = None
     ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """What `by_bias` gives, a block of measurements at a time, at the cost of those parameters that matter there: yields (rows, a slice;
-        columns (c,); derivative (rows, c)).
+        """What `by_bias` gives, a block of measurements at a time, at the cost of those parameters that matter there: yields (rows, a
+        slice; columns (c,); derivative (rows, c)).
 
         regressors : sparse, in rows, (n, k); block (n,) int, rising: number of the block of each row. A parameter matters until FORGOTTEN s
         after the last measurement that depends on it. positions (m, 3, k) : filled with what `and_positions` gives at stamps (m,).

@@ -224,7 +224,9 @@ def test_an_offset_that_cannot_be_is_one_sentence(files, offset, said, capsys):
 
 
 def test_ranges_need_no_tdoas(files, capsys):
-    (files / "twr.csv").write_text("t,tag,to,mm,sigma,px,py,pz\n0.5,9,1,2500,100,1,2,3\n0.6,9,5,,100,1,2,3\n0.7,9,0,750,50,1,2,3\n0.8,9,0,760,50,1,2,3\n0.9,9,1,760,50,1,2,3\n")
+    rows = "9,1,2500,100", "9,5,,100", "9,0,750,50", "9,0,760,50", "9,1,760,50"
+    lines = [f"{0.5 + 0.1 * k:.1f},{row},1,2,3" for k, row in enumerate(rows)]
+    (files / "twr.csv").write_text("\n".join(["t,tag,to,mm,sigma,px,py,pz", *lines, ""]))
     flight = read_columns(["twr.csv"], parse_columns("time=t,anchor=to,range=mm:mm,range_std=sigma:mm"), NAMED)
     assert len(flight.tdoa) == 0 and flight.range.anchor.tolist() == [1, 0, 0, 1] and (flight.start, flight.end) == (0.5, 0.9)
     np.testing.assert_allclose(flight.range.d, [2.5, 0.75, 0.76, 0.76])

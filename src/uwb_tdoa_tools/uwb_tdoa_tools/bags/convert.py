@@ -78,8 +78,8 @@ def shifted(flight: Flight, offsets: dict[str, float]) -> Flight:
 
 
 def _from_zero_on(flight: Flight) -> Flight:
-    """The Flight without what its other sensors say before 0 s, where what locates the tag is not: a clock that was moved may begin there, and a bag
-    has no place for it."""
+    """The Flight without what its other sensors say before 0 s, where what locates the tag is not: a clock that was moved may begin there,
+    and a bag has no place for it."""
     changed, said = {}, list(flight.meta.get("remarks", ()))
     for name in _held(flight) if flight.start >= 0.0 else ():
         stream = getattr(flight, name)

@@ -73,8 +73,8 @@ def parse_columns(text: str) -> dict[str, tuple[str, float]]:
             usual = " or ".join(filter(None, units)) or "none"
             raise InputError(f"--columns: {entry!r}: {unit!r} is no unit of {ours}; use {usual}.")
         columns[ours] = name, units[unit]
-    given = [stream for stream, mine in STREAMS.items() if mine.keys() & columns.keys()]
-    for stream in given if {*RADIO} & {*given} else ["tdoa", *given]:
+    wanted = [stream for stream, mine in STREAMS.items() if mine.keys() & columns.keys()]
+    for stream in wanted if {*RADIO} & {*wanted} else ["tdoa", *wanted]:
         needed = [*(name for name in STREAMS[stream] if name not in OPTIONAL)]
         if missing := [name for name in needed if name not in columns]:
             raise InputError(f"--columns: {missing[0]} is missing; {', '.join(needed)} belong together.")

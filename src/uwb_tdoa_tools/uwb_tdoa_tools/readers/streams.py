@@ -38,8 +38,8 @@ def make_flight(
     """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams left out.
 
     streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
-        "tdoa": a, b, d (m), and std (m) if the tag knows it; "range": anchor, d (m), and std (m); "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz,
-        qw. "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow": x, y (pixel counts),
+        "tdoa": a, b, d (m), and std (m) if the tag knows it; "range": anchor, d (m), and std (m); "gyro": x, y, z (deg/s); "acc": x, y, z
+        (g); "pose": x, y, z (m), qx, qy, qz, qw. "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow": x, y (pixel counts),
         which become a velocity where "tof" and IMU are.
     extra : the same of everything else, for `Flight.extra`.
     meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps

@@ -21,7 +21,8 @@ EXAMPLE = "{flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], st
 def read_marks(path: str | Path, flights: Sequence[Flight]) -> list[Mark]:
     """[Mark] of a YAML file, for Flights. Raises InputError for one that is not as EXAMPLE, or of no or too short a flight.
 
-    `from` and `to`: s since the first TDOA of the flight, or its first range where it has no TDOAs; position: m, of the tag, on average between them.
+    `from` and `to`: s since the first TDOA of the flight, or its first range where it has no TDOAs; position: m, of the tag, on average
+    between them.
     """
     content = read_yaml(path)
     entries = content.get("marks") if isinstance(content, dict) else None

@@ -207,10 +207,10 @@ def self_calibrate(
         raise InputError(f"the flights are {last.seconds:g} s in the air together; {LEAST:g} s are needed: fly for longer.")
     shares = _shares(last, best - mean, found, names) if n <= MANY else {}
     best = best + found.step
-    moved, delays = given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :]
+    moved, delays, tdoa_std = given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :], last.tdoa_std(config) if tdoas else None
     return SelfCalibration(
         given, Prior.of(given, std, base.covariance, common), names, base, moved, delays, found, last.seconds, first.slow,
-        runs.slow_innovations(moved, delays), last.tdoa_std(config) if tdoas else None, _changes(prior, found, best - mean), _left_out(first, prior),
+        runs.slow_innovations(moved, delays), tdoa_std, _changes(prior, found, best - mean), _left_out(first, prior),
         runs.grounded, shares,
     )  # fmt: skip
 
