@@ -40,6 +40,7 @@ INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
 UNSURE_TIME = 0.5  # s of TDOAs, after a silence in which a tag got lost, in which it is looked for anew
 LOST_TIME = 30.0  # s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter starts anew
 MAX_STEP = 0.05  # s, longest single prediction
+AVERAGED = 0.25  # s of inertial samples that tell how a sensor is mounted which comes when the filter runs
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 LINEAR_RANGE = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
@@ -114,7 +115,14 @@ def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray
     if distrusted != ekf.distrusted:
         ekf.distrusted = distrusted
         _switch(ekf, parameters, records)
+    first, averaged = ekf.imu.t == -np.inf, ekf.levelled > -np.inf and sample.t >= ekf.levelled
+    if first and ekf.running and parameters.use_imu:
+        ekf.levelled = sample.t + AVERAGED
+    elif averaged or not ekf.running:
+        ekf.levelled = -np.inf
     if ekf.running and _advance(ekf, parameters, sample.t, records):
+        if averaged and not ekf.distrusted:
+            initialization.level_first(ekf, parameters, records)
         if continuous and not ekf.distrusted:
             rest.feel(ekf, sample, sample.t - ekf.imu.t)
         ekf.quiet = parameters.zero_velocity and continuous and not ekf.distrusted and inertial.is_quiet(ekf.imu)
@@ -128,7 +136,7 @@ def _switch(ekf: Record, parameters: Record, records: np.ndarray) -> None:
     if ekf.running and ekf.distrusted:
         initialization.widen(ekf, records)
     elif ekf.running:
-        initialization.level_anew(ekf, parameters, records)
+        initialization.level_anew(ekf, parameters, 2.0 * math.pi, records)
 
 
 @compiled
@@ -261,7 +269,7 @@ def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> 
     False if the filter has stopped, because nothing has told for too long where the tag is."""
     if t - ekf.t > LOST_TIME:
         return _stop(ekf, t)
-    sensed = parameters.use_imu and t - ekf.imu.t < parameters.imu_timeout and not ekf.distrusted
+    sensed = parameters.use_imu and t - ekf.imu.t < parameters.imu_timeout and not ekf.distrusted and t >= ekf.levelled
     if sensed and ekf.t < t:
         inertial.weigh(ekf.imu, ekf.quiet, parameters)
     while ekf.t < t:

@@ -347,14 +347,23 @@ def widen(ekf: Record, history: np.ndarray) -> None:
 
 
 @compiled
-def level_anew(ekf: Record, parameters: Record, history: np.ndarray) -> None:
-    """Stay at position and velocity; attitude as at a start: level, the yaw unknown; biases as at a start too."""
+def level_anew(ekf: Record, parameters: Record, yaw_std: float, history: np.ndarray) -> None:
+    """Stay at position and velocity; attitude as at a start: level, the yaw as it is, to so many rad; biases as at a start too."""
     best = ekf.hypotheses[ekf.best]
     x, y, z, w = best.x[6], best.x[7], best.x[8], best.x[9]
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     x, covariance = best.x[:6].copy().reshape(1, 6), best.P[:6, :6].copy().reshape(1, 6, 6)
-    _begin(ekf, parameters, ekf.t, Places(x, covariance, np.zeros(1)), yaw, 2.0 * math.pi)
+    _begin(ekf, parameters, ekf.t, Places(x, covariance, np.zeros(1)), yaw, yaw_std)
     add_reset(ekf, ekf.t, history)
+
+
+@compiled
+def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
+    """The same when inertial samples have come for the first time: the yaw is known as well as it was."""
+    alive = 0
+    for h in range(HYPOTHESES):
+        alive += hypotheses.alive(ekf.hypotheses[h])
+    level_anew(ekf, parameters, 2.0 * math.pi if alive > 1 else math.sqrt(ekf.hypotheses[ekf.best].P[8, 8]), history)
 
 
 @compiled

@@ -141,6 +141,7 @@ EKF = _record(
     ("next_floor", float),  # s, stamp before which not to say again that the tag is at its fixed height
     ("plausibility", PLAUSIBILITY),  # of the inertial samples,
     ("distrusted", bool),  # which are not used, because they cannot be right
+    ("levelled", float),  # s, stamp until which they are averaged, where the filter ran before there were any; -inf: they are used
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
     ("resting", bool),  # the tag does not move, see rest.py,
     ("floor_place", float, 2),  # m, x and y of where anchors are known to be late on the ground, NaN: anywhere,
@@ -261,6 +262,7 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
     ekf.hypotheses["P"][:] = np.eye(ERROR_STATES)
     ekf.since_record[:] = np.eye(ERROR_STATES)
     ekf.consistency = 1.0
+    ekf.levelled = -np.inf
     return state
 
 

@@ -80,7 +80,7 @@ class Report:
 def check(recording: Recording, others: Sequence[Survey] = ()) -> Report:
     """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one."""
     streams = fed(recording)
-    found = [*(streams.findings() if len(recording.tdoa) else ()), *sensors(recording)]
+    found = [*streams.findings(), *sensors(recording)]
     for rule in (*labels.RULES, *wiring.RULES, *range_offset.RULES):
         found += rule(recording)
     if not len(recording.tdoa):  # of ranges alone: nothing else is there to be tried
