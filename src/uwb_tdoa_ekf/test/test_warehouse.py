@@ -122,6 +122,30 @@ def test_after_a_silence_in_which_it_walked_a_tag_is_found_within_two_seconds():
         assert max(after_gaps(flight, found)) < 2.0 and found["nees"] < 6.0
 
 
+def test_after_a_silence_no_tdoa_makes_a_wrong_place_certain():
+    where = hall("100 x 60 m, 77 anchors")
+    for seed in (3, 4, 15):  # each was wrong by more than 5 deviations within 0.1 s
+        flight = fly(where, seed, 17.0, dead=[(3.0, 16.3)])
+        found = judge(flight, WITHOUT_IMU)
+        assert (found["off"] / found["std"]).max() < 5.0, seed
+
+
+def test_a_tag_that_walks_beyond_the_margin_is_found_after_a_silence():
+    where = hall("100 x 60 m, 77 anchors")
+    flight = fly(where, 18, 17.0, dead=[(3.0, 16.3)])
+    over = np.abs(flight.truth.p[-70:, :2] - 0.5 * np.array(where.size)) - np.ptp(where.anchors.positions[:, :2], axis=0) / 2.0
+    assert over.max() > 1.0  # m beyond the anchors, by which the search is bounded
+    found = judge(flight, WITHOUT_IMU)
+    assert (found["off"][found["odometry"].t > 16.4] < 1.0).all()
+
+
+def test_how_far_a_place_is_outside_and_one_that_is_no_number_is_nowhere():
+    bounds = np.array([[0.0, 0.0, 0.0], [4.0, 4.0, 4.0]])
+    for x, beyond in (([2.0, 2.0, 3.0], -1.0), ([4.5, -0.2, 2.0], 0.5), ([2.0, -0.7, 5.0], 1.0), ([2.0, np.nan, 2.0], np.inf)):
+        assert workspace.outside(bounds, np.array(x)) == pytest.approx(beyond)
+        assert workspace.contains(bounds, np.array(x)) == (beyond <= 0.0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("config", [FilterConfig(), WITHOUT_IMU])
 def test_ten_minutes_with_dead_zones_and_a_change_of_floor(config):

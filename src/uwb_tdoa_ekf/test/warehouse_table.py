@@ -1,6 +1,6 @@
 """The tables of docs/warehouse.md: starts in halls, slow tags, anchors in a plane, a walk of ten minutes.
 
-python src/uwb_tdoa_ekf/test/warehouse_table.py [--starts N] [--seeds N] [--only WORD] [--bound]
+python src/uwb_tdoa_ekf/test/warehouse_table.py [--starts N] [--seeds N] [--first N] [--only WORD] [--bound]
 """
 
 import argparse
@@ -100,7 +100,7 @@ def say(name, runs):
 def say_walks(name, where, seeds, config):
     """What is the worst in walks of ten minutes with three dead zones and a change of floor, and a line of each that is worse than asked."""
     worst, sure, wrong, nees = [], [], [], []
-    for seed in range(seeds):
+    for seed in seeds:
         flight = fly(where, seed, 600.0, dead=[(120.0, 133.3), (220.0, 233.3), (450.0, 463.3)], lift=300.0)
         found = judge(flight, config)
         deviations, gaps = found["off"] / found["std"], after_gaps(flight, found)
@@ -111,7 +111,7 @@ def say_walks(name, where, seeds, config):
             after = ", ".join(f"{gap:.2f}" for gap in gaps)
             print(f"{name}, seed {seed}: wrong and certain for {sure[-1]:.2f} s, wrong after silences for {after} s", flush=True)
     print(
-        f"{name}, {seeds} seeds: NEES {np.mean(nees):.2f}, at most {max(nees):.2f}; largest error {max(worst):.1f} deviations; wrong and certain in "
+        f"{name}, {len(seeds)} seeds: NEES {np.mean(nees):.2f}, at most {max(nees):.2f}; largest error {max(worst):.1f} deviations; wrong and certain in "
         f"{np.count_nonzero(sure)}; wrong after silences for {max(wrong):.2f} s at most",
         flush=True,
     )
@@ -122,6 +122,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--starts", type=int, default=100, metavar="N", help="in each hall (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="of each row in the room (default: %(default)s)")
+    parser.add_argument("--first", type=int, default=0, metavar="N", help="seed of the walks of ten minutes (default: %(default)s)")
     parser.add_argument("--only", default="", metavar="WORD", help="rows with this in their name")
     parser.add_argument(
         "--bound", action="store_true", help="instead: errors along the axes of the runs in halls where no estimate can be good"
@@ -153,7 +154,7 @@ def main():
             say(name, [judge(fly(where, seed, **kind), config) for seed in range(count)])
     for imu, config in (("", with_imu), (", no IMU", without)):
         if args.only in (name := f"ten minutes{imu}"):
-            say_walks(name, hall(first, floors=2), args.seeds, config)
+            say_walks(name, hall(first, floors=2), range(args.first, args.first + args.seeds), config)
 
 
 if __name__ == "__main__":

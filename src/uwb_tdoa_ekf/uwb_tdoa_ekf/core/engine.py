@@ -155,7 +155,11 @@ def _on_tdoa(
         if not was_running:
             _wait_for_start(ekf, anchors, parameters, t, records)
         return
+    before = ekf.unsure_until
     _before_update(ekf, anchors, parameters, t, records)
+    if parameters.recover and initialization.waits(ekf, anchors, parameters, t, ekf.unsure_until > before, records):
+        ekf.last_tdoa = t
+        return
     late = _update(ekf, anchors, parameters, tdoa, residual, records)
     initialization.relocate(ekf, anchors, parameters, t, records)
     known = anchors[tdoa.b].delay - anchors[tdoa.a].delay

@@ -141,6 +141,25 @@ def is_unsure(ekf: Record) -> bool:
 
 
 @compiled
+def waits(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, silent: bool, history: np.ndarray) -> bool:
+    """Whether a TDOA stamped t, s, of a tag that may be anywhere after a silence is kept for a search; with the last that this needs,
+    searches.
+
+    Each by itself is linearized far from where the tag is, and the covariance would shrink about a wrong place. Not of a tag that few TDOAs
+    come from. silent : the silence ends with this TDOA.
+    """
+    first = ekf.kept - 1 - MINIMUM
+    if silent and first >= 0 and ekf.window[first].t > ekf.last_tdoa - RECOVERY_WINDOW:
+        ekf.waits_until = t + RECOVERY_WINDOW
+    if t >= ekf.waits_until:
+        return False
+    if len(recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))) >= MINIMUM:
+        ekf.waits_until = -np.inf
+        recover(ekf, anchors, parameters, t, True, history)
+    return True
+
+
+@compiled
 def relocate(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray) -> None:
     """Of a tag that few TDOAs come from, and whose place is hardly known by now: go where its last TDOAs tell it is, if they tell that
     better than the filter. So far from where the TDOAs are linearized these do together what each of them does not alone."""
@@ -300,7 +319,7 @@ def recover(
     share = locate(window, anchors, ekf.workspace, parameters, known, places)
     x, covariance, cost = places.x, places.covariance, places.cost
     explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
-    if not workspace.contains(ekf.workspace, x[0]) or share < AGREE_ANYHOW:
+    if workspace.outside(ekf.workspace, x[0]) > (workspace.STD if anywhere else 0.0) or share < AGREE_ANYHOW:
         return
     if anywhere and cost[count - 1] < np.inf:
         _reopen(ekf, cost)
@@ -319,6 +338,8 @@ def recover(
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
         _put(hypothesis, x[place], covariance[place])
+    if anywhere:  # what anchors told before the silence, they told of another place
+        systematic.begin(ekf.information, ekf.hypotheses[ekf.best].P)
     ekf.consistency, ekf.late_as_known = 1.0, False
     ekf.rest_since = t
     ekf.recoveries += 1

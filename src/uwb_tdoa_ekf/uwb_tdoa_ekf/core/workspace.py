@@ -145,10 +145,18 @@ def rows_heard(window: np.ndarray) -> np.ndarray:
 @compiled
 def contains(bounds: np.ndarray, x: np.ndarray) -> bool:
     """True if position x (3,), m, is within `bounds` (2, 3)."""
+    return outside(bounds, x) <= 0.0
+
+
+@compiled
+def outside(bounds: np.ndarray, x: np.ndarray) -> float:
+    """How far position x (3,), m, is beyond `bounds` (2, 3), along the axis along which it is farthest, m; not above 0 within; inf where it
+    is not a number."""
+    farthest = -np.inf
     for k in range(3):
-        if not bounds[0, k] <= x[k] <= bounds[1, k]:
-            return False
-    return True
+        beyond = max(bounds[0, k] - x[k], x[k] - bounds[1, k])
+        farthest = max(farthest, beyond) if beyond == beyond else np.inf
+    return farthest
 
 
 @compiled
