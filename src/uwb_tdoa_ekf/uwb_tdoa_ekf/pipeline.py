@@ -103,7 +103,8 @@ class Pipeline:
             used = part if self._config.use_imu else part._replace(imu=part.imu[:0])
             fed = Fed(part, *feed(self.state, self._parameters, used, self._records))
             if not self._corrections.idle:
-                self._corrections.add_pose(*poses_of(Odometry.from_rows(fed.odometry)))
+                telling = fed.odometry[self._corrections.telling(fed.odometry["t"])]
+                self._corrections.add_pose(*poses_of(Odometry.from_rows(telling)))
             parts.append(fed)
         if self.monitor is not None:
             self.monitor.add(odometry_of(parts), self.residuals(parts))
