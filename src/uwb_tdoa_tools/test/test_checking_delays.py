@@ -49,3 +49,13 @@ def test_gross_errors_do_not_count():
     rng, late = np.random.default_rng(1), np.full(len(T), 0.25)
     measured = course(T - late) + np.where(rng.random(len(T)) < 0.1, rng.uniform(-50.0, 50.0, len(T)), 0.0)
     assert delays(SERIES, T, lambda delay: measured - course(T - delay)).constant()[1] == pytest.approx(0.25)
+
+
+def test_a_series_of_which_nothing_or_little_is_heard_together_tells_nothing():
+    """As of most pairs of a hall: of a few samples some delay explains nearly all."""
+    few, together = np.arange(3, 60), np.array([0, 1, 2, 3, 4, 5])
+    t = np.concatenate([T, 7.0 * few, T[:300:50][together]])
+    series = np.concatenate([SERIES, np.full(len(few), 3), np.full(len(together), 4)])
+    noise = 0.1 * np.random.default_rng(0).standard_normal(len(t))
+    of = delays(series, t, lambda delay: np.sin(1.3 * t) + noise - np.sin(1.3 * (t - delay)))
+    assert [of.of_series(k) for k in (3, 4)] == [(1.0, 0.0)] * 2 and of.of_series(0)[0] == 1.0

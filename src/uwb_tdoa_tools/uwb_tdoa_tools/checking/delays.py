@@ -6,6 +6,7 @@ What changes slowly, as a systematic error does, is taken out first: a mean for 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ LONGEST, STEP = 1.5, 0.05  # s that are tried to both sides, and between them
 DELAYS = np.arange(-LONGEST, LONGEST + 0.5 * STEP, STEP)
 NONE = len(DELAYS) // 2  # place of the delay 0
 BLOCK, FEWEST = 5.0, 5  # s, and samples that a series must have in one
+TELLING = 30.0  # samples, about, of which a series has that many in a block, that it must have to be told anything of
 MOST = 15000  # TDOAs that are looked at, evenly taken
 LIMIT = 2.0  # standard deviations of a series, robust, beyond which an error counts no more: what is behind obstacles is many
 
@@ -32,10 +34,18 @@ class Delays:
     power: np.ndarray
 
     def of_series(self, k: int) -> tuple[float, float]:
-        """(ratio, s): what is left of a series with its best delay, over what is left with the best one of all; and that delay."""
-        own, common = self.power[k].sum(axis=0), int(np.argmin(self.power.sum(axis=(0, 1))))
+        """(ratio, s): what is left of a series with its best delay, over what is left with the best one of all; and that delay. (1, 0) of a
+        series that tells nothing."""
+        own, common = self.power[k].sum(axis=0), self._common
+        if own[NONE] < TELLING:
+            return 1.0, 0.0
         best = int(np.argmin(own))
         return float(own[best] / max(own[common], 1e-12)), float(DELAYS[best] - DELAYS[common])
+
+    @cached_property
+    def _common(self) -> int:
+        """Place of the best delay of all."""
+        return int(np.argmin(self.power.sum(axis=(0, 1))))
 
     def constant(self) -> tuple[float, float]:
         """(ratio, s): what is left with the best delay of all, over what is left without any; and that delay."""
