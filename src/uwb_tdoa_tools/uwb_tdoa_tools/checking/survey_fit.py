@@ -72,26 +72,28 @@ class SurveyFit:
         moved = np.ones(len(self.positions), dtype=bool) if free is None else np.isin(range(len(self.positions)), free)
         columns = np.flatnonzero(np.repeat(moved, 3))  # of the coordinates that are free
         anchors, start = self.positions.copy(), [x.copy() for x in self._start]
+        heard = [moved & np.isin(np.arange(len(moved)), ends[1:3]) for ends in self._windows]  # in each window; of a hall few are
+        places = [np.flatnonzero(np.repeat(some[moved], 3)) for some in heard]  # of their coordinates, among the free ones
         for _ in range(SWEEPS):
             H = np.eye(len(columns)) / PRIOR**2
             g = (self.positions - anchors).reshape(-1)[columns] / PRIOR**2
             eliminated = []
-            for x, window in zip(start, self._windows):
-                by_tag, by_anchors, residual = _linearised(x, window, anchors, moved)
+            for x, window, some, its in zip(start, self._windows, heard, places):
+                by_tag, by_anchors, residual = _linearised(x, window, anchors, some)
                 weight = min(1.0, TOGETHER / len(residual)) / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
                 left = by_tag * weight[:, None]
                 A = left.T @ by_tag + np.diag([TAG**-2] * 3 + [SPEED**-2] * 3)
                 B = left.T @ by_anchors
                 c = left.T @ residual - np.r_[np.zeros(3), x[3:] / SPEED**2]
                 solved = np.linalg.solve(A, np.column_stack([B, c]))
-                H += by_anchors.T @ (weight[:, None] * by_anchors) - B.T @ solved[:, :-1]
-                g += by_anchors.T @ (weight * residual) - B.T @ solved[:, -1]
+                H[np.ix_(its, its)] += by_anchors.T @ (weight[:, None] * by_anchors) - B.T @ solved[:, :-1]
+                g[its] += by_anchors.T @ (weight * residual) - B.T @ solved[:, -1]
                 eliminated.append(solved)
             step = np.linalg.solve(H, g)
             step *= min(1.0, STEP / max(np.abs(step).max(), 1e-9))
             anchors.reshape(-1)[columns] += step
-            for x, solved in zip(start, eliminated):
-                x += np.clip(solved[:, -1] - solved[:, :-1] @ step, -2.0, 2.0)
+            for x, solved, its in zip(start, eliminated, places):
+                x += np.clip(solved[:, -1] - solved[:, :-1] @ step[its], -2.0, 2.0)
         return self._loss(start, anchors), anchors
 
     def _loss(self, states: list[np.ndarray], anchors: np.ndarray) -> float:
