@@ -7,10 +7,12 @@ import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet
 from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
+from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.diagnose import _calibrated, _Work
 from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.diagnosis.self_calibration import self_calibrate
+from uwb_tdoa_tools.diagnosis.self_calibration.equations import Runs
 from uwb_tdoa_tools.diagnosis.self_calibration.prior import with_calibration
 from uwb_tdoa_tools.diagnosis.self_calibration.solve import CLEARLY, LEFT
 from uwb_tdoa_tools.scoring.evaluation import evaluate
@@ -64,6 +66,17 @@ def test_what_is_applied_is_found_with_its_evidence_and_the_same_in_all_flights(
     shares = [(one.share, one.std) for one in added[1].shares]
     assert len(shares) == 2 and all(abs(share - 1.0) < 0.3 and std < 0.2 for share, std in shares)
     assert "The same in all 2 flights" in diagnosis.as_text()
+
+
+def test_the_noise_that_the_filter_is_told_asks_for_no_functions_of_the_place():
+    flight, config = flight_with(LATE), FilterConfig()
+    anchors = flight.anchors
+    about = anchors, np.zeros(len(anchors)), np.full(4 * len(anchors), 0.1)
+    with_all, alone = (Runs([flight], EffectSet(), config).equations(*about, functions=functions) for functions in (True, False))
+    n = len(alone.vector)
+    assert n == 4 * len(anchors) < len(with_all.vector)
+    np.testing.assert_allclose(alone.gram, with_all.gram[:n, :n], rtol=1e-9, atol=1e-6)
+    assert alone.tdoa_std(config) == pytest.approx(with_all.tdoa_std(config), rel=1e-9)
 
 
 def test_a_delay_of_one_flight_is_no_delay_of_the_other():

@@ -16,6 +16,7 @@ from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
+from uwb_tdoa_tools.diagnosis.self_calibration.equations import _sparse
 from uwb_tdoa_tools.diagnosis.self_calibration.prior import Prior, Solution
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.surveying.report import apart, as_text
@@ -86,6 +87,13 @@ def test_columns_of_some_anchors_are_made_of_their_tdoas_alone(sound):
         columns = part.columns(effect, keys).toarray()
         np.testing.assert_allclose(columns, part.cells.means(whole), atol=1e-12)
         assert np.abs(columns).max() > 0.1
+
+
+def test_what_a_survey_asks_of_single_anchors_is_made_of_their_tdoas_alone(sound):
+    samples = residuals(sound, GroundTruth(), EffectSet())["tdoa"].samples
+    ids = [str(i) for i in samples.anchors.ids]
+    for effect, keys in (EFFECTS["anchor_delay"](), ids), (EFFECTS["anchor_position"](), [f"{i}.{axis}" for i in ids[30:50] for axis in "xyz"]):
+        np.testing.assert_array_equal(_sparse(effect, samples, keys).toarray(), np.nan_to_num(effect.regressors(samples, keys)))
 
 
 @pytest.mark.slow

@@ -83,8 +83,7 @@ class RadioResidual(ChannelResidual):
         if are_many([self]) and self.innovations is None and _of_single_anchors(effect):  # nothing else has to do with these anchors
             named = np.isin(samples.anchors.ids, [int(i) for key in keys for i in key.partition(".")[0].split("-")])
             rows = np.flatnonzero(named[samples.a] | named[samples.b])
-            t, a, b, p, q = (values[rows] for values in (samples.t, samples.a, samples.b, samples.p, samples.q))
-            samples = type(samples)(t, a, b, p, q, samples.anchors, samples.start)
+            samples = of_rows(samples, rows)
         values = np.nan_to_num(effect.regressors(samples, list(keys)))
         if self.innovations is not None:
             values = self.innovations.by_bias(values)
@@ -241,6 +240,12 @@ class Tdoa(Channel[TdoaResidual]):
 
     def health(self, residuals: Sequence[TdoaResidual]) -> Figures:
         return pairs.health(residuals)
+
+
+def of_rows(samples: Samples, rows: np.ndarray) -> Samples:
+    """Some of the Samples, with what effects of single anchors ask for."""
+    t, a, b, p, q = (values[rows] for values in (samples.t, samples.a, samples.b, samples.p, samples.q))
+    return type(samples)(t, a, b, p, q, samples.anchors, samples.start)
 
 
 def _of_single_anchors(effect: Effect) -> bool:

@@ -20,6 +20,7 @@ from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.sensitivity import TDOAS
@@ -29,7 +30,7 @@ from ...parallel import in_one_thread
 from ...scoring.metrics import AIRBORNE
 from ..channels import Comparison, RadioResidual
 from ..channels.ranging import RangeResidual
-from ..channels.tdoa import TdoaResidual, compared
+from ..channels.tdoa import TdoaResidual, compared, of_rows
 from ..constraints import Distance, Mark
 from ..references.nothing import Nothing
 from ..regression.fit import NU, student_scale
@@ -62,7 +63,7 @@ def tdoa_std_of(
     config, anchors = config or FilterConfig(), flights[0].anchors
     loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
     runs, no_delays = Runs(flights, effects, config, streams=(TDOAS,)), np.zeros(len(anchors))
-    return runs.equations(anchors, no_delays, loose, map_function=map_function).tdoa_std(config)
+    return runs.equations(anchors, no_delays, loose, map_function=map_function, functions=False).tdoa_std(config)
 
 
 def measured_noise(
@@ -140,16 +141,17 @@ class Runs:
 
     def equations(
         self, anchors: Anchors, delays: np.ndarray, loose: np.ndarray, progress: Callable[[], object] = lambda: None,
-        map_function: MapFunction = map,
+        map_function: MapFunction = map, functions: bool = True,
     ) -> Equations:  # fmt: skip
-        """Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may be."""
+        """Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may be; functions : whether to have
+        those of the place, too, which the inflation does not ask for."""
         gram: np.ndarray = np.zeros(())
         vector: np.ndarray = np.zeros(())
         marks: list[_Mark] = []
         several: list[FlightEquations] = []
         here = [[one for one in self._marks if one.flight == flight.name] for flight in self.flights]
         items = [(flight, self.spans.get(flight.name), some) for flight, some in zip(self.flights, here)]
-        told = map_function(partial(_of_flight, self._base, self._reference, anchors, delays, loose), items)
+        told = map_function(partial(_of_flight, self._base, self._reference, (anchors, delays), loose, functions), items)
         for (one, span), flight in zip(told, self.flights):
             self.spans[flight.name] = span
             marks += one.marks
@@ -190,13 +192,14 @@ def _residuals(
 
 
 def _of_flight(
-    base: EffectSet, reference: Nothing, anchors: Anchors, delays: np.ndarray, loose: np.ndarray,
+    base: EffectSet, reference: Nothing, about: tuple[Anchors, np.ndarray], loose: np.ndarray, functions: bool,
     item: tuple[Flight, tuple[float, float] | None, list[Mark]],
 ) -> tuple[FlightEquations, tuple[float, float]]:  # fmt: skip
-    """(FlightEquations, span) of (Flight, span or None, marks of it)."""
+    """(FlightEquations, span) of (Flight, span or None, marks of it). about : Anchors, and by how much they are late, (N,) m; functions :
+    as of `Runs.equations`."""
     flight, known_span, marks = item
-    parts, span = _residuals(base, reference, anchors, delays, flight, known_span)
-    gram, vector, blocks, known = _equations(parts, flight, marks)
+    parts, span = _residuals(base, reference, *about, flight, known_span)
+    gram, vector, blocks, known = _equations(parts, flight, marks, functions)
     n = len(loose)
     inflation = _inflation(gram[:n, :n], vector[:n], blocks, loose)
     less = SYSTEMATIC * inflation
@@ -215,18 +218,18 @@ def _slow(parts: Sequence[RadioResidual]) -> np.ndarray:
 
 
 def _equations(
-    parts: Sequence[RadioResidual], flight: Flight, constraints: Sequence[Mark]
+    parts: Sequence[RadioResidual], flight: Flight, constraints: Sequence[Mark], functions: bool
 ) -> tuple[np.ndarray, np.ndarray, list[_Told], list[_Mark]]:
     """(gram (k, k), vector (k,), [_Told] of each block) of the normal equations that the RadioResiduals of a Flight give, and [_Mark] of
-    constraints of it."""
+    constraints of it. functions : as of `Runs.equations`."""
     innovations = parts[0].innovations
     assert innovations is not None  # as of a Reference that does not know the path
-    n, t, air, own = 4 * len(flight.anchors), innovations.t, np.zeros(len(innovations.t), bool), []
+    n, t, air, placed = 4 * len(flight.anchors), innovations.t, np.zeros(len(innovations.t), bool), []
     for part in parts:
         places = innovations.places(part.samples.channel)
         air[places] = part.airborne
-        own.append(_selection(places, len(t)) @ _regressors(part.samples))
-    regressors = sum(own[1:], own[0])
+        placed.append(_selection(places, len(t)) @ _regressors(part.samples, functions))
+    regressors = sum(placed[1:], placed[0])
     stamps = [one.stamps(flight.start) for one in constraints]
     moved = np.zeros((sum(map(len, stamps)), 3, regressors.shape[1]))
     error = innovations.value[air] / np.sqrt(innovations.variance[air])
@@ -240,29 +243,42 @@ def _equations(
         some, value, variance = derivative[inside], innovations.value[rows][inside], innovations.variance[rows][inside]
         weight = (NU + 1.0) / (NU + (value / np.sqrt(variance) / scale) ** 2) / variance
         own, right = (some * weight[:, None]).T @ some, some.T @ (weight * value)
-        gram[np.ix_(columns, columns)] += own
+        _add(gram, columns, own)
         vector[columns] += right
         last = np.searchsorted(columns, n)
         blocks.append(_Told(columns[:last], own[:last, :last], right[:last]))
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
 
 
-def _regressors(samples: Samples) -> csr_array:
-    """Derivatives of TDOAs by coordinates and delays of anchors, and functions of the place of each: sparse, in rows, (n, 24 N)."""
+@compiled
+def _add(gram: np.ndarray, columns: np.ndarray, own: np.ndarray) -> None:
+    """Add own (c, c) to the rows and columns (c,) of gram (k, k), row by row: as numpy does, without copies of them."""
+    for i in range(len(columns)):
+        for j in range(len(columns)):
+            gram[columns[i], columns[j]] += own[i, j]
+
+
+def _regressors(samples: Samples, functions: bool) -> csr_array:
+    """Derivatives of TDOAs by coordinates and delays of anchors, and functions of the place of each, if they are wanted: sparse, in rows,
+    (n, 24 N) or (n, 4 N)."""
     ids = [str(i) for i in samples.anchors.ids]
     late = _sparse(AnchorDelay(), samples, ids)
-    functions = np.nan_to_num(features(samples.p))
-    n, times = late.shape[0], functions.shape[1]
-    each = csr_array(  # every entry of `late` times all functions: as many columns in the place of one
+    positions = _sparse(AnchorPosition(), samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
+    return hstack([positions, late, *([_of_places(late, samples.p)] if functions else [])], format="csr")
+
+
+def _of_places(late: csr_array, p: np.ndarray) -> csr_array:
+    """Every entry of `late` (n, N) times all functions of the places p (n, 3) m: as many columns in the place of one."""
+    values = np.nan_to_num(features(p))
+    n, times = late.shape[0], values.shape[1]
+    return csr_array(
         (
-            (late.data[:, None] * functions[np.repeat(np.arange(n), np.diff(late.indptr))]).ravel(),
+            (late.data[:, None] * values[np.repeat(np.arange(n), np.diff(late.indptr))]).ravel(),
             (late.indices[:, None] * times + np.arange(times)).ravel(),
             late.indptr * times,
         ),
         shape=(n, late.shape[1] * times),
     )
-    positions = _sparse(AnchorPosition(), samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
-    return hstack([positions, late, each], format="csr")
 
 
 def _selection(places: np.ndarray, n: int) -> csr_array:
@@ -271,9 +287,17 @@ def _selection(places: np.ndarray, n: int) -> csr_array:
 
 
 def _sparse(effect: Effect, samples: Samples, keys: list[str]) -> csr_array:
-    """Regressors of an Effect, sparse, in rows: (n, keys)."""
-    parts = [effect.regressors(samples, keys[first : first + AT_ONCE]) for first in range(0, len(keys), AT_ONCE)]
-    return hstack([csr_array(np.nan_to_num(part)) for part in parts], format="csr")
+    """Regressors of an Effect of single anchors, sparse, in rows: (n, keys). What is of other anchors is zero, and not asked for."""
+    parts = []
+    for first in range(0, len(keys), AT_ONCE):
+        some = keys[first : first + AT_ONCE]
+        named = np.isin(samples.anchors.ids, [int(key.partition(".")[0]) for key in some])
+        rows = np.flatnonzero(named[samples.a] | named[samples.b])
+        values = csr_array(np.nan_to_num(effect.regressors(of_rows(samples, rows), some)))
+        held = np.zeros(len(samples.t), np.int64)
+        held[rows] = np.diff(values.indptr)
+        parts.append(csr_array((values.data, values.indices, np.append(0, np.cumsum(held))), shape=(len(held), len(some))))
+    return hstack(parts, format="csr")
 
 
 @dataclass(frozen=True, eq=False)
