@@ -10,6 +10,7 @@ from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, T
 from uwb_tdoa_bias.effects.samples import Track
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import poses_of, run_offline
+from uwb_tdoa_tools.diagnosis import validation
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.comparison import Baseline, ValidationCase, _gain_interval, compare, score, why_not
 from uwb_tdoa_tools.diagnosis.detectors import Detection
@@ -121,6 +122,11 @@ def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_n
     assert kept.detections == () and "does not make the filter better" in kept.refused[-1].why
 
 
+def test_a_trial_is_judged_by_the_figure_of_the_whole_row(flights):
+    judged = score(ValidationCase(flights[0], NONE), run_offline(flights[0]))
+    assert judged.rmse_3d == judged.row()["rmse_3d"] > 0.0
+
+
 def test_a_rehearsal_at_the_poses_of_the_run_itself_is_that_run(flights):
     effects = EffectSet((AnchorDelay({"1": 0.3}), TagLeverArm({"x": 0.1, "z": 0.1})))
     run = run_offline(flights[0], None, Corrector(flights[0].anchors, effects))
@@ -196,3 +202,25 @@ def test_a_gain_that_a_shift_of_the_reference_can_feign_is_none():
     assert "may be chance" in why_not(*sides, 0.0) and "may be 10 cm from where" in why_not(*sides, 0.1)
     sides[1]["pooled"]["rmse_3d"] = 0.16
     assert "do not make the error smaller" in why_not(*sides, 0.0)
+
+
+class _Figures:
+    """Trials of models whose error grows by what each candidate, that is not in them, is worth."""
+
+    def __init__(self, worth):
+        self.worth, self.tried = worth, 0
+
+    def errors(self, models):
+        self.tried += len(models)
+        return [1.0 + sum(value for name, value in self.worth.items() if name not in candidates) for candidates, _ in models]
+
+
+def test_as_many_go_at_once_as_may_together():
+    names = list("abcdefghij")
+    nothing = _Figures(dict.fromkeys(names, 0.001))
+    assert validation._gone(nothing, (names, []), names, 1.05) == names and nothing.tried == 1
+    one = _Figures({**dict.fromkeys(names, 0.001), "h": 0.049})
+    assert validation._gone(one, (names, []), names, 1.05) == [name for name in names if name != "h"] and one.tried < len(names)
+    both = _Figures({"a": 0.04, "b": 0.04})
+    assert validation._gone(both, (["a", "b"], []), ["a", "b"], 1.05) == ["a"]  # either may go, but not both
+    assert validation._gone(both, (["a", "b"], []), [], 1.05) == []

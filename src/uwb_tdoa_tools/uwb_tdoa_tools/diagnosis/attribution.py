@@ -119,8 +119,15 @@ def attribute(
     which each is done.
     """
 
+    known: list[tuple[tuple[Effect, ...], list[ChannelResiduals]]] = []
+
     def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
-        return residuals_of(flights, reference, EffectSet((*base.effects, *model)), progress, map_function)
+        """Those beside a model; of the last one, and of none, they are kept."""
+        again = [residuals for other, residuals in known if other == tuple(model)]
+        if not again:
+            again = [residuals_of(flights, reference, EffectSet((*base.effects, *model)), progress, map_function)]
+            known[1:] = [(tuple(model), again[0])]
+        return again[0]
 
     under_base = at(())
     shown = {name for flight in under_base for name in flight}

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
+    from uwb_tdoa_ekf.offline import Run
     from ..parallel import MapFunction
     from .attribution import Attribution
     from .detectors import Detection
@@ -95,7 +96,8 @@ def select_by_error(
     Candidates go, one by one, if the error is smaller without, or of a single flight hardly larger; detections stay only if it is
     smaller with them. At most TRIAL_FLIGHTS flights are judged. Trials run the filter with the corrections that it
     would get at the poses of a run with all.
-    After one has gone, those that seemed to do harm too are tried again first; in the end all are tried beside what is kept.
+    After one has gone, those that seemed to do harm too are tried again first; in the end all are tried beside what is kept. Where a
+    trial is costly, as many go at once as may together.
     What happened at a time of a single flight is tried, so that its worth is known, and not kept.
     map_function : as of `attribute`.
     """
@@ -111,15 +113,15 @@ def select_by_error(
         less = [([c for c in candidates if c is not one], detections) for one in suspects]
         without = dict(zip(suspects, trials.errors(less)))
         harmful = sorted((one for one in suspects if without[one] <= error * (1.0 + least)), key=without.__getitem__)
-        if harmful:
-            why = _why_without(error, without[harmful[0]])
-            refused.append(Refused(harmful[0].label, why))
-            candidates = [one for one in candidates if one is not harmful[0]]
-            worth[harmful[0]] = without[harmful[0]] - error
+        gone = _gone(trials, (candidates, detections), harmful, error * (1.0 + least)) if trials.costly else harmful[:1]
+        if gone:
+            refused += [Refused(one.label, _why_without(error, without[one])) for one in gone]
+            worth.update((one, without[one] - error) for one in gone)
+            candidates = [one for one in candidates if one not in gone]
             error, without = trials.start(candidates, detections), {}
         elif len(suspects) == len(_applicable(candidates)):
             break
-        suspects = harmful[1:] or _applicable(candidates)
+        suspects = _applicable(candidates) if trials.costly else harmful[1:] or _applicable(candidates)
     worth.update((candidate, trial - error) for candidate, trial in without.items())
     for detection in attribution.detections:
         if not detection.effect.usable:
@@ -138,6 +140,22 @@ def select_by_error(
         candidates = [one for one in candidates if one is not momentary]
     selection = attribution.selection.kept(candidates)  # fitted as in the trials
     return ValidatedSelection(selection, tuple(detections), tuple(refused), worth)
+
+
+def _gone(trials: _Trials, model: Model, harmful: Sequence[Candidate], limit: float) -> Sequence[Candidate]:
+    """Of Candidates of a model, the least worth first, those that may go together: without all of them the error, m, is at most a limit,
+    as it is without each. They are tried together; if that is too many, one half after the other, and so on."""
+    candidates, detections = model
+    gone: list[Candidate] = []
+    parts = [list(harmful)] if harmful else []
+    while parts:
+        part = parts.pop(0)
+        rest = [one for one in candidates if one not in (*gone, *part)]
+        if (len(part) == 1 and not gone) or trials.errors([(rest, detections)])[0] <= limit:
+            gone += part
+        elif len(part) > 1:
+            parts[:0] = [part[: len(part) // 2], part[len(part) // 2 :]]
+    return gone
 
 
 def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -171,6 +189,11 @@ class _Trials:
         self._map_function = map_function
         self._poses: Sequence[Poses | None] = [None]
 
+    @property
+    def costly(self) -> bool:
+        """Whether to make as few trials as will do: of a single flight, among MANY anchors, which is long if it has heard them all."""
+        return len(self._flights) == 1 and self._attribution.selection.table.sparse
+
     def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
         """The error of a model; later trials take the poses of its runs."""
         (told,) = self._tried(_error_and_poses, [(candidates, detections)])
@@ -198,17 +221,23 @@ class _Trials:
 
 def error_of(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:
     """3D RMSE, m, of a trial."""
-    return _error_and_poses(config, trial)[0]
+    return _tried(config, trial)[0]
 
 
 def _error_and_poses(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> tuple[float, Poses]:
     """(3D RMSE, m, poses of the run) of a trial: a ValidationCase, and the poses that it is corrected at, None for
     those of the run itself."""
+    error, run = _tried(config, trial)
+    return error, poses_of(run.odometry)
+
+
+def _tried(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> tuple[float, Run]:
+    """(3D RMSE, m, Run) of a trial."""
     case, poses = trial
     anchors, effects = case.flight.anchors, case.effects
     corrector = Corrector(anchors, effects) if poses is None else RehearsedCorrector(anchors, effects, poses)
     run = run_offline(case.flight, config, corrector)
-    return score(case, run).row()["rmse_3d"], poses_of(run.odometry)
+    return score(case, run).rmse_3d, run
 
 
 def validation_cases(

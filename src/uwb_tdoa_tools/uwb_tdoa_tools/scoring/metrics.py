@@ -157,8 +157,17 @@ class Score:
         self.part, self.first, self.last = judged_part(truth)
         self.t, self.error, self.covariance = position_errors(odometry, truth, self.first, self.last)
         self.p = position_at(self.t, truth)
-        self.nees = nees(self.error, self.covariance)
         self.nis = nis(residuals) if residuals is not None else np.empty(0)
+
+    @cached_property
+    def nees(self) -> np.ndarray:
+        """(n,), of each error."""
+        return nees(self.error, self.covariance)
+
+    @property
+    def rmse_3d(self) -> float:
+        """m: that of `row`, alone."""
+        return _rms(np.linalg.norm(self.error, axis=1))
 
     @cached_property
     def series(self) -> ErrorSeries:

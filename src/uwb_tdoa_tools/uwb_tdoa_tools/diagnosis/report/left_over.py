@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 LARGE, ABOVE = 0.15, 3.0  # m, and times the root mean square of all, that a pair may be off for BLOCK s before it is named
 NAMED = 3
+NEAR = 0.999  # of that limit, from which on a pair is looked at closely
 
 
 def left_over(diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -32,8 +33,10 @@ def _of_part(part: ChannelResidual, of: str) -> Iterator[tuple[float, str]]:
     block = (rows.t / BLOCK).astype(int)
     usual = np.sqrt(np.median(rows.y**2) / 0.455)  # the median of squares is 0.455 of their mean, for Gaussian noise
     label = rows.series * (block.max() + 1) + block
-    for number in np.unique(label):
-        mine = label == number
+    number = np.unique(label, return_inverse=True)[1]
+    power = np.bincount(number, rows.y**2) / np.bincount(number)
+    for place in np.flatnonzero(power > (NEAR * max(LARGE, ABOVE * usual)) ** 2):
+        mine = number == place
         size = float(np.sqrt(np.mean(rows.y[mine] ** 2)))
         name = part.place_in_room(rows.series[mine][0])
         if name and mine.sum() >= 3 and size > max(LARGE, ABOVE * usual):
