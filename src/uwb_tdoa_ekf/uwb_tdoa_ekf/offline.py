@@ -134,7 +134,8 @@ def _batches(
     Corrections need poses that are `lag` old: measurements less than that apart can be corrected as one batch.
     """
     known = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(d) & np.isfinite(t))
-    known = known[np.lexsort((d[known], b[known], a[known], t[known]))]  # siblings of one stamp as on line
+    if not (np.diff(t[known]) > 0.0).all():
+        known = known[np.lexsort((d[known], b[known], a[known], t[known]))]  # siblings of one stamp as on line
     stamps, lag, first = t[known], math.inf if corrector.idle else corrector.lag, 0
     while first < len(known) or not first:
         end = min(int(np.searchsorted(stamps, stamps[first] + lag)), first + longest) if len(known) else 1

@@ -221,17 +221,17 @@ class _Trials:
 
 def error_of(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:
     """3D RMSE, m, of a trial."""
-    return _tried(config, trial)[0]
+    return _judged(config, trial)[0]
 
 
 def _error_and_poses(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> tuple[float, Poses]:
     """(3D RMSE, m, poses of the run) of a trial: a ValidationCase, and the poses that it is corrected at, None for
     those of the run itself."""
-    error, run = _tried(config, trial)
+    error, run = _judged(config, trial)
     return error, poses_of(run.odometry)
 
 
-def _tried(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> tuple[float, Run]:
+def _judged(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> tuple[float, Run]:
     """(3D RMSE, m, Run) of a trial."""
     case, poses = trial
     anchors, effects = case.flight.anchors, case.effects

@@ -98,7 +98,11 @@ def _known_spans(known: np.ndarray) -> np.ndarray:
 
 def _inside(part: Any, spans: Spans) -> Any:
     """What of a Truth or an Odometry is stamped within spans ((first, last), ...), s."""
-    inside = np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0)
+    if not (np.diff(part.t) >= 0.0).all():
+        return rows_of(part, np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0))
+    inside = np.zeros(len(part.t), bool)
+    for first, last in spans:
+        inside[np.searchsorted(part.t, first) : np.searchsorted(part.t, last, side="right")] = True
     return rows_of(part, inside)
 
 
