@@ -118,7 +118,6 @@ def attribute(
     progress() is called now and then; map_function(function, items) : as map, but for the time and the process in
     which each is done.
     """
-
     known: list[tuple[tuple[Effect, ...], list[ChannelResiduals]]] = []
 
     def at(model: Sequence[Effect]) -> list[ChannelResiduals]:
