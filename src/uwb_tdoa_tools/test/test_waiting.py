@@ -20,6 +20,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners
 
 FIRST, EVERY, LONG_ENOUGH = 2.0, 5.0, 10.0  # s; the last: of computing, after which enough is known of what does not end before
+PATIENCE = 120.0  # s for a command that is interrupted to end
 CROWD = 0.05  # of the time that a command has waited for a core, from which on others compute on the same ones
 WORDS = {  # command: words after it
     "bench": "--quick --only core",
@@ -79,6 +80,17 @@ def waited(pid):
         return 0.0
 
 
+def end(process):
+    """Interrupt a command, so that it ends what it has started, nodes in process groups of their own among it, which a kill would leave
+    behind; and kill what is left of its group."""
+    for number, patience in ((signal.SIGINT, PATIENCE), (signal.SIGKILL, None)):
+        try:
+            os.killpg(process.pid, number)
+            process.communicate(timeout=patience)
+        except (ProcessLookupError, subprocess.TimeoutExpired):
+            pass
+
+
 def silences(name, words, folder):
     """[s] of computing until each thing that a command says, and until its end, or LONG_ENOUGH; and the share of time that it had to wait
     for a core."""
@@ -104,10 +116,7 @@ def silences(name, words, folder):
             if clock > LONG_ENOUGH or clock - spoken > 2.0 * EVERY:
                 out.append(clock - spoken)
                 break
-        try:
-            os.killpg(process.pid, signal.SIGKILL)  # what it has started, too
-        except ProcessLookupError:
-            pass
+        end(process)
     return crowd, out
 
 
