@@ -163,6 +163,7 @@ def test_memory_and_estimate_of_a_tag_do_not_depend_on_how_many_anchors_are_inst
 
 @pytest.mark.slow
 def test_a_tag_costs_what_it_hears_and_starts_with_ten_thousand_anchors_within_three_seconds():
+    """By what is installed it would cost some hundred times as much. The ratio itself, which other processes disturb, is for the benchmark."""
     cost(20, 5.0, 1)  # what is compiled, is
     (few, *_), (many, _, start, _) = (cost(n, 30.0) for n in (20, 10_000))
-    assert many < 1.1 * few and start < 3.0
+    assert many < 2.0 * few and start < 3.0
