@@ -123,3 +123,11 @@ def test_what_is_recorded_of_tdoas_does_not_depend_on_what_else_is():
     np.testing.assert_array_equal(alone.rows, both.rows[places])
     np.testing.assert_array_equal(alone.value, both.value[places])
     np.testing.assert_array_equal(alone.variance, both.variance[places])
+
+
+def test_ranges_that_the_filter_does_not_use_leave_no_innovations():
+    flight = with_ranges(fly(seed=6, duration=4.0))
+    found = record_innovations(flight, FilterConfig(use_range=False), streams=("tdoa", "range"))
+    assert found.streams == ("tdoa",) and len(found.places("tdoa")) == len(found.t) > 0
+    alone = record_innovations(flight.without("range"), streams=("tdoa", "range"))
+    assert alone.streams == ("tdoa",)

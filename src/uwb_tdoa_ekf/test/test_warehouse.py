@@ -13,6 +13,7 @@ from uwb_tdoa_ekf.estimator import Estimator
 
 WITHOUT_IMU = FilterConfig(use_imu=False)
 SLOW = {"duration": 12.0, "speed": 1.0}
+PAIRS = 6  # of runs, at most, whose processor times are compared
 
 
 def surroundings(positions, a, b, reach=30.0, tag_side="unknown"):
@@ -163,7 +164,10 @@ def test_memory_and_estimate_of_a_tag_do_not_depend_on_how_many_anchors_are_inst
 
 @pytest.mark.slow
 def test_a_tag_costs_what_it_hears_and_starts_with_ten_thousand_anchors_within_three_seconds():
-    """By what is installed it would cost some hundred times as much. The ratio itself, which other processes disturb, is for the benchmark."""
+    """Runs in turn, until a pair that nothing disturbs shows it. What grows with what is installed, up to 500 times here, shows it in none."""
     cost(20, 5.0, 1)  # what is compiled, is
-    (few, *_), (many, _, start, _) = (cost(n, 30.0) for n in (20, 10_000))
-    assert many < 2.0 * few and start < 3.0
+    ratios, start = [], np.inf
+    while min(ratios, default=np.inf) >= 1.1 and len(ratios) < PAIRS:
+        (few, *_), (many, _, start, _) = (cost(n, 30.0, 1) for n in (20, 10_000))
+        ratios.append(many / few)
+    assert min(ratios) < 1.1 and start < 3.0, ratios

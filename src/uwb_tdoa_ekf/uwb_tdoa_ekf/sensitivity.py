@@ -122,13 +122,14 @@ def _pieces(
 def record_innovations(
     flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None, streams: Sequence[str] = (TDOAS,)
 ) -> Innovations:
-    """Run a Flight through bias correction and filter, without its pressure, and keep what `Innovations` of some streams need, TDOAS or
-    SENSORS that the flight has. Takes what run_offline takes."""
+    """Run a Flight through bias correction and filter, without its pressure, and keep what `Innovations` need of the TDOAS, and of those
+    SENSORS among `streams` that the flight has and the filter uses. Takes what run_offline takes."""
     corrector = corrector or Corrector(flight.anchors)
     # Its offset is not among the states of the history.
     config = replace(config or FilterConfig(), use_pressure=False)  # type: ignore[call-arg]  # parameters of SENSORS are known at run time
     records: list[np.ndarray] = []
     run = run_offline(flight, config, corrector, records)
+    streams = [name for name in streams if name == TDOAS or name in run.aids]
     corrected = corrector.effects.correct_streams(flight)
     of_tdoas = structured(RESIDUAL, *(getattr(run.residuals, name) for name in OF_ROW))
     sources = [of_tdoas if name == TDOAS else run.aids[name] for name in streams]

@@ -10,6 +10,7 @@ import pytest
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.sensors import Ranges
 from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.bags.bag import write_bag
@@ -214,6 +215,15 @@ def test_only_tdoas_place_an_anchor(ranged):
 
 def test_tdoas_know_nothing_of_the_delay_of_the_tag(flights, result):
     assert abs(np.mean(result.delays)) < 0.05 and result.prior.common == 0.0
+
+
+def test_ranges_that_are_not_to_be_used_tell_nothing(flights):
+    """Neither of anchors, nor that the tag may have a delay."""
+    tdoa = flights[0].tdoa
+    late = replace(flights[0], range=Ranges(tdoa.t, tdoa.a, np.full(len(tdoa), 9.0), np.zeros(len(tdoa))))
+    config = FilterConfig(use_range=False)
+    with_them, without = (self_calibrate([flight], Tape(0.2, trusted=TRUSTED), config=config) for flight in (late, flights[0]))
+    np.testing.assert_array_equal(with_them.surveyed.positions, without.surveyed.positions)
 
 
 def test_survey_of_a_recording_of_ranges(ranged, tmp_path, capsys):

@@ -380,7 +380,7 @@ def level_anew(ekf: Record, parameters: Record, yaw_std: float, history: np.ndar
 
 @compiled
 def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
-    """The same when inertial samples have come for the first time: the yaw is known as well as it was."""
+    """`level_anew` when inertial samples have come for the first time: the yaw is known as well as it was before."""
     alive = 0
     for h in range(HYPOTHESES):
         alive += hypotheses.alive(ekf.hypotheses[h])

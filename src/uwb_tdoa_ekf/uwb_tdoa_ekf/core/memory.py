@@ -162,7 +162,7 @@ EKF = _record(
     ("next_bounds", float),  # s, stamp before which not to look anew who is heard
     ("information", float, (3, 3)),  # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py
     ("unsure_until", float),  # s, stamp until which the tag may be anywhere, as its place was hardly known before
-    ("waits_until", float),  # s, stamp until which its TDOAs wait for a search,
+    ("waits_until", float),  # s, stamp until which its TDOAs wait for a search
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),
     ("first_tdoa", float),  # s, stamps: of the first TDOA since the filter stopped, and the last one

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, most_severe_first
 
 from ..readers.streams import protocol
-from . import coverage, imu_rules, labels, range_offset, tdoa_rules, wiring
+from . import coverage, imu_rules, labels, tag_delay, tdoa_rules, wiring
 from .ordered import OrderedRecording
 from .survey_fit import displacement
 from .tdoa_rules import SAME, furthest
@@ -81,7 +81,7 @@ def check(recording: Recording, others: Sequence[Survey] = ()) -> Report:
     """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one."""
     streams = fed(recording)
     found = [*streams.findings(), *sensors(recording)]
-    for rule in (*labels.RULES, *wiring.RULES, *range_offset.RULES):
+    for rule in (*labels.RULES, *wiring.RULES, *tag_delay.RULES):
         found += rule(recording)
     if not len(recording.tdoa):  # of ranges alone: nothing else is there to be tried
         return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)

@@ -39,15 +39,13 @@ class Nothing(Reference):
     def __init__(
         self, config: FilterConfig | None = None, constraints: Sequence[Constraint] = (), streams: Sequence[str] = (TDOAS,)
     ) -> None:
-        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`); streams : of which, where a flight has them,
-        innovations are kept."""
+        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`); streams : as of `record_innovations`."""
         self._config, self.constraints, self._streams = config, tuple(constraints), tuple(streams)
 
     def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
-        streams = [name for name in self._streams if name == TDOAS or getattr(flight, name) is not None]
-        innovations = record_innovations(flight, self._config, Corrector(flight.anchors, effects), streams)
+        innovations = record_innovations(flight, self._config, Corrector(flight.anchors, effects), self._streams)
         estimate = innovations.run.odometry
         return ReferenceView(Truth(estimate.t, estimate.p, estimate.q), innovations)

@@ -228,7 +228,8 @@ def _equations(
     for part in parts:
         places = innovations.places(part.samples.channel)
         air[places] = part.airborne
-        placed.append(_selection(places, len(t)) @ _regressors(part.samples, functions))
+        own = _regressors(part.samples, functions)
+        placed.append(own if len(places) == len(t) else _selection(places, len(t)) @ own)
     regressors = sum(placed[1:], placed[0])
     stamps = [one.stamps(flight.start) for one in constraints]
     moved = np.zeros((sum(map(len, stamps)), 3, regressors.shape[1]))
@@ -242,20 +243,20 @@ def _equations(
             continue
         some, value, variance = derivative[inside], innovations.value[rows][inside], innovations.variance[rows][inside]
         weight = (NU + 1.0) / (NU + (value / np.sqrt(variance) / scale) ** 2) / variance
-        own, right = (some * weight[:, None]).T @ some, some.T @ (weight * value)
-        _add(gram, columns, own)
+        more, right = (some * weight[:, None]).T @ some, some.T @ (weight * value)
+        _add(gram, columns, more)
         vector[columns] += right
         last = np.searchsorted(columns, n)
-        blocks.append(_Told(columns[:last], own[:last, :last], right[:last]))
+        blocks.append(_Told(columns[:last], more[:last, :last], right[:last]))
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
 
 
 @compiled
-def _add(gram: np.ndarray, columns: np.ndarray, own: np.ndarray) -> None:
-    """Add own (c, c) to the rows and columns (c,) of gram (k, k), row by row: as numpy does, without copies of them."""
+def _add(gram: np.ndarray, columns: np.ndarray, more: np.ndarray) -> None:
+    """Add more (c, c) to the rows and columns (c,) of gram (k, k), row by row: as numpy does, without copies of them."""
     for i in range(len(columns)):
         for j in range(len(columns)):
-            gram[columns[i], columns[j]] += own[i, j]
+            gram[columns[i], columns[j]] += more[i, j]
 
 
 def _regressors(samples: Samples, functions: bool) -> csr_array:

@@ -189,7 +189,8 @@ def self_calibrate(
         if base.covariance is not None:
             base = replace(base, covariance=base.covariance.without(tape.unknown))
     runs = Runs([replace(flight, anchors=start) for flight in flights], base, config, constraints)
-    common = TAG_DELAY if any(flight.range is not None for flight in flights) else 0.0
+    ranged = config.use_range and any(flight.range is not None for flight in flights)  # type: ignore[attr-defined]  # as of SENSORS
+    common = TAG_DELAY if ranged else 0.0
     n, prior = len(given), Prior.of(given, start_std, base.covariance, common)
     mean = np.concatenate([start.positions.ravel(), np.zeros(n)])
 

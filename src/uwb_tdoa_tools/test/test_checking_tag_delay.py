@@ -7,7 +7,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.checking.check import check
-from uwb_tdoa_tools.checking.range_offset import range_offset, window_offsets
+from uwb_tdoa_tools.checking.tag_delay import tag_delay, window_offsets
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
@@ -27,24 +27,24 @@ def longer(flight, by):
 
 @pytest.mark.parametrize("by", [0.25, -0.2])
 def test_what_all_ranges_are_wrong_by_is_told(ranged, by):
-    (found,) = range_offset(of_flight(longer(ranged, by)))
+    (found,) = tag_delay(of_flight(longer(ranged, by)))
     assert found.severity == "warning" and found.value == pytest.approx(by, abs=0.03)
     assert ("too long" if by > 0.0 else "too short") in found.cause
     report = check(of_flight(longer(ranged, by)))
-    assert not report.faulty and "range_offset" in {finding.rule for finding in report.findings}
+    assert not report.faulty and "tag_delay" in {finding.rule for finding in report.findings}
 
 
 def test_nothing_is_said_of_sound_ranges_nor_of_a_tape_of_ten_centimetres(ranged):
-    assert not [*range_offset(of_flight(ranged))]
+    assert not [*tag_delay(of_flight(ranged))]
     shaken = ranged.anchors.positions + 0.1 * np.random.default_rng(3).standard_normal(ranged.anchors.positions.shape)
-    assert not [*range_offset(of_flight(replace(ranged, anchors=ranged.anchors.at(shaken))))]
+    assert not [*tag_delay(of_flight(replace(ranged, anchors=ranged.anchors.at(shaken))))]
 
 
 def test_outliers_and_what_is_no_range_tell_nothing(ranged):
     rng, d = np.random.default_rng(0), longer(ranged, 0.25).range.d
     d = np.where(rng.random(len(d)) < 0.1, d + rng.exponential(2.0, len(d)), d)
     d[::50] = np.nan
-    (found,) = range_offset(of_flight(replace(ranged, range=replace(ranged.range, d=d))))
+    (found,) = tag_delay(of_flight(replace(ranged, range=replace(ranged.range, d=d))))
     assert found.value == pytest.approx(0.25, abs=0.08)
 
 
@@ -53,6 +53,6 @@ def test_where_nothing_tells_nothing_is_said(ranged):
     assert len(offsets) == 0
     flat = ranged.anchors.at(ranged.anchors.positions * [1.0, 1.0, 0.0])
     assert np.isfinite(window_offsets(ranged.range, flat)).all()
-    assert not [*range_offset(of_flight(replace(ranged, range=None)))]
+    assert not [*tag_delay(of_flight(replace(ranged, range=None)))]
     millimetres = replace(ranged.range, d=1000.0 * ranged.range.d)
-    assert not [*range_offset(of_flight(replace(ranged, range=millimetres)))]
+    assert not [*tag_delay(of_flight(replace(ranged, range=millimetres)))]

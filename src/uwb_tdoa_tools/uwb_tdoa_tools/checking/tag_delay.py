@@ -17,25 +17,25 @@ if TYPE_CHECKING:
 
 WINDOW = 0.25  # s in which the tag hardly moves
 FEWEST_ANCHORS, FEWEST_WINDOWS, MOST_WINDOWS = 5, 10, 200
-LARGE, IN_METRES = 0.1, 5.0  # m: what is said, and what no antenna makes
+LARGE, LARGEST = 0.1, 5.0  # m: from which on it is said, and more than which no antenna makes
 AGREE = 0.8  # share of the windows that say the same sign
 SCALE = 0.2  # m, beyond which a range counts less
 DILUTION = 5.0  # most that an error of the ranges may become in what they have in common
 STEPS, DAMPING = 20, 1e-3
 
 
-def range_offset(recording: Recording) -> Iterator[Finding]:
+def tag_delay(recording: Recording) -> Iterator[Finding]:
     """All ranges are wrong by about as much: the position is off by more than that where anchors are on one side, or at few heights."""
     ranges = recording.sensors.get("range")
     offsets = window_offsets(ranges, recording.anchors) if isinstance(ranges, Ranges) else np.empty(0)
     if len(offsets) < FEWEST_WINDOWS:
         return
     offset = float(np.median(offsets))
-    if LARGE < abs(offset) < IN_METRES and np.mean(np.sign(offsets) == np.sign(offset)) > AGREE:
+    if LARGE < abs(offset) < LARGEST and np.mean(np.sign(offsets) == np.sign(offset)) > AGREE:
         cause = f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: the antenna delay of the tag"
         low, high = np.quantile(offsets, [0.25, 0.75])
         evidence = f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, {low:.2f} to {high:.2f} m in half of them"
-        yield Finding("range_offset", WARNING, cause, evidence, "calibrate it: survey, or diagnose where there is ground truth", offset)
+        yield Finding("tag_delay", WARNING, cause, evidence, "calibrate it: survey, or diagnose where there is ground truth", offset)
 
 
 def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:
@@ -68,4 +68,4 @@ def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
     return float(x[3]) if told else None
 
 
-RULES = (range_offset,)
+RULES = (tag_delay,)
