@@ -12,7 +12,7 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from flights import fly
-from geometry_msgs.msg import TwistWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -210,6 +210,30 @@ class Rig:
         """Play a topic that a node can do without."""
         publisher = self._publishers[topic] = self.node.create_publisher(STREAMS[topic], topic, self._qos)
         self.wait(publisher.get_subscription_count, f"{topic} to be heard")
+
+    def pose_publisher(self, process):
+        """Publisher of initialpose that the started node of this Process, which has anchors, hears, and nothing of which is under way.
+
+        A node may hear a topic later than it is heard: poses of no frame are published until it has refused the last.
+        """
+        publisher, sent = self.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 100), []
+        self.wait(publisher.get_subscription_count, "initialpose to be heard")
+
+        def refused():
+            message = PoseWithCovarianceStamped()
+            message.header.frame_id = f"nowhere{len(sent)}"
+            sent.append(f"initialpose: not taken: its frame is '{message.header.frame_id}'")
+            publisher.publish(message)
+            pause = time.monotonic() + 0.5
+            while time.monotonic() < pause and not said():
+                self._executor.spin_once(timeout_sec=0.05)
+            return said()
+
+        def said():
+            return any(sent[-1] in line for line in process.lines)
+
+        self.wait(refused, "a pose of no frame to be refused")
+        return publisher
 
     def watch(self, process):
         """Wait for nothing any more when this Process has ended, which starts nodes itself."""

@@ -148,8 +148,7 @@ def test_what_a_robot_does_to_a_running_filter(make_rig):
     rig.wait(lambda: rig.residuals[-1].innovation_variance > 80.0, "the new tdoa_std to count")
 
     # a pose
-    poses = rig.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
-    rig.wait(poses.get_subscription_count, "initialpose to be heard")
+    poses = rig.pose_publisher(process)
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = "map", stamp(t + 0.25)
     message.pose.pose.position.x, message.pose.pose.position.y = 1.0, 2.0

@@ -99,15 +99,17 @@ def test_no_pose_and_no_parameter_ends_a_node_and_no_flood_of_poses_fills_it(mak
     stranger = Stranger(rig)
     rig.send_anchors(corners())
     rig.counts("ekf_node", state="starting")
-    odd = pose(1e308 * np.eye(6)), pose(np.full((6, 6), 1e300)), pose(np.full((6, 6), 1e20))
+    poses = rig.pose_publisher(process)
 
-    def refused(text, *poses):
-        """Whether the node has said so; else they are published (again): the node may hear this topic later than it is heard."""
-        stranger.publish("initialpose", *poses)
+    def refused(text, *told):
+        """Whether the node has said so; else these poses are published: few at a time, because its queue holds no more."""
+        for message in told:
+            poses.publish(message)
         assert stranger.alive("ekf_node")
         return any(text in line for line in process.lines)
 
-    rig.wait(lambda: refused("initialpose: not taken", *odd), "odd poses to be refused")
+    odd = pose(1e308 * np.eye(6)), pose(np.full((6, 6), 1e300)), pose(np.full((6, 6), 1e20))
+    rig.wait(lambda: refused("initialpose: not taken: it holds numbers", *odd), "odd poses to be refused")
     rig.wait(lambda: refused("100 wait for their time already", *[pose(np.eye(6), 2_000_000_000)] * 5), "too many poses to be refused")
     for kind in (SetParameters, SetParametersAtomically):
         service = "set_parameters" if kind is SetParameters else "set_parameters_atomically"
@@ -137,12 +139,13 @@ def test_more_anchors_than_a_message_may_hold_are_refused(make_rig):
 
 def test_a_frozen_node_takes_no_other_parameter_anchors_transform_or_pose(make_rig):
     rig, flight = make_rig(), recording(2.0)
-    rig.start("ekf_node", ekf_node=["-p", "frozen:=true"])
+    (process,) = rig.start("ekf_node", ekf_node=["-p", "frozen:=true"])
     stranger = Stranger(rig)
     first, other = transform((0.0, 0.0, 0.0, 1.0)), transform((1.0, 0.0, 0.0, 0.0))
     stranger.publish("/tf_static", first)
-    stranger.publish("initialpose", pose(np.zeros((6, 6))))  # before the start it may be told
     rig.send_anchors(flight.anchors)
+    rig.counts("ekf_node", state="starting")
+    poses = rig.pose_publisher(process)  # before the start a pose may be told: these are refused for their frame only
     rig.play(flight, send_tdoa=rig.send_corrected)
     rig.wait(lambda: rig.odometry, "odometry")
     rig.counts("ekf_node", TDOAs_received=len(flight.tdoa), refused_because_frozen=0)
@@ -162,7 +165,7 @@ def test_a_frozen_node_takes_no_other_parameter_anchors_transform_or_pose(make_r
     rig.counts("ekf_node", refused_because_frozen=6)
     stranger.publish("/tf_static", first, other)
     rig.counts("ekf_node", refused_because_frozen=7)
-    stranger.publish("initialpose", pose(np.eye(6)))
+    poses.publish(pose(np.eye(6)))
     counts = rig.counts("ekf_node", refused_because_frozen=8)
     assert counts["restarts"] == 0 and rig.values("ekf_node")["state"] == "running" and rig.values("ekf_node")["frozen"] == "yes"
 
