@@ -13,7 +13,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 from uwb_tdoa_tools.benchmark import core, nodes, source, usage  # noqa: E402
 from uwb_tdoa_tools.benchmark.figures import Figure, as_json, table  # noqa: E402
-from uwb_tdoa_tools.benchmark.flights import TDOA_RATE, make_flight  # noqa: E402
+from uwb_tdoa_tools.benchmark.flights import among, TDOA_RATE, make_flight  # noqa: E402
 from uwb_tdoa_tools.commands import bench  # noqa: E402
 
 OTHERS = 0.2  # of the CPU time, from which on nothing can be asked of what is played in real time
@@ -58,6 +58,15 @@ def test_a_flight_of_the_rates_it_is_measured_at():
     assert len(flight.tdoa) == pytest.approx(4.0 * TDOA_RATE, rel=0.02)
     assert flight.truth.t[-1] < flight.imu.t[0] + 4.0
     assert (np.diff(flight.tdoa.t) >= 0.0).all()
+
+
+def test_a_flight_among_more_anchors_hears_its_own():
+    flight = make_flight(4.0)
+    hall = among(flight, 1000)
+    assert len(hall.anchors) == 1000 and hall.tdoa is flight.tdoa
+    np.testing.assert_array_equal(hall.anchors.positions[:8], flight.anchors.positions)
+    far = np.linalg.norm(hall.anchors.positions[8:, None] - flight.anchors.positions, axis=2)
+    assert far.min() > 500.0 and len(np.unique(hall.anchors.positions, axis=0)) == 1000
 
 
 def test_cpu_time_and_memory_of_a_process():
@@ -118,7 +127,7 @@ def test_ready_is_read_from_the_log():
 
 def test_bad_usage(tmp_path, capsys):
     assert bench.main(["--only", "cpu"]) == 2
-    assert "core, offline, nodes, tags, replay, graph" in capsys.readouterr().err.replace("'", "")
+    assert "core, offline, nodes, tags, hall, replay, graph" in capsys.readouterr().err.replace("'", "")
     assert bench.main(["--json", str(tmp_path / "no" / "bench.json"), "--out", str(tmp_path)]) == 2
     assert "its directory does not exist" in capsys.readouterr().err
     assert bench.main(["--only", "offline", "--model", str(tmp_path / "no.onnx"), "--out", str(tmp_path)]) == 2

@@ -7,6 +7,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.results import rows_of
 
 from ..calibrating.parts import between
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 SHORTEST = 16.0  # s that the simulation needs to take off and land
 TDOA_RATE = 400.0  # Hz
+FAR, SPACING, ROW = 1000.0, 8.0, 125  # m, m, anchors: where those stand that nobody hears
 
 
 def make_flight(seconds: float, anchors: int = 8, tdoa_rate: float = TDOA_RATE, **more: Any) -> Flight:
@@ -25,6 +27,16 @@ def make_flight(seconds: float, anchors: int = 8, tdoa_rate: float = TDOA_RATE, 
     room = "corners" if anchors == 8 else f"random-1-{anchors}"
     flight = simulate(SimulationConfig(seed=1, constellation=room, duration=max(seconds, SHORTEST), **more))
     return first(thinned(flight, tdoa_rate), seconds)
+
+
+def among(flight: Flight, installed: int) -> Flight:
+    """The flight where so many anchors are installed: its own, and others out of the radio's reach, in rows of a hall beside it."""
+    beyond = np.arange(installed - len(flight.anchors))
+    far = np.column_stack([FAR + SPACING * (beyond % ROW), SPACING * (beyond // ROW), np.full(len(beyond), 4.0)])
+    own = flight.anchors
+    ids = np.concatenate([own.ids, max(own.ids) + 1 + beyond])
+    orientations = np.concatenate([own.orientations, np.full((len(beyond), 4), np.nan)])
+    return replace(flight, anchors=Anchors(ids, np.concatenate([own.positions, far]), orientations))
 
 
 def thinned(flight: Flight, rate: float) -> Flight:

@@ -17,7 +17,7 @@ from ..live.run import accounts
 from ..live.processes import Diagnostics, Processes, own_domain, variables, wait
 from ..live.session import session
 from .figures import Figure
-from .flights import make_flight
+from .flights import among, make_flight
 from .source import Source, latencies
 from .usage import cpu_seconds, memory
 
@@ -36,18 +36,22 @@ BLOCK = 3.0  # s over which CPU and latencies are taken: their median and quarti
 READY_LIMIT, MATCH_LIMIT, SETTLE_LIMIT = 300.0, 60.0, 60.0  # s; the very first start compiles the filter
 # Tags, Hz, Hz
 FLEETS = (1, 1000.0, 400.0), (2, 1000.0, 400.0), (4, 1000.0, 400.0), (8, 1000.0, 400.0), (30, 100.0, 100.0), (60, 100.0, 40.0)
+INSTALLED = 8, 1000, 10_000  # anchors, 8 of which are heard
 TARGET_CPU, TARGET_LATENCY, TARGET_READY = 25.0, 10.0, 0.5  # % of one core, ms, s
 TARGET_LATENCY_OF_FLEET = 30.0  # ms
+TARGET_START = 3.0  # s, of a node among many anchors
 SECTION = "both nodes live at 1 kHz IMU + 400 Hz TDOA, default parameters and QoS"
 
 
 @dataclass
 class Measured:
-    """ready : {title: s from its start}; memory : {title: bytes}; cpu : {title: share of one core in each block};
+    """ready : {title: s from its start}; first : s from the anchors to the first odometry, half a second of which passes before the
+    first measurement; memory : {title: bytes}; cpu : {title: share of one core in each block};
     latency : one (n,) array of ms per block; lost, late : messages; source_late : (k,) ms, each message of the source;
     source_cpu : share of one core in each block."""
 
     ready: dict[str, float] = field(default_factory=dict)
+    first: float = np.nan
     memory: dict[str, int] = field(default_factory=dict)
     cpu: dict[str, np.ndarray] = field(default_factory=dict)
     latency: list[np.ndarray] = field(default_factory=list)
@@ -92,6 +96,22 @@ def measure_tags(progress: Callable[[str], object], folder: Path, quick: bool = 
         section = f"{tags} tag{'s' * (tags > 1)} at {imu_rate:g} Hz IMU + {tdoa_rate:g} Hz TDOA, {len(starts)} localization_node"
         flight = make_flight(seconds, tdoa_rate=tdoa_rate, imu_rate=imu_rate)
         yield from _figures(section, fly(flight, folder, spaces, starts), None, TARGET_LATENCY_OF_FLEET)
+
+
+def measure_hall(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
+    """Generator of Figures for a tag in a localization_node by how many anchors are installed, of which it hears the same 8."""
+    progress("hall, first start")
+    start(folder)
+    flight = make_flight(10.0 if quick else 20.0, tdoa_rate=200.0, imu_rate=100.0)
+    for installed in INSTALLED[::2] if quick else INSTALLED:
+        progress(f"hall, {installed} anchors live")
+        section = f"{installed} anchors installed, 8 heard, 100 Hz IMU + 200 Hz TDOA, localization_node"
+        live = fly(among(flight, installed), folder, [""], pool([""], 1))
+        (ready,) = live.ready.values()
+        yield Figure.of(section, "ready after its start", "s", ready)
+        yield Figure.of(section, "from the anchors to the first odometry", "s", live.first)
+        yield Figure.of(section, "both together", "s", ready + live.first, TARGET_START)
+        yield from _figures(section, live)
 
 
 def start(folder: Path) -> dict[str, float]:
@@ -148,6 +168,8 @@ def fly(flight: Flight, folder: Path, namespaces: Sequence[str], starts: Starts)
     out.source_cpu, out.source_late = np.diff([own for _, _, own in samples]) / took, 1e3 * np.maximum(late, 0.0)
     delay = [latencies(sent, stamps, *np.array(got, dtype=np.int64).reshape(-1, 2).T) for got in source.received]
     block = np.searchsorted(times, sent, side="right") - 1
+    arrived = [got[0][0] for got in source.received if got]
+    out.first = 1e-9 * (min(arrived) - source.anchors_sent) if arrived else np.nan
     out.latency = [1e3 * np.concatenate([d[block == k] for d in delay]) for k in range(len(took))]
     _count(out, flight, namespaces, diagnostics, source)
     return out

@@ -38,6 +38,7 @@ class Source:
         self.publishers = {
             kind: ros.publish_stream(node, kind, topic) for kind, topic in ((Imu, "/imu/data"), (Tdoa, "/uwb/tdoa"))
         }
+        self.anchors_sent = 0  # ns since 1970
         self._anchors = node.create_publisher(AnchorArray, "/uwb/anchors", ANCHORS_QOS)
         self.received: list[list[tuple[int, int]]] = [[] for _ in namespaces]  # (arrival, stamp), ns
         self.subscriptions = [  # whose callbacks only run while somebody waits, before and after `play`
@@ -55,7 +56,8 @@ class Source:
         each message was late.
         """
         assert flight.imu is not None
-        self._anchors.publish(anchors_to_message(flight.anchors))
+        message, self.anchors_sent = anchors_to_message(flight.anchors), time.time_ns()
+        self._anchors.publish(message)
         start = time.time_ns() // 10**9 + 1  # stamps are of now, too
         events = self._events(flight, start - flight.imu.t[0])
         began, period = time.perf_counter() + AHEAD, round((flight.imu.t[-1] - flight.imu.t[0]) * 1e3 + 1.0) * 10**6

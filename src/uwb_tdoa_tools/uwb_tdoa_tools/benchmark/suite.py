@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from .figures import Figure
 
-PARTS = ("core", "offline", "nodes", "tags", "replay", "graph")
+PARTS = ("core", "offline", "nodes", "tags", "hall", "replay", "graph")
 
 
 def measure(
@@ -42,6 +42,7 @@ def measure(
             **({"peer": partial(peer.measure, say, other, quick)} if other is not None else {}),
             "nodes": lambda: nodes.measure(say, folder, quick),
             "tags": lambda: nodes.measure_tags(say, folder, quick),
+            "hall": lambda: nodes.measure_hall(say, folder, quick),
             "graph": lambda: graph.measure(say, folder, quick),
             "replay": lambda: rates.measure(say, folder, quick),
         }
