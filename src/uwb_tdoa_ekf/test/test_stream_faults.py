@@ -16,7 +16,8 @@ from faults import FAULTS  # noqa: E402
 from rig import make_rig  # noqa: E402, F401
 from stream_faults import PUBLISHERS, lanes_of, play, process_of, publish_twice  # noqa: E402
 
-SECONDS = 6.0  # s of each fault, and within which it is named
+SECONDS = 6.0  # s of each fault, and within which it is named (how soon: stream_faults.py)
+FLOWN = 5  # times at most: what a loaded machine hands over late or loses tells less
 FLIGHTS = [(), ("IMU in g", "TDOAs stamped 0")]  # in lanes side by side; faults that do not hide each other
 
 
@@ -24,19 +25,34 @@ def values_of(status):
     return {entry.key: entry.value for entry in status.values}
 
 
+def said_by(lane):
+    """What the node of a Lane has said while flights were played: statuses of each flight."""
+    return [[status for at, status in lane.heard if low < at < high] for _, ((low, high, _),) in lane.plan]
+
+
+def is_named(lane, name):
+    """Whether the node of a Lane has named a fault."""
+    return any(re.search(FAULTS[name][1], text(status)) for statuses in said_by(lane) for status in statuses)
+
+
+def text(status):
+    return f"{status.message}; {values_of(status)['wrong with the streams']}"
+
+
 def test_faults_are_named_and_a_healthy_flight_runs(make_rig):
-    lanes = lanes_of(make_rig, len(FLIGHTS))
-    play(lanes, [[[(0.0, SECONDS, names)]] for names in FLIGHTS])
-    for lane in lanes:
-        for _, ((low, high, names),) in lane.plan:
-            statuses = [status for at, status in lane.heard if low < at < high]
-            said = [f"{status.message}; {values_of(status)['wrong with the streams']}" for status in statuses]
-            if not names:
-                assert statuses[-1].message == "running" and statuses[-1].level == DiagnosticStatus.OK, said
-                assert {values_of(status)["wrong with the streams"] for status in statuses} == {"nothing"}
-            for name in names:
-                assert any(re.search(FAULTS[name][1], text) for text in said), (name, said, [values_of(each) for each in statuses])
-                assert statuses[-1].level != DiagnosticStatus.OK and statuses[-1].message != "running", (name, said)
+    lanes = healthy, faulty = lanes_of(make_rig, len(FLIGHTS))
+    for _ in range(FLOWN):
+        play(lanes, [[[(0.0, SECONDS, names)]] for names in FLIGHTS])
+        if all(is_named(faulty, name) for name in FLIGHTS[1]):
+            break  # within the first flight, but on a loaded machine
+    said = [text(status) for lane in lanes for statuses in said_by(lane) for status in statuses]
+    for statuses in said_by(healthy):
+        assert statuses[-1].message == "running" and statuses[-1].level == DiagnosticStatus.OK, said
+        assert {values_of(status)["wrong with the streams"] for status in statuses} == {"nothing"}, said
+    for name in FLIGHTS[1]:
+        assert is_named(faulty, name), (name, said)
+    last = said_by(faulty)[-1][-1]
+    assert last.level != DiagnosticStatus.OK and last.message != "running", said
 
     lane = lanes[0]
     for name, topic in PUBLISHERS.items():

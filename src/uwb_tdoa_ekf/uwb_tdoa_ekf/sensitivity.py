@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.compiled import compiled
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
 
 TDOAS = "tdoa"  # the stream of TDOAs, beside those of the SENSORS
+NEEDED = "t", "kind", "transition", "row", "gain", "innovation"  # of a record of the history
 FORGOTTEN = 10.0  # s after which a parameter that no measurement depends on any more has left the estimate
 
 
@@ -119,6 +121,13 @@ def _pieces(
     return out
 
 
+class _Needed(list):
+    """Arrays of a history, of each of which only the fields that `_through` reads are kept: less than half."""
+
+    def append(self, records: np.ndarray) -> None:
+        super().append(repack_fields(records[[*NEEDED]]))
+
+
 def record_innovations(
     flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None, streams: Sequence[str] = (TDOAS,)
 ) -> Innovations:
@@ -127,7 +136,7 @@ def record_innovations(
     corrector = corrector or Corrector(flight.anchors)
     # Its offset is not among the states of the history.
     config = replace(config or FilterConfig(), use_pressure=False)  # type: ignore[call-arg]  # parameters of SENSORS are known at run time
-    records: list[np.ndarray] = []
+    records = _Needed()
     run = run_offline(flight, config, corrector, records)
     streams = [name for name in streams if name == TDOAS or name in run.aids]
     corrected = corrector.effects.correct_streams(flight)
@@ -145,7 +154,6 @@ def record_innovations(
     for some in records:
         keys = zip(some["t"].tolist(), some["innovation"].tolist())
         of.append(np.array([waiting[key].pop(0) if waiting.get(key) else -1 for key in keys], dtype=np.int64))
-    records = [np.ascontiguousarray(some) for some in records]
     first = np.cumsum([0, *map(len, sources[:-1])])
     stream = np.searchsorted(first, used, side="right") - 1
     return Innovations(tuple(streams), stream, used - first[stream], t, value, outcomes["variance"][used], run, records, of)

@@ -136,6 +136,14 @@ def test_check_tries_few_exchanges_of_ids_in_a_hall(sound, monkeypatch):
     assert len(runs) < 0.5 * len(hall()) ** 2 / 2.0
 
 
+def test_a_fast_tag_does_not_speak_against_the_survey():
+    hears = {"anchors": hall(), "radio_reach": 18.0, "bias": False, "protocol": "tdoa3"}
+    config = SimulationConfig(**hears, duration=180.0, speed=4.0, imu_rate=100.0, seed=2)
+    fit = tdoa_rules.survey_fit(OrderedRecording.of(of_flight(simulate(config))))
+    assert len(fit) > tdoa_rules.FEWEST and tdoa_rules.gained(fit) is None
+    assert fit._loss(fit._start, fit.positions) - fit.solve()[0] > tdoa_rules.GAIN  # it would, from where a start puts the tag
+
+
 def test_check_says_in_one_line_who_is_not_heard_in_a_hall(sound):
     found = [finding for finding in check(of_flight(sound)).findings if finding.rule.startswith("anchor_")]
     heard = np.unique(np.concatenate([sound.tdoa.a, sound.tdoa.b]))

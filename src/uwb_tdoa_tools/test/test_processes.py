@@ -118,8 +118,8 @@ READY = "echo '[INFO] [1.5] [node]: ready; correcting with: none'"
 def test_who_starts_and_works_is_waited_for_however_long_that_takes(start, quick, tmp_path):
     start("node", *COMPILING)
     wait_for_output(tmp_path / "node.log", "compiling")
-    until, told = time.monotonic() + 3.0, []
-    processes.wait(0.5, "the node", start.processes, None, lambda: told and time.monotonic() > until, told.append)
+    until, told = time.monotonic() + 6.0, []
+    processes.wait(3.0, "the node", start.processes, None, lambda: told and time.monotonic() > until, told.append)
     assert set(told) == {"waiting for the node: node: compiling, which is done once: 40%, 20 s"}
 
 

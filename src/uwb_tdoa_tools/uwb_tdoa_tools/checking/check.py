@@ -181,9 +181,9 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
     """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
     gain = tdoa_rules.gained(fit)
     if gain is not None:
-        _, anchors = fit.solve()
+        heard, (_, anchors) = fit.heard, fit.solve()
         evidence = f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
-        evidence += f"by {np.median(displacement(fit.positions, anchors)):.1f} m in the median"
+        evidence += f"by {np.median(displacement(fit.positions[heard], anchors[heard])):.1f} m in the median"
         cause = "the survey does not fit: of another room, or anchors have been moved"
         yield Finding("survey_misfit", ERROR, cause, evidence, OTHER_SURVEY, gain)
 

@@ -49,7 +49,7 @@ class SurveyFit:
             locate(rows[first:end], state.anchors, box, config.parameters()[0], Height(np.nan, np.nan), places)
             self._windows.append(window)
             self._start.append(places.x[0])
-        self.before = self._loss(self._start, positions)
+        self.before, _ = self.solve([])  # where the tag fits best: a fast one is not where a start puts it
 
     def __len__(self) -> int:
         """Windows that tell something."""
@@ -68,7 +68,7 @@ class SurveyFit:
 
     def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
         """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows; None for all)
-        moved."""
+        moved, and the tag."""
         moved = np.ones(len(self.positions), dtype=bool) if free is None else np.isin(range(len(self.positions)), free)
         columns = np.flatnonzero(np.repeat(moved, 3))  # of the coordinates that are free
         anchors, start = self.positions.copy(), [x.copy() for x in self._start]
@@ -90,7 +90,7 @@ class SurveyFit:
                 g[its] += by_anchors.T @ (weight * residual) - B.T @ solved[:, -1]
                 eliminated.append(solved)
             step = np.linalg.solve(H, g)
-            step *= min(1.0, STEP / max(np.abs(step).max(), 1e-9))
+            step *= min(1.0, STEP / max(np.abs(step).max(initial=0.0), 1e-9))
             anchors.reshape(-1)[columns] += step
             for x, solved, its in zip(start, eliminated, places):
                 x += np.clip(solved[:, -1] - solved[:, :-1] @ step[its], -2.0, 2.0)

@@ -247,7 +247,7 @@ def _equations(
         _add(gram, columns, more)
         vector[columns] += right
         last = np.searchsorted(columns, n)
-        blocks.append(_Told(columns[:last], more[:last, :last], right[:last]))
+        blocks.append(_Told(columns[:last], more[:last, :last].copy(), right[:last]))  # the whole of `more` takes megabytes
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
 
 
