@@ -59,3 +59,10 @@ def test_a_series_of_which_nothing_or_little_is_heard_together_tells_nothing():
     noise = 0.1 * np.random.default_rng(0).standard_normal(len(t))
     of = delays(series, t, lambda delay: np.sin(1.3 * t) + noise - np.sin(1.3 * (t - delay)))
     assert [of.of_series(k) for k in (3, 4)] == [(1.0, 0.0)] * 2 and of.of_series(0)[0] == 1.0
+
+
+def test_of_nothing_nothing_is_late():
+    few = np.arange(0.0, 600.0, 7.0)  # never five in a block
+    of = delays(np.zeros(len(few), int), few, lambda delay: np.sin(1.3 * few) - np.sin(1.3 * (few - delay)))
+    assert of.constant() == (1.0, 0.0) and of.exact() == 0.0
+    assert of.drift() == (1.0, 0.0) and of.jump()[:2] == (1.0, 0.0)

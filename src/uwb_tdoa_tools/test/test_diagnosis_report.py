@@ -20,7 +20,7 @@ from uwb_tdoa_tools.diagnosis.report.apply import applying
 from uwb_tdoa_tools.diagnosis.report.entries import doubt_in_words, entries, worth_in_words
 from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.diagnosis.report.unclear import by_remedy, untold
-from uwb_tdoa_tools.diagnosis.report.verdict import verdict
+from uwb_tdoa_tools.diagnosis.report.verdict import _flights, verdict
 from uwb_tdoa_tools.diagnosis.report.words import TERMS
 from known_effects import clean_flight
 
@@ -59,6 +59,13 @@ def test_the_verdict_has_the_error_before_and_after_its_interval_and_how_many_fl
     assert found.headline == "The position error (3D RMSE) falls from 30.0 cm to 20.0 cm: 33 % of it is gone."
     assert "95 % intervals: 27.0 to 33.0 cm before, 18.0 to 22.0 cm after; gain 33 % (24 to 44 %)." in found.more
     assert any("flights that took no part in the fit: 2 flights" in sentence for sentence in found.more)
+
+
+def test_a_flight_of_which_each_half_was_judged_was_flown_once():
+    parts = ("one", 2.0, 55.0), ("one", 7.0, 60.0), ("two", 1.0, 31.0)
+    scores = [SimpleNamespace(name=name, first=first, last=last) for name, first, last in parts]
+    before = {"runs": [{"flight": name} for name, _, _ in parts], "scores": scores}
+    assert _flights(SimpleNamespace(before=before)) == "2 flights, 88 s in the air"
 
 
 def test_the_report_tells_every_phase_of_the_judged_flights(result, page):

@@ -7,11 +7,12 @@ import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_tools.checking import pair_rules, tdoa_rules
+from uwb_tdoa_tools.checking import delays, pair_rules, tdoa_rules
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.known_path import MANY, KnownPath
 from uwb_tdoa_tools.checking.ordered import SHORT, OrderedRecording
 from uwb_tdoa_tools.checking.recording import of_flight
+from uwb_tdoa_tools.checking.time_rules import DRIFTS, JUMPS, OF_ALL
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
@@ -142,6 +143,15 @@ def test_a_fast_tag_does_not_speak_against_the_survey():
     fit = tdoa_rules.survey_fit(OrderedRecording.of(of_flight(simulate(config))))
     assert len(fit) > tdoa_rules.FEWEST and tdoa_rules.gained(fit) is None
     assert fit._loss(fit._start, fit.positions) - fit.solve()[0] > tdoa_rules.GAIN  # it would, from where a start puts the tag
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3])
+def test_tdoas_that_are_late_in_a_hall_are_found_and_others_are_not(sound, late, monkeypatch):
+    monkeypatch.setattr(delays, "MOST", len(sound.tdoa) // 20)  # as of a recording of an hour
+    of = delays.of_tdoas(KnownPath(replace(sound, tdoa=replace(sound.tdoa, t=sound.tdoa.t + late))))
+    ratio, delay = of.constant()
+    assert delay == pytest.approx(late) and (ratio < OF_ALL) == (late > 0.0)
+    assert of.drift()[0] > DRIFTS and of.jump()[0] > JUMPS
 
 
 def test_check_says_in_one_line_who_is_not_heard_in_a_hall(sound):

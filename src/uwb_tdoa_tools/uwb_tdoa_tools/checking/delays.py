@@ -13,6 +13,8 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
+from .known_path import MANY
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from .known_path import KnownPath
@@ -29,7 +31,7 @@ LIMIT = 2.0  # standard deviations of a series, robust, beyond which an error co
 @dataclass(frozen=True)
 class Delays:
     """power (series, blocks, len(DELAYS)) : sum of squares that is left of each series, in units of its variance as it is, with each
-    delay."""
+    delay. All together tell nothing, and nothing is late, where fewer than TELLING samples are in it."""
 
     power: np.ndarray
 
@@ -51,10 +53,16 @@ class Delays:
         """(ratio, s): what is left with the best delay of all, over what is left without any; and that delay."""
         total = self.power.sum(axis=(0, 1))
         best = int(np.argmin(total))
-        return float(total[best] / max(total[NONE], 1e-12)), float(DELAYS[best])
+        return (float(total[best] / total[NONE]), float(DELAYS[best])) if self._tells else (1.0, 0.0)
+
+    @property
+    def _tells(self) -> bool:
+        return bool(self.power[..., NONE].sum() >= TELLING)
 
     def exact(self) -> float:
         """s, the best delay of all, between those that are tried: the vertex of a parabola through the three about it."""
+        if not self._tells:
+            return 0.0
         total = self.power.sum(axis=(0, 1))
         k = int(np.clip(np.argmin(total), 1, len(total) - 2))
         before, here, after = total[k - 1 : k + 2]
@@ -63,6 +71,8 @@ class Delays:
 
     def drift(self) -> tuple[float, float]:
         """(ratio, s): what is left if the delay changes evenly, over what is left with a constant one; from first to last block."""
+        if not self._tells:
+            return 1.0, 0.0
         of = self.power.sum(axis=0)
         blocks = np.arange(len(of))
         start, end = np.meshgrid(np.arange(of.shape[1]), np.arange(of.shape[1]), indexing="ij")
@@ -75,6 +85,8 @@ class Delays:
     def jump(self) -> tuple[float, float, int]:
         """(ratio, s, block): what is left if the delay changes once, over what is left with a constant one; by how much, and the
         first block after that."""
+        if not self._tells:
+            return 1.0, 0.0, 0
         of = self.power.sum(axis=0)
         before = np.cumsum(of, axis=0)
         after = before[-1] - before
@@ -84,12 +96,13 @@ class Delays:
         return float(left[k] / max(before[-1].min(), 1e-12)), float(step), k + 1
 
 
-def delays(series: np.ndarray, t: np.ndarray, error: Callable[[float], np.ndarray]) -> Delays:
-    """Delays of (n,) samples at t, s, of series numbered from 0; error(delay) -> (n,), what is left of each."""
+def delays(series: np.ndarray, t: np.ndarray, error: Callable[[float], np.ndarray], count_of_series: int | None = None) -> Delays:
+    """Delays of (n,) samples at t, s, of series numbered from 0; error(delay) -> (n,), what is left of each. count_of_series :
+    how many there are, where samples of the last may be missing."""
     block = ((t - t.min()) / BLOCK).astype(int)
     blocks = block.max() + 1
     group = series * blocks + block
-    size = (series.max() + 1) * blocks
+    size = (count_of_series or series.max() + 1) * blocks
     count = np.bincount(group, minlength=size)
     counted = count[group] >= FEWEST
     power, scale = np.zeros((size, len(DELAYS))), None
@@ -110,11 +123,20 @@ def _scatter(series: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def of_tdoas(path: KnownPath) -> Delays | None:
     """Delays of the pairs of a KnownPath, in their order; None without any."""
-    if not path.pairs:
+    parts = _looked_at(path)
+    if not any(map(len, parts)):
         return None
-    every = max(1, sum(map(len, path.pairs.values())) // MOST)
-    parts = [part[::every] for part in path.pairs.values()]
     series, rows = np.repeat(np.arange(len(parts)), [len(part) for part in parts]), np.concatenate(parts)
     t, samples = path.t[rows], path.samples
     a, b = samples.position_a[rows], samples.position_b[rows]
-    return delays(series, t, lambda delay: path.d[rows] - tdoa(path.track.positions(t - delay), a, b))
+    return delays(series, t, lambda delay: path.d[rows] - tdoa(path.track.positions(t - delay), a, b), len(parts))
+
+
+def _looked_at(path: KnownPath) -> list[np.ndarray]:
+    """Rows of each pair of a KnownPath that are looked at, about MOST of all together: of a room some of each block, of a hall, of which
+    few pairs are heard in a block, those of some blocks."""
+    every = max(1, sum(map(len, path.pairs.values())) // MOST)
+    if len(path.ids) <= MANY:
+        return [part[::every] for part in path.pairs.values()]
+    chosen = ((path.t - path.start) / BLOCK).astype(int) % every == 0
+    return [part[chosen[part]] for part in path.pairs.values()]

@@ -161,8 +161,10 @@ def _names(diagnosis: Diagnosis) -> list[str]:
 
 
 def _flights(diagnosis: Diagnosis) -> str:
-    count = len(_names(diagnosis))
-    seconds = sum(score.last - score.first for score in diagnosis.before["scores"])
+    ends: dict[str, list[float]] = {}  # of each: parts of a flight that are judged by themselves lie within each other
+    for score in diagnosis.before["scores"]:
+        ends.setdefault(score.name, []).extend([score.first, score.last])
+    count, seconds = len(_names(diagnosis)), sum(max(of) - min(of) for of in ends.values())
     return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s in the air"
 
 
