@@ -145,6 +145,13 @@ def test_a_fast_tag_does_not_speak_against_the_survey():
     assert fit._loss(fit._start, fit.positions) - fit.solve()[0] > tdoa_rules.GAIN  # it would, from where a start puts the tag
 
 
+def test_a_hall_is_no_plane_unless_those_that_are_heard_together_lie_in_one(sound):
+    level = np.column_stack([sound.anchors.positions[:, :2], np.full(len(sound.anchors), 4.0)])
+    for anchors, is_flat in ((sound.anchors, False), (Anchors.from_positions(level), True)):
+        found = check(of_flight(replace(sound, imu=None, anchors=anchors))).findings
+        assert ("anchors_flat" in {finding.rule for finding in found}) == is_flat
+
+
 @pytest.mark.parametrize("late", [0.0, 0.3])
 def test_tdoas_that_are_late_in_a_hall_are_found_and_others_are_not(sound, late, monkeypatch):
     monkeypatch.setattr(delays, "MOST", len(sound.tdoa) // 20)  # as of a recording of an hour

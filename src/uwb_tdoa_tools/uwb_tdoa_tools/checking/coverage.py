@@ -82,22 +82,24 @@ def _silence(windows: Sequence[TdoaWindow], heard: np.ndarray) -> tuple[float, f
 
 
 def flat(view: CoverageView) -> Iterator[Finding]:
-    """Anchors in one plane tell next to nothing about the distance from it, and nothing about the side."""
+    """Anchors in one plane, all or of a hall those that are heard at once, tell next to nothing about the distance from it, and nothing
+    about the side."""
     p = view.anchors.positions
-    if len(p) < 4:
-        return
-    size, thickness = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)[[0, 2]] / np.sqrt(len(p))
-    if thickness < FLAT * size:
+    together = [p[window.heard > 0] for window in view.windows] if len(p) > MANY else [p]
+    sizes = [_size_and_thickness(some) for some in together if len(some) > FEWEST]
+    found = [(size, thickness) for size, thickness in sizes if thickness < FLAT * size]
+    if len(found) > PART * len(sizes):
+        size, thickness = np.median(found, axis=0)
         evidence = f"they are within {thickness:.2f} m (rms) of a plane and {size:.1f} m across"
         remedy = "put half of the anchors low, and half of them high; plan --improve move says which where"
-        yield Finding(
-            "anchors_flat",
-            WARNING,
-            "the anchors lie in a plane: the direction across it is hardly told",
-            evidence,
-            remedy,
-            thickness,
-        )
+        cause = "the anchors lie in a plane: the direction across it is hardly told"
+        yield Finding("anchors_flat", WARNING, cause, evidence, remedy, float(thickness))
+
+
+def _size_and_thickness(positions: np.ndarray) -> tuple[float, float]:
+    """m, largest and smallest standard deviation of positions (n, 3) along any direction."""
+    size, thickness = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[[0, 2]] / np.sqrt(len(positions))
+    return float(size), float(thickness)
 
 
 def side(view: CoverageView) -> Iterator[Finding]:
