@@ -35,11 +35,12 @@ def _of_part(part: ChannelResidual, of: str) -> Iterator[tuple[float, str]]:
     label = rows.series * (block.max() + 1) + block
     number = np.unique(label, return_inverse=True)[1]
     power = np.bincount(number, rows.y**2) / np.bincount(number)
+    order, ends = np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))
     for place in np.flatnonzero(power > (NEAR * max(LARGE, ABOVE * usual)) ** 2):
-        mine = number == place
+        mine = order[ends[place - 1] if place else 0 : ends[place]]
         size = float(np.sqrt(np.mean(rows.y[mine] ** 2)))
         name = part.place_in_room(rows.series[mine][0])
-        if name and mine.sum() >= 3 and size > max(LARGE, ABOVE * usual):
+        if name and len(mine) >= 3 and size > max(LARGE, ABOVE * usual):
             first = block[mine][0] * BLOCK
             x, y, z = rows.place[mine].mean(axis=0)
             yield size, f"{name} from {first:.0f} to {first + BLOCK:.0f} s{of}, around ({x:.1f}, {y:.1f}, {z:.1f}) m"
