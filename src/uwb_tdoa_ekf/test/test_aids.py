@@ -9,7 +9,7 @@ from priors import Prior
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_ekf.core import barometer, height, update, velocity
+from uwb_tdoa_ekf.core import auxiliary, height, update, velocity
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import AID
 from uwb_tdoa_ekf.core.state import TRANSITION, inject
@@ -62,25 +62,26 @@ def test_a_velocity_depends_on_velocity_and_attitude(seed, axis):
 
 
 def with_offset(prior):
-    """Random offset states for a prior; the joint covariance (17, 17)."""
-    joint = np.zeros((17, 17))
+    """Random offset states for a prior; the joint covariance (18, 18)."""
+    joint = np.zeros((18, 18))
     joint[:15, :15] = prior.hypothesis.P
-    link = 0.1 * prior.rng.standard_normal((2, 15)) @ np.linalg.cholesky(prior.hypothesis.P).T
+    link = 0.1 * prior.rng.standard_normal((3, 15)) @ np.linalg.cholesky(prior.hypothesis.P).T
     joint[15:, :15], joint[:15, 15:] = link, link.T
-    joint[15:, 15:] = [[2.0, 0.1], [0.1, 1.0]]
+    joint[15:, 15:] = [[2.0, 0.1, 0.2], [0.1, 1.0, -0.1], [0.2, -0.1, 1.5]]
     prior.hypothesis.offset_cross[:], prior.hypothesis.offset_P[:] = link, joint[15:, 15:]
-    prior.hypothesis.offset[:] = [3.0, -0.2]
+    prior.hypothesis.offset[:] = [3.0, -0.2, 0.4]
     return joint
 
 
-@given(seeds, st.sampled_from([0.0, 1.0]))
-def test_an_update_reaches_the_offset_of_the_barometer_as_the_textbook_says(seed, on_offset):
+@given(seeds, st.sampled_from([None, auxiliary.PRESSURE, auxiliary.RANGE]))
+def test_an_update_reaches_the_auxiliary_states_as_the_textbook_says(seed, of):
     prior = Prior(seed)
     joint, innovation = with_offset(prior), prior.innovation
-    h = np.append(prior.h, [on_offset, 0.0])
-    if on_offset:
-        innovation.cross_covariance[:] = joint[:15] @ h
-        innovation.prior_variance, innovation.on_offset = h @ joint @ h, 1.0
+    h = np.append(prior.h, np.zeros(3))
+    if of is not None:
+        h[15 + of] = 1.0
+        auxiliary.depend(prior.hypothesis, innovation, of)
+        np.testing.assert_allclose(innovation.prior_variance, h @ joint @ h, rtol=1e-9)
     innovation.total_variance = innovation.prior_variance + innovation.noise_variance
     gain = joint @ h / (h @ joint @ h + innovation.noise_variance)
     expected = joint - np.outer(gain, h @ joint)
@@ -89,7 +90,7 @@ def test_an_update_reaches_the_offset_of_the_barometer_as_the_textbook_says(seed
     np.testing.assert_allclose(prior.hypothesis.P, expected[:15, :15], atol=1e-9 * scale)
     np.testing.assert_allclose(prior.hypothesis.offset_cross, expected[15:, :15], atol=1e-9 * scale)
     np.testing.assert_allclose(prior.hypothesis.offset_P, expected[15:, 15:], atol=1e-9 * scale)
-    np.testing.assert_allclose(prior.hypothesis.offset, [3.0, -0.2] + gain[15:] * innovation.value, atol=1e-9)
+    np.testing.assert_allclose(prior.hypothesis.offset, [3.0, -0.2, 0.4] + gain[15:] * innovation.value, atol=1e-9)
 
 
 @given(seeds)
@@ -98,17 +99,17 @@ def test_the_covariance_with_the_offset_moves_with_the_state(seed):
     joint, rng = with_offset(prior), prior.rng
     blocks = {name: rng.standard_normal((3, 3)) for name in ("velocity_attitude", "velocity_accel_bias")}
     transition.dt, transition.attitude_attitude = 0.01, Rotation.from_rotvec(rng.standard_normal(3)).as_matrix()
-    phi = np.eye(17)
+    phi = np.eye(18)
     phi[:3, 3:6], phi[6:9, 6:9], phi[6:9, 12:15] = 0.01 * np.eye(3), transition.attitude_attitude, -0.01 * np.eye(3)
-    phi[15:, 15:] = [[1.0, 0.01], [0.0, 1.0]]
+    phi[15, 16] = 0.01
     for name, columns in (("velocity_attitude", slice(6, 9)), ("velocity_accel_bias", slice(9, 12))):
         transition[name] = blocks[name]
         phi[3:6, columns] = blocks[name]
-    barometer.predict(prior.hypothesis, transition)
+    auxiliary.predict(prior.hypothesis, transition)
     expected = phi @ joint @ phi.T
     np.testing.assert_allclose(prior.hypothesis.offset_cross, expected[15:, :15], atol=1e-9)
     np.testing.assert_allclose(prior.hypothesis.offset_P, expected[15:, 15:], atol=1e-9)
-    np.testing.assert_allclose(prior.hypothesis.offset, [3.0 - 0.01 * 0.2, -0.2])
+    np.testing.assert_allclose(prior.hypothesis.offset, [3.0 - 0.01 * 0.2, -0.2, 0.4])
 
 
 def only(flight, *names):

@@ -75,7 +75,7 @@ def test_a_number_must_be_above_zero(value):
             accepted.append(name)
         except InputError as error:
             assert name in str(error)
-    assert accepted == (["vibration_gain", "fixed_height_std"] if value == 0.0 else [])  # 0: it does not vibrate, or stay on a floor
+    assert accepted == (["vibration_gain", "range_offset_std", "fixed_height_std"] if value == 0.0 else [])  # 0: there is no such thing
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "north"])

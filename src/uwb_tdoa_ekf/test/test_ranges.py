@@ -15,6 +15,7 @@ from uwb_tdoa_ekf.core.memory import AID, new_state
 from uwb_tdoa_ekf.core.verdicts import INVALID, REPEATED, USED
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.smoother import smooth
 
 NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 RATE, STD = 100.0, 0.1  # Hz, m
@@ -112,3 +113,15 @@ def test_two_ranges_make_a_tdoa():
     assert (made["t"], made["a"], made["b"], made["d"]) == (1.05, 2, 1, 1.5) and made["variance"] == pytest.approx(0.25)
     one["t"] = 2.0  # a second later
     assert not ranges.pair(state.ekf[0], one)
+
+
+def test_an_offset_of_all_ranges_is_found(ranged):
+    longer = replace(ranged, range=replace(ranged.range, d=ranged.range.d + 0.25))
+    before = error(ranged, run_offline(longer).odometry)
+    after = error(ranged, run_offline(longer, FilterConfig(range_offset_std=0.3)).odometry)
+    assert after < 0.5 * before
+
+
+def test_the_smoother_knows_of_no_offset(ranged):
+    one, other = (smooth(ranged, FilterConfig(range_offset_std=std)).odometry for std in (0.0, 0.3))
+    np.testing.assert_array_equal(one.p, other.p)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 import math
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -37,8 +37,9 @@ def smooth(flight: Flight, config: FilterConfig | None = None, corrector: Correc
     from the beginning.
     Memory: 3.5 kB per update.
     """
-    # Its offset is not among the states of the history.
-    config = replace(config or FilterConfig(), use_pressure=False)  # type: ignore[call-arg]  # parameters of SENSORS are known at run time
+    # The offsets of these are not among the states of the history.
+    without: dict[str, Any] = {"use_pressure": False, "range_offset_std": 0.0}
+    config = replace(config or FilterConfig(), **without)
     if config.use_imu and config.initial_yaw_std > YAW_STD:
         offset = run_offline(flight, config, corrector).yaw_offset
         config = replace(config, initial_yaw=config.initial_yaw + offset, initial_yaw_std=YAW_STD)

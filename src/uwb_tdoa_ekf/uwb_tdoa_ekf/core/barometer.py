@@ -1,7 +1,6 @@
 """A barometer: its altitude is the height of the body plus an offset that wanders and drifts.
 
-Offset and drift are states beside the 15 of the error state, with their own covariance and their covariance with those;
-without a barometer (variance of the offset 0) nothing is computed for them.
+Offset and drift are states beside the 15 of the error state, see auxiliary.py.
 """
 
 from __future__ import annotations
@@ -13,9 +12,10 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, weight
 
+from .auxiliary import PRESSURE, PRESSURE_DRIFT, RANGE, depend
 from .hypotheses import alive
 from .state import ERROR_STATES
-from .update import OFFSET_STATES, kalman, project
+from .update import kalman, project
 from .verdicts import REJECTED, USED
 
 GATE = 4.0  # standard deviations beyond which an altitude is not used
@@ -67,57 +67,18 @@ def _compare(hypothesis: Record, altitude: float, parameters: Record, innovation
     innovation.value = altitude - hypothesis.x[2] - hypothesis.offset[0]
     innovation.noise_variance = parameters.pressure_std**2
     project(hypothesis.P, innovation)
-    cross, P = hypothesis.offset_cross, hypothesis.offset_P
-    for j in range(ERROR_STATES):
-        innovation.cross_covariance[j] += cross[0, j]
-    innovation.prior_variance += 2.0 * cross[0, 2] + P[0, 0]
-    innovation.on_offset = 1.0
+    depend(hypothesis, innovation, PRESSURE)
 
 
 @compiled
 def _take_anew(hypothesis: Record, altitude: float, parameters: Record) -> None:
     """The offset is what leads from the height of the filter to an altitude; the drift is not known."""
     hypothesis.offset[0], hypothesis.offset[1] = altitude - hypothesis.x[2], 0.0
-    hypothesis.offset_cross[:] = 0.0
-    for j in range(ERROR_STATES):
-        hypothesis.offset_cross[0, j] = -hypothesis.P[2, j]
-    hypothesis.offset_P[:] = 0.0
-    hypothesis.offset_P[0, 0] = hypothesis.P[2, 2] + parameters.pressure_std**2
-    hypothesis.offset_P[1, 1] = parameters.pressure_drift**2
-
-
-@compiled
-def predict(hypothesis: Record, transition: Record) -> None:
-    """After `state.predict` of a HYPOTHESIS that has an offset: its covariance with the state, by the same TRANSITION."""
-    dt, cross = transition.dt, hypothesis.offset_cross
-    A, B, E = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude
-    for k in range(OFFSET_STATES):
-        t0, t1, t2 = cross[k, 6], cross[k, 7], cross[k, 8]
-        for r in range(3):
-            cross[k, r] += dt * cross[k, 3 + r]
-            by_attitude = A[r, 0] * t0 + A[r, 1] * t1 + A[r, 2] * t2
-            by_bias = B[r, 0] * cross[k, 9] + B[r, 1] * cross[k, 10] + B[r, 2] * cross[k, 11]
-            cross[k, 3 + r] += by_attitude + by_bias
-            cross[k, 6 + r] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * cross[k, 12 + r]
-    _drift(hypothesis, dt)
-
-
-@compiled
-def coast(hypothesis: Record, dt: float) -> None:
-    """The same after `state.coast`."""
-    cross = hypothesis.offset_cross
-    for k in range(OFFSET_STATES):
-        for r in range(3):
-            cross[k, r] += dt * cross[k, 3 + r]
-    _drift(hypothesis, dt)
-
-
-@compiled
-def _drift(hypothesis: Record, dt: float) -> None:
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
-    hypothesis.offset[0] += dt * hypothesis.offset[1]
     for j in range(ERROR_STATES):
-        cross[0, j] += dt * cross[1, j]
-    P[0, 0] += dt * (2.0 * P[0, 1] + dt * P[1, 1])
-    P[0, 1] += dt * P[1, 1]
-    P[1, 0] = P[0, 1]
+        cross[PRESSURE, j], cross[PRESSURE_DRIFT, j] = -hypothesis.P[2, j], 0.0
+    P[:RANGE, :] = 0.0
+    P[:, :RANGE] = 0.0
+    P[PRESSURE, PRESSURE] = hypothesis.P[2, 2] + parameters.pressure_std**2
+    P[PRESSURE_DRIFT, PRESSURE_DRIFT] = parameters.pressure_drift**2
+    P[PRESSURE, RANGE] = P[RANGE, PRESSURE] = -cross[RANGE, 2]

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
 from . import (
     aids,
-    barometer,
+    auxiliary,
     curvature,
     ground,
     height,
@@ -284,14 +284,14 @@ def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> 
                 continue
             if sensed:
                 predict(hypothesis, ekf.imu, parameters, dt, ekf.transition)
-                if hypothesis.offset_P[0, 0] > 0.0:
-                    barometer.predict(hypothesis, ekf.transition)
+                if auxiliary.present(hypothesis):
+                    auxiliary.predict(hypothesis, ekf.transition)
                 if h == ekf.best:
                     history.add_prediction(ekf, records)
             else:
                 coast(hypothesis, dt, parameters.motion_noise**2, STALE_TURN_PSD if parameters.use_imu else 0.0)
-                if hypothesis.offset_P[0, 0] > 0.0:
-                    barometer.coast(hypothesis, dt)
+                if auxiliary.present(hypothesis):
+                    auxiliary.coast(hypothesis, dt)
                 if h == ekf.best:
                     history.add_coasting(ekf, dt, records)
         ekf.t = t if t - ekf.t <= MAX_STEP else ekf.t + dt

@@ -8,7 +8,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
-from . import ground, height, hypotheses, inertial, standing, systematic, workspace
+from . import auxiliary, ground, height, hypotheses, inertial, standing, systematic, workspace
 from .history import add_reset
 from .memory import HYPOTHESES, PLACES, WINDOW, YAWS
 from .ground import Height
@@ -420,7 +420,7 @@ def _mean_accel(imu: Record, parameters: Record) -> np.ndarray:
 def _put(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None:
     """Position and velocity x (6,) and their covariance (6, 6)."""
     hypothesis.x[:6] = x
-    hypothesis.offset_P[:] = 0.0  # of a barometer: to be found anew
+    auxiliary.forget(hypothesis)
     hypothesis.P[:6, :6] = covariance
 
 

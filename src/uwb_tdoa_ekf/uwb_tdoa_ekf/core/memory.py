@@ -13,10 +13,11 @@ import numpy as np
 from uwb_tdoa_bias.effects.slope import N_STATES
 from uwb_tdoa_bias.foundation.compiled import Record
 
+from .auxiliary import OFFSET_STATES
 from .ground import MOST_PAIRS, PAIR
 from .sensor_functions import rows_of
 from .state import ERROR_STATES, GRAVITY, NOMINAL_STATES, TRANSITION
-from .update import INNOVATION, OFFSET_STATES
+from .update import INNOVATION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,9 +46,9 @@ HYPOTHESIS = _record(
     ("log_weight", float),  # log probability relative to the best; -inf: pruned
     ("x", float, NOMINAL_STATES),  # see state.py
     ("P", float, (ERROR_STATES, ERROR_STATES)),  # symmetric to the bit
-    ("offset", float, OFFSET_STATES),  # m and m/s, of the barometer, and its drift;
+    ("offset", float, OFFSET_STATES),  # m and m/s, auxiliary states, see auxiliary.py;
     ("offset_cross", float, (OFFSET_STATES, ERROR_STATES)),  # covariance with the error state, and
-    ("offset_P", float, (OFFSET_STATES, OFFSET_STATES)),  # their own; 0: there is no barometer
+    ("offset_P", float, (OFFSET_STATES, OFFSET_STATES)),  # their own; 0: there is none
 )
 
 # What is known of the inertial sensor.

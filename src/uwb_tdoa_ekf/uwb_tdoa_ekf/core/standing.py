@@ -12,7 +12,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
-from . import ground
+from . import auxiliary, ground
 from .history import add_reset, add_update
 from .hypotheses import alive
 from .memory import HYPOTHESES
@@ -223,7 +223,7 @@ def put(ekf: Record, position: np.ndarray, covariance: np.ndarray, t: float, rec
         hypothesis = ekf.hypotheses[h]
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
-        hypothesis.offset_P[:] = 0.0
+        auxiliary.forget(hypothesis)
         hypothesis.x[:3] = position
         hypothesis.P[:3, :3] = covariance
         stop(hypothesis.x[:6], hypothesis.P[:6, :6], ekf.still_covariance)

@@ -11,9 +11,9 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
+from . import auxiliary
 from .state import ERROR_STATES, inject
 
-OFFSET_STATES = 2  # of a barometer, beside the error states, see barometer.py
 LONGEST_ROW = 6  # error states that one measurement may depend on
 
 INNOVATION = np.dtype(
@@ -30,7 +30,8 @@ INNOVATION = np.dtype(
             float,
             ERROR_STATES,
         ),  # P h', of state and prediction; the gain is this over total_variance
-        ("on_offset", float),  # entry of the Jacobian row for the offset of the barometer: 0, but for its own altitudes
+        ("on_offset", float, auxiliary.OFFSET_STATES),  # entries of the Jacobian row for the auxiliary states: 0, but of their own sensors
+        ("offset_covariance", float, auxiliary.OFFSET_STATES),  # scratch of auxiliary.correct
         ("repeated", float),  # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does not move
         ("weight", float),  # 0 to 1, given by robust.update
         ("total_variance", float),  # of the value, as the update took it
@@ -53,40 +54,22 @@ def project(P: np.ndarray, innovation: Record) -> None:
     variance = 0.0
     for n in range(innovation.entries):
         variance += innovation.row[n] * covariance[innovation.states[n]]
-    innovation.prior_variance, innovation.on_offset, innovation.repeated = variance, 0.0, 1.0
+    innovation.prior_variance, innovation.repeated = variance, 1.0
+    innovation.on_offset[:] = 0.0
 
 
 @compiled
 def kalman(hypothesis: Record, innovation: Record) -> None:
     """Kalman update of a HYPOTHESIS with an INNOVATION of value, cross_covariance and total_variance."""
     P, covariance, total = hypothesis.P, innovation.cross_covariance, innovation.total_variance
-    if hypothesis.offset_P[0, 0] > 0.0:
-        _correct_offset(hypothesis, innovation)
+    if auxiliary.present(hypothesis):
+        auxiliary.correct(hypothesis, innovation)
     inject(hypothesis.x, covariance, innovation.value / total)
     for i in range(ERROR_STATES):
         gain = covariance[i] / total
         for j in range(i, ERROR_STATES):
             P[i, j] -= gain * covariance[j]
             P[j, i] = P[i, j]
-
-
-@compiled
-def _correct_offset(hypothesis: Record, innovation: Record) -> None:
-    """The part of `kalman` for the offset of the barometer and its drift."""
-    cross, P, total = hypothesis.offset_cross, hypothesis.offset_P, innovation.total_variance
-    first, second = innovation.on_offset * P[0, 0], innovation.on_offset * P[0, 1]  # covariance with the prediction
-    for n in range(innovation.entries):
-        first += innovation.row[n] * cross[0, innovation.states[n]]
-        second += innovation.row[n] * cross[1, innovation.states[n]]
-    hypothesis.offset[0] += first / total * innovation.value
-    hypothesis.offset[1] += second / total * innovation.value
-    for j in range(ERROR_STATES):
-        cross[0, j] -= first / total * innovation.cross_covariance[j]
-        cross[1, j] -= second / total * innovation.cross_covariance[j]
-    P[0, 0] -= first / total * first
-    P[0, 1] -= first / total * second
-    P[1, 0] = P[0, 1]
-    P[1, 1] -= second / total * second
 
 
 @compiled

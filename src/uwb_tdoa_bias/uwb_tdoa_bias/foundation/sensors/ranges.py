@@ -101,6 +101,9 @@ SENSOR = Sensor(
     parameters={
         "use_range": parameter(True, "use distances to anchors, as of two-way ranging, if there are any", fixed=True),
         "range_std": parameter(0.1, "m; of a distance to an anchor, uncorrected systematic part included", high=100.0),
+        "range_offset_std": parameter(
+            0.0, "m; standard deviation of an unknown offset common to all ranges; 0.0: they are calibrated", high=100.0, with_low=True
+        ),
     },
     invalid="give ids of uwb/anchors, and distances in metres, 0 or more",
     remedy="its unit, and the anchors' positions",
