@@ -51,10 +51,12 @@ def test_without_them_there_is_no_odometry(ranged):
     assert len(run_offline(ranged, FilterConfig(use_range=False)).odometry) == 0
 
 
-def test_live_is_off_line(ranged):
-    estimator = Estimator(ranged.anchors)
+@pytest.mark.parametrize("offset_std", [0.0, 0.3])
+def test_live_is_off_line(ranged, offset_std):
+    config = FilterConfig(range_offset_std=offset_std)
+    estimator = Estimator(ranged.anchors, config)
     odometry, _ = feed(estimator, ranged)
-    expected = run_offline(ranged)
+    expected = run_offline(ranged, config)
     assert_same(odometry, expected.odometry)
     assert estimator.counts["range_used"] == np.sum(expected.aids["range"]["verdict"] == USED)
 
@@ -115,11 +117,22 @@ def test_two_ranges_make_a_tdoa():
     assert not ranges.pair(state.ekf[0], one)
 
 
-def test_an_offset_of_all_ranges_is_found(ranged):
+@pytest.mark.parametrize("offset", [0.0, 0.25])
+def test_an_offset_of_all_ranges_is_found(ranged, offset):
+    longer = replace(ranged, range=replace(ranged.range, d=ranged.range.d + offset))
+    known = run_offline(ranged).odometry
+    found = run_offline(longer, FilterConfig(range_offset_std=0.3)).odometry
+    assert error(ranged, found) < 1.2 * error(ranged, known)
+    truth = np.stack([np.interp(found.t, ranged.truth.t, column) for column in ranged.truth.p.T], axis=1)
+    away = found.p - truth
+    assert np.mean(np.einsum("ni,nij,nj->n", away, np.linalg.inv(found.covariance[:, :3, :3]), away)) < 3.0  # as many as there are axes
+
+
+def test_who_knows_of_no_offset_is_wrong_and_certain(ranged):
+    """What the offset is for."""
     longer = replace(ranged, range=replace(ranged.range, d=ranged.range.d + 0.25))
-    before = error(ranged, run_offline(longer).odometry)
-    after = error(ranged, run_offline(longer, FilterConfig(range_offset_std=0.3)).odometry)
-    assert after < 0.5 * before
+    found = run_offline(longer, FilterConfig(range_offset_std=0.3))
+    assert error(ranged, run_offline(longer).odometry) > 2.0 * error(ranged, found.odometry)
 
 
 def test_the_smoother_knows_of_no_offset(ranged):

@@ -13,6 +13,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from . import ground, hypotheses, standing
+from .auxiliary import RANGE
 from .history import add_update
 from .memory import HYPOTHESES
 from .state import GRAVITY, rotation
@@ -65,6 +66,7 @@ def feel(ekf: Record, sample: Record, dt: float) -> None:
             hypothesis.P[k, :] = 0.0
             hypothesis.P[:, k] = 0.0
             hypothesis.P[k, k] = LIFT**2
+            hypothesis.offset_cross[RANGE, k] = 0.0
     ekf.resting, ekf.next_look = False, sample.t + AWAY
 
 

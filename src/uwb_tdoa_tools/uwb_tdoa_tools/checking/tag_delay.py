@@ -22,6 +22,7 @@ AGREE = 0.8  # share of the windows that say the same sign
 SCALE = 0.2  # m, beyond which a range counts less
 DILUTION = 5.0  # most that an error of the ranges may become in what they have in common
 STEPS, DAMPING = 20, 1e-3
+REMEDY = "calibrate it: survey, or diagnose where there is ground truth; until then let the filter find it: range_offset_std: 0.3"
 
 
 def tag_delay(recording: Recording) -> Iterator[Finding]:
@@ -35,7 +36,7 @@ def tag_delay(recording: Recording) -> Iterator[Finding]:
         cause = f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: the antenna delay of the tag"
         low, high = np.quantile(offsets, [0.25, 0.75])
         evidence = f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, {low:.2f} to {high:.2f} m in half of them"
-        yield Finding("tag_delay", WARNING, cause, evidence, "calibrate it: survey, or diagnose where there is ground truth", offset)
+        yield Finding("tag_delay", WARNING, cause, evidence, REMEDY, offset)
 
 
 def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:
