@@ -8,7 +8,7 @@ these derivatives knows of the path whatever the filter knew: the inertial senso
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
@@ -16,6 +16,7 @@ from numpy.lib.recfunctions import repack_fields
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.compiled import compiled
 
+from .core import auxiliary
 from .core.config import FilterConfig
 from .core.history import RESET
 from .core.memory import RESIDUAL, joined, structured
@@ -134,9 +135,7 @@ def record_innovations(
     """Run a Flight through bias correction and filter, without its pressure, and keep what `Innovations` need of the TDOAS, and of those
     SENSORS among `streams` that the flight has and the filter uses. Takes what run_offline takes."""
     corrector = corrector or Corrector(flight.anchors)
-    # The offsets of these are not among the states of the history.
-    without: dict[str, Any] = {"use_pressure": False, "range_offset_std": 0.0}
-    config = replace(config or FilterConfig(), **without)
+    config = replace(config or FilterConfig(), **auxiliary.NONE)
     records = _Needed()
     run = run_offline(flight, config, corrector, records)
     streams = [name for name in streams if name == TDOAS or name in run.aids]

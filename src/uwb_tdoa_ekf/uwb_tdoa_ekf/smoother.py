@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
+from .core import auxiliary
 from .core.config import FilterConfig
 from .core.history import RESET
 from .core.hypotheses import YAW_STD
@@ -37,9 +38,7 @@ def smooth(flight: Flight, config: FilterConfig | None = None, corrector: Correc
     from the beginning.
     Memory: 3.5 kB per update.
     """
-    # The offsets of these are not among the states of the history.
-    without: dict[str, Any] = {"use_pressure": False, "range_offset_std": 0.0}
-    config = replace(config or FilterConfig(), **without)
+    config = replace(config or FilterConfig(), **auxiliary.NONE)
     if config.use_imu and config.initial_yaw_std > YAW_STD:
         offset = run_offline(flight, config, corrector).yaw_offset
         config = replace(config, initial_yaw=config.initial_yaw + offset, initial_yaw_std=YAW_STD)

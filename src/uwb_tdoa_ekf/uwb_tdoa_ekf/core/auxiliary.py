@@ -6,12 +6,15 @@ there is none nothing is computed. What they are, and where they begin, `baromet
 
 from __future__ import annotations
 
+from typing import Any
+
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from .state import ERROR_STATES
 
 PRESSURE, PRESSURE_DRIFT, RANGE = 0, 1, 2  # m and m/s, of the barometer; m, of all ranges
 OFFSET_STATES = 3
+NONE: dict[str, Any] = {"use_pressure": False, "range_offset_std": 0.0}  # parameters of a filter without them: a history has none
 
 
 @compiled
@@ -95,7 +98,7 @@ def _drift(hypothesis: Record, dt: float) -> None:
     hypothesis.offset[PRESSURE] += dt * hypothesis.offset[PRESSURE_DRIFT]
     for j in range(ERROR_STATES):
         cross[PRESSURE, j] += dt * cross[PRESSURE_DRIFT, j]
-    P[0, 0] += dt * (2.0 * P[0, 1] + dt * P[1, 1])
-    P[0, 1] += dt * P[1, 1]
-    P[0, 2] += dt * P[1, 2]
-    P[1, 0], P[2, 0] = P[0, 1], P[0, 2]
+    P[PRESSURE, PRESSURE] += dt * (2.0 * P[PRESSURE, PRESSURE_DRIFT] + dt * P[PRESSURE_DRIFT, PRESSURE_DRIFT])
+    for k in (PRESSURE_DRIFT, RANGE):
+        P[PRESSURE, k] += dt * P[PRESSURE_DRIFT, k]
+        P[k, PRESSURE] = P[PRESSURE, k]

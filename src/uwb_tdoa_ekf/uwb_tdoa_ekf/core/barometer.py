@@ -36,10 +36,10 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
         hypothesis = ekf.hypotheses[h]
         if not alive(hypothesis):
             continue
-        if anew or hypothesis.offset_P[0, 0] == 0.0:
+        if anew or hypothesis.offset_P[PRESSURE, PRESSURE] == 0.0:
             _take_anew(hypothesis, altitude, parameters)
             continue
-        hypothesis.offset_P[0, 0] += dt * excess * parameters.pressure_walk**2
+        hypothesis.offset_P[PRESSURE, PRESSURE] += dt * excess * parameters.pressure_walk**2
         _compare(hypothesis, altitude, parameters, innovation)
         total = innovation.prior_variance + innovation.noise_variance
         normalized = innovation.value / math.sqrt(total)
@@ -64,7 +64,7 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
 def _compare(hypothesis: Record, altitude: float, parameters: Record, innovation: Record) -> None:
     """Fill in what an altitude (m) says to a HYPOTHESIS and its offset."""
     innovation.entries, innovation.states[0], innovation.row[0] = 1, 2, 1.0
-    innovation.value = altitude - hypothesis.x[2] - hypothesis.offset[0]
+    innovation.value = altitude - hypothesis.x[2] - hypothesis.offset[PRESSURE]
     innovation.noise_variance = parameters.pressure_std**2
     project(hypothesis.P, innovation)
     depend(hypothesis, innovation, PRESSURE)
@@ -73,7 +73,7 @@ def _compare(hypothesis: Record, altitude: float, parameters: Record, innovation
 @compiled
 def _take_anew(hypothesis: Record, altitude: float, parameters: Record) -> None:
     """The offset is what leads from the height of the filter to an altitude; the drift is not known."""
-    hypothesis.offset[0], hypothesis.offset[1] = altitude - hypothesis.x[2], 0.0
+    hypothesis.offset[PRESSURE], hypothesis.offset[PRESSURE_DRIFT] = altitude - hypothesis.x[2], 0.0
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
     for j in range(ERROR_STATES):
         cross[PRESSURE, j], cross[PRESSURE_DRIFT, j] = -hypothesis.P[2, j], 0.0

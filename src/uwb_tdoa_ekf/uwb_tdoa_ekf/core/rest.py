@@ -66,7 +66,7 @@ def feel(ekf: Record, sample: Record, dt: float) -> None:
             hypothesis.P[k, :] = 0.0
             hypothesis.P[:, k] = 0.0
             hypothesis.P[k, k] = LIFT**2
-            hypothesis.offset_cross[RANGE, k] = 0.0
+            hypothesis.offset_cross[RANGE, k] = 0.0  # as P; that of the barometer stays as it was
     ekf.resting, ekf.next_look = False, sample.t + AWAY
 
 

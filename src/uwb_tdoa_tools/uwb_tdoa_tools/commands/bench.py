@@ -20,7 +20,7 @@ tags, replays, and what else nodes answer. Figures are medians with their quarti
   core    us per IMU prediction and per robust TDOA update, by anchors and kind of robustness
   offline seconds for a recording of 45 s, with correction, network and smoother
   nodes   time to ready, CPU, memory, latency and losses of both nodes at 1 kHz IMU + 400 Hz TDOA
-  tags    the same for 1 to 8 tags, and for 30 at 100 Hz, in localization_nodes; all tags hear the same streams
+  tags    the same for 1 to 8 tags, and for 30 and 60 at 100 Hz, in localization_nodes; all tags hear the same streams
   hall    the same for a tag that hears 8 of 8, 1000 and 10 000 installed anchors
   replay  how fast a bag goes through both nodes without loss
   graph   how long parameters, a told pose and a clock that stops wait while streams, /clock and /tf flow; idle CPU
