@@ -13,6 +13,7 @@ import pytest
 signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before anything imports rclpy: this session talks to itself only, beside others on the same machine.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before anything imports numpy, as executables do: threads of BLAS only wait for each other
 try:
     from domain_coordinator import domain_id
 except ImportError:  # no ROS: the tests of the cores need none

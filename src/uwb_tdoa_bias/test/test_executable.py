@@ -114,11 +114,12 @@ def test_a_part_of_ours_that_is_missing_is_a_defect():
 
 
 @pytest.mark.parametrize("given, kept", [(None, "1"), ("3", "3")])
-def test_the_linear_algebra_of_a_node_takes_one_thread_unless_the_user_says_more(write, monkeypatch, given, kept):
-    name = f"tells_{kept}"
+@pytest.mark.parametrize("start", [executable, node_executable])
+def test_linear_algebra_takes_one_thread_unless_the_user_says_more(write, monkeypatch, start, given, kept):
+    name = f"tells_{kept}_{start.__name__}"
     write(name, "import os\nseen = os.environ['OMP_NUM_THREADS']\ndef main(): return seen")
     monkeypatch.setenv("OMP_NUM_THREADS", given) if given else monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    assert node_executable(name)() == kept  # before anything is imported
+    assert start(name)() == kept  # before anything is imported
 
 
 def test_a_folder_of_recordings_does_not_say_how_libraries_behave(write, tmp_path, monkeypatch):

@@ -18,8 +18,7 @@ CHECKED = ("simulated", "in time"), ("measured", "late")  # check reads no groun
     [
         *(("simulated", name) for name in TRUTHS if name != "on another epoch"),  # which is in the one with z down, too
         ("measured", "late"),
-        ("measured", "in another frame"),
-        ("measured", "z down, on another epoch"),
+        ("measured", "z down, on another epoch"),  # is in another frame, too
     ],
 )
 def test_from_csv_and_tape_to_a_diagnosed_flight(tmp_path, monkeypatch, capsys, shared_data, source, name):

@@ -52,7 +52,6 @@ KEYS = {
     "rotorpy": (None, "rotorpy"),  # an oracle of tests, for who wants it
     "scipy": ("python3-scipy", "scipy"),
     "sklearn": ("python3-sklearn", "scikit-learn"),
-    "threadpoolctl": ("python3-sklearn", "scikit-learn"),  # which needs it itself
     "tqdm": ("python3-tqdm", "tqdm"),
     "yaml": ("python3-yaml", "PyYAML"),
 }

@@ -18,7 +18,6 @@ from functools import lru_cache
 from typing import Any, Protocol, TYPE_CHECKING, TypeVar
 
 from joblib import Parallel, cpu_count, delayed, parallel_config
-from threadpoolctl import threadpool_limits
 
 from uwb_tdoa_bias.foundation.elsewhere import elsewhere
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 
 CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
 
-Function = TypeVar("Function", bound="Callable[..., Any]")
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
@@ -40,11 +38,6 @@ class MapFunction(Protocol):
     which each is done."""
 
     def __call__(self, function: Callable[[Item], Made], items: Iterable[Item], /) -> Iterable[Made]: ...
-
-
-# Decorator: linear algebra in one thread. Of small matrices, several only wait for each other, and by spinning: with another
-# process beside it, diagnose took six times the processor time.
-in_one_thread: Callable[[Function], Function] = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 def add_options(parser: argparse._ActionsContainer) -> None:
@@ -127,7 +120,6 @@ def _closing(outcomes: Any) -> Iterator[Any]:
             outcomes.close()
 
 
-@in_one_thread
 def _attempt(function: Callable[[Item], Made], item: Item, folder: str | None) -> tuple[Made | None, Exception | None]:
     """(result, None), or (None, what cli tells in one sentence): else joblib would raise it before earlier results. folder : in which
     paths of the item are, or None."""

@@ -29,13 +29,14 @@ SAID = 1.5  # s of importing after which it is said that something goes on
 
 
 def executable(module: str) -> Callable[..., Any]:
-    """The entry point of a module with a main(): imports the module when it is called, returns what main returns."""
+    """The entry point of a module with a main(): imports the module when it is called, returns what main returns. Its linear algebra, of
+    small matrices, takes one thread: several would wait for each other by spinning. In the environment, because libraries that are loaded
+    later read it too; a user's own setting stays."""
     return partial(_run, module)
 
 
 def node_executable(module: str) -> Callable[..., Any]:
-    """The same of a node. Its linear algebra, of small matrices, takes one thread: several would wait for each other by
-    spinning. In the environment, because libraries that are loaded later read it too; a user's own setting stays."""
+    """The same of a node."""
     return partial(_run_node, module)
 
 
@@ -57,6 +58,7 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _run(module: str, *arguments: Any) -> Any:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     name = module.rpartition(".")[2]
     try:
         main = _imported(module).main
@@ -74,7 +76,6 @@ def _run(module: str, *arguments: Any) -> Any:
 
 
 def _run_node(module: str, *arguments: Any) -> Any:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     gc.disable()  # until the node runs: nothing that is imported is garbage, and searching it is a tenth of a start
     return _run(module, *arguments)
 

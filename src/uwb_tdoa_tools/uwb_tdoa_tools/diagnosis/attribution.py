@@ -13,7 +13,6 @@ from uwb_tdoa_bias.effects.covariates import UPWARDS
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
 
-from ..parallel import in_one_thread
 from .channels import CHANNELS, residuals
 from .channels.views import MOST_LINKS
 from .detectors import DETECTORS
@@ -106,7 +105,6 @@ class Attribution:
         return out
 
 
-@in_one_thread
 def attribute(
     flights: Sequence[Flight], reference: Reference, base: EffectSet = EffectSet(),
     kinds: Collection[str] | None = None, undeclared: bool = True, progress: Callable[[], object] = lambda: None,

@@ -12,7 +12,6 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..checking.numbers import numbers
-from ..parallel import in_one_thread
 from ..scoring.metrics import Score
 from . import comparison, output, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
@@ -88,7 +87,6 @@ class Diagnosis:
         return html(self)
 
 
-@in_one_thread
 def diagnose(
     flights: Sequence[Flight], holdout: Sequence[Flight] = (), base: EffectSet = EffectSet(),
     config: FilterConfig | None = None, reference: Reference | None = None,

@@ -12,7 +12,6 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.correction.features import columns
 
-from ..parallel import in_one_thread
 from . import labels as labelling, linear, paper, physics, structured
 
 if TYPE_CHECKING:
@@ -61,7 +60,6 @@ class Trained:
         return self.model.onnx(self.meta) if self.model else None
 
 
-@in_one_thread
 def train(
     recipe: Recipe, training: Sequence[Flight], validation: Sequence[Flight], name: str,
     progress: Callable[[str], object] = lambda text: None, found: physics.Physics | None = None, curve: bool = True,

@@ -18,7 +18,6 @@ import numpy as np
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.flight import AIDS
 
-from ..parallel import in_one_thread
 from ..scoring.shrinkage import SHARES, Shrinkage, best_share
 from ..scoring.evaluation import evaluate
 from . import models, physics
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 FOLDS = 5
 
 
-@in_one_thread
 def cross_validated(
     recipe: Recipe, flights: Sequence[Flight], plain: Mapping[str, float], found: physics.Physics | None = None,
     progress: Callable[[str], object] = lambda text: None, map_function: MapFunction = map,
@@ -95,7 +93,6 @@ def train(
     return trained, borne_out
 
 
-@in_one_thread
 def _left_out(
     recipe: Recipe, flights: Sequence[Flight], plain: Mapping[str, float],
     fold: tuple[list[int], list[int], physics.Physics | None],
@@ -112,6 +109,5 @@ def _left_out(
     return {name: list(of_flight.items()) for name, of_flight in errors.items()}
 
 
-@in_one_thread
 def _error(flight: Flight, effects: EffectSet | None = None, network: Network | None = None) -> float:
     return evaluate(flight.without(*AIDS), None, effects, network)[0].row()["rmse_3d"]

@@ -26,7 +26,6 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.sensitivity import TDOAS
 
 from ...checking.known_path import MANY
-from ...parallel import in_one_thread
 from ...scoring.metrics import AIRBORNE
 from ..channels import Comparison, RadioResidual
 from ..channels.ranging import RangeResidual
@@ -54,7 +53,6 @@ FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 AT_ONCE = 32  # regressors that are made together
 
 
-@in_one_thread
 def tdoa_std_of(
     flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None, map_function: MapFunction = map
 ) -> float:
@@ -78,7 +76,6 @@ def measured_noise(
         return None
 
 
-@in_one_thread
 def slow_innovations(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None) -> float:
     """m, scale of the innovations of Flights that are slow, averaged over half a second, beside the EffectSet `effects`: what anchors
     that are elsewhere or late make. Their ground truth is not used. Raises InputError for a flight that is too short."""

@@ -13,7 +13,6 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from ...checking.known_path import MANY
-from ...parallel import in_one_thread
 from ..over_flights import Share
 from .equations import SYSTEMATIC, Runs
 from .placing import PLACED_STD, place
@@ -165,7 +164,6 @@ class SelfCalibration:
         return self.position_std < IMPROVED * self.given_std
 
 
-@in_one_thread
 def self_calibrate(
     flights: Sequence[Flight], tape: Tape = Tape(), base: EffectSet = EffectSet(), config: FilterConfig | None = None,
     constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
