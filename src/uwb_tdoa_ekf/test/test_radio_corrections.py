@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.sensors import Ranges
 from uwb_tdoa_ekf.core.aids import STREAMS
-from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE, TDOA, Measurements
+from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE, ODOMETRY, TDOA, Measurements
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.installed import Installed
 from uwb_tdoa_ekf.offline import run_offline
@@ -64,6 +64,14 @@ def measured(t, anchor, value):
     return Measurements(np.empty(0, IMU_SAMPLE), np.empty(0, TDOA), rows)
 
 
+def odometry_at(t, p):
+    """(n,) of ODOMETRY of a tag at p (n, 3) m, whose attitude nobody knows."""
+    rows = np.zeros(len(t), ODOMETRY)
+    rows["t"], rows["x"] = t, np.nan
+    rows["x"][:, :3] = p
+    return rows
+
+
 def test_a_slice_is_corrected_at_the_last_pose_before_it():
     corrections = RadioCorrections(EffectSet((MOVED,)), Installed(BOX))
     moved = BOX.positions[1] + [0.6, 0.0, -0.4]
@@ -72,8 +80,7 @@ def test_a_slice_is_corrected_at_the_last_pose_before_it():
     found = []
     for k, part in enumerate(corrections.slices(measured(t, np.ones(5, int), np.full(5, 4.0)))):
         found.append(part.aids)
-        p = places[min(k, 1)][None]
-        corrections.add_pose(part.aids["t"][-1:], p, np.full((1, 4), np.nan), np.zeros((1, 3)), np.zeros(1))
+        corrections.add_odometry(odometry_at(part.aids["t"][-1:], places[min(k, 1)]))
     assert [part["t"].tolist() for part in found] == [t[:2].tolist(), t[2:4].tolist(), t[4:].tolist()]
     np.testing.assert_array_equal(found[0]["value"][:, 0], 4.0)  # nobody knows where it is
     for part, place in zip(found[1:], places):
@@ -110,8 +117,8 @@ def test_what_comes_at_once_and_one_by_one_is_corrected_alike():
         for part in parts:
             for piece in corrections.slices(part):
                 out += piece.aids["value"][:, 0].tolist()
-                at = piece.aids["t"][-1:] - t[0]
-                corrections.add_pose(at, np.stack([at, at, at], axis=1), np.full((1, 4), np.nan), np.zeros((1, 3)), np.zeros(1))
+                last = piece.aids["t"][-1:]
+                corrections.add_odometry(odometry_at(last, last - t[0]))
         return out
 
     given = measured(t, np.ones(400, int), np.full(400, 4.0))
@@ -136,9 +143,7 @@ def test_what_holds_no_distances_is_one_part_and_distances_after_it_are_correcte
                 pieces += 1
                 out += piece.aids["value"][:, 0].tolist()
                 stamps = np.concatenate([piece.imu["t"], piece.aids["t"]])
-                some = stamps[corrections.telling(stamps)]
-                at = np.tile((some - t[0])[:, None], (1, 3))
-                corrections.add_pose(some, at, np.full((len(at), 4), np.nan), np.zeros((len(at), 3)), np.zeros(len(at)))
+                corrections.add_odometry(odometry_at(stamps, (stamps - t[0])[:, None]))
             assert pieces == 1
         return out
 

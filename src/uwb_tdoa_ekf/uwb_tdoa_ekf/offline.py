@@ -17,9 +17,9 @@ from .core.hypotheses import yaw_offset
 from .core.memory import AID, RESIDUAL, TDOA, joined, structured
 from .core.verdicts import INVALID
 from .installed import Installed
-from .pipeline import Pipeline, odometry_of, poses_of
+from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
-from .results import VERDICTS, Odometry, Residuals
+from .results import VERDICTS, Odometry, Residuals, poses_of
 from .rows import aid_rows, imu_rows, usable_tdoas
 
 if TYPE_CHECKING:

@@ -7,12 +7,10 @@ from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_bias.effects import EffectSet
 
 from .core.engine import feed, set_pose
 from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined
-from .frames import rotation_std
 from .installed import Installed, forget, new_state_of
 from .monitoring.monitor import Monitor
 from .monitoring.slices import LENGTH
@@ -103,8 +101,7 @@ class Pipeline:
             used = part if self._config.use_imu else part._replace(imu=part.imu[:0])
             fed = Fed(part, *feed(self.state, self._parameters, used, self._records))
             if not self._corrections.idle:
-                telling = fed.odometry[self._corrections.telling(fed.odometry["t"])]
-                self._corrections.add_pose(*poses_of(Odometry.from_rows(telling)))
+                self._corrections.add_odometry(fed.odometry)
             parts.append(fed)
         if self.monitor is not None:
             self.monitor.add(odometry_of(parts), self.residuals(parts))
@@ -120,9 +117,3 @@ class Pipeline:
 def odometry_of(parts: Sequence[Fed]) -> Odometry:
     """What came of several Fed."""
     return Odometry.from_rows(joined(ODOMETRY, [part.odometry for part in parts]))
-
-
-def poses_of(odometry: Odometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4), v (n, 3) m/s, yaw_std
-    (n,) rad)."""
-    return odometry.t, odometry.p, odometry.q, odometry.v, known_yaw_std(rotation_std(odometry.q, odometry.covariance))

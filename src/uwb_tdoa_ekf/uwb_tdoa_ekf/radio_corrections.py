@@ -11,7 +11,8 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects.samples import RADIO
 
 from .core.aids import STREAMS
-from .core.memory import Measurements
+from .core.memory import ODOMETRY, Measurements
+from .results import Odometry, poses_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from .installed import Installed
 
 SLICE = 0.05  # s; what is measured in a slice is corrected at the last pose of those before
+_NOWHERE = np.zeros(1, ODOMETRY)
+_NOWHERE["x"] = np.nan
 KINDS = {STREAMS.index(channel): kind for channel, kind in RADIO.items() if channel in STREAMS}  # {kind of AID: type of its samples}
 
 
@@ -31,7 +34,7 @@ class RadioCorrections:
         acting = ((kind, effects.acting_on(samples.channel)) for kind, samples in KINDS.items())
         self._correctors = {kind: Corrector(installed.anchors, mine) for kind, mine in acting if len(mine)}
         self._installed, self._slice, self._start = installed, -math.inf, math.nan
-        self._pose = self._latest = np.full(3, np.nan), np.full(4, np.nan), 0.0
+        self._pose = self._latest = _NOWHERE  # (1,) of ODOMETRY, of which nothing is computed before there are distances
         self._together = False  # whether the last part may hold several slices
 
     @property
@@ -39,28 +42,19 @@ class RadioCorrections:
         """True if there is nothing to correct with."""
         return not self._correctors
 
-    def add_pose(self, t: np.ndarray, p: np.ndarray, q: np.ndarray, v: np.ndarray, yaw_std: np.ndarray) -> None:
-        """Tell where the tag was, as of a Corrector: several, in the order of their stamps."""
-        if not len(t):
+    def add_odometry(self, rows: np.ndarray) -> None:
+        """Tell where the tag was: (n,) of ODOMETRY that came of the last part, in the order of their stamps."""
+        if not len(rows):
             return
-        before = self._before(t) if self._together else 0
+        before = int(np.searchsorted(np.floor(rows["t"] / SLICE), self._slice)) if self._together else 0
         if before:
-            self._pose = p[before - 1], q[before - 1], float(yaw_std[before - 1])
-        self._latest, self._together = (p[-1], q[-1], float(yaw_std[-1])), False
-
-    def telling(self, t: np.ndarray) -> np.ndarray:
-        """Places (k,) in stamps t (n,), s, ascending, of the poses that `add_pose` asks for after a part: the last one before the slice
-        that it ends in, and the last."""
-        return np.unique([max(self._before(t) - 1, 0), len(t) - 1]) if len(t) else np.empty(0, np.int64)
-
-    def _before(self, t: np.ndarray) -> int:
-        """How many of some stamps lie before the slice."""
-        return int(np.searchsorted(np.floor(t / SLICE), self._slice))
+            self._pose = rows[before - 1 : before]
+        self._latest, self._together = rows[-1:], False
 
     def slices(self, measured: Measurements) -> Iterator[Measurements]:
-        """Measurements in parts, corrected. The poses that come of each are to be told by `add_pose` before the next is asked for. What
+        """Measurements in parts, corrected. What comes of each is to be told by `add_odometry` before the next is asked for. What
         holds no distances, as all of a recording without any, is one part."""
-        if not self._ranged(measured.aids).any():
+        if not len(measured.aids) or not self._ranged(measured.aids).any():
             yield self._unchanged(measured)
             return
         of_rows = [np.floor(part["t"] / SLICE) for part in measured]
@@ -93,14 +87,15 @@ class RadioCorrections:
         """The (m,) of AID in Measurements of a slice, without what is known to be wrong with them."""
         aids = measured.aids
         self._begin(measured, self._ranged(aids))
+        _, p, q, _, yaw_std = poses_of(Odometry.from_rows(self._pose))
         for kind, corrector in self._correctors.items():
             anchors, (rows,) = self._installed.anchors, np.nonzero(aids["kind"] == kind)
             at = anchors.index(self._installed.ids[aids["anchor"][rows]])
             rows, at = rows[at >= 0], at[at >= 0]
             if not len(rows):
                 continue
-            p, q, yaw_std = (np.repeat(np.array(part)[None], len(rows), axis=0) for part in self._pose)
-            samples = KINDS[kind](aids["t"][rows], at, at, p, q, anchors, self._start, yaw_std=yaw_std)
+            where = (np.repeat(part, len(rows), axis=0) for part in (p, q))
+            samples = KINDS[kind](aids["t"][rows], at, at, *where, anchors, self._start, yaw_std=np.repeat(yaw_std, len(rows)))
             bias, std, _, _ = corrector.contribution(samples)
             aids = aids.copy() if aids is measured.aids else aids
             aids["value"][rows, 0] -= bias

@@ -137,7 +137,8 @@ def start_slowly(ekf: Record, anchors: np.ndarray, parameters: Record, t: float,
 @compiled
 def is_unsure(ekf: Record) -> bool:
     """Whether the place of the tag is hardly known."""
-    return np.trace(ekf.hypotheses[ekf.best].P[:3, :3]) > UNKNOWN**2
+    P = ekf.hypotheses[ekf.best].P
+    return P[0, 0] + P[1, 1] + P[2, 2] > UNKNOWN**2
 
 
 @compiled

@@ -12,7 +12,8 @@ import numpy as np
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_ekf.offline import poses_of, run_offline
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.results import poses_of
 
 from ..scoring.by_phase import EVERYTHING
 from .comparison import Baseline, ValidationCase, score
