@@ -77,8 +77,7 @@ class RecordedOdometry:
     """Recorded estimates. World frame of the filter and body frame as in nav_msgs/Odometry.
 
     t : (n,) s, header stamps; p : (n, 3) m and v : (n, 3) m/s in the world frame; q : (n, 4) x y z w, body to world;
-    covariance : (n, 6, 6) of position (world) and rotation, m^2 and rad^2;
-    twist_covariance : (n, 6, 6) of linear and angular velocity in the body frame, as recorded; remarks : what is missing, sentences.
+    covariance : (n, 6, 6) of position (world) and rotation, m^2 and rad^2; remarks : what is missing, sentences.
     """
 
     t: np.ndarray
@@ -86,7 +85,6 @@ class RecordedOdometry:
     v: np.ndarray
     q: np.ndarray
     covariance: np.ndarray
-    twist_covariance: np.ndarray
     remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -261,7 +259,7 @@ def read_odometry(
     p, v, q = rows[:, 0:3], rows[:, 3:6], rows[:, 6:10]
     known = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0.0)
     v = np.where(known[:, None], Rotation.from_quat(np.where(known[:, None], q, [0.0, 0.0, 0.0, 1.0])).apply(v), np.nan)
-    return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6), remarks)
+    return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), remarks)
 
 
 def late_tdoas(

@@ -34,6 +34,8 @@ AXES, ATTITUDE = {"gyro": 0.8, "accel": 0.75}, 1.2
 # Of the power that is left behind a low pass: healthy 0.87 at least, and where the sensor is too smooth; and the time constants, s.
 FILTERED, FILTERED_TOO, SLOWNESS = 0.8, 0.97, (0.05, 0.1, 0.2, 0.4, 0.8)  # of the power that is left with a low pass; s, its time constants
 SENSORS = {"gyro": "gyroscope", "accel": "accelerometer"}
+# Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
+ARRANGEMENTS = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
 # What an attitude x, y, z, w may be instead: {words: places, signs}
 ATTITUDES = {
     "of a frame that is mirrored along x": ([0, 1, 2, 3], (1, -1, -1, 1)),
@@ -172,9 +174,8 @@ def _best_arrangement(motion: TrueMotion, sensor: str) -> tuple[float, np.ndarra
 
 def _arrangements(sensor: str) -> list[np.ndarray]:
     """[(3, 3) matrix that undoes it] of what may be wrong with the axes of a sensor."""
-    changes = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
-    changes += [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)] if sensor == "gyro" else []
-    return changes[1:]  # the first is as it is
+    scales = [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)] if sensor == "gyro" else []
+    return [*ARRANGEMENTS[1:], *scales]
 
 
 def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:
@@ -182,16 +183,18 @@ def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:
     return {sensor: motion.power(sensor, true[sensor]) for sensor in SENSORS}
 
 
+def signed_axis(direction: np.ndarray) -> str:
+    """Which axis a (3,) direction is along: "y", or "-y"."""
+    k = int(np.argmax(np.abs(direction)))
+    return f"{'-' if direction[k] < 0.0 else ''}{'xyz'[k]}"
+
+
 def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Finding:
     scale = _scale(change)
     if abs(scale - 1.0) > 0.1:
         cause = f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the turns of the ground truth"
         return Finding("imu_rate_unit", ERROR, cause, evidence, f"angular_velocity *= {scale:.6g}", scale)
-    words = []
-    for k, row in enumerate(change):
-        place = int(np.argmax(np.abs(row)))
-        if place != k or row[place] < 0.0:
-            words.append(f"{'xyz'[k]} is {'-' if row[place] < 0.0 else ''}{'xyz'[place]}")
+    words = [f"{axis} is {found}" for axis, found in zip("xyz", map(signed_axis, change)) if found != axis]
     cause = f"axes of the {SENSORS[sensor]} are exchanged or mirrored: {', '.join(words)} of what it reads"
     return Finding(f"{sensor}_axes", ERROR, cause, evidence, "put the driver right: x forward, y left, z up", power)
 

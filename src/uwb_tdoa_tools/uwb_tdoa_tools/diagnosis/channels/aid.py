@@ -8,19 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import AidSamples, SmoothTerm, aid_samples
-from uwb_tdoa_bias.effects.covariates import OF_AIDS, OF_IMU, sensor_covariate
+from uwb_tdoa_bias.effects.covariates import OF_AIDS, sensor_covariate
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
-from .base import Channel, ChannelResidual, Rows, covariate_of
+from .base import Channel, ChannelResidual, Rows
 from .figures import figures
-from .inertial import CELL, features_of
+from .inertial import CELL, vibration_at
 from .knots import knots_of
 from .pairs import APART
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_bias.foundation.flight import Imu
     from uwb_tdoa_bias.foundation.sensors import Stream
     from .base import Comparison
     from .base import Figures
@@ -99,7 +98,7 @@ class Aid(Channel[AidResidual]):
         middles = np.array([some.mean() for some in np.split(t, edges)])
         error = np.stack([_median(some) for some in np.split(error, edges)])
         samples = aid_samples(
-            self.name, middles, comparison.track, comparison.start, _vibration(comparison.flight.imu, middles)
+            self.name, middles, comparison.track, comparison.start, vibration_at(comparison.flight.imu, middles)
         )
         error = error - comparison.effects.uncorrected(samples)
         return AidResidual(samples, error, self.labels, self.unit, self.floating)
@@ -107,9 +106,7 @@ class Aid(Channel[AidResidual]):
     def smooth_terms(self, residuals: Sequence[AidResidual]) -> list[SmoothTerm]:
         out = []
         for name in OF_AIDS:
-            values = covariate_of(name, residuals)
-            knots = None if values is None else knots_of(values, name)
-            if knots is not None:
+            if knots := knots_of(name, residuals):
                 out += [SmoothTerm(channel=label, covariate=name, knots=knots) for label in self.labels]
         return out
 
@@ -136,10 +133,3 @@ class Aid(Channel[AidResidual]):
 def _median(values: np.ndarray) -> np.ndarray:
     known = np.isfinite(values).any(axis=0)
     return np.where(known, np.nanmedian(np.where(known, values, 0.0), axis=0), np.nan)
-
-
-def _vibration(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:
-    """(n,) m/s^2; None without an IMU."""
-    if imu is None:
-        return None
-    return np.interp(t, imu.t, features_of(imu)[:, OF_IMU.index("vibration")])

@@ -108,12 +108,6 @@ class ChannelResidual:
         raise NotImplementedError
 
 
-def covariate_of(name: str, residuals: Sequence[ChannelResidual]) -> np.ndarray | None:
-    """Values of a covariate at all that is looked at in several ChannelResiduals: (n,); None where one does not know it."""
-    known = [values for values in (part.covariate(name) for part in residuals) if values is not None]
-    return np.concatenate(known) if len(known) == len(residuals) else None
-
-
 ChannelResiduals = dict[str, ChannelResidual]  # of one flight, by the name of the channel
 Own = TypeVar("Own", bound=ChannelResidual)
 
