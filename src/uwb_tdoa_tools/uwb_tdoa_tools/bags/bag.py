@@ -122,16 +122,14 @@ def write_bag(flight: Flight, out: str | Path, storage: str = "mcap", force: boo
         return _write(writer, topics, store)
 
 
-def write_odometry(
-    odometry: Odometry, anchors: Anchors, out: str | Path, storage: str = "mcap", force: bool = False
-) -> dict[str, int]:
+def write_odometry(odometry: Odometry, anchors: Anchors, out: str | Path, force: bool = False) -> dict[str, int]:
     """Write an Odometry among Anchors as a bag with odometry, uwb/anchors and /tf_static; see `write_bag`."""
     store = typestore()
     if not len(odometry):
         raise InputError(f"{out}: there is no odometry to write.")
     topics = _of_anchors(anchors, int(bag_messages.nanoseconds("odometry", odometry.t[:1])[0]), store)
     topics["/odometry"] = "nav_msgs/msg/Odometry", _STREAM_QOS, bag_messages.odometry_messages(odometry, anchors.frame, store)
-    with new_bag(out, storage, force) as writer:
+    with new_bag(out, "mcap", force) as writer:
         return _write(writer, topics, store)
 
 
@@ -274,14 +272,14 @@ def late_tdoas(
         return sum(residual.verdict == residual.VERDICT_LATE for _, _, residual in readable(path, reader, found))
 
 
-def read_fields(path: str | Path, topic: str, namespace: str = "") -> dict[str, np.ndarray]:
+def read_fields(path: str | Path, topic: str) -> dict[str, np.ndarray]:
     """Columns of a recorded topic whose messages have a header, e.g. uwb/residual or uwb/tdoa_corrected.
 
     Returns {"t": (n,) s, field: (n,) array, ...} for every field that is one number or one string, in order of header
     stamps; raises InputError.
     """
     with open_bag(path) as reader:
-        topic = Names(namespace)(topic)
+        topic = Names()(topic)
         found = _connections(path, reader, topic)
         if not found:
             raise InputError(f"{path}: has no topic {topic}; record it.")
