@@ -5,7 +5,6 @@ Both sensors are compared over short cells; constant biases and what changes slo
 
 from __future__ import annotations
 
-from itertools import permutations, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
 from .delays import BLOCK, LONGEST, delays
-from .imu_rules import SCALES
+from .imu_rules import ARRANGEMENTS, SCALES, scale_of, signed_axis
 from .inertial_values import smooth
 from .time_rules import changing
 
@@ -34,8 +33,6 @@ AXES, ATTITUDE = {"gyro": 0.8, "accel": 0.75}, 1.2
 # Of the power that is left behind a low pass: healthy 0.87 at least, and where the sensor is too smooth; and the time constants, s.
 FILTERED, FILTERED_TOO, SLOWNESS = 0.8, 0.97, (0.05, 0.1, 0.2, 0.4, 0.8)  # of the power that is left with a low pass; s, its time constants
 SENSORS = {"gyro": "gyroscope", "accel": "accelerometer"}
-# Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
-ARRANGEMENTS = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
 # What an attitude x, y, z, w may be instead: {words: places, signs}
 ATTITUDES = {
     "of a frame that is mirrored along x": ([0, 1, 2, 3], (1, -1, -1, 1)),
@@ -158,13 +155,9 @@ def axes(motion: TrueMotion) -> Iterator[Finding]:
 
 def _explains(motion: TrueMotion, sensor: str, base: float, power: float, change: np.ndarray) -> bool:
     """Whether a change of the axes explains much of what is left without; one that makes values small, more than no values would."""
-    if _scale(change) < 0.9:
+    if scale_of(change) < 0.9:
         base = min(base, motion.power(sensor, motion.true[sensor], np.zeros((3, 3))))
     return power < AXES[sensor] * base
-
-
-def _scale(change: np.ndarray) -> float:
-    return abs(np.linalg.det(change)) ** (1.0 / 3.0)
 
 
 def _best_arrangement(motion: TrueMotion, sensor: str) -> tuple[float, np.ndarray]:
@@ -183,14 +176,8 @@ def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:
     return {sensor: motion.power(sensor, true[sensor]) for sensor in SENSORS}
 
 
-def signed_axis(direction: np.ndarray) -> str:
-    """Which axis a (3,) direction is along: "y", or "-y"."""
-    k = int(np.argmax(np.abs(direction)))
-    return f"{'-' if direction[k] < 0.0 else ''}{'xyz'[k]}"
-
-
 def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Finding:
-    scale = _scale(change)
+    scale = scale_of(change)
     if abs(scale - 1.0) > 0.1:
         cause = f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the turns of the ground truth"
         return Finding("imu_rate_unit", ERROR, cause, evidence, f"angular_velocity *= {scale:.6g}", scale)

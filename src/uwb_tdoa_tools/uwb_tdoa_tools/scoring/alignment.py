@@ -19,7 +19,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..checking.delays import of_tdoas
 from ..checking.known_path import KnownPath
-from ..checking.motion_rules import ARRANGEMENTS, FEWEST, TrueMotion, signed_axis
+from ..checking.imu_rules import ARRANGEMENTS, signed_axis
+from ..checking.motion_rules import FEWEST, TrueMotion
 from .metrics import ALIGN, judged_part, position_at
 
 if TYPE_CHECKING:
