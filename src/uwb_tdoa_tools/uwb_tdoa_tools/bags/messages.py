@@ -18,7 +18,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import Sensor, Stream
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER, UNKNOWN_VARIANCE
-from uwb_tdoa_ekf.frames import to_odometry
+from uwb_tdoa_ekf.frames import pose_and_twist
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -208,14 +208,12 @@ def odometry_messages(odometry: Odometry, frame: str, store: Typestore) -> Itera
     types = store.types
     Message, Vector3 = types["nav_msgs/msg/Odometry"], types["geometry_msgs/msg/Vector3"]
     Pose, Twist = types["geometry_msgs/msg/PoseWithCovariance"], types["geometry_msgs/msg/TwistWithCovariance"]
-    velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
-    of_twist = np.tile(np.diag([0.0] * 3 + [UNKNOWN_VARIANCE] * 3), (len(odometry.t), 1, 1))
-    of_twist[:, :3, :3] = covariance[:, 6:, 6:]
-    columns = nanoseconds("odometry", odometry.t).tolist(), odometry.p.tolist(), odometry.q.tolist(), velocity.tolist()
-    for stamp, p, q, v, of_pose, its in zip(*columns, covariance[:, :6, :6], of_twist):
-        twist = types["geometry_msgs/msg/Twist"](Vector3(*v), Vector3(0.0, 0.0, 0.0))
-        pose = Pose(pose_of(store, p, q), of_pose.ravel())
-        yield stamp, Message(header_of(store, stamp, frame), BODY_FRAME, pose, Twist(twist, its.ravel()))
+    n = len(odometry)
+    numbers = pose_and_twist(odometry, np.zeros((n, 3)), np.full(n, UNKNOWN_VARIANCE))
+    for stamp, of_pose, of_twist in zip(nanoseconds("odometry", odometry.t).tolist(), *numbers):
+        twist = types["geometry_msgs/msg/Twist"](Vector3(*of_twist[:3]), Vector3(*of_twist[3:6]))
+        pose = Pose(pose_of(store, of_pose[:3], of_pose[3:7]), of_pose[7:])
+        yield stamp, Message(header_of(store, stamp, frame), BODY_FRAME, pose, Twist(twist, of_twist[6:]))
 
 
 def odometry_row(message: Any) -> tuple[float, ...]:

@@ -21,10 +21,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_bias.foundation.sensors import Stream
-    from .base import Comparison
-    from .base import Figures
+    from .base import Comparison, Figures
 
-FEWEST_ATTITUDES, FEWEST_CELLS = 10, 8
+FEWEST_CELLS = 8
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ class Aid(Channel[AidResidual]):
     def residual(self, comparison: Comparison) -> AidResidual | None:
         part, reference = getattr(comparison.flight, self.name), comparison.reference
         known = all(reference.positions_known[k] for k in self.positions)
-        if part is None or not known or (self.of_attitude and not self._attitude(comparison)):
+        if part is None or not known or (self.of_attitude and not comparison.attitude_known):
             return None
         poses, (first, last) = comparison.poses, comparison.span
         inside = (part.t >= max(first, poses.t[0])) & (part.t <= min(last, poses.t[-1]))
@@ -119,10 +118,6 @@ class Aid(Channel[AidResidual]):
             if known.any():
                 out.append({"axis": label, **figures(t[known], r[known])})
         return {"axes": out}
-
-    def _attitude(self, comparison: Comparison) -> bool:
-        known = np.isfinite(comparison.poses.q).all(axis=1).sum()
-        return comparison.reference.attitude_known and known > FEWEST_ATTITUDES
 
     def _values(self, part: Stream) -> np.ndarray:
         """(n, k) of a stream, NaN for what was not measured."""

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ..regression.algebra import Matrix
     from .views import CovariateView
 
+FEWEST_ATTITUDES = 10
 Figures = dict[str, list[dict[str, Any]]]  # of the health of channels: {"pairs", "anchors", "axes", ...: rows}
 
 
@@ -48,6 +49,11 @@ class Comparison:
     def poses(self) -> Truth:
         """Truth: where the flight was, or is believed to have been."""
         return self.view.poses
+
+    @property
+    def attitude_known(self) -> bool:
+        """Whether the reference tells attitudes, and of more than a few poses."""
+        return bool(self.reference.attitude_known and np.isfinite(self.poses.q).all(axis=1).sum() > FEWEST_ATTITUDES)
 
     @cached_property
     def track(self) -> Track:
