@@ -88,11 +88,12 @@ def test_noise_is_told_from_bias(flight, name):
 
 
 def test_an_undeclared_effect_is_found_by_its_covariate(flight):
-    attribution = attribute([undeclared.drag_on_cable(flight)], TRUTH)
+    dragged = undeclared.drag_on_cable(flight)
+    attribution = attribute([dragged], TRUTH)
     assert names_found(attribution) == ["tdoa/speed"]
     term = attribution.effects[0]
     assert isinstance(term, SmoothTerm) and term.usable
-    left = attribution.remaining[0]["tdoa"]
+    left = residuals(dragged, TRUTH, EffectSet(attribution.effects))["tdoa"]
     assert 1.4826 * np.median(np.abs(left.residual[left.airborne])) == pytest.approx(0.06, rel=0.1)
 
 

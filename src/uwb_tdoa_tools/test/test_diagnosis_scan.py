@@ -8,7 +8,7 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
-from uwb_tdoa_tools.diagnosis.regression.scan import Scan
+from uwb_tdoa_tools.diagnosis.regression.scan import Scan, _held
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from known_effects import clean_flight, effect_of
@@ -55,7 +55,7 @@ def test_the_gain_is_that_of_normal_equations_with_the_same_weights(flight):
     chosen = (Candidate((Term(effect, tuple(effect.values)),)),)
     table = table.with_terms(chosen[0].terms)
     model = fit(table, chosen[0].columns, np.ones(3 * len(table.channels)))
-    gain, shapes, shape, knots, _ = scan.gains(table, model, chosen)[0]
+    gain, shapes, shape, knots, _ = scan.gains(table, _held(table, model, chosen))[0]
     term = SmoothTerm(covariate=shapes.view.covariate, form=shapes.view.form, knots=knots, shape=shape)
     candidate = Candidate((Term(term, term.keys_of((shapes.view.key,))),))
     table = table.with_terms(candidate.terms)

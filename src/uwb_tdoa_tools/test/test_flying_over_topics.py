@@ -11,8 +11,10 @@ pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./de
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 from uwb_tdoa_bias.foundation import ros  # noqa: E402
+from uwb_tdoa_bias.foundation.flight import Imu, Tdoas  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
 from uwb_tdoa_tools.flying.over_topics import OverTopics  # noqa: E402
+from uwb_tdoa_tools.flying.simulator import Measured  # noqa: E402
 from uwb_tdoa_tools.flying.vehicle import STATE  # noqa: E402
 from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
 
@@ -37,16 +39,12 @@ def topics():
     node, pace = ros.StreamNode("vehicle"), Pace()
     made = OverTopics(node, HALL, pace, clock=True)
     none = np.empty(0)
-    made.take(SimpleNamespace(imu=SimpleNamespace(t=none, gyro=np.empty((0, 3)), accel=np.empty((0, 3))), tdoa=_tdoas(none), aids={}))
+    made.take(Measured(Imu(none, np.empty((0, 3)), np.empty((0, 3))), Tdoas(none, none, none, none, none), {}))
     made.turned(5.0, np.zeros(STATE))
     made.status = EstimatorStatus(status=EstimatorStatus.STATUS_RUNNING)
     yield made
     node.destroy_node()
     rclpy.shutdown()
-
-
-def _tdoas(none):
-    return SimpleNamespace(t=none, a=none, b=none, d=none, variance=none)
 
 
 def odometry(t, frame="map", p=(1.0, 2.0, 0.5), q=(0.0, 0.0, 2.0**-0.5, 2.0**-0.5), v=(1.0, 0.0, 0.0), variance=0.04):

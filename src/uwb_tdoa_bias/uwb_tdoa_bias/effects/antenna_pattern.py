@@ -41,10 +41,6 @@ class AntennaPattern(ArrivalEffect):
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("tag", "anchor"), ("tag",), ("anchor",)]
 
-    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
-        keys = tuple(self.values)
-        return self.delay_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
-
     def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
         out = np.zeros((len(rows), len(keys)))

@@ -12,7 +12,6 @@ from .wording import significant, size
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight
     from .samples import AidSamples
 
@@ -32,10 +31,6 @@ class BarometerDrift(Effect):
     portable = False
     usable = False  # the filter estimates it while it flies
     channels = ("pressure",)
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("rate",)]
 
     def uncorrected(self, samples: AidSamples) -> np.ndarray:
         return self.values.get("rate", 0.0) * (samples.t - samples.start)[:, None]

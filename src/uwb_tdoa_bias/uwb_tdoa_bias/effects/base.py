@@ -122,11 +122,11 @@ class Effect:
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        """Sets of parameters that make sense together, as tuples of names, the full set first.
+        """Sets of parameters that make sense together, as tuples of names, the full set first; here the one of `example`.
 
         anchors : Anchors; pairs : (m, 2) ids of the pairs that were heard. Both may be None where they do not matter.
         """
-        raise NotImplementedError
+        return [(cls.example,)]
 
     @property
     def label(self) -> str:
@@ -227,8 +227,8 @@ class ArrivalEffect(Effect):
     channels = tuple(RADIO)
 
     def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
-        """By how much the anchors in `rows` (k * n,), the samples repeated k times, seem too far: (k * n,) m."""
-        raise NotImplementedError
+        """By how much the anchors in `rows` (k * n,), the samples repeated k times, seem too far: (k * n,) m; here linear in all values."""
+        return self.delay_regressors(samples, rows, list(self.values)) @ np.array(list(self.values.values()))
 
     def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         """Its derivative with respect to `keys`, (k * n, len(keys))."""

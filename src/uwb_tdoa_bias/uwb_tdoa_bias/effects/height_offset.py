@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
-from .wording import significant, size
-
-if TYPE_CHECKING:
-    from ..foundation.anchors import Anchors
+from .wording import directed
 
 
 class HeightOffset(AidEffect):
@@ -30,15 +25,9 @@ class HeightOffset(AidEffect):
     reference = "VL53L1X data sheet: offset calibration, up to some centimetres"
     channels = ("height",)
 
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("offset",)]
-
     def aid(self) -> Affine:
         return Affine(np.eye(1), np.array([self.values.get("offset", 0.0)]))
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
-            return ()
-        way = "long" if self.values["offset"] > 0.0 else "short"
-        return (f"Check where the range finder is mounted, and its offset: it reads {size(self, 'offset')} too {way}.",)
+        off = directed(self, "offset", "too long", "too short")
+        return (f"Check where the range finder is mounted, and its offset: it reads {off}.",) if off else ()

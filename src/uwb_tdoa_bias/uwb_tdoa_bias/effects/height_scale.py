@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
-from .wording import significant, size
-
-if TYPE_CHECKING:
-    from ..foundation.anchors import Anchors
+from .wording import directed
 
 
 class HeightScale(AidEffect):
@@ -29,16 +24,9 @@ class HeightScale(AidEffect):
     reference = "speed of sound: 0.18 % per degree"
     channels = ("height",)
 
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("scale",)]
-
     def aid(self) -> Affine:
         return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(1), np.zeros(1))
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
-            return ()
-        way = "long" if self.values["scale"] > 0.0 else "short"
-        scale = size(self, "scale", "%", 100.0)
-        return (f"Check the unit and the calibration of the range finder: it reads {scale} too {way}.",)
+        off = directed(self, "scale", "too long", "too short", "%", 100.0)
+        return (f"Check the unit and the calibration of the range finder: it reads {off}.",) if off else ()

@@ -12,7 +12,7 @@ from .base import need_truth
 from .affine import Affine
 from .imu_error import ImuEffect, need_imu
 from .samples import Track
-from .wording import significant, size
+from .wording import directed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,10 +69,5 @@ class ImuGravity(ImuEffect):
         return replace(flight, imu=replace(imu, accel=imu.accel + up))
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
-            return ()
-        sign = "much" if self.excess > 0.0 else "little"
-        return (
-            f"Check the accelerometer's factor from g to m/s^2, and local gravity: it reads {size(self, 'excess')} "
-            f"too {sign} upwards.",
-        )
+        off = directed(self, "excess", "too much", "too little")
+        return (f"Check the accelerometer's factor from g to m/s^2, and local gravity: it reads {off} upwards.",) if off else ()

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .base import Effect
-from .pair_offset import PairOffset, link_keys
+from .pair_offset import PairOffset
 from .wording import listed, significant, size
 
 if TYPE_CHECKING:
-    from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight
     from .samples import Samples
 
@@ -33,11 +32,7 @@ class NoiseLevel(Effect):
     fitted = False
 
     check_key = PairOffset.check_key
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        keys = link_keys(pairs)
-        return [keys, *((key,) for key in keys)]
+    groups = PairOffset.groups
 
     def noise_std(self, samples: Samples) -> np.ndarray:
         a, b = samples.anchors.ids[samples.a], samples.anchors.ids[samples.b]

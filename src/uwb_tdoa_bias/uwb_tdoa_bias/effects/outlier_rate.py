@@ -11,7 +11,6 @@ from .base import Effect
 from .wording import significant, size
 
 if TYPE_CHECKING:
-    from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight
 
 
@@ -31,10 +30,6 @@ class OutlierRate(Effect):
     portable = False
     fitted = False
     usable = False  # the filter's weights are the remedy
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("share",)]
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         rng, tdoa = rng or np.random.default_rng(), flight.tdoa

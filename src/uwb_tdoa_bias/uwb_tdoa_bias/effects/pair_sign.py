@@ -23,9 +23,7 @@ class PairSign(LabelEffect):
     reference = "Tdoa.msg: d_ab = |p - b| - |p - a|"
     expected = "-1 for the other sign, or 1"
 
-    @classmethod
-    def check_key(cls, key: str) -> None:
-        PairOffset.check_key(key)
+    check_key = PairOffset.check_key
 
     @staticmethod
     def possible(value: float) -> bool:

@@ -12,7 +12,6 @@ from .wording import significant, size
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from ..foundation.anchors import Anchors
     from .samples import Samples
 
 EXAMPLES = 4.0, 8.0  # m, distances that advice names
@@ -35,13 +34,6 @@ class RangeBias(ArrivalEffect):
     }
     covariates = ("range",)
     reference = "Decawave APS011: the range error is a bent function of received power, hence of range"
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("quadratic",)]
-
-    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
-        return self.values.get("quadratic", 0.0) * self.delay_regressors(samples, rows, ("quadratic",))[:, 0]
 
     def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)

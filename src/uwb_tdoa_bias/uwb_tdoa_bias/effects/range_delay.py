@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from .stamp_error import StampEffect
-from .wording import significant, size
 
 
 class RangeDelay(StampEffect):
@@ -11,21 +10,11 @@ class RangeDelay(StampEffect):
 
     name = "range_delay"
     stream = "range"
-    unit = "s"
-    bound = 1.0
-    negligible = 0.002
-    typical = 0.05
-    example = "offset"
     physics = "a two-way exchange takes milliseconds, one anchor after the other, and the host stamps what it receives"
+    remedy = "Stamp ranges at the instant they are taken: their stamps are {}."
     confounded_with = ("truth_time_offset",)
     distinguished_by = {"truth_time_offset": "a flight with IMU: its stamps belong to neither"}
     witnesses = ("tdoa", "gyro", "accel")  # without any of these the ground truth may as well be late
     reference = "DW1000 user manual: a two-way exchange takes two or three messages and a report"
     needs_reference = True
     channels = ("range",)
-
-    def advice(self) -> tuple[str, ...]:
-        if not significant(self):
-            return ()
-        way = "late" if self.values["offset"] > 0.0 else "early"
-        return (f"Stamp ranges at the instant they are taken: their stamps are {size(self, 'offset', 'ms', 1e3)} {way}.",)

@@ -8,11 +8,10 @@ import numpy as np
 
 from .base import Effect
 from .samples import RADIO
-from .wording import significant, size
+from .wording import directed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from ..foundation.anchors import Anchors
     from .samples import Samples
 
 
@@ -33,10 +32,6 @@ class RangeScale(Effect):
     channels = tuple(RADIO)
     reference = "DW1000 user manual: one tick is 15.65 ps, 4.69 mm"
 
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("scale",)]
-
     def bias(self, samples: Samples) -> np.ndarray:
         return self.values.get("scale", 0.0) * samples.true()
 
@@ -44,9 +39,5 @@ class RangeScale(Effect):
         return np.repeat(samples.true()[:, None], len(keys), axis=1)
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
-            return ()
-        sign = "large" if self.values["scale"] > 0.0 else "small"
-        return (
-            f"Check how the tag turns ticks into metres: everything is {size(self, 'scale', '%', 100.0)} too {sign}.",
-        )
+        off = directed(self, "scale", "too large", "too small", "%", 100.0)
+        return (f"Check how the tag turns ticks into metres: everything is {off}.",) if off else ()

@@ -13,7 +13,6 @@ from .wording import measured, significant
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from ..foundation.anchors import Anchors
     from .samples import Samples
 
 LINK = RadioLink()
@@ -35,13 +34,6 @@ class ReceivedPowerBias(ArrivalEffect):
     confounded_with = ("range_bias", "antenna_pattern")
     reference = "Decawave APS011, table 2 (500 MHz, 64 MHz PRF)"
     uses_attitude = True
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("scale",)]
-
-    def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
-        return self.values.get("scale", 0.0) * self.delay_regressors(samples, rows, ("scale",))[:, 0]
 
     def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
         anchors = samples.anchors

@@ -16,7 +16,6 @@ AXES = {"gyro": "the gyroscope reads {} about {}", "accel": "the accelerometer r
 SENSOR_UNITS = {"gyro": "rad/s", "accel": "m/s^2"}
 OF_PLACE = ("x", "y", "height", "range", "bearing", "elevation", "bearing_in_anchor", "elevation_in_anchor")
 OF_DIRECTION = ("bearing_in_tag", "elevation_in_tag", "tilt")
-SPANS = ("step", "interval")  # shapes that hold in a part of the covariate
 # What could do such a thing, and what tells; the first of which both words fit: of whom, and over what.
 _CAUSES = (
     (("pair", "direction"), None,

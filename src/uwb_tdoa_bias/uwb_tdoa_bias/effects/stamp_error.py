@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
 from .aid_error import need_stream
 from .base import Effect
+from .wording import directed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight
     from .samples import AidSamples, Samples
 
 
 class StampEffect(Effect):
-    """An effect on the stamps of one stream. Subclasses say which, by its name in a Flight."""
+    """An effect on the stamps of one stream. Subclasses say which, by its name in a Flight, and what to do about it."""
 
-    stream = "tdoa"
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("offset",)]
+    unit = "s"
+    bound = 1.0
+    negligible = 0.002
+    typical = 0.05
+    example = "offset"
+    stream: ClassVar[str]
+    remedy: ClassVar[str]  # a sentence, {} for by how much the stamps are late or early
 
     def stamp_offset(self, stream: str) -> float:
         return self.values.get("offset", 0.0) if stream == self.stream else 0.0
@@ -35,6 +37,10 @@ class StampEffect(Effect):
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         need_stream(self, flight, self.stream)
         return shifted(flight, self.stream, self.stamp_offset(self.stream))
+
+    def advice(self) -> tuple[str, ...]:
+        off = directed(self, "offset", "late", "early", "ms", 1e3)
+        return (self.remedy.format(off),) if off else ()
 
 
 def shifted(flight: Flight, stream: str, seconds: float) -> Flight:

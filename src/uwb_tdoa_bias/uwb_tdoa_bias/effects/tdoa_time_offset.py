@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from .stamp_error import StampEffect
-from .wording import significant, size
 
 
 class TdoaTimeOffset(StampEffect):
@@ -11,12 +10,8 @@ class TdoaTimeOffset(StampEffect):
 
     name = "tdoa_time_offset"
     stream = "tdoa"
-    unit = "s"
-    bound = 1.0
-    negligible = 0.002
-    typical = 0.05
-    example = "offset"
     physics = "the radio's stamps lag behind the IMU's: by buffers, or because they are taken on arrival at the host"
+    remedy = "Stamp TDOAs at the instant they are taken: their stamps are {}."
     confounded_with = ("truth_time_offset",)
     distinguished_by = {
         "truth_time_offset": "a flight with IMU: its stamps belong to neither",
@@ -24,11 +19,3 @@ class TdoaTimeOffset(StampEffect):
     witnesses = ("gyro", "accel")  # without an inertial sensor the ground truth may as well be late
     reference = "UTIL web page: about 10 ms of radio latency"
     needs_reference = True
-
-    def advice(self) -> tuple[str, ...]:
-        if not significant(self):
-            return ()
-        sign = "late" if self.values["offset"] > 0.0 else "early"
-        return (
-            f"Stamp TDOAs at the instant they are taken: their stamps are {size(self, 'offset', 'ms', 1e3)} {sign}.",
-        )

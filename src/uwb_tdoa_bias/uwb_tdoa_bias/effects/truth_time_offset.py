@@ -7,7 +7,6 @@ from typing import Any, TYPE_CHECKING
 from ..foundation.sensors import DIAGNOSED
 from .base import need_truth
 from .stamp_error import StampEffect
-from .wording import significant, size
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,12 +20,10 @@ class TruthTimeOffset(StampEffect):
 
     name = "truth_time_offset"
     stream = "truth"
-    unit = "s"
-    bound = 1.0
-    negligible = 0.002
-    typical = 0.05
-    example = "offset"
     physics = "motion-capture poses reach the log late, over a radio link"
+    remedy = (
+        "Correct the stamps of the ground truth, which are {}: that changes what the estimate is compared with, not the estimate."
+    )
     confounded_with = ("tdoa_time_offset", "range_delay")
     reference = "UTIL web page: motion-capture poses logged on board have about 10 ms of radio latency"
     needs_reference = True
@@ -39,12 +36,3 @@ class TruthTimeOffset(StampEffect):
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         need_truth(self, flight)
         return super().inject(flight, rng)
-
-    def advice(self) -> tuple[str, ...]:
-        if not significant(self):
-            return ()
-        sign = "late" if self.values["offset"] > 0.0 else "early"
-        return (
-            f"Correct the stamps of the ground truth, which are {size(self, 'offset', 'ms', 1e3)} {sign}: that "
-            "changes what the estimate is compared with, not the estimate.",
-        )

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
 from .wording import significant, size
-
-if TYPE_CHECKING:
-    from ..foundation.anchors import Anchors
 
 
 class VelocityMisalignment(AidEffect):
@@ -28,10 +23,6 @@ class VelocityMisalignment(AidEffect):
     physics = "the camera, the flow sensor or the axes of the wheels are turned against the body's axes"
     reference = "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: misalignment of wheels"
     channels = ("velocity",)
-
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("yaw",)]
 
     def aid(self) -> Affine:
         yaw = self.values.get("yaw", 0.0)

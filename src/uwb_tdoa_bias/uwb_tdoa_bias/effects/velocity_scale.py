@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
-from .wording import significant, size
-
-if TYPE_CHECKING:
-    from ..foundation.anchors import Anchors
+from .wording import directed
 
 
 class VelocityScale(AidEffect):
@@ -29,17 +24,9 @@ class VelocityScale(AidEffect):
     reference = "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: systematic errors of odometry"
     channels = ("velocity",)
 
-    @classmethod
-    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        return [("scale",)]
-
     def aid(self) -> Affine:
         return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(3), np.zeros(3))
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
-            return ()
-        way = "fast" if self.values["scale"] > 0.0 else "slow"
-        scale = size(self, "scale", "%", 100.0)
-        what = "over a known distance (radius of the wheels, focal length)"
-        return (f"Calibrate the velocity {what}: it is {scale} too {way}.",)
+        off = directed(self, "scale", "too fast", "too slow", "%", 100.0)
+        return (f"Calibrate the velocity over a known distance (radius of the wheels, focal length): it is {off}.",) if off else ()

@@ -43,6 +43,13 @@ def size(effect: Effect, key: str, unit: str | None = None, factor: float = 1.0)
     return measured(abs(effect.values[key]) * factor, effect.std.get(key, 0.0) * abs(factor), unit)
 
 
+def directed(effect: Effect, key: str, above: str, below: str, unit: str | None = None, factor: float = 1.0) -> str:
+    """The `size` of a significant parameter of an Effect, and which way it is off: "12.0 ± 0.3 ms late"; "" if the data do not tell it."""
+    if key not in significant(effect):
+        return ""
+    return f"{size(effect, key, unit, factor)} {above if effect.values[key] > 0.0 else below}"
+
+
 def listed(words: Iterable[str], last: str = "and") -> str:
     """ "a, b and c" """
     words = list(words)

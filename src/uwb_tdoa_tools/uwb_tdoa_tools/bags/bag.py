@@ -77,8 +77,7 @@ class RecordedOdometry:
     """Recorded estimates. World frame of the filter and body frame as in nav_msgs/Odometry.
 
     t : (n,) s, header stamps; p : (n, 3) m and v : (n, 3) m/s in the world frame; q : (n, 4) x y z w, body to world;
-    covariance : (n, 6, 6) of position (world) and rotation, m^2 and rad^2;
-    twist_covariance : (n, 6, 6) of linear and angular velocity in the body frame, as recorded; remarks : what is missing, sentences.
+    covariance : (n, 6, 6) of position (world) and rotation, m^2 and rad^2; remarks : what is missing, sentences.
     """
 
     t: np.ndarray
@@ -86,7 +85,6 @@ class RecordedOdometry:
     v: np.ndarray
     q: np.ndarray
     covariance: np.ndarray
-    twist_covariance: np.ndarray
     remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -124,16 +122,14 @@ def write_bag(flight: Flight, out: str | Path, storage: str = "mcap", force: boo
         return _write(writer, topics, store)
 
 
-def write_odometry(
-    odometry: Odometry, anchors: Anchors, out: str | Path, storage: str = "mcap", force: bool = False
-) -> dict[str, int]:
+def write_odometry(odometry: Odometry, anchors: Anchors, out: str | Path, force: bool = False) -> dict[str, int]:
     """Write an Odometry among Anchors as a bag with odometry, uwb/anchors and /tf_static; see `write_bag`."""
     store = typestore()
     if not len(odometry):
         raise InputError(f"{out}: there is no odometry to write.")
     topics = _of_anchors(anchors, int(bag_messages.nanoseconds("odometry", odometry.t[:1])[0]), store)
     topics["/odometry"] = "nav_msgs/msg/Odometry", _STREAM_QOS, bag_messages.odometry_messages(odometry, anchors.frame, store)
-    with new_bag(out, storage, force) as writer:
+    with new_bag(out, "mcap", force) as writer:
         return _write(writer, topics, store)
 
 
@@ -261,7 +257,7 @@ def read_odometry(
     p, v, q = rows[:, 0:3], rows[:, 3:6], rows[:, 6:10]
     known = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0.0)
     v = np.where(known[:, None], Rotation.from_quat(np.where(known[:, None], q, [0.0, 0.0, 0.0, 1.0])).apply(v), np.nan)
-    return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), rows[:, 46:82].reshape(-1, 6, 6), remarks)
+    return RecordedOdometry(t, p, v, q, rows[:, 10:46].reshape(-1, 6, 6), remarks)
 
 
 def late_tdoas(
@@ -276,14 +272,14 @@ def late_tdoas(
         return sum(residual.verdict == residual.VERDICT_LATE for _, _, residual in readable(path, reader, found))
 
 
-def read_fields(path: str | Path, topic: str, namespace: str = "") -> dict[str, np.ndarray]:
+def read_fields(path: str | Path, topic: str) -> dict[str, np.ndarray]:
     """Columns of a recorded topic whose messages have a header, e.g. uwb/residual or uwb/tdoa_corrected.
 
     Returns {"t": (n,) s, field: (n,) array, ...} for every field that is one number or one string, in order of header
     stamps; raises InputError.
     """
     with open_bag(path) as reader:
-        topic = Names(namespace)(topic)
+        topic = Names()(topic)
         found = _connections(path, reader, topic)
         if not found:
             raise InputError(f"{path}: has no topic {topic}; record it.")

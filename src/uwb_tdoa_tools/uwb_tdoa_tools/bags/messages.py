@@ -18,7 +18,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import Sensor, Stream
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER, UNKNOWN_VARIANCE
-from uwb_tdoa_ekf.frames import to_odometry
+from uwb_tdoa_ekf.frames import pose_and_twist
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -59,7 +59,7 @@ def imu_messages(imu: Imu, store: Typestore) -> Iterator[tuple[int, Any]]:
     unknown, none = np.zeros(9), np.zeros(9)
     none[0] = -1.0
     for stamp, rate, force in zip(nanoseconds("imu", imu.t).tolist(), imu.gyro.tolist(), imu.accel.tolist()):
-        header = _header(store, stamp, BODY_FRAME)
+        header = header_of(store, stamp, BODY_FRAME)
         yield stamp, Message(header, no_orientation, none, Vector3(*rate), unknown, Vector3(*force), unknown)
 
 
@@ -79,7 +79,7 @@ def sensor_messages(sensor: Sensor, stream: Stream, store: Typestore) -> Iterato
     content = {field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:])) for field, values in sensor.content(stream).items()}
     for k, stamp in enumerate(nanoseconds(sensor.name, stream.t).tolist()):
         message = _blank(store, sensor.message)
-        message.header = _header(store, stamp, BODY_FRAME)
+        message.header = header_of(store, stamp, BODY_FRAME)
         for field, values in content.items():
             *way, last = field.split(".")
             _set(reduce(getattr, way, message), last, values[k])
@@ -132,7 +132,7 @@ def tdoa_messages(tdoa: Tdoas, store: Typestore, antenna: Sequence[float] | None
     Message, frame = store.types["uwb_tdoa_msgs/msg/Tdoa"], ANTENNA_FRAME if antenna else BODY_FRAME
     columns = (nanoseconds("tdoa", tdoa.t), tdoa.a, tdoa.b, tdoa.d, tdoa.variance)
     for stamp, *values in zip(*(column.tolist() for column in columns)):
-        yield stamp, Message(_header(store, stamp, frame), *values)
+        yield stamp, Message(header_of(store, stamp, frame), *values)
 
 
 def tdoa_row(message: Any) -> tuple[float, ...]:
@@ -150,7 +150,7 @@ def pose_messages(truth: Truth, frame: str, store: Typestore) -> Iterator[tuple[
     Message = store.types["geometry_msgs/msg/PoseStamped"]
     q_or_zero = np.where(np.isfinite(truth.q), truth.q, 0.0)
     for stamp, p, q in zip(nanoseconds("truth", truth.t).tolist(), truth.p.tolist(), q_or_zero.tolist()):
-        yield stamp, Message(_header(store, stamp, frame), _pose(store, p, q))
+        yield stamp, Message(header_of(store, stamp, frame), pose_of(store, p, q))
 
 
 def pose_row(message: Any) -> tuple[float, ...]:
@@ -169,10 +169,10 @@ def anchors_message(anchors: Anchors, stamp: int, store: Typestore) -> tuple[int
     Anchor = store.types["uwb_tdoa_msgs/msg/Anchor"]
     q_or_zero = np.where(np.isfinite(anchors.orientations), anchors.orientations, 0.0)
     array = [
-        Anchor(number, _pose(store, p, q))
+        Anchor(number, pose_of(store, p, q))
         for number, p, q in zip(anchors.ids.tolist(), anchors.positions.tolist(), q_or_zero.tolist())
     ]
-    return stamp, store.types["uwb_tdoa_msgs/msg/AnchorArray"](_header(store, stamp, anchors.frame), array)
+    return stamp, store.types["uwb_tdoa_msgs/msg/AnchorArray"](header_of(store, stamp, anchors.frame), array)
 
 
 def transforms_message(
@@ -192,7 +192,7 @@ def transforms_message(
         frames.append((BODY_FRAME, ANTENNA_FRAME, antenna, (0.0, 0.0, 0.0, 1.0)))
     transforms = [
         types["geometry_msgs/msg/TransformStamped"](
-            _header(store, stamp, parent),
+            header_of(store, stamp, parent),
             child,
             types["geometry_msgs/msg/Transform"](
                 types["geometry_msgs/msg/Vector3"](*p), types["geometry_msgs/msg/Quaternion"](*q)
@@ -208,34 +208,33 @@ def odometry_messages(odometry: Odometry, frame: str, store: Typestore) -> Itera
     types = store.types
     Message, Vector3 = types["nav_msgs/msg/Odometry"], types["geometry_msgs/msg/Vector3"]
     Pose, Twist = types["geometry_msgs/msg/PoseWithCovariance"], types["geometry_msgs/msg/TwistWithCovariance"]
-    velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
-    of_twist = np.tile(np.diag([0.0] * 3 + [UNKNOWN_VARIANCE] * 3), (len(odometry.t), 1, 1))
-    of_twist[:, :3, :3] = covariance[:, 6:, 6:]
-    columns = nanoseconds("odometry", odometry.t).tolist(), odometry.p.tolist(), odometry.q.tolist(), velocity.tolist()
-    for stamp, p, q, v, of_pose, its in zip(*columns, covariance[:, :6, :6], of_twist):
-        twist = types["geometry_msgs/msg/Twist"](Vector3(*v), Vector3(0.0, 0.0, 0.0))
-        pose = Pose(_pose(store, p, q), of_pose.ravel())
-        yield stamp, Message(_header(store, stamp, frame), BODY_FRAME, pose, Twist(twist, its.ravel()))
+    n = len(odometry)
+    numbers = pose_and_twist(odometry, np.zeros((n, 3)), np.full(n, UNKNOWN_VARIANCE))
+    for stamp, of_pose, of_twist in zip(nanoseconds("odometry", odometry.t).tolist(), *numbers):
+        twist = types["geometry_msgs/msg/Twist"](Vector3(*of_twist[:3]), Vector3(*of_twist[3:6]))
+        pose = Pose(pose_of(store, of_pose[:3], of_pose[3:7]), of_pose[7:])
+        yield stamp, Message(header_of(store, stamp, frame), BODY_FRAME, pose, Twist(twist, of_twist[6:]))
 
 
 def odometry_row(message: Any) -> tuple[float, ...]:
-    """Stamp, position, velocity in the child frame, quaternion, pose covariance (36), twist covariance (36)."""
+    """Stamp, position, velocity in the child frame, quaternion, pose covariance (36)."""
     return (
         stamp_of(message.header),
         *_point(message.pose.pose.position),
         *_point(message.twist.twist.linear),
         *_quaternion(message.pose.pose.orientation),
         *message.pose.covariance.tolist(),
-        *message.twist.covariance.tolist(),
     )
 
 
-def _header(store: Typestore, stamp: int, frame: str) -> Any:
+def header_of(store: Typestore, stamp: int, frame: str) -> Any:
+    """std_msgs/Header; stamp : ns."""
     time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
     return store.types["std_msgs/msg/Header"](time, frame)
 
 
-def _pose(store: Typestore, p: Sequence[float], q: Sequence[float]) -> Any:
+def pose_of(store: Typestore, p: Sequence[float] | np.ndarray, q: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> Any:
+    """geometry_msgs/Pose of p (3,) m and q x y z w."""
     types = store.types
     return types["geometry_msgs/msg/Pose"](
         types["geometry_msgs/msg/Point"](*p), types["geometry_msgs/msg/Quaternion"](*q)

@@ -70,9 +70,7 @@ def per_event(anchors: int, robust: str, hypotheses: int, repeats: int) -> tuple
         robust=robust, initial_yaw_std=FilterConfig.initial_yaw_std if hypotheses > 1 else 0.5, odometry_rate=RARELY
     )
     core = Core(flight, config)
-    core.run(BEFORE, core.state)
-    if not core.state.record.running:
-        raise RuntimeError("the filter has not started, so that there is nothing to measure")
+    core.start()
     seconds = np.array([[core.timed(False), core.timed(True)] for _ in range(repeats + 1)])
     seconds = seconds[1:]  # the first fills caches
     alive = np.count_nonzero(np.isfinite(core.last.record.hypotheses["log_weight"]))
@@ -86,11 +84,14 @@ def per_aid(aid: str, repeats: int) -> np.ndarray:
     noise: dict[str, Any] = {f"{aid}_noise": NOISES[aid]}
     flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False, **noise)
     core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
-    core.run(BEFORE, core.state)
-    if not core.state.record.running:
-        raise RuntimeError("the filter has not started, so that there is nothing to measure")
+    core.start()
     seconds = np.array([[core.timed(True), core.timed(True, True)] for _ in range(repeats + 1)])[1:]
     return 1e6 * (seconds[:, 1] - seconds[:, 0]) / core.aids
+
+
+def sample_before(stamps: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The last of some stamps (m,), rising, that is no later than each of t (n,), or the first of all: (n,)."""
+    return stamps[np.maximum(np.searchsorted(stamps, t, side="right") - 1, 0)]
 
 
 class Core:
@@ -103,18 +104,20 @@ class Core:
         imu, tdoa = flight.imu, flight.tdoa
         self._imu = structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
         # no prediction of their own: at the stamp of the inertial sample before
-        stamps = imu.t[np.maximum(np.searchsorted(imu.t, tdoa.t, side="right") - 1, 0)]
+        stamps = sample_before(imu.t, tdoa.t)
         rows = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
         self._tdoa = structured(TDOA, stamps, *rows, tdoa.d, np.zeros(len(tdoa)))
         self._aids = loaded(flight, config)[0].take(math.inf).aids
-        self._aids["t"] = imu.t[np.maximum(np.searchsorted(imu.t, self._aids["t"], side="right") - 1, 0)]
+        self._aids["t"] = sample_before(imu.t, self._aids["t"])
         self._begin = imu.t[0]
 
-    def run(self, until: float, state: FilterState) -> None:
-        """Feed the flight's first seconds; what is measured is the rest."""
+    def start(self) -> None:
+        """Feed what comes BEFORE; what is measured is the rest. Raises RuntimeError if the filter does not run by then."""
         streams = self._imu, self._tdoa, self._aids
-        ends = [int(np.searchsorted(stream["t"], self._begin + until)) for stream in streams]
-        self._feed(state, *(stream[:end] for stream, end in zip(streams, ends)))
+        ends = [int(np.searchsorted(stream["t"], self._begin + BEFORE)) for stream in streams]
+        self._feed(self.state, *(stream[:end] for stream, end in zip(streams, ends)))
+        if not self.state.record.running:
+            raise RuntimeError("the filter has not started, so that there is nothing to measure")
         self._imu, self._tdoa, self._aids = (stream[end:] for stream, end in zip(streams, ends))
         self.samples, self.tdoas, self.aids = len(self._imu), len(self._tdoa), len(self._aids)
 

@@ -7,6 +7,8 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from ..scoring import metrics
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from numpy.typing import ArrayLike
@@ -61,8 +63,7 @@ def table(figures: Iterable[Figure]) -> list[str]:
 
 def as_json(figures: Iterable[Figure]) -> list[dict[str, Any]]:
     """List of dicts; JSON has no NaN: null."""
-    rows = [asdict(figure) | {"met": figure.met} for figure in figures]
-    return [{key: None if value != value else value for key, value in row.items()} for row in rows]
+    return [metrics.as_json(asdict(figure) | {"met": figure.met}) for figure in figures]
 
 
 def _cells(figure: Figure) -> tuple[str, ...]:

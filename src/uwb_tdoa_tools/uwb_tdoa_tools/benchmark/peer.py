@@ -31,14 +31,15 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
-from .core import BEFORE, MEASURED, RARELY, Core
+from .core import BEFORE, MEASURED, RARELY, Core, sample_before
 from .figures import Figure
 from .flights import make_flight
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from numpy.typing import ArrayLike
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
 
 VERSION = 1
 EVENT = np.dtype([("t", float), ("gyro", float, 3), ("accel", float, 3), ("d", float), ("a", np.int32), ("b", np.int32)])
@@ -95,16 +96,21 @@ class Peer:
         return p, v, q
 
 
+def events(imu: Imu, tdoa: Tdoas, anchors: Anchors) -> tuple[np.ndarray, np.ndarray]:
+    """(inertial samples, TDOAs) between known Anchors: two arrays of EVENT."""
+    samples: np.ndarray = np.zeros(len(imu), EVENT)
+    ranges: np.ndarray = np.zeros(len(tdoa), EVENT)
+    samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
+    ranges["t"], ranges["a"], ranges["b"], ranges["d"] = tdoa.t, anchors.index(tdoa.a), anchors.index(tdoa.b), tdoa.d
+    return samples, ranges
+
+
 def events_of(flight: Flight, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
     """(inertial samples, the same and TDOAs) of a Flight from begin to end, s: two arrays of EVENT in order of their stamps, each
     TDOA at that of the sample before, as `Core` measures ours."""
     assert flight.imu is not None
-    imu, tdoa = flight.imu, flight.tdoa
-    samples: np.ndarray = np.zeros(len(imu), EVENT)
-    ranges: np.ndarray = np.zeros(len(tdoa), EVENT)
-    samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
-    ranges["t"] = imu.t[np.maximum(np.searchsorted(imu.t, tdoa.t, side="right") - 1, 0)]
-    ranges["a"], ranges["b"], ranges["d"] = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b), tdoa.d
+    samples, ranges = events(flight.imu, flight.tdoa, flight.anchors)
+    ranges["t"] = sample_before(flight.imu.t, ranges["t"])
     samples, ranges = (part[(part["t"] >= begin) & (part["t"] < end)] for part in (samples, ranges))
     both = np.concatenate([samples, ranges])
     return samples, both[np.argsort(both["t"], kind="stable")]
@@ -117,7 +123,7 @@ def measure(progress: Callable[[str], object], peer: Peer, quick: bool = False) 
     flight = make_flight(BEFORE + MEASURED, start_in_air=True, multipath=False)
     assert flight.imu is not None and flight.truth is not None
     core = Core(flight, FilterConfig(initial_yaw_std=0.5, odometry_rate=RARELY))
-    core.run(BEFORE, core.state)
+    core.start()
     begin, end, truth = flight.imu.t[0] + BEFORE, flight.imu.t[-1], flight.truth
     samples, both = events_of(flight, begin, np.inf)
     first = int(np.searchsorted(truth.t, begin))

@@ -36,6 +36,8 @@ RATIO, DEVIATIONS = 0.9, 2.5  # of what stays unexplained; healthy flights: 0.98
 TIE = 0.03  # ratios this close say the same: the simplest arrangement is taken
 CHOSEN = 8  # arrangements that are tried on the longer part
 UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
+# Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
+ARRANGEMENTS = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
 # Of the gyroscope, and what it would be. (Degrees/s are seen in the stream itself.)
 SCALES = {180.0 / np.pi: "rad/s, divided by 57.3 once too often", 2.0 * np.pi: "revolutions/s, not rad/s"}
 
@@ -102,9 +104,7 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     of_short = _unexplained(short)
     arrangements = []
     for accel in (UPRIGHT, MIRROR):
-        for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-            gyro = np.zeros((3, 3))
-            gyro[range(3), order] = signs
+        for gyro in ARRANGEMENTS:
             ratio, _ = compare(of_short, _unexplained(_arranged(short, accel, gyro)))
             arrangements.append((ratio, accel, gyro))
     arrangements.sort(key=lambda entry: entry[0] if np.isfinite(entry[0]) else np.inf)
@@ -133,7 +133,7 @@ def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:
 
 
 def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -> Finding:
-    scale = abs(np.linalg.det(gyro)) ** (1.0 / 3.0)
+    scale = scale_of(gyro)
     unit = next((name for value, name in SCALES.items() if abs(value / scale - 1.0) < 1e-6), None)
     if unit:
         line = f"for axis in 'xyz': setattr(w, axis, {scale:.6g} * getattr(w, axis))  # w = message.angular_velocity"
@@ -149,11 +149,17 @@ def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -
         if not np.array_equal(matrix, UPRIGHT):
             parts.append((name, variable, matrix))
     who = " and ".join(name for name, _, _ in parts)
-    line = "; ".join(f"{v}.x, {v}.y, {v}.z = {', '.join(_axis(v, row) for row in matrix)}" for _, v, matrix in parts)
+    line = "; ".join(f"{v}.x, {v}.y, {v}.z = {', '.join(signed_axis(row, f'{v}.') for row in matrix)}" for _, v, matrix in parts)
     cause = f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed"
     return Finding("imu_axes", ERROR, cause, evidence, line, ratio)
 
 
-def _axis(variable: str, row: np.ndarray) -> str:
-    k = int(np.argmax(np.abs(row)))
-    return ("-" if row[k] < 0.0 else "") + f"{variable}.{'xyz'[k]}"
+def scale_of(matrix: np.ndarray) -> float:
+    """By how much a (3, 3) matrix makes lengths larger."""
+    return abs(np.linalg.det(matrix)) ** (1.0 / 3.0)
+
+
+def signed_axis(direction: np.ndarray, of: str = "") -> str:
+    """Which axis a (3,) direction is along: "y", or "-y"; of : written before its name."""
+    k = int(np.argmax(np.abs(direction)))
+    return f"{'-' if direction[k] < 0.0 else ''}{of}{'xyz'[k]}"

@@ -5,7 +5,6 @@ Both sensors are compared over short cells; constant biases and what changes slo
 
 from __future__ import annotations
 
-from itertools import permutations, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
 from .delays import BLOCK, LONGEST, delays
-from .imu_rules import SCALES
+from .imu_rules import ARRANGEMENTS, SCALES, scale_of, signed_axis
 from .inertial_values import smooth
 from .time_rules import changing
 
@@ -156,13 +155,9 @@ def axes(motion: TrueMotion) -> Iterator[Finding]:
 
 def _explains(motion: TrueMotion, sensor: str, base: float, power: float, change: np.ndarray) -> bool:
     """Whether a change of the axes explains much of what is left without; one that makes values small, more than no values would."""
-    if _scale(change) < 0.9:
+    if scale_of(change) < 0.9:
         base = min(base, motion.power(sensor, motion.true[sensor], np.zeros((3, 3))))
     return power < AXES[sensor] * base
-
-
-def _scale(change: np.ndarray) -> float:
-    return abs(np.linalg.det(change)) ** (1.0 / 3.0)
 
 
 def _best_arrangement(motion: TrueMotion, sensor: str) -> tuple[float, np.ndarray]:
@@ -172,9 +167,8 @@ def _best_arrangement(motion: TrueMotion, sensor: str) -> tuple[float, np.ndarra
 
 def _arrangements(sensor: str) -> list[np.ndarray]:
     """[(3, 3) matrix that undoes it] of what may be wrong with the axes of a sensor."""
-    changes = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
-    changes += [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)] if sensor == "gyro" else []
-    return changes[1:]  # the first is as it is
+    scales = [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)] if sensor == "gyro" else []
+    return [*ARRANGEMENTS[1:], *scales]
 
 
 def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:
@@ -183,15 +177,11 @@ def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:
 
 
 def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Finding:
-    scale = _scale(change)
+    scale = scale_of(change)
     if abs(scale - 1.0) > 0.1:
         cause = f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the turns of the ground truth"
         return Finding("imu_rate_unit", ERROR, cause, evidence, f"angular_velocity *= {scale:.6g}", scale)
-    words = []
-    for k, row in enumerate(change):
-        place = int(np.argmax(np.abs(row)))
-        if place != k or row[place] < 0.0:
-            words.append(f"{'xyz'[k]} is {'-' if row[place] < 0.0 else ''}{'xyz'[place]}")
+    words = [f"{axis} is {found}" for axis, found in zip("xyz", map(signed_axis, change)) if found != axis]
     cause = f"axes of the {SENSORS[sensor]} are exchanged or mirrored: {', '.join(words)} of what it reads"
     return Finding(f"{sensor}_axes", ERROR, cause, evidence, "put the driver right: x forward, y left, z up", power)
 

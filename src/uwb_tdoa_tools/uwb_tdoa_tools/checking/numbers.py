@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_ekf.streams import NOTE, StreamRules, most_severe_first
+from uwb_tdoa_ekf.streams import NOTE, most_severe_first
 
 from . import coverage, inertial_values
 from .against_truth import against_truth
+from .check import fed
+from .recording import of_flight
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
@@ -19,11 +21,7 @@ if TYPE_CHECKING:
 def numbers(flight: Flight) -> list[Finding]:
     """[Finding] of a Flight, most severe first: of its streams by themselves, and against its ground truth if it has one. What several
     rules name by the same name is told once."""
-    streams, imu, of = StreamRules(flight.anchors), flight.imu, flight.tdoa
-    if imu is not None:
-        streams.feed_imu(imu.t, np.full(len(imu), np.nan), imu.gyro, imu.accel)
-    streams.feed_tdoa(of.t, np.full(len(of), np.nan), of.a, of.b, of.d)
-    streams.finish()
+    streams, imu = fed(of_flight(flight)), flight.imu
     found = streams.findings()
     found += coverage.missing(coverage.CoverageView(flight.anchors, list(streams.tdoa), np.empty((0, 3))))
     if imu is not None and not any(finding.rule == "imu_clipped" for finding in found):

@@ -49,13 +49,12 @@ RANGED = tuple(name for name, kind in RADIO.items() if kind.ends == 1)  # stream
 
 @dataclass(frozen=True, eq=False)
 class Attribution:
-    """residuals, remaining : [{channel: ChannelResidual}] under the base model and under the whole; selection : Selection;
+    """residuals : [{channel: ChannelResidual}] under the base model; selection : Selection;
     detections : (Detection, ...); candidates : all declared Candidates; refused : (Refused, ...); names : of the flights; alone :
     ((name of a flight, Selection), ...) of what one flight shows and the others do not; floor : Selection of what there is near the
     floor, beside what is found in the air; None if nobody knows; floor_names : of the flights of its Table."""
 
     residuals: list[ChannelResiduals]
-    remaining: list[ChannelResiduals]
     selection: Selection
     detections: tuple[Detection, ...]
     candidates: list[Candidate]
@@ -176,9 +175,7 @@ def attribute(
     if near:
         floor = on_floor([part for _, part in near], [one for one in wanted if one.on_floor], undeclared, refused, progress)
     floor_names = tuple(name for name, _ in near)
-    return Attribution(
-        under_base, remaining, selection, detections, declared, tuple(refused), names, alone, floor, floor_names
-    )  # fmt: skip
+    return Attribution(under_base, selection, detections, declared, tuple(refused), names, alone, floor, floor_names)
 
 
 def near_floor(residuals: ChannelResiduals) -> ChannelResiduals:

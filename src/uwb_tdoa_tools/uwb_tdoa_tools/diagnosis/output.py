@@ -9,6 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects.wording import listed
 
+from ..scoring import metrics
 from .over_flights import course
 from .report import anchors
 from .report.entries import doubt_in_words, entries, worth_in_words
@@ -25,7 +26,7 @@ WIDTH, LABEL = 120, 10  # columns of the screen, and of them for what a line is
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """What diagnosis.json holds: plain values. Its keys are described in docs/diagnosis.md."""
-    return _plain(
+    return metrics.as_json(
         {
             "verdict": verdict(diagnosis).sentences,
             "flights": [flight.name for flight in diagnosis.flights],
@@ -150,18 +151,3 @@ def _ambiguous(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         for entry in entries(diagnosis)
         if entry.findings[0].declared and entry.undecided
     ]
-
-
-def _plain(value: Any) -> Any:
-    """numpy and non-finite numbers as JSON has them."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value

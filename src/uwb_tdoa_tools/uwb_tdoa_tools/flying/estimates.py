@@ -12,7 +12,7 @@ from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector, LabelCo
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.results import Odometry, concatenated, poses_of
 
-from ..benchmark.peer import EVENT, Peer
+from ..benchmark.peer import Peer, events
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -134,15 +134,10 @@ class TheirFilter:
 
     def take(self, measured: Measured) -> None:
         """Take what arrived: Measured, of which other sensors are passed over."""
-        imu, tdoa = measured.imu, measured.tdoa
-        samples, ranges = np.zeros(len(imu), EVENT), np.zeros(len(tdoa), EVENT)
-        samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
-        ranges["t"], ranges["d"] = tdoa.t, tdoa.d
-        ranges["a"], ranges["b"] = self._anchors.index(tdoa.a), self._anchors.index(tdoa.b)
-        events = np.concatenate([samples, ranges])
-        if len(events):
-            self._peer.run(events[np.argsort(events["t"], kind="stable")])
-            self._states.append((float(events["t"].max()), *self._peer.state()))
+        both = np.concatenate(events(measured.imu, measured.tdoa, self._anchors))
+        if len(both):
+            self._peer.run(both[np.argsort(both["t"], kind="stable")])
+            self._states.append((float(both["t"].max()), *self._peer.state()))
             if all(np.isfinite(part).all() for part in self._states[-1]):
                 self._newest = self._states[-1]
 

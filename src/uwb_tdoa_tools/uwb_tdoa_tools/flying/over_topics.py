@@ -101,8 +101,7 @@ class OverTopics:
             self._pose.publish(self._pose_of(*self._told))
             self._told = None
         self._measured = measured
-        parts: dict[str, Any] = {"imu": measured.imu, "tdoa": measured.tdoa, **measured.aids}
-        for name, part in parts.items():
+        for name, part in measured.streams.items():
             self._outputs[name].publish(*self._parts(part.t), part)
 
     def turned(self, t: float, state: np.ndarray) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from statistics import median_low
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_ekf.reorder_buffer import TRIAL
 
@@ -56,8 +56,7 @@ class Lockstep:
 
     def sent(self, now: float, measured: Measured) -> None:
         """Measured, all up to `now`, s, was published."""
-        parts: dict[str, Any] = {"imu": measured.imu, "tdoa": measured.tdoa, **measured.aids}
-        self._newest |= {stream: part.t[-1] for stream, part in parts.items() if len(part.t)}
+        self._newest |= {stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)}
         self._first = now if self._first is None else self._first
         settled = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED
         self._reach = max(min(self._newest.values(), default=now), now - LONGEST_GAP) - settled

@@ -39,6 +39,11 @@ class Measured:
     tdoa: Tdoas
     aids: dict[str, Stream]
 
+    @property
+    def streams(self) -> dict[str, Any]:
+        """{name: what came of it}, of all."""
+        return {"imu": self.imu, "tdoa": self.tdoa, **self.aids}
+
 
 class Simulator:
     """One vehicle for so many seconds. state (17,), as of `vehicle`; vehicle : the true Vehicle; believed : the one that its controller is

@@ -24,8 +24,7 @@ class Transport:
         """Measured that has arrived by `now`, s, after one more Measured was sent."""
         if not self._latency and not self._jitter:
             return measured
-        parts: dict[str, Any] = {"imu": measured.imu, "tdoa": measured.tdoa, **measured.aids}
-        parts = {stream: self._due(stream, part, now) for stream, part in parts.items()}
+        parts = {stream: self._due(stream, part, now) for stream, part in measured.streams.items()}
         return Measured(parts.pop("imu"), parts.pop("tdoa"), parts)
 
     def _due(self, stream: str, part: Any, now: float) -> Any:

@@ -67,11 +67,6 @@ class Vehicle:
         """The record, of NUMBERS, that compiled code takes."""
         return np.array([tuple(asdict(self).values())], NUMBERS)[0]
 
-    @property
-    def most_thrust(self) -> float:
-        """N, of all rotors together."""
-        return ROTORS * self.thrust * self.top_speed**2
-
     def at_rest(self, x: float, y: float, yaw: float) -> np.ndarray:
         """A state (17,): standing on what is below (x, y), m, with its rotors still."""
         state = np.zeros(STATE)

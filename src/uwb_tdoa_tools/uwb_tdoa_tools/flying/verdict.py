@@ -9,6 +9,7 @@ import numpy as np
 
 from uwb_tdoa_ekf.results import rows_of
 
+from ..scoring.by_phase import rms
 from ..scoring.metrics import nees, position_at
 from .mission import DONE, REFUSED
 from .trial import REST_AFTER
@@ -78,7 +79,7 @@ def _of_mission(flown: Flown, mission: Mission, end: float) -> dict[str, Any]:
         inside = slice(first, last + 1, 8)
         wanted = mission.wanted(t[inside])[:, 0]
         off = np.nan_to_num(states[inside, POSITION] - wanted)  # no height is wanted where it sinks to the ground
-        tracking = _rms(np.linalg.norm(off, axis=1))
+        tracking = rms(np.linalg.norm(off, axis=1))
     place = float(np.linalg.norm(states[-1, :2] - mission.place))
     figures = {
         "took_off": took_off,
@@ -157,11 +158,7 @@ def _estimation(
 def _figures(distance: np.ndarray, normalised: np.ndarray) -> dict[str, float | None]:
     usable = normalised[np.isfinite(normalised)]
     return {
-        "rmse": _rms(distance),
+        "rmse": rms(distance),
         "largest": float(distance.max()),
         "nees": float(usable.mean()) if len(usable) else None,
     }
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

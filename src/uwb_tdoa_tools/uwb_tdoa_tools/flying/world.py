@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 MOMENTS = "rest", "lift-off", "circle", "landing", "anywhere"  # in a flight; on a circle of no radius it hovers
-CHANGES = "silent", "late"
 LONGEST_SILENCE = 60.0  # s
 
 
@@ -44,7 +43,7 @@ class World:
     antennas : received power and both antennas make signals late, as in `simulate`; each flight has another specimen of the tag
     silence : (one of MOMENTS, s) when and for how long nothing is heard; or None
     person : somebody walks through the hall and blocks what passes through him
-    change : one of CHANGES, what one anchor, drawn by seed, is from the middle of the path on; or ""
+    change : "silent" or "late", what one anchor, drawn by seed, is from the middle of the path on; or ""
     lateness : by how much it is late then
     effects : EffectSet, what `inject` puts into flights
     latency, jitter : of everything on its way to the estimate, least, and mean of what comes on top

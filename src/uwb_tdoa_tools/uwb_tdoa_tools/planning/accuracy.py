@@ -65,11 +65,6 @@ class AccuracyMap:
     bound: np.ndarray
     claimed: np.ndarray
 
-    @property
-    def std(self) -> np.ndarray:
-        """Scatter about the bias, (n, 3) m: eq. 22 of Grasso et al."""
-        return np.sqrt(np.maximum(self.rmse**2 - self.bias**2, 0.0))
-
 
 def accuracy_map(samples: Samples, installation: Installation, grid: Grid) -> AccuracyMap:
     """AccuracyMap of Samples. Estimates outside of the grid are left out."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..bags.bag import LATCHED_QOS
 from ..bags.files import new_bag
-from ..bags.messages import anchors_message
+from ..bags.messages import anchors_message, header_of, pose_of
 from ..bags.message_types import typestore
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ TOPICS = {
     "uwb/anchors": "uwb_tdoa_msgs/msg/AnchorArray",
 }
 _CUBES, _SPHERES, _TEXT = 6, 7, 9  # visualization_msgs/msg/Marker
-_IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 
 def messages(chart: Chart, anchors: Anchors, stamp: int = 0) -> dict[str, Any]:
@@ -78,22 +77,11 @@ def publish(found: dict[str, Any]) -> None:
             rclpy.spin_once(node, timeout_sec=0.2)
 
 
-def _header(store: Typestore, frame: str, stamp: int) -> Any:
-    return store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame)
-
-
-def _pose(store: Typestore, p: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> Any:
-    types = store.types
-    return types["geometry_msgs/msg/Pose"](
-        types["geometry_msgs/msg/Point"](*map(float, p)), types["geometry_msgs/msg/Quaternion"](*_IDENTITY)
-    )
-
-
 def _occupancy(store: Typestore, grid: Grid, values: np.ndarray, k: int, frame: str, stamp: int) -> Any:
     """Values (n,) of layer k as an OccupancyGrid at the height of the layer's middle."""
     types, (nx, ny, _) = store.types, grid.shape
-    header = _header(store, frame, stamp)
-    corner = _pose(store, (*grid.lower[:2], grid.axes[2][k]))
+    header = header_of(store, stamp, frame)
+    corner = pose_of(store, (*grid.lower[:2], grid.axes[2][k]))
     info = types["nav_msgs/msg/MapMetaData"](header.stamp, grid.step, nx, ny, corner)
     data = np.ascontiguousarray(grid.layer(values, k).ravel(), dtype=np.int8)
     return types["nav_msgs/msg/OccupancyGrid"](header, info, data)
@@ -109,7 +97,7 @@ def _markers(store: Typestore, chart: Chart, anchors: Anchors, stamp: int) -> An
     drawn.append(_Drawn("anchors", _SPHERES, 0.15, points=anchors.positions))
     for number, p in zip(anchors.ids.tolist(), anchors.positions):
         drawn.append(_Drawn("ids", _TEXT, 0.25, number, at=p + [0, 0, 0.25], text=str(number)))
-    header = _header(store, anchors.frame, stamp)
+    header = header_of(store, stamp, anchors.frame)
     return types["visualization_msgs/msg/MarkerArray"]([_marker(store, header, one) for one in drawn])
 
 
@@ -131,9 +119,9 @@ class _Drawn:
 def _marker(store: Typestore, header: Any, drawn: _Drawn) -> Any:
     types = store.types
     colour, zero = types["std_msgs/msg/ColorRGBA"], types["builtin_interfaces/msg/Duration"](0, 0)
-    nothing = types["sensor_msgs/msg/CompressedImage"](_header(store, "", 0), "", np.empty(0, np.uint8))
+    nothing = types["sensor_msgs/msg/CompressedImage"](header_of(store, 0, ""), "", np.empty(0, np.uint8))
     return types["visualization_msgs/msg/Marker"](
-        header, drawn.namespace, drawn.number, drawn.kind, 0, _pose(store, drawn.at),
+        header, drawn.namespace, drawn.number, drawn.kind, 0, pose_of(store, drawn.at),
         types["geometry_msgs/msg/Vector3"](*[drawn.size] * 3), colour(0.1, 0.3, 0.9, 1.0), zero, False,
         [types["geometry_msgs/msg/Point"](*p) for p in np.asarray(drawn.points).tolist()],
         [colour(*c) for c in np.asarray(drawn.colours).tolist()],

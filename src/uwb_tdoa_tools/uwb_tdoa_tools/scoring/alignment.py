@@ -10,7 +10,6 @@ tells, only the difference of two clocks is known, that of the ground truth and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +19,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..checking.delays import of_tdoas
 from ..checking.known_path import KnownPath
+from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.motion_rules import FEWEST, TrueMotion
 from .metrics import ALIGN, judged_part, position_at
 
@@ -42,7 +42,6 @@ COMMON, ALIKE, APART = 0.6, 1.3, 2.0  # of the shorter path in common; error of 
 AS_WELL = 0.02  # share by which a turned frame and stamps that are late may differ in what they leave, to be as likely
 FITS = 0.6  # of the size of the path, that may be left where an epoch is found
 EPOCH_STEP = 0.1  # s between epochs that are tried
-ARRANGEMENTS = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,11 +292,7 @@ def paths(truth: Truth, odometry: Poses) -> tuple[np.ndarray, np.ndarray]:
     _, first, last = judged_part(truth)
     begin, end = max(first, odometry.t[0]) + LONGEST, min(last, odometry.t[-1]) - LONGEST
     t = np.arange(begin, max(begin, end), 1.0 / RATE)
-    return position_at(t, truth), _at(t, odometry)
-
-
-def _at(t: np.ndarray, path: Poses) -> np.ndarray:
-    return np.stack([np.interp(t, path.t, path.p[:, k]) for k in range(3)], axis=1)
+    return position_at(t, truth), position_at(t, odometry)
 
 
 def _epoch(flight: Flight, odometry: Poses) -> float:
@@ -307,7 +302,7 @@ def _epoch(flight: Flight, odometry: Poses) -> float:
     truth = flight.truth
     if len(odometry.t) < 2:
         raise InputError(f"{flight.name}: the ground truth is on another clock than the TDOAs, and there is no estimate to find it by.")
-    ours, theirs = (_at(np.arange(one.t[0], one.t[-1], EPOCH_STEP), one) for one in (odometry, truth))
+    ours, theirs = (position_at(np.arange(one.t[0], one.t[-1], EPOCH_STEP), one) for one in (odometry, truth))
     lags, size, told = np.arange(-len(theirs) + 1, len(ours)), np.sqrt(np.sum(ours.var(axis=0))), []
     for pair, arrangements in (((ours, theirs), (np.eye(3),)), ((ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)), ARRANGEMENTS)):
         error = _apart_by_lag(pair[0], pair[1], lags, arrangements)
@@ -353,8 +348,4 @@ def moved_frame(truth: Truth, axes: np.ndarray, shift: np.ndarray) -> Truth:
 
 def _axes_in_words(axes: np.ndarray) -> str:
     """Which axis of the survey each axis of the ground truth is: "x, y, -z"."""
-    words = []
-    for column in axes.T:
-        k = int(np.argmax(np.abs(column)))
-        words.append(f"{'-' if column[k] < 0.0 else ''}{'xyz'[k]}")
-    return ", ".join(words)
+    return ", ".join(map(signed_axis, axes.T))

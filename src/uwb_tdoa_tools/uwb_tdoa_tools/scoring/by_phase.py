@@ -44,10 +44,10 @@ class ErrorSeries:
         error, duration = self.error[chosen], sum(last - first for first, last in parts)
         distance = np.linalg.norm(error, axis=1)
         out: dict[str, Any] = {"begin": begin, "duration": duration, "count": int(chosen.sum())}
-        out |= {f"rmse_{axis}": _rms(error[:, k]) for k, axis in enumerate("xyz")}
-        out |= {"rmse_3d": _rms(distance), "max_3d": _of(np.max, distance)}
-        out["std_3d"] = _of(lambda P: np.sqrt(np.mean(np.einsum("nii->n", P))), self.covariance[chosen])
-        out["nees_mean"], out["step"] = _of(np.mean, self.nees[chosen]), _of(np.max, self.step[chosen])
+        out |= {f"rmse_{axis}": rms(error[:, k]) for k, axis in enumerate("xyz")}
+        out |= {"rmse_3d": rms(distance), "max_3d": or_nan(np.max, distance)}
+        out["std_3d"] = or_nan(lambda P: np.sqrt(np.mean(np.einsum("nii->n", P))), self.covariance[chosen])
+        out["nees_mean"], out["step"] = or_nan(np.mean, self.nees[chosen]), or_nan(np.max, self.step[chosen])
         for name, covered in (("without_estimate", self.covered), ("without_truth", self.known)):
             out[name] = max(0.0, duration - sum(_overlap(covered, first, last) for first, last in parts))
         return out
@@ -96,9 +96,11 @@ def _larger(one: float, other: float) -> float:
     return other if math.isnan(one) else float(np.max([one, other]))
 
 
-def _rms(values: np.ndarray) -> float:
-    return _of(lambda v: np.sqrt(np.mean(v**2)), values)
+def rms(values: np.ndarray) -> float:
+    """Root mean square; NaN of nothing."""
+    return or_nan(lambda v: np.sqrt(np.mean(v**2)), values)
 
 
-def _of(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+def or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+    """function(values); NaN of nothing."""
     return float(function(values)) if len(values) else math.nan

@@ -15,12 +15,12 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 from uwb_tdoa_ekf.results import rows_of
 
-from .by_phase import EVERYTHING, ErrorSeries, PooledErrors
+from .by_phase import EVERYTHING, ErrorSeries, PooledErrors, or_nan, rms
 from .distribution import Distribution
 from .phases import AIRBORNE, TITLES, in_the_air, motion, phases
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
     from uwb_tdoa_bias.foundation.flight import Truth
     from uwb_tdoa_ekf.results import Residuals
     from .by_phase import Spans
@@ -126,13 +126,13 @@ def summary(errors: np.ndarray, normalised: np.ndarray, innovations: np.ndarray)
     """The figures of one run, or of several pooled: errors (n, 3) m, NEES (n,), NIS (k,). A dict of floats."""
     distance = np.linalg.norm(errors, axis=1)
     finite = np.isfinite(distance)
-    out = {f"rmse_{axis}": _rms(errors[:, k]) for k, axis in enumerate("xyz")}
-    out["rmse_3d"] = _rms(distance)
-    out["median_3d"], out["max_3d"] = _or_nan(np.median, distance), _or_nan(np.max, distance)
+    out = {f"rmse_{axis}": rms(errors[:, k]) for k, axis in enumerate("xyz")}
+    out["rmse_3d"] = rms(distance)
+    out["median_3d"], out["max_3d"] = or_nan(np.median, distance), or_nan(np.max, distance)
     out["frac_gt_1m"] = float(np.mean(~(distance <= LOST))) if len(distance) else 1.0
     out["diverged"] = bool(out["frac_gt_1m"] > LOST_SHARE or not finite.all())
-    out["nees_mean"], out["nees_median"] = _or_nan(np.mean, normalised), _or_nan(np.median, normalised)
-    out["nis_mean"], out["nis_median"] = _or_nan(np.mean, innovations), _or_nan(np.median, innovations)
+    out["nees_mean"], out["nees_median"] = or_nan(np.mean, normalised), or_nan(np.median, normalised)
+    out["nis_mean"], out["nis_median"] = or_nan(np.mean, innovations), or_nan(np.median, innovations)
     return out
 
 
@@ -171,7 +171,7 @@ class Score:
     @property
     def rmse_3d(self) -> float:
         """m: that of `row`, alone."""
-        return _rms(np.linalg.norm(self.error, axis=1))
+        return rms(np.linalg.norm(self.error, axis=1))
 
     @cached_property
     def series(self) -> ErrorSeries:
@@ -313,11 +313,19 @@ def pooled(scores: Iterable[Score]) -> dict[str, Any]:
     return pool.figures()
 
 
-def as_json(row: Any) -> Any:
-    """JSON has no NaN and no infinity: null; of dicts in it, too."""
-    if isinstance(row, dict):
-        return {key: as_json(value) for key, value in row.items()}
-    return None if isinstance(row, float) and not math.isfinite(row) else row
+def as_json(value: Any) -> Any:
+    """A value, or dicts and sequences of values, as JSON has them: NaN and infinity are null, arrays lists."""
+    if isinstance(value, dict):
+        return {str(key): as_json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [as_json(item) for item in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value
 
 
 def _as_texts(numbers: dict[str, Any]) -> dict[str, Any]:
@@ -332,11 +340,3 @@ def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
 
 def _named(shares: np.ndarray) -> dict[str, float]:
     return {f"coverage_3sigma_{axis}": float(share) for axis, share in zip("xyz", shares)}
-
-
-def _rms(values: np.ndarray) -> float:
-    return _or_nan(lambda v: np.sqrt(np.mean(v**2)), values)
-
-
-def _or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
-    return float(function(values)) if len(values) else float("nan")

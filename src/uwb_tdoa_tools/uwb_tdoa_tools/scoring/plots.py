@@ -24,7 +24,7 @@ SHADES = {  # of phases that follow one another
 }  # fmt: skip
 
 
-def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path, title: str | None = None) -> None:
+def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path) -> None:
     """Error per axis with its 3-sigma band over all of the recording, its phases shaded, and the path from above and from the side,
     to an image file."""
     figure, axes = plt.subplots(3, 2, figsize=(13, 8), width_ratios=(3, 2), layout="constrained")
@@ -53,7 +53,7 @@ def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path,
     axes[0, 1].legend(loc="upper right")
     row = score.row()
     where = TITLES[score.part].removesuffix(" recording")
-    figure.suptitle(title or f"{row['flight']}: 3D RMSE {row['rmse_3d']:.3f} m {where}, {found['whole']['rmse_3d']:.3f} m of all")
+    figure.suptitle(f"{row['flight']}: 3D RMSE {row['rmse_3d']:.3f} m {where}, {found['whole']['rmse_3d']:.3f} m of all")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

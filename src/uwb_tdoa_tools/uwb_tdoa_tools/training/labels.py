@@ -33,15 +33,14 @@ class Labels:
     """Labelled TDOAs of one flight.
 
     name : of the flight; samples : Samples, poses from ground truth; error : (n,) m, measured minus geometric;
-    looks : independent looks that one sample counts as, because errors are alike for a while; has_attitude : the poses
-    have measured attitudes, else the vehicle is taken to be level at yaw 0; digest : hex, of everything above.
+    looks : independent looks that one sample counts as, because errors are alike for a while; digest : hex, of
+    everything above.
     """
 
     name: str
     samples: Samples
     error: np.ndarray
     looks: float
-    has_attitude: bool
     digest: str
 
     def __len__(self) -> int:
@@ -61,7 +60,6 @@ class Labels:
 def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
     """Labels of a Flight, its airborne part without outliers; what `effects` explain is taken out. Raises InputError
     where it cannot teach anything."""
-    has_attitude = bool(np.isfinite(known_truth(flight).q).all())
     flight = effects.correct_streams(replace(level(flight), imu=None))
     truth, data, anchors = known_truth(flight), flight.tdoa, flight.anchors
     first, last = airborne(truth)
@@ -88,7 +86,7 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
         raise InputError(f"{flight.name}: all labels are zero: its TDOAs were made from the ground truth itself.")
     looks = min(1.0, len(anchors) * (last - first) / MEMORY / kept.sum())
     samples = _rows(samples, kept)
-    return Labels(flight.name, samples, error[kept], looks, has_attitude, _digest(samples, error[kept]))
+    return Labels(flight.name, samples, error[kept], looks, _digest(samples, error[kept]))
 
 
 def known_truth(flight: Flight) -> Truth:

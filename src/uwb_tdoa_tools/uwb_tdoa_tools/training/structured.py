@@ -154,10 +154,6 @@ class Structured:
             self.link_covariances[viewer] = posterior.dense_covariance[mine, mine] / s**2
             first = mine.stop
 
-    def forget_sites(self) -> None:
-        """Keep what holds for all anchors; each is then at a site of which nothing is known."""
-        self.site_ids, self.site_positions, self.weights = self.site_ids[:0], self.site_positions[:0], self.weights[:0]
-
     @property
     def sees_attitude(self) -> bool:
         """Whether the mean depends on how the tag is turned."""

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from .base import Comparison
 
 SHIFT = 0.05  # s; the cells are those of the gyroscope
-FEWEST_ATTITUDES = 10
 
 
 class Accel(Inertial):
@@ -28,10 +27,8 @@ class Accel(Inertial):
     negligible = 0.01
 
     def residual(self, comparison: Comparison) -> ImuResidual | None:
-        imu, poses, reference = comparison.flight.imu, comparison.poses, comparison.reference
-        if imu is None or not (reference.attitude_known and all(reference.positions_known)):
-            return None
-        if np.isfinite(poses.q).all(axis=1).sum() <= FEWEST_ATTITUDES:
+        imu = comparison.flight.imu
+        if imu is None or not (comparison.attitude_known and all(comparison.reference.positions_known)):
             return None
         track, edges = comparison.track, cells_in_the_air(comparison, imu, SHIFT)
         middles = edges[1:-1]

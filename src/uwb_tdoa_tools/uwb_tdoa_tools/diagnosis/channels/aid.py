@@ -8,24 +8,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import AidSamples, SmoothTerm, aid_samples
-from uwb_tdoa_bias.effects.covariates import OF_AIDS, OF_IMU, sensor_covariate
+from uwb_tdoa_bias.effects.covariates import OF_AIDS, sensor_covariate
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
-from .base import Channel, ChannelResidual, Rows, covariate_of
+from .base import Channel, ChannelResidual, Rows
 from .figures import figures
-from .inertial import CELL, features_of
+from .inertial import CELL, vibration_at
 from .knots import knots_of
 from .pairs import APART
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_bias.foundation.flight import Imu
     from uwb_tdoa_bias.foundation.sensors import Stream
-    from .base import Comparison
-    from .base import Figures
+    from .base import Comparison, Figures
 
-FEWEST_ATTITUDES, FEWEST_CELLS = 10, 8
+FEWEST_CELLS = 8
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ class Aid(Channel[AidResidual]):
     def residual(self, comparison: Comparison) -> AidResidual | None:
         part, reference = getattr(comparison.flight, self.name), comparison.reference
         known = all(reference.positions_known[k] for k in self.positions)
-        if part is None or not known or (self.of_attitude and not self._attitude(comparison)):
+        if part is None or not known or (self.of_attitude and not comparison.attitude_known):
             return None
         poses, (first, last) = comparison.poses, comparison.span
         inside = (part.t >= max(first, poses.t[0])) & (part.t <= min(last, poses.t[-1]))
@@ -99,7 +97,7 @@ class Aid(Channel[AidResidual]):
         middles = np.array([some.mean() for some in np.split(t, edges)])
         error = np.stack([_median(some) for some in np.split(error, edges)])
         samples = aid_samples(
-            self.name, middles, comparison.track, comparison.start, _vibration(comparison.flight.imu, middles)
+            self.name, middles, comparison.track, comparison.start, vibration_at(comparison.flight.imu, middles)
         )
         error = error - comparison.effects.uncorrected(samples)
         return AidResidual(samples, error, self.labels, self.unit, self.floating)
@@ -107,9 +105,7 @@ class Aid(Channel[AidResidual]):
     def smooth_terms(self, residuals: Sequence[AidResidual]) -> list[SmoothTerm]:
         out = []
         for name in OF_AIDS:
-            values = covariate_of(name, residuals)
-            knots = None if values is None else knots_of(values, name)
-            if knots is not None:
+            if knots := knots_of(name, residuals):
                 out += [SmoothTerm(channel=label, covariate=name, knots=knots) for label in self.labels]
         return out
 
@@ -123,10 +119,6 @@ class Aid(Channel[AidResidual]):
                 out.append({"axis": label, **figures(t[known], r[known])})
         return {"axes": out}
 
-    def _attitude(self, comparison: Comparison) -> bool:
-        known = np.isfinite(comparison.poses.q).all(axis=1).sum()
-        return comparison.reference.attitude_known and known > FEWEST_ATTITUDES
-
     def _values(self, part: Stream) -> np.ndarray:
         """(n, k) of a stream, NaN for what was not measured."""
         values, std = part.values, getattr(part, "std", 0.0)
@@ -136,10 +128,3 @@ class Aid(Channel[AidResidual]):
 def _median(values: np.ndarray) -> np.ndarray:
     known = np.isfinite(values).any(axis=0)
     return np.where(known, np.nanmedian(np.where(known, values, 0.0), axis=0), np.nan)
-
-
-def _vibration(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:
-    """(n,) m/s^2; None without an IMU."""
-    if imu is None:
-        return None
-    return np.interp(t, imu.t, features_of(imu)[:, OF_IMU.index("vibration")])

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ..regression.algebra import Matrix
     from .views import CovariateView
 
+FEWEST_ATTITUDES = 10
 Figures = dict[str, list[dict[str, Any]]]  # of the health of channels: {"pairs", "anchors", "axes", ...: rows}
 
 
@@ -48,6 +49,11 @@ class Comparison:
     def poses(self) -> Truth:
         """Truth: where the flight was, or is believed to have been."""
         return self.view.poses
+
+    @property
+    def attitude_known(self) -> bool:
+        """Whether the reference tells attitudes, and of more than a few poses."""
+        return bool(self.reference.attitude_known and np.isfinite(self.poses.q).all(axis=1).sum() > FEWEST_ATTITUDES)
 
     @cached_property
     def track(self) -> Track:
@@ -106,12 +112,6 @@ class ChannelResidual:
     def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """{label with unit: (t (k,) s, residual (k,))}, to be plotted and judged."""
         raise NotImplementedError
-
-
-def covariate_of(name: str, residuals: Sequence[ChannelResidual]) -> np.ndarray | None:
-    """Values of a covariate at all that is looked at in several ChannelResiduals: (n,); None where one does not know it."""
-    known = [values for values in (part.covariate(name) for part in residuals) if values is not None]
-    return np.concatenate(known) if len(known) == len(residuals) else None
 
 
 ChannelResiduals = dict[str, ChannelResidual]  # of one flight, by the name of the channel

@@ -20,7 +20,7 @@ STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration and rad/s, below which 
 STILL_CHANGE = 0.02  # rad/s, the same of what is measured less what was measured at the start
 BEGINNING = 2  # cells before, in which it may begin to turn
 TURNING = [column for column, name in enumerate(OF_IMU) if name == "turning_rate" or name.startswith("rate_")]
-FEWEST_ATTITUDES, FEWEST_CELLS = 10, 4
+FEWEST_CELLS = 4
 
 
 class Gyro(Inertial):
@@ -38,7 +38,7 @@ class Gyro(Inertial):
             return None
         if not comparison.reference.attitude_known:
             return self._at_rest(comparison, imu)
-        if np.isfinite(poses.q).all(axis=1).sum() <= FEWEST_ATTITUDES:
+        if not comparison.attitude_known:
             return None
         edges = cells_in_the_air(comparison, imu, SHIFT)
         measured, true = means(imu.t, imu.gyro, edges), _true_rates(poses, edges)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.effects import ImuSamples, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, sensor_covariate
 
-from .base import Channel, ChannelResidual, Rows, covariate_of
+from .base import Channel, ChannelResidual, Rows
 from .extra import extra_at, extra_names
 from .figures import figures
 from .knots import knots_of
@@ -63,9 +63,7 @@ class Inertial(Channel[ImuResidual]):
     def smooth_terms(self, residuals: Sequence[ImuResidual]) -> list[SmoothTerm]:
         out = []
         for name in self._covariates(residuals):
-            values = covariate_of(name, residuals)
-            knots = None if values is None else knots_of(values, name)
-            if knots is not None:
+            if knots := knots_of(name, residuals):
                 out += [SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots) for axis in self.axes]
         return out
 
@@ -106,6 +104,11 @@ class Inertial(Channel[ImuResidual]):
 def features_of(imu: Imu) -> np.ndarray:
     """Covariates OF_IMU along the stream: (n, len(OF_IMU))."""
     return ImuFeatures()(imu.t, imu.gyro, imu.accel)
+
+
+def vibration_at(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:
+    """(n,) m/s^2 at stamps t (n,) s; None without an IMU."""
+    return None if imu is None else np.interp(t, imu.t, features_of(imu)[:, OF_IMU.index("vibration")])
 
 
 def cells_in_the_air(comparison: Comparison, imu: Imu, shift: float) -> np.ndarray:

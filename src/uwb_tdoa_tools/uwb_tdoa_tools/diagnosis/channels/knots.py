@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from .base import ChannelResidual
 
 PIECES = 4
 FEWEST = 100  # values
 
 
-def knots_of(values: np.ndarray, name: str) -> tuple[float, ...] | None:
-    """Quantiles of the values (n,) of a covariate, or for one of names these names: tuple; None if it hardly varies."""
+def knots_of(name: str, residuals: Sequence[ChannelResidual]) -> tuple[float, ...] | None:
+    """Quantiles of a covariate at all that is looked at in several ChannelResiduals, or for one of names these names: tuple; None if it
+    hardly varies, or one of them does not know it."""
+    known = [values for values in (part.covariate(name) for part in residuals) if values is not None]
+    if len(known) < len(residuals):
+        return None
+    values = np.concatenate(known)
     values = values[np.isfinite(values)]
     if len(values) < FEWEST:
         return None

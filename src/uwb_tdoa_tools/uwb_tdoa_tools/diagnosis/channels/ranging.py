@@ -11,7 +11,7 @@ from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_MOTION, OF_TDOA
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
-from .base import Channel, covariate_of
+from .base import Channel
 from .extra import extra_names
 from .figures import figures
 from .knots import knots_of
@@ -58,9 +58,7 @@ class Ranging(Channel[RangeResidual]):
     def smooth_terms(self, residuals: Sequence[RangeResidual]) -> list[SmoothTerm]:
         out = []
         for name in (*COVARIATES, *extra_names([part.samples for part in residuals]), *OF_ARRIVAL):
-            values = covariate_of(name, residuals)
-            knots = None if values is None else knots_of(values, name)
-            if knots is not None:
+            if knots := knots_of(name, residuals):
                 forms = ("arrival" if name in OF_ARRIVAL else "common", "anchor")[: 1 if are_many(residuals) else 2]
                 out += [SmoothTerm(channel=self.name, covariate=name, form=form, knots=knots) for form in forms]
         return out

@@ -15,22 +15,22 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 
 from uwb_tdoa_bias.effects import Samples, SmoothTerm, samples_at
-from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
+from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_TDOA
 from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
 from uwb_tdoa_ekf.sensitivity import Innovations
 
 from ...checking.known_path import MANY
 from ..regression.algebra import Matrix
 from . import pairs
-from .base import Channel, ChannelResidual, Rows, covariate_of
+from .base import Channel, ChannelResidual, Rows
 from .extra import extra_at, extra_names
+from .inertial import vibration_at
 from .knots import knots_of
 from .views import OF_EACH, views_of_pairs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_bias.foundation.flight import Imu
     from .base import Comparison, Figures
     from .views import CovariateView
 
@@ -173,7 +173,7 @@ def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> 
     if not airborne.any():
         return None
     samples = kind(**vars(samples_at(t, a, b, poses, anchors, comparison.start)))
-    samples = replace(samples, vibration=_vibration(flight.imu, t), extra=extra_at(flight, t))
+    samples = replace(samples, vibration=vibration_at(flight.imu, t), extra=extra_at(flight, t))
     if kind is Samples:
         previous = np.concatenate([[-1], anchors.ids[b[:-1]]])
         samples = replace(samples, interval=np.diff(t, prepend=t[:1]), previous=previous)
@@ -199,16 +199,12 @@ class Tdoa(Channel[TdoaResidual]):
     def smooth_terms(self, residuals: Sequence[TdoaResidual]) -> list[SmoothTerm]:
         out, many = [], are_many(residuals)
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
-            values = covariate_of(name, residuals)
-            knots = None if values is None else knots_of(values, name)
-            if knots is not None:
+            if knots := knots_of(name, residuals):
                 out.append(SmoothTerm(covariate=name, form="common", knots=knots))
                 if name not in CATEGORIES and not name.startswith(EXTRA) and not many:
                     out.append(SmoothTerm(covariate=name, form="anchor", knots=knots))
         for name in OF_ARRIVAL:
-            values = covariate_of(name, residuals)
-            knots = None if values is None else knots_of(values, name)
-            if knots is not None:
+            if knots := knots_of(name, residuals):
                 out += [SmoothTerm(covariate=name, form=form, knots=knots) for form in ("arrival", "anchor")[: 1 if many else 2]]
         return out
 
@@ -269,10 +265,3 @@ def covariate_at(name: str, samples: Samples) -> np.ndarray | None:
 def of_arrivals(function: Callable[[Samples, np.ndarray], np.ndarray], samples: Samples) -> np.ndarray:
     """(ends, n): of the first and, where there are two, of the second anchor."""
     return function(samples, samples.rows).reshape(samples.ends, -1)
-
-
-def _vibration(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:
-    if imu is None:
-        return None
-    features = ImuFeatures()(imu.t, imu.gyro, imu.accel)
-    return np.interp(t, imu.t, features[:, OF_IMU.index("vibration")])

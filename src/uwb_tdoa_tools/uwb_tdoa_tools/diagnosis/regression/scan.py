@@ -94,7 +94,7 @@ class Scan:
         everywhere = np.ones(len(table.y), dtype=bool)
         model = refit(table, columns_of(chosen), replace(model, weight=weight), everywhere)
         held = _held(table, model, chosen)
-        found = self._gains(table, held)[:PROPOSED]
+        found = self.gains(table, held)[:PROPOSED]
         found = _best_first(table, [self._refined(held, item) for item in found])
         return [self._candidate(*item[1:]) for item in _various(found)]
 
@@ -111,12 +111,9 @@ class Scan:
         best = max(moved, key=lambda each: each[0], default=item)
         return (*best[:4], tried * FINER) if best[0] > gain else item
 
-    def gains(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[_Item]:
+    def gains(self, table: Table, held: _Held) -> list[_Item]:
         """[(gain, _Shapes, shape, knots, how many were tried)], the best first after what its coefficients and its search cost: what a
-        Fit of the chosen Candidates would gain, twice a log-likelihood, with the weights that it has."""
-        return self._gains(table, _held(table, model, chosen))
-
-    def _gains(self, table: Table, held: _Held) -> list[_Item]:
+        Fit would gain, twice a log-likelihood, with the weights that it has."""
         return _best_first(table, [item for group in self._groups for item in group.best(*held)])
 
     def _candidate(self, shapes: _Shapes, shape: str, knots: tuple[float, ...], tried: int) -> Candidate:
