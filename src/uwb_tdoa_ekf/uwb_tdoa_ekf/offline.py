@@ -109,6 +109,13 @@ def without_offset(flight: Flight, offset: float) -> Flight:
     return flight.replaced(range=replace(flight.range, d=flight.range.d - offset))
 
 
+def without_unknown_offset(flight: Flight, config: FilterConfig, corrector: Corrector | None = None) -> Flight:
+    """The Flight without the offset of all ranges that the filter finds, where a FilterConfig makes it look for one. Takes what
+    run_offline takes."""
+    offset = run_offline(flight, config, corrector).range_offset if may_have_offset(flight, config) else None
+    return flight if offset is None else without_offset(flight, offset[0])
+
+
 def loaded(flight: Flight, config: FilterConfig) -> tuple[ReorderBuffer, dict[str, tuple[int, np.ndarray, np.ndarray]]]:
     """ReorderBuffer with the inertial samples and the SENSORS of a Flight, and of each of these how many there are, the places of those
     that can be measurements, in the order of their stamps, and their ranks among all that leave the buffer."""

@@ -22,7 +22,7 @@ from .core.history import RESET
 from .core.memory import RESIDUAL, joined, structured
 from .core.state import ERROR_STATES, MOVING_STATES
 from .core.verdicts import USED
-from .offline import Run, may_have_offset, run_offline, without_offset
+from .offline import Run, run_offline, without_unknown_offset
 from .results import OF_ROW
 
 if TYPE_CHECKING:
@@ -137,9 +137,8 @@ def record_innovations(
     (`range_offset_std`) is found first and taken out of them, unless ranges are among `streams`: then it is among the parameters."""
     corrector = corrector or Corrector(flight.anchors)
     config = replace(config or FilterConfig(), **auxiliary.NO_PRESSURE)
-    if RANGES not in streams and may_have_offset(flight, config):
-        offset = run_offline(flight, config, corrector).range_offset
-        flight = flight if offset is None else without_offset(flight, offset[0])
+    if RANGES not in streams:
+        flight = without_unknown_offset(flight, config, corrector)
     config = replace(config, **auxiliary.NONE)
     records = _Needed()
     run = run_offline(flight, config, corrector, records)
