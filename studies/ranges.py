@@ -8,15 +8,18 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import without_offset
+from uwb_tdoa_tools.localizing.estimate import Estimator
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.noise import FixedNoise
 from uwb_tdoa_tools.planning.pairing import every_range
 from uwb_tdoa_tools.planning.precision import bound, information, position_error
-from uwb_tdoa_tools.scoring.evaluation import evaluate
+from uwb_tdoa_tools.scoring.evaluation import evaluate, score_of
 from uwb_tdoa_tools.scoring.metrics import airborne, position_at
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 STD = 0.1  # m, of a range and of a TDOA, white
+OFFSET, OFFSET_STD = 0.25, 0.3  # m, by which all ranges are too long, and what the filter is told of that
 PATHS = "sines", "circle", "square", "rising_circle", "sines"
 KNOWN = FilterConfig(tdoa_std=STD, range_std=STD, tdoa_correlation_length=1.0)  # of what is simulated
 NONE = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
@@ -50,6 +53,15 @@ def run(args):
         for words, config in (("defaults", FilterConfig()), ("told the noise", KNOWN)):
             rows = [evaluate(taken(flight), config)[0].row() for flight in tqdm(flights, unit="flight", disable=None)]
             print(line(what, words, rows, [bound_of(flight) for flight in flights]), flush=True)
+    print("\n| ranges, 0.25 m too long | estimate | range_offset_std | mean 3D RMSE | NEES |\n|---|---|---:|---:|---:|")
+    for what in ("ranges", "both"):
+        longer = [without_offset(SETS[what](flight), -OFFSET) for flight in flights]
+        for estimate in ("filtered", "smoothed"):
+            for std in (0.0, OFFSET_STD):
+                estimator = Estimator(FilterConfig(range_offset_std=std), smoothed=estimate == "smoothed")
+                rows = [score_of(flight, estimator)[0].row() for flight in tqdm(longer, unit="flight", disable=None)]
+                errors, nees = (np.mean([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean"))
+                print(f"| {what} | {estimate} | {std:g} m | {errors:.3f} m | {nees:.2f} |", flush=True)
     print("\n| ranges beside TDOAs | mean 3D RMSE | largest over that without |\n|---|---:|---:|")
     flights = [flown(seed, persistent=True) for seed in range(args.flights)]
     without = np.array([rmse(flight.without("range")) for flight in flights])

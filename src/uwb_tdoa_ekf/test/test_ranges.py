@@ -10,11 +10,12 @@ import pytest
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.sensors import Ranges
 from uwb_tdoa_ekf.core import ranges
+from uwb_tdoa_ekf.core.auxiliary import RANGE
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import AID, new_state
 from uwb_tdoa_ekf.core.verdicts import INVALID, REPEATED, USED
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.offline import run_offline, without_offset
 from uwb_tdoa_ekf.smoother import smooth
 
 NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
@@ -135,6 +136,25 @@ def test_who_knows_of_no_offset_is_wrong_and_certain(ranged):
     assert error(ranged, run_offline(longer).odometry) > 2.0 * error(ranged, found.odometry)
 
 
-def test_the_smoother_knows_of_no_offset(ranged):
-    one, other = (smooth(ranged, FilterConfig(range_offset_std=std)).odometry for std in (0.0, 0.3))
-    np.testing.assert_array_equal(one.p, other.p)
+def test_the_smoother_takes_the_offset_out_that_the_filter_finds(ranged):
+    run, known = smooth(without_offset(ranged, -0.25), FilterConfig(range_offset_std=0.3)), smooth(ranged)
+    offset, std = run.range_offset
+    assert abs(offset - 0.25) < 3.0 * std < 0.1 and known.range_offset is None
+    assert error(ranged, run.odometry) < 1.2 * error(ranged, known.odometry)
+
+
+@pytest.mark.parametrize("engine", [run_offline, smooth])
+def test_without_ranges_nobody_looks_for_an_offset(engine):
+    flight = fly(seed=1, duration=5.0)
+    one, other = (engine(flight, FilterConfig(range_offset_std=std)) for std in (0.0, 0.3))
+    assert_same(one.odometry, other.odometry)
+    assert other.range_offset is None
+
+
+def test_an_offset_is_kept_where_it_was_known_best():
+    state = new_state(np.zeros((1, 3)))
+    ekf, hypothesis = state.ekf[0], state.ekf[0]["hypotheses"][0]
+    for offset, variance in ((0.0, 0.0), (0.3, 0.04), (0.2, 0.01), (0.5, 0.09)):
+        hypothesis["offset"][RANGE], hypothesis["offset_P"][RANGE, RANGE] = offset, variance
+        ranges.keep_offset(state.ekf[0], hypothesis)
+    assert ekf["range_offset"].tolist() == [0.2, 0.01]

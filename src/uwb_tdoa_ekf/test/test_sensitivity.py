@@ -9,6 +9,7 @@ from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, samples_at
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.sensitivity import FORGOTTEN, record_innovations
 
 # Nothing that decides or learns, so that the filter is as linear as it can be.
@@ -60,6 +61,20 @@ def test_every_used_tdoa_is_found_in_the_history(aided):
     places = np.concatenate(found.of)
     assert sorted(places[places >= 0].tolist()) == list(range(len(found.rows)))
     assert np.all(np.diff(flight.tdoa.t[found.rows]) >= 0.0)
+
+
+def test_an_unknown_offset_of_ranges_bends_no_innovations_of_tdoas():
+    flight = with_ranges(fly(seed=5, duration=6.0), std=0.1)
+    config = FilterConfig(range_offset_std=0.3)
+    longer = without_offset(flight, -0.3)
+    known, unknown, found = (record_innovations(*both) for both in ((flight,), (longer,), (longer, config)))
+
+    def beside(one):
+        return np.sqrt(np.mean((one.value - known.value)[one.t > SETTLED] ** 2))
+
+    assert beside(found) < 0.02 < 0.1 < beside(unknown)
+    of_ranges = record_innovations(longer, config, streams=("tdoa", "range")), record_innovations(longer, streams=("tdoa", "range"))
+    np.testing.assert_array_equal(*(one.value for one in of_ranges))  # there the offset is what somebody looks for
 
 
 def test_blocks_of_sparse_regressors_give_the_same():

@@ -1,14 +1,14 @@
 from dataclasses import replace
 
 from covariances import assert_covariance
-from flights import WORKSPACE, fly, leaving, position_at
+from flights import WORKSPACE, corners, fly, leaving, position_at, with_ranges
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.offline import run_offline, without_offset
 from uwb_tdoa_ekf.smoother import smooth
 
 NOISE = dict(accel_noise=0.05, gyro_noise=0.003)
@@ -93,6 +93,22 @@ def test_its_covariance_holds_errors_that_do_not_average_out():
     expected = np.einsum("nii->n", filtered.persistent[rows[known]])
     np.testing.assert_array_equal(np.einsum("nii->n", smoothed.persistent[known]), expected)
     assert (np.einsum("nii->n", smoothed.covariance[known, :3, :3]) > expected).all() and expected.min() > 0.0
+
+
+def test_its_covariance_holds_what_an_offset_of_all_ranges_may_be_off_by():
+    """Of white noise, so that nothing else persists; anchors at about one height, where an error of the offset is a much larger one of the height."""
+    told = dict(range_std=0.1, tdoa_correlation_length=1.0, robust="gate", gate=1e6, adapt_noise=False, **NOISE)
+    config, nees = FilterConfig(vibration_gain=0.0, initial_yaw_std=0.5, range_offset_std=0.3, **told), []
+    for seed in range(8):
+        flight = with_ranges(fly(seed, 5.0, anchors=corners((7.0, 8.0, 0.3)), **NOISE), seed, 100.0, 0.1)
+        none = Tdoas(*(column[:0] for column in vars(flight.tdoa).values()))
+        smoothed = smooth(without_offset(replace(flight, tdoa=none), -0.3), config).odometry
+        middle = (smoothed.t > 1.5) & (smoothed.t < 4.5)
+        error, covariance = smoothed.p[middle] - position_at(flight, smoothed.t[middle]), smoothed.covariance[middle, :3, :3]
+        both = covariance, covariance - smoothed.persistent[middle]
+        nees.append([np.einsum("ni,nij,nj->n", error, np.linalg.inv(one), error).mean() for one in both])
+    honest, less = np.mean(nees, axis=0)
+    assert 2.0 < honest < 5.0 and less > 2.0 * honest
 
 
 def test_without_imu_it_is_the_least_squares_solution():

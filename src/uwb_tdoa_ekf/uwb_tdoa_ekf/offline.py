@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import TYPE_CHECKING
 
@@ -36,7 +36,8 @@ class Run:
     """Result of one recording. odometry : Odometry; residuals : Residuals, one per TDOA of the flight, in its order;
     bias, bias_std : (n,) m, what was taken from each raw TDOA; recoveries : how often the filter lost and found the
     tag; yaw_offset : rad, from initial_yaw to the start of the yaw hypothesis that was right; aids : {stream: (m,) of
-    RESIDUAL, one per measurement}, for those of the SENSORS that the flight has."""
+    RESIDUAL, one per measurement}, for those of the SENSORS that the flight has; range_offset : (m, m), by how much all ranges are too
+    long, where the filter knew it best, and its standard deviation, of noise alone; None if it did not look for that."""
 
     odometry: Odometry
     residuals: Residuals
@@ -45,6 +46,7 @@ class Run:
     recoveries: int
     yaw_offset: float
     aids: dict[str, np.ndarray]
+    range_offset: tuple[float, float] | None = None
 
     @property
     def counts(self) -> dict[str, int]:
@@ -91,7 +93,27 @@ def run_offline(
     of_aids = joined(RESIDUAL, [part.aids for part in parts])
     aids = {name: _became(n, rows, [of_aids[ranks]]) for name, (n, rows, ranks) in places.items()}
     ekf = pipeline.state.record
-    return Run(odometry_of(parts), residuals, bias, std, int(ekf.recoveries), yaw_offset(int(ekf.best)), aids)
+    offset, variance = ekf.range_offset.tolist()
+    found = (offset, math.sqrt(variance)) if variance < math.inf else None
+    return Run(odometry_of(parts), residuals, bias, std, int(ekf.recoveries), yaw_offset(int(ekf.best)), aids, found)
+
+
+def may_have_offset(flight: Flight, config: FilterConfig) -> bool:
+    """Whether a FilterConfig makes the filter look for an offset of all ranges of a Flight."""
+    looked_for = config.use_range and config.range_offset_std > 0.0  # type: ignore[attr-defined]  # as of SENSORS
+    return looked_for and flight.range is not None and len(flight.range) > 0
+
+
+def without_offset(flight: Flight, offset: float) -> Flight:
+    """The Flight with ranges that are shorter by an offset, m."""
+    return flight.replaced(range=replace(flight.range, d=flight.range.d - offset))
+
+
+def without_unknown_offset(flight: Flight, config: FilterConfig, corrector: Corrector | None = None) -> Flight:
+    """The Flight without the offset of all ranges that the filter finds, where a FilterConfig makes it look for one. Takes what
+    run_offline takes."""
+    offset = run_offline(flight, config, corrector).range_offset if may_have_offset(flight, config) else None
+    return flight if offset is None else without_offset(flight, offset[0])
 
 
 def loaded(flight: Flight, config: FilterConfig) -> tuple[ReorderBuffer, dict[str, tuple[int, np.ndarray, np.ndarray]]]:

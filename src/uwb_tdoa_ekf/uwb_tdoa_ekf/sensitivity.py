@@ -22,7 +22,7 @@ from .core.history import RESET
 from .core.memory import RESIDUAL, joined, structured
 from .core.state import ERROR_STATES, MOVING_STATES
 from .core.verdicts import USED
-from .offline import Run, run_offline
+from .offline import Run, run_offline, without_unknown_offset
 from .results import OF_ROW
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
     from uwb_tdoa_bias.foundation.flight import Flight
 
-TDOAS = "tdoa"  # the stream of TDOAs, beside those of the SENSORS
+TDOAS, RANGES = "tdoa", "range"  # streams: that of TDOAs, which is none of the SENSORS, and that of ranges
 NEEDED = "t", "kind", "transition", "row", "gain", "innovation"  # of a record of the history
 FORGOTTEN = 10.0  # s after which a parameter that no measurement depends on any more has left the estimate
 
@@ -133,9 +133,13 @@ def record_innovations(
     flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None, streams: Sequence[str] = (TDOAS,)
 ) -> Innovations:
     """Run a Flight through bias correction and filter, without its pressure, and keep what `Innovations` need of the TDOAS, and of those
-    SENSORS among `streams` that the flight has and the filter uses. Takes what run_offline takes."""
+    SENSORS among `streams` that the flight has and the filter uses. Takes what run_offline takes. An unknown offset of all ranges
+    (`range_offset_std`) is found first and taken out of them, unless ranges are among `streams`: then it is among the parameters."""
     corrector = corrector or Corrector(flight.anchors)
-    config = replace(config or FilterConfig(), **auxiliary.NONE)
+    config = replace(config or FilterConfig(), **auxiliary.NO_PRESSURE)
+    if RANGES not in streams:
+        flight = without_unknown_offset(flight, config, corrector)
+    config = replace(config, **auxiliary.NONE)
     records = _Needed()
     run = run_offline(flight, config, corrector, records)
     streams = [name for name in streams if name == TDOAS or name in run.aids]

@@ -8,6 +8,8 @@ import pytest
 
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.streams import ERROR, Finding
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.calibrating import calibrate as library
@@ -62,6 +64,18 @@ def test_without_ground_truth_other_flights_get_better_and_none_is_read(flights)
     before = score_of(other, Estimator())[0].row()["rmse_3d"]
     after = score_of(replace(other, anchors=made[0].anchors), Estimator(None, made[0].effects))[0].row()["rmse_3d"]
     assert after < 0.8 * before
+
+
+@pytest.mark.slow
+def test_ranges_of_another_tag_judge():
+    """Another tag has a delay of its own, which the filter finds: anchors are not to blame for that."""
+    flown = dict(CLEAN, range_noise=0.1)
+    ranged = [simulate(SimulationConfig(seed=seed, trajectory=path, **flown)) for seed, path in ((500, "sines"), (501, "circle"))]
+    ranged = [
+        without_offset(replace(flight, truth=None, tdoa=Tdoas(*np.empty((4, 0)))), -delay) for flight, delay in zip(ranged, (0.25, 0.4))
+    ]
+    made = without_truth(ranged[:1], ranged[1:])
+    assert made.why_not is None and made.after < 0.05 and made.before > 0.2
 
 
 @pytest.mark.slow

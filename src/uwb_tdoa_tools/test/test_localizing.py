@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
+from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
@@ -125,6 +127,14 @@ def test_ranges_alone_are_believed_as_tdoas_are(ranged, tmp_path):
     assert len(lines) == 1 + len(ranged.range)
     assert {line.split(",")[1] for line in lines[1:]} == {line.split(",")[2] for line in lines[1:]} == {str(i) for i in ranged.anchors.ids}
     assert (tmp_path / "out" / "ranged_residuals.png").exists() and (tmp_path / "out" / "ranged_zones.csv").exists()
+
+
+def test_an_offset_of_ranges_that_was_found_is_told(ranged):
+    estimator = Estimator(FilterConfig(range_offset_std=0.3), smoothed=True)
+    told = belief.believe(ranged, estimator(without_offset(ranged, -0.25)))
+    assert told.figures["range_offset"] == pytest.approx(0.25, abs=0.02)
+    assert "all ranges are 25 cm too long: that was found, and taken out" in told.sentences()
+    assert "range_offset" not in believed(ranged).figures
 
 
 def test_ranges_that_contradict_each_other_are_not_good(ranged):

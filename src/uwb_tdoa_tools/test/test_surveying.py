@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+import yaml
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -13,8 +14,10 @@ from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.sensors import Ranges
 from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
+from uwb_tdoa_tools.diagnosis.noise import parameters_of
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.diagnosis.self_calibration.equations import delay_effect, tdoa_std_of
 from uwb_tdoa_tools.diagnosis.self_calibration.placing import place
@@ -208,6 +211,18 @@ def test_ranges_tell_of_anchors_and_of_the_delay_of_the_tag(ranged):
     assert "TDOAs" not in as_text(found)
 
 
+def test_another_tag_needs_no_parameter_by_hand(ranged):
+    """What a survey writes beside the anchors lets the filter find by how much another tag differs from the one that was surveyed."""
+    (first, same), _ = ranged
+    found = self_calibrate([first], Tape(0.1, trusted=TRUSTED))
+    told, other = FilterConfig(**parameters_of([first], found.tdoa_std)), without_offset(same, 0.15)
+
+    def left(flight, config=None):
+        return error(at(flight, found.anchors.positions), effects=found.effects, config=config)
+
+    assert left(other, told) < 1.1 * left(same, told) < 1.2 * left(same) and left(other) > 1.5 * left(other, told)
+
+
 def test_only_tdoas_place_an_anchor(ranged):
     with pytest.raises(InputError, match="--unknown 3: only TDOAs place an anchor"):
         self_calibrate(ranged[0][:1], Tape(0.1, unknown=("3",)))
@@ -233,5 +248,8 @@ def test_survey_of_a_recording_of_ranges(ranged, tmp_path, capsys):
     (out / "ekf_node.yaml").write_text("of another day")
     assert main([str(bag), "--trusted", *TRUSTED, "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "wrote anchors.yaml, anchors.csv, effects.yaml, survey.json and survey.png" in said and "ekf_node.yaml" not in said
-    assert not (out / "ekf_node.yaml").exists() and json.loads((out / "survey.json").read_text())["tdoa_std"] is None
+    assert "wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png" in said
+    assert yaml.safe_load((out / "ekf_node.yaml").read_text()) == {"/**": {"ros__parameters": {"range_offset_std": 0.3}}}
+    told = json.loads((out / "survey.json").read_text())
+    delay, std = told["tag_delay"]
+    assert told["tdoa_std"] is None and f"all ranges are {100 * delay:.1f} +- {100 * std:.1f} cm too long" in said

@@ -14,7 +14,8 @@ from .state import ERROR_STATES
 
 PRESSURE, PRESSURE_DRIFT, RANGE = 0, 1, 2  # m and m/s, of the barometer; m, of all ranges
 OFFSET_STATES = 3
-NONE: dict[str, Any] = {"use_pressure": False, "range_offset_std": 0.0}  # parameters of a filter without them: a history has none
+NO_PRESSURE: dict[str, Any] = {"use_pressure": False}  # parameters of a filter without those of the barometer,
+NONE: dict[str, Any] = {**NO_PRESSURE, "range_offset_std": 0.0}  # and of one without any: a history has none
 
 
 @compiled

@@ -192,6 +192,7 @@ def _on_range(
         innovation.repeated, innovation.curvature = rest.repetition(ekf, t), 0.0
         _assimilate(ekf, h, parameters, t, residual, records)
         if h == ekf.best:
+            ranges.keep_offset(ekf, hypothesis)
             systematic.observe(ekf.information, anchor, anchor, innovation, t, ekf.last_tdoa)
     _after_update(ekf, anchors, parameters, t, True, abs(residual.innovation) < INLIER, records)
 

@@ -139,6 +139,7 @@ EKF = _record(
     ("barometer", BAROMETER),
     ("velocity", VELOCITY),
     ("ranged", AID, 1),  # the last distance to an anchor
+    ("range_offset", float, 2),  # m, of all distances, when it was known best, and its variance, m^2; inf: it was not looked for
     ("next_floor", float),  # s, stamp before which not to say again that the tag is at its fixed height
     ("plausibility", PLAUSIBILITY),  # of the inertial samples,
     ("distrusted", bool),  # which are not used, because they cannot be right
@@ -264,7 +265,7 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
     ekf.hypotheses["x"][:, 9] = 1.0
     ekf.hypotheses["P"][:] = np.eye(ERROR_STATES)
     ekf.since_record[:] = np.eye(ERROR_STATES)
-    ekf.consistency = 1.0
+    ekf.consistency, ekf.range_offset[1] = 1.0, np.inf
     ekf.levelled = -np.inf
     return state
 

@@ -58,3 +58,11 @@ def compare(
             hypothesis.offset[RANGE], P[RANGE, RANGE] = 0.0, parameters.range_offset_std**2
         innovation.value -= hypothesis.offset[RANGE]
         depend(hypothesis, innovation, RANGE)
+
+
+@compiled
+def keep_offset(ekf: Record, hypothesis: Record) -> None:
+    """After the update of a HYPOTHESIS: its offset of all ranges, where it was never known better; later it may be forgotten."""
+    variance = hypothesis.offset_P[RANGE, RANGE]
+    if 0.0 < variance < ekf.range_offset[1]:
+        ekf.range_offset[0], ekf.range_offset[1] = hypothesis.offset[RANGE], variance

@@ -51,7 +51,9 @@ class Belief:
         spread = ", ".join(f"{axis} {100 * told[f'std_{axis}']:.0f}" for axis in "xyz")
         within = f"standard deviation {100 * told['std']:.0f} cm ({spread}): the position is within {100 * told['within']:.0f} cm for 95 % of the time"
         fits = f"{told['explained']:.1%} of {_counted(told)} fit it within three standard deviations (NIS {told['nis']:.2f}, 1 or less is sound)"
-        return [f"{self.level}: {within}; {fits}", *self.reasons, *self.remedies]
+        off = told.get("range_offset")
+        offset = [] if off is None else [f"all ranges are {100 * abs(off):.0f} cm too {'long' if off > 0.0 else 'short'}: that was found, and taken out"]
+        return [f"{self.level}: {within}; {fits}", *offset, *self.reasons, *self.remedies]
 
 
 def believe(flight: Flight, run: Run, corrected: bool = False) -> Belief:
@@ -61,6 +63,8 @@ def believe(flight: Flight, run: Run, corrected: bool = False) -> Belief:
     figures = {"seconds": _length(left), "estimates": len(odometry), "tdoas": len(flight.tdoa), "recoveries": run.recoveries}
     if ranges := len(left) - len(flight.tdoa):
         figures["ranges"] = ranges
+    if run.range_offset is not None:
+        figures["range_offset"] = run.range_offset[0]
     faults = [finding for finding in check(of_flight(flight)).findings if finding.severity == ERROR]
     reasons = [f"check: {finding.cause} ({finding.evidence})" for finding in faults]
     remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults]

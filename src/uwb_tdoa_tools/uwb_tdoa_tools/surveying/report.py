@@ -58,6 +58,7 @@ def as_dict(found: SelfCalibration) -> dict[str, Any]:
         "covariance": found.solution.covariance.tolist(),
         "tdoa_std": found.tdoa_std,
         "delay_std": found.solution.delay_std,
+        "tag_delay": found.tag_delay,
         "function_std": found.solution.function_std,
     }
 
@@ -86,6 +87,12 @@ def as_text(found: SelfCalibration) -> str:
     for row in apart(found):
         by = ", ".join(f"{100 * value:+.1f} +- {100 * std:.1f}" for value, std in zip(found.shifts[row], found.position_std[row]))
         lines.append(f"anchor {found.given.ids[row]} does not stand where it was given, as the others do: off by {by} cm (x, y, z)")
+    if found.tag_delay is not None:
+        delay, its_std = found.tag_delay
+        lines.append(
+            f"all ranges are {100 * abs(delay):.1f} +- {100 * its_std:.1f} cm too {'long' if delay > 0.0 else 'short'}, beside what was known: the antenna "
+            "delay of the tag; another tag has its own: the filter finds what differs, by range_offset_std"
+        )
     lines += found.blocked
     if found.marks:
         before, after, nearer = found.marks

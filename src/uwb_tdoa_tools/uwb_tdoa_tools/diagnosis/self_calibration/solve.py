@@ -139,6 +139,14 @@ class SelfCalibration:
         return AnchorPosition(*position, source="survey"), AnchorDelay(*delay, source="survey")
 
     @property
+    def tag_delay(self) -> tuple[float, float] | None:
+        """(m, m): what all ranges are too long by, which is in the delays of all anchors, and its standard deviation; None without ranges."""
+        if not self.prior.common:
+            return None
+        first = self.shifts.size
+        return float(self.delays.mean()), float(np.sqrt(self.solution.covariance[first:, first:].mean()))
+
+    @property
     def covariance(self) -> Covariance:
         """What the next calibration starts from."""
         return to_keep(keys_of(self.given.ids), self.solution.covariance)
